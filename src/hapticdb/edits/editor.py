@@ -2,12 +2,12 @@
 
 import os
 from collections.abc import Set as AbstractSet
-from typing import Self
+from dataclasses import dataclass
+from typing import Literal, Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.edits.steps import EditStep, Kind
 from hapticdb.environment import Environment
 from hapticdb.errors import (
     ConflictError,
@@ -21,6 +21,37 @@ from hapticdb.store.connect import open_store
 
 MOST_STEPS = 1000
 """Greatest number of steps that can be undone. A larger value keeps more records in memory."""
+Kind = Literal["move", "take out", "put back"]
+
+
+@dataclass(frozen=True, eq=False)
+class _EditStep:
+    """One edit of one object, which was one transaction.
+
+    before : the object before it; for "put back", as it was when it was taken out;
+    transform (4, 4) : world_from_part after it, metres; for "take out", where the object was.
+    """
+
+    kind: Kind
+    before: Object
+    transform: NDArray[np.float64]
+
+    @property
+    def object_id(self) -> int:
+        return self.before.id
+
+    def describe(self) -> str:
+        """One line for people: what was done, to which object."""
+        whom = f"{self.before.id} ({self.before.name})"
+        if self.kind == "take out":
+            return f"took out {whom}"
+        if self.kind == "put back":
+            return f"put back {whom}"
+        way = self.transform[:3, 3] - self.before.transform[:3, 3]
+        turned = self.transform[:3, :3] @ np.linalg.inv(self.before.transform[:3, :3])
+        angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
+        told = f"moved {whom} by {1000 * float(np.linalg.norm(way)):.4g} mm"
+        return f"{told}, turned it by {angle:.3g} degrees" if angle > 0.01 else told
 
 
 class Editor:
@@ -53,8 +84,8 @@ class Editor:
         )
         self._seen: dict[int, int] = {}
         self._out: dict[int, Object] = {}
-        self._done: list[EditStep] = []
-        self._undone: list[EditStep] = []
+        self._done: list[_EditStep] = []
+        self._undone: list[_EditStep] = []
         self._history: list[str] = []
         self.look()
 
@@ -130,7 +161,7 @@ class Editor:
         """
         before, place = self._present(object_id), as_floats(transform, "a transform").copy()
         moved = self._move(before, place)
-        return self._note(EditStep("move", before, place), moved)
+        return self._note(_EditStep("move", before, place), moved)
 
     def take_out(self, object_id: int) -> Object:
         """Take an object out of the scene; returns it as it was.
@@ -141,7 +172,7 @@ class Editor:
             As for `move`.
         """
         before = self._take_out(self._present(object_id))
-        return self._note(EditStep("take out", before, before.transform), before)
+        return self._note(_EditStep("take out", before, before.transform), before)
 
     def put_back(self, object_id: int) -> Object:
         """Put an object back that this editor has taken out: where it was, with its id.
@@ -159,7 +190,7 @@ class Editor:
             raise UsageError(f"object {object_id} was not taken out by this editor")
         before = self._out[object_id]
         now = self._put_back(before)
-        return self._note(EditStep("put back", before, before.transform), now)
+        return self._note(_EditStep("put back", before, before.transform), now)
 
     def undo(self) -> str:
         """Undo the last step, as a new transaction; returns a line for people.
@@ -198,7 +229,7 @@ class Editor:
 
     # -- transactions ------------------------------------------------------------------------
 
-    def _again(self, step: EditStep, what: str, *, undone: bool) -> None:
+    def _again(self, step: _EditStep, what: str, *, undone: bool) -> None:
         """Do a step, or undo it; a conflict drops all steps of its object."""
         inverse: dict[Kind, Kind] = {
             "move": "move", "take out": "put back", "put back": "take out",
@@ -274,7 +305,7 @@ class Editor:
         if np.array_equal(written.transform, place):
             self._seen[written.id] = written.revision
 
-    def _note(self, step: EditStep, result: Object) -> Object:
+    def _note(self, step: _EditStep, result: Object) -> Object:
         """Add a new step; what was undone before cannot be done again."""
         self._done = [*self._done, step][-MOST_STEPS:]
         self._undone.clear()

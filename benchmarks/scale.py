@@ -30,13 +30,12 @@ from copies import Plan, Source, write_copies
 from hapticdb import Environment, PointShell
 from hapticdb.query.frame import Strategy
 from hapticdb.sample import write_sample
-from hapticdb.store.base import SupportsCaches
 from hapticdb.store.connect import create_store
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import find_binaries
 from paper.measure import Alternative, Cell, in_turns
 from paper.plots import draw
-from paper.subject import CURVES, PAPER_CACHE
+from paper.subject import CURVES, PAPER_CACHE, limited
 from paper.workload import SEED, random_poses, slide_poses, sphere_shell
 from places import serving
 
@@ -187,8 +186,7 @@ def measure(urls: Sequence[str], sizes: Sequence[ScaleSize]) -> list[Cell]:
         for url, size, stored in zip(urls, sizes, storage, strict=True):
             shell = sphere_shell(size.plan.grid.voxel_size)
             env = opened.enter_context(hapticdb.open(url, read_only=True))
-            if isinstance(env.store, SupportsCaches):  # a server got its cache when it was started
-                env.store.limit_cache(PAPER_CACHE)
+            limited(env, PAPER_CACHE)
             env.calibrate(keep=False)
             conditions = {"cache": "4 MB", "file": "cached", "shell": "sphere"}
             for kind, poses in size.parked_poses().items():

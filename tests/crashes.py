@@ -20,8 +20,6 @@ from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
-from hapticdb.store.postgres.tables.placing import PostgresRows
-from hapticdb.store.postgres.tables.writing import PostgresWriter
 from validity import Contents, contents, valid_contents
 
 N_PARTS = 30
@@ -162,13 +160,8 @@ def small(url: str, file: Path, layout: Layout = "brick") -> Environment:
 
 
 PLACE = placement(0.02, 0.01, -0.03)
-STEPS: dict[str, type[Any]] = {
-    "_next_revision": PostgresWriter,
-    "take": PostgresRows,
-    "put": PostgresRows,
-    "_log": PostgresWriter,
-}
-"""Steps of a write, in their order, by the class whose methods they are."""
+STEPS = ("_next_revision", "_take", "_put", "_log")
+"""Steps of a write, in their order: methods of `PostgresWriter`."""
 Edit = Callable[[Environment], object]
 EDITS: list[tuple[str, Edit]] = [
     ("move", lambda env: env.move(7, PLACE)),
@@ -191,7 +184,7 @@ def edited(file: Path, undisturbed: dict[Layout, Contents]) -> list[Contents]:
 
 
 def steps_of(name: str) -> list[str]:
-    return [step for step in STEPS if step != "put" or name == "move"]
+    return [step for step in STEPS if step != "_put" or name == "move"]
 
 
 def felt(

@@ -14,7 +14,6 @@ from assemblies import (
     assembly,
     ball,
     index_rows,
-    left_behind,
     oracle_voxels,
     placement,
     rows_of,
@@ -29,7 +28,7 @@ from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
 from hapticdb.query.cost_model import machine_name
-from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS, blob, write_voxels
 from mesh_files import gltf
@@ -83,28 +82,6 @@ def test_objects_are_ordered_by_id_and_say_what_they_are(env: Environment, file:
         assert env.object(obj.id).name == obj.name
 
 
-def test_an_object_is_linked_by_its_absolute_path(
-    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    (tmp_path / "alias.obj").symlink_to(file)
-    monkeypatch.chdir(tmp_path)
-    (first,) = hapticdb.import_files("e.db", ["alias.obj"], small_options())
-    assert {o.link for o in first.added} == {str(file.resolve())}
-    (again,) = hapticdb.import_files("sqlite:///e.db", ["./assembly.obj"])
-    assert again.status == "complete"
-
-
-@pytest.mark.parametrize("missing", [0, 5, -1])
-def test_what_is_not_there_is_told(env: Environment, missing: int) -> None:
-    before = env.store.revision()
-    for ask in (env.object, env.voxels, env.remove):
-        with pytest.raises(hapticdb.errors.ObjectNotFoundError, match=f"no object {missing} in"):
-            ask(missing)
-    with pytest.raises(hapticdb.errors.ObjectNotFoundError):
-        env.move(missing, np.eye(4))
-    assert env.store.revision() == before
-
-
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_voxels_return_as_written(tmp_path: Path, layout: Layout, curve: CurveName) -> None:
     """Voxels at the grid's border are included."""
@@ -117,34 +94,6 @@ def test_voxels_return_as_written(tmp_path: Path, layout: Layout, curve: CurveNa
         assert found.dtype == np.int64
         assert voxel_set(found) == voxel_set(inside)
         assert (np.diff(env.grid.encode(found)) > 0).all()
-
-
-# --- removing -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize(("layout", "curve"), KINDS)
-def test_removing_takes_the_rows_of_one_object(
-    tmp_path: Path, file: Path, layout: Layout, curve: CurveName
-) -> None:
-    hapticdb.import_files(tmp_path / "e.db", [file], small_options(curve, layout))
-    with hapticdb.open(tmp_path / "e.db") as env:
-        before = index_rows(env)
-        env.remove(2)
-        assert [o.id for o in env.objects()] == [1, 3, 4]
-        assert index_rows(env) == {row for row in before if row[1] != 2}
-        *_, change = env.store.changes()
-        assert (change.revision, change.action, change.id) == (5, "remove", 2)
-        for i in (1, 3, 4):
-            env.remove(i)
-        assert not index_rows(env)
-
-
-def test_a_removed_object_comes_back_under_a_new_id(env: Environment, file: Path) -> None:
-    before = index_rows(env)
-    env.remove(2)
-    report = env.add(file)
-    assert [(o.id, o.name) for o in report.added] == [(5, "box 1")]
-    assert {(k, 2 if i == 5 else i, bits) for k, i, bits in index_rows(env)} == before
 
 
 # --- moving -------------------------------------------------------------------------------------
@@ -311,24 +260,6 @@ def test_an_environment_opened_to_read_refuses_every_write(env: Environment, fil
     assert rows_of(Path(env.url)) == before
 
 
-def test_leaving_its_context_closes_an_environment(tmp_path: Path) -> None:
-    with hapticdb.create(tmp_path / "e.db", small_grid()) as env:
-        assert env.objects() == []
-    assert left_behind(tmp_path) == ["e.db"]
-    env.close()  # closing twice is harmless
-    with pytest.raises(ZeroDivisionError), hapticdb.open(tmp_path / "e.db") as again:
-        raise ZeroDivisionError
-    again.close()
-    assert left_behind(tmp_path) == ["e.db"]
-
-
-def test_a_closed_environment_says_so(env: Environment, sphere: PointShell) -> None:
-    env.close()
-    for ask in (env.objects, lambda: env.remove(1), lambda: env.touch(sphere, np.eye(4))):
-        with pytest.raises(hapticdb.HapticDBError):
-            ask()
-
-
 # --- other readers ------------------------------------------------------------------------------
 
 EDIT = """
@@ -381,32 +312,7 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
             env.touch(sphere, pose, exclude=[2])
 
 
-def test_what_comes_into_an_environment_opened_empty_is_felt(
-    tmp_path: Path, file: Path, sphere: PointShell
-) -> None:
-    env = hapticdb.create(tmp_path / "e.db", small_grid())
-    for strategy in STRATEGIES:
-        assert not len(env.touch(sphere, np.eye(4), strategy, law="plane").hits)
-    with hapticdb.open(tmp_path / "e.db") as other:
-        other.add(file)
-        pose = placement(*other.object(2).bounds[0])
-    found = [env.touch(sphere, pose, strategy, law="plane") for strategy in STRATEGIES]
-    assert len(found[0].hits)
-    assert len({(t.hits.tobytes(), t.force.tobytes()) for t in found}) == 1
-
-
 # --- statistics ---------------------------------------------------------------------------------
-
-
-def test_quantiles_follow_the_edits(env: Environment) -> None:
-    for n_objects in (4, 3):
-        keys = np.sort(np.array([row[0] for row in index_rows(env)]))
-        vector = env.quantiles(7)
-        ranks = [max(-(-i * len(keys) // 7), 1) for i in range(8)]
-        assert vector.n_rows == len(keys)
-        assert vector.bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
-        assert len(env.objects()) == n_objects
-        env.remove(n_objects)
 
 
 def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointShell) -> None:

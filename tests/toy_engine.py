@@ -12,7 +12,6 @@ from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from functools import cached_property
 from threading import Lock
-from types import MappingProxyType
 from typing import Literal
 
 import numpy as np
@@ -36,11 +35,10 @@ from hapticdb.store.base import (
     Rows,
     Size,
     Store,
+    joined,
     touched_ranges,
 )
-from hapticdb.store.batches import joined
 from hapticdb.store.believed import distances_crc, rows_crc
-from hapticdb.store.engines import Capability
 from hapticdb.store.refusals import (
     check_distances,
     check_unwritten,
@@ -322,8 +320,7 @@ class MemoryStore:
         state = self._state()
         kept = self._contents.histograms.get(resolution)
         since = kept[0] if kept else 0
-        written = sum(obj.voxels for obj, _ in state.objects.values() if obj.revision > since)
-        return Freshness(since if kept else None, state.revision - since, written)
+        return Freshness(since if kept else None, state.revision - since)
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
         self._check_writable()
@@ -339,9 +336,6 @@ class MemoryStore:
 
     # -- hapticdb check ----------------------------------------------------------------------
 
-    def checker(self) -> "MemoryStore":
-        return self
-
     def findings(self) -> Iterator[str]:
         yield from ()
 
@@ -354,13 +348,6 @@ class MemoryEngine:
     """The engine of the scheme ``memory``."""
 
     title = "memory"
-    lacks: Mapping[Capability, str] = MappingProxyType(
-        {
-            "grant": " is in memory: only this process can reach it",
-            "backup": " is in memory, not a file: copy it with 'hapticdb copy'",
-            "restore": " is in memory, not a file: copy into it with 'hapticdb copy'",
-        }
-    )
 
     def open(self, url: str, *, read_only: bool) -> Store:
         contents = ENVIRONMENTS.get(self.name_of(url))

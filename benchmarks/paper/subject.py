@@ -11,8 +11,8 @@ from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import HapticQuery, Query, Strategy
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import SupportsCaches
 from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.sqlite.store import SQLiteStore
 from paper.cells import ALL_CACHED, ONE_STATEMENT
 from paper.looping import looping, server_cache
 from paper.measure import Alternative, Cell, Pose
@@ -115,8 +115,8 @@ def limited(env: Environment, size_bytes: int) -> str:
 
     A server has one cache for all connections: it is not changed, and its size is named.
     """
-    if isinstance(env.store, SupportsCaches):
-        env.store.limit_cache(size_bytes)
+    if isinstance(env.store, SQLiteStore):
+        env.store._connection.fetch(f"PRAGMA cache_size = -{size_bytes >> 10}")  # noqa: SLF001 - no user limits it
     elif isinstance(env.store, PostgresStore):
         size_bytes = server_cache(env.store)
     return ALL_CACHED if size_bytes >= env.size().bytes else f"{size_bytes / (1 << 20):.0f} MB"

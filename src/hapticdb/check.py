@@ -22,7 +22,7 @@ from hapticdb.store.base import (
     Store,
     row_shift,
 )
-from hapticdb.store.believed import BandChecksum, RowsChecksum
+from hapticdb.store.believed import Checksum
 from hapticdb.store.connect import open_store
 
 ROWS_AT_ONCE = 1 << 17
@@ -121,9 +121,8 @@ def check_environment(
 
 def _check(store: Store, report: CheckReport, progress: CheckCallback | None) -> None:
     with store.snapshot():
-        checker = store.checker()
         try:
-            for finding in checker.findings():
+            for finding in store.findings():
                 report.add(finding)
             objects = {obj.id: obj for obj in store.objects()}
         except DamagedError as error:
@@ -179,7 +178,7 @@ class _Sums:
 
     def __init__(self) -> None:
         self.voxels: dict[int, int] = {}
-        self.checksums: dict[int, RowsChecksum] = {}
+        self.checksums: dict[int, Checksum] = {}
 
     def add(self, rows: Rows) -> None:
         """Add a batch to the counts and the checksums of its objects."""
@@ -190,15 +189,10 @@ class _Sums:
         order = np.argsort(rows.ids, kind="stable")
         ids = rows.ids[order]
         starts = np.flatnonzero(np.diff(ids, prepend=ids[0] - 1))
-        sums = np.add.reduceat(counts[order], starts)
-        bricks = rows.occupancy.reshape(-1, BRICK_BYTES) if rows.occupancy.size else None
-        for start, end, total in zip(
-            starts.tolist(), [*starts[1:].tolist(), len(ids)], sums.tolist(), strict=True
-        ):
-            object_id, own = int(ids[start]), order[start:end]
-            self.voxels[object_id] = self.voxels.get(object_id, 0) + total
-            checksum = self.checksums.setdefault(object_id, RowsChecksum())
-            checksum.update(rows.keys[own], rows.occupancy if bricks is None else bricks[own])
+        for own in np.split(order, starts[1:]):
+            object_id = int(rows.ids[own[0]])
+            self.voxels[object_id] = self.voxels.get(object_id, 0) + int(counts[own].sum())
+            self.checksums.setdefault(object_id, Checksum()).add(rows.picked(own))
 
 
 def _row_findings(
@@ -207,12 +201,11 @@ def _row_findings(
     report: CheckReport,
     progress: CheckCallback | None,
 ) -> Iterator[str]:
-    checker = store.checker()
     sums = _Sums()
     places = _Places(store, objects)
     total = store.size().rows
     key, object_id = -1, 0
-    while len(rows := checker.rows_after(key, object_id, ROWS_AT_ONCE)):
+    while len(rows := store.rows_after(key, object_id, ROWS_AT_ONCE)):
         if not _is_ascending(rows, key, object_id):
             yield f"rows after key {key} are not in order"
             return
@@ -231,7 +224,7 @@ def _row_findings(
         found = sums.voxels.get(obj.id, 0)
         if found != obj.voxels:
             yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
-        checksum = sums.checksums.get(obj.id, RowsChecksum()).value()
+        checksum = sums.checksums.get(obj.id, Checksum()).value()
         if obj.rows_crc is not None and checksum != obj.rows_crc:
             yield f"object {obj.id} ({obj.name}): its rows are not those that were written"
 
@@ -239,30 +232,12 @@ def _row_findings(
 # -- distances ------------------------------------------------------------------------------------
 
 
-class _BandSums:
-    """Voxels in bricks with distances, and checksums of distances, of each object."""
-
-    def __init__(self) -> None:
-        self.voxels: dict[int, int] = {}
-        self.checksums: dict[int, BandChecksum] = {}
-
-    def add(self, rows: Rows) -> None:
-        """Add a batch to the counts and the checksums of its objects."""
-        counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
-        for object_id in np.unique(rows.ids).tolist():
-            at = np.flatnonzero(rows.ids == object_id)
-            own = rows.picked(at)
-            self.voxels[object_id] = self.voxels.get(object_id, 0) + int(counts[at].sum())
-            assert own.distances is not None  # noqa: S101 - read with distances
-            self.checksums.setdefault(object_id, BandChecksum()).update(own.keys, own.distances)
-
-
 def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
     """Distances that are damaged, missing, or of no object."""
-    checker, sums = store.checker(), _BandSums()
+    sums = _Sums()
     key, object_id = -1, 0
     key_end = 1 << max(3 * store.grid.bits - row_shift(store.layout), 0)
-    while len(rows := checker.rows_after(key, object_id, BAND_ROWS_AT_ONCE, distances=True)):
+    while len(rows := store.rows_after(key, object_id, BAND_ROWS_AT_ONCE, distances=True)):
         if not _is_ascending(rows, key, object_id):
             yield f"distances after key {key} are not in order"
             return
@@ -285,7 +260,7 @@ def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
             continue
         if sums.voxels.get(obj.id, 0) != obj.voxels:
             yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
-        if sums.checksums.get(obj.id, BandChecksum()).value() != obj.distances_crc:
+        if sums.checksums.get(obj.id, Checksum()).value() != obj.distances_crc:
             yield f"object {obj.id} ({obj.name}): its distances are not those that were written"
 
 

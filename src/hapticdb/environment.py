@@ -22,7 +22,7 @@ from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import as_id
 from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-from hapticdb.store.base import Freshness, Layout, Object, Size, Store
+from hapticdb.store.base import Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
@@ -319,10 +319,6 @@ class Environment(Queries):
     def quantiles(self, resolution: int = DEFAULT_RESOLUTION) -> QuantileVector:
         """Quantile vector of the index's keys (the paper's Definition 2)."""
         return QuantileVector.of(self._store, resolution)
-
-    def freshness(self) -> Freshness:
-        """Age of the statistics that grouping by cost uses."""
-        return self._store.freshness(DEFAULT_RESOLUTION)
 
     def analyze(self) -> QuantileVector:
         """Renew the statistics that grouping by cost uses, even if they are up to date."""

@@ -22,8 +22,7 @@ from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-from hapticdb.store.base import Layout, Object, Rows, Store
-from hapticdb.store.batches import joined
+from hapticdb.store.base import Layout, Object, Rows, Store, joined
 from hapticdb.store.believed import distances_crc
 from hapticdb.store.connect import create_store, exists, open_store
 

@@ -50,7 +50,7 @@ def assert_is_right(
 
 
 @given(st.integers(0, 10_000), st.sampled_from([0.7, 5.0, 40.0]))
-@settings(max_examples=10)
+@settings(max_examples=6)
 def test_clearance_is_that_of_brute_force(
     tmp_path_factory: pytest.TempPathFactory, seed: int, reach: float
 ) -> None:

@@ -116,20 +116,6 @@ def test_poses_may_lie_in_a_file_or_in_memory_that_is_read_only(tmp_path: Path) 
             assert felt.forces.tobytes() == expected.forces.tobytes()
 
 
-def test_no_poses_are_an_empty_batch(tmp_path: Path) -> None:
-    with make(tmp_path, 6) as env:
-        scatter(env)
-        nothing: list[Floats | list[int]] = [[], np.empty((0, 4, 4))]
-        for none in nothing:
-            felt = env.touch(cloud(5), poses=none, objects=True)
-            assert len(felt) == 0
-            assert felt.forces.shape == (0, 3)
-            assert felt.offsets.tolist() == [0]
-            assert felt.objects == []
-            assert len(env.clearance(cloud(5), none)) == 0
-            assert env.collides(cloud(5), none).shape == (0,)
-
-
 def test_the_objects_of_a_batch_are_those_of_its_poses(tmp_path: Path) -> None:
     with make(tmp_path, 6) as env:
         write_voxels(env.store, block((0, 0, 0), (63, 63, 3)), "floor")
@@ -186,15 +172,3 @@ def test_what_is_wrong_is_said_in_one_line(tmp_path: Path) -> None:
         pytest.raises(UsageError, match="lexicographic"),
     ):
         plain.touch(shell, poses=poses)
-
-
-def test_a_tool_larger_than_the_memory_is_told_so(tmp_path: Path) -> None:
-    with make(tmp_path, 8) as env:
-        rng = np.random.default_rng(0)
-        write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
-        shell = cloud(5000, extent=0.1)
-        with (
-            env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=2) as feeler,
-            pytest.raises(UsageError, match="larger budget"),
-        ):
-            feeler.touch(np.eye(4)[None])

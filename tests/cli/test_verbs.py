@@ -35,7 +35,7 @@ def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
         assert (found["voxel_size"], found["bits"]) == (env.grid.voxel_size, 6)
         assert (found["name"], found["engine"]) == (env.name, env.engine)
         assert found["bytes"] == env.size().bytes > 0
-    assert found["statistics"] == {"source": "kept", "revision": 3, "changes": 0, "rows": 0}
+    assert found["statistics"] == {"source": "kept", "revision": 3, "changes": 0}
     assert (found["curve"], found["layout"], found["objects"]) == ("z", "brick", 3)
 
 

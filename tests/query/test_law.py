@@ -4,21 +4,18 @@ The scene of most is the floor: every voxel below the plane z = 0 is solid, eigh
 voxels measure 2^-8 m where a point must lie exactly on a border, 5 mm elsewhere.
 """
 
-import itertools
 import math
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import pytest
-import trimesh
 from hypothesis import HealthCheck, example, given, settings
 from hypothesis import strategies as st
 from numpy.typing import ArrayLike, NDArray
 
 import hapticdb
-from hapticdb import Environment, Grid, PointShell, TangentPlane
-from hapticdb.kernels.surfaces.voxelize import count_voxels, voxelize
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import blob, floor_voxels, write_voxels
@@ -32,7 +29,7 @@ ROUNDING = 1e-12
 Array = NDArray[np.float64]
 UP = (0.0, 0.0, 1.0)
 few = settings(
-    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
+    max_examples=20, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture]
 )
 strategies = pytest.mark.parametrize("strategy", STRATEGIES)
 # strategies without costs, which would have to be measured in each new environment
@@ -179,20 +176,6 @@ def test_the_average_counts_hits_and_not_contacts(
     force = 1.5 * n_deep / divisor
     np.testing.assert_allclose(touch.force, [0, 0, force], atol=ROUNDING)
     np.testing.assert_allclose(touch.torque, [0, -0.0012 * force, 0], atol=ROUNDING)
-
-
-# --- bounds of the depth ------------------------------------------------------------------------
-
-
-@few
-@given(seed=st.integers(0, 2**32 - 1))
-def test_depths_are_bounded_by_half_a_voxel_along_the_normal(floor: Environment, seed: int) -> None:
-    shell = random_shell(seed, 60, 7 * SIZE)
-    touch = floor.touch(shell, at(z=-4 * SIZE), "points")
-    bounds = SIZE / 2 * np.abs(shell.normals[touch.hits]).sum(axis=1)
-    assert (touch.depths >= 0).all()
-    assert (touch.depths <= bounds + 1e-15).all()
-    assert (bounds <= math.sqrt(3) / 2 * SIZE * (1 + 1e-12)).all()
 
 
 # --- case 4 -------------------------------------------------------------------------------------
@@ -373,20 +356,3 @@ def test_two_objects_in_one_voxel_push_once_and_are_both_named(
     assert [tuple(p) for p in all_three.pairs] == [
         (n, i) for n, found in enumerate(ids) for i in found
     ]
-
-
-def test_half_the_voxel_size_gives_about_four_times_the_surface_voxels() -> None:
-    sphere = trimesh.creation.icosphere(subdivisions=5, radius=0.4)
-    triangles = np.asarray(sphere.vertices)[np.asarray(sphere.faces)] + 0.5
-    counts = [count_voxels(voxelize(triangles * 2**bits, bits)[1]) for bits in (6, 7, 8)]
-    for coarse, fine in itertools.pairwise(counts):
-        assert fine == pytest.approx(4 * coarse, rel=0.03)
-
-
-# --- stiffness ----------------------------------------------------------------------------------
-
-
-def test_the_wrench_is_never_capped(floor: Environment) -> None:
-    """No force is capped here: caps belong to devices."""
-    touch = floor.touch(shell_of(punch(4)), at(z=-0.004), law=TangentPlane(stiffness=1e9))
-    np.testing.assert_allclose(touch.force, [0, 0, 6e6], rtol=1e-12, atol=1e-6)

@@ -13,7 +13,6 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
 from hapticdb.kernels.query import contact, refining
 from hapticdb.kernels.records import RESULTS
@@ -155,11 +154,6 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(
         assert felt.hits[n] == felt.contacts[n] == len(wanted.hits)
         n_felt += len(wanted.hits)
     assert n_felt > 0
-
-
-def test_the_statement_computes_the_tangent_plane_alone(env: Environment) -> None:
-    with pytest.raises(UsageError, match="tangent-plane law alone"):
-        env.touch(shell_of(7), np.eye(4), "statement", law=Penalty())
 
 
 def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> None:

@@ -19,12 +19,9 @@ import hapticdb
 from children import child, exit_code
 from command_line import Run, refused, run  # noqa: F401 - a fixture
 from hapticdb import Grid, backup_environment, restore_environment
-from hapticdb.store.engines import BackupProgress
-from hapticdb.store.sqlite import backup as sqlite_backup
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import blob, floor_voxels, write_voxels
-from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
@@ -82,26 +79,6 @@ def test_a_copy_has_what_was_committed_and_nothing_beside_it(path: Path, tmp_pat
     assert names(tmp_path / "copy.db") == ["floor", "blob 1", "blob 2"]
 
 
-def test_a_copy_is_as_of_one_moment_though_others_write_at_each_step(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(sqlite_backup, "STEP_PAGES", 2)
-    heard: list[BackupProgress] = []
-    with closing(SQLiteStore.open(path)) as store:
-
-        def write_meanwhile(progress: BackupProgress) -> None:
-            heard.append(progress)
-            write(store, 10 + len(heard))
-
-        backup_environment(path, tmp_path / "copy.db", progress=write_meanwhile)
-    done = [progress.bytes_done for progress in heard]
-    assert len(heard) > 3
-    assert done == sorted(set(done))
-    assert done[-1] == heard[-1].bytes_total
-    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
-    assert len(names(path)) == 2 + len(heard)
-
-
 def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
     path: Path, tmp_path: Path
 ) -> None:
@@ -135,39 +112,6 @@ def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, pat
     backup_environment(path, copy, replace=True)
     assert names(copy) == ["floor", "blob 1", "blob 2"]
     assert copy.stat().st_mode & 0o777 == 0o640
-
-
-def test_what_was_not_finished_is_left_out(path: Path, copy: Path) -> None:
-    def fail(_: object) -> NoReturn:
-        raise KeyboardInterrupt
-
-    before = files(path.parent)
-    with pytest.raises(KeyboardInterrupt):
-        backup_environment(path, path.with_name("new.db"), progress=fail)
-    with pytest.raises(KeyboardInterrupt):
-        restore_environment(copy, path, progress=fail)
-    assert files(path.parent) == before
-
-
-def test_a_copy_is_made_of_a_file_in_a_folder_that_cannot_be_written(
-    path: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hapticdb.store.sqlite.file.needs_immutable", lambda _: True)
-    backup_environment(path, tmp_path / "copy.db")
-    monkeypatch.undo()
-    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
-    assert not Path(f"{path}-shm").exists()
-
-
-def test_a_copy_of_a_file_of_format_1_is_of_the_newest(path: Path, tmp_path: Path) -> None:
-    make_old(path)
-    before = path.read_bytes()
-    backup_environment(path, tmp_path / "copy.db")
-    assert path.read_bytes() == before
-    assert sqlite_log.file_mark(tmp_path / "copy.db") not in {None, sqlite_log.NO_MARK}
-    assert names(tmp_path / "copy.db") == ["floor", "blob 1"]
-    restore_environment(tmp_path / "copy.db", path)
-    assert names(path) == ["floor", "blob 1"]
 
 
 def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
@@ -228,15 +172,6 @@ def test_a_copy_goes_where_the_file_is_gone_or_damaged(path: Path, copy: Path, w
         path.unlink()
     restore_environment(copy, path)
     assert sorted(files(path.parent)) == ["copy.db", "q.db"]
-    assert names(path) == ["floor", "blob 1"]
-
-
-def test_a_copy_goes_through_a_link(path: Path, copy: Path, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "elsewhere" / "link.db"
-    link.symlink_to(path)
-    restore_environment(copy, link)
-    assert link.is_symlink()
     assert names(path) == ["floor", "blob 1"]
 
 
@@ -314,16 +249,6 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         restore_environment(other, tmp_path / "q.db")
     assert files(tmp_path) == before
-
-
-def test_a_log_without_its_file_is_not_given_to_a_new_one(path: Path, copy: Path) -> None:
-    killed(path, 3)
-    path.unlink()
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match=r"q\.db-wal was left"):
-        hapticdb.create(path, GRID)
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match=r"q\.db-wal was left"):
-        backup_environment(copy, path)
-    assert not path.exists()
 
 
 def test_every_copy_has_a_mark_of_its_own(path: Path, copy: Path, tmp_path: Path) -> None:

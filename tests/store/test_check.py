@@ -21,7 +21,6 @@ from hapticdb import Grid, PointShell
 from hapticdb.store import believed
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.raw import PAGE_BYTES
-from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import KINDS, write_voxels
 
 LAYOUTS: tuple[Layout, ...] = ("brick", "voxel")
@@ -55,7 +54,6 @@ def used(path: Path, sphere: PointShell) -> None:
             lambda: env.store.costs("elsewhere"),
             lambda: env.quantiles(10),
             env.size,
-            env.freshness,
             lambda: env.remove(2),
             env.analyze,
         ):
@@ -95,36 +93,6 @@ def test_a_sound_environment_stays_sound_through_edits(
         assert (report.objects, report.without_row_checksums) == (3, 0)
 
 
-def everything(path: Path) -> list[object]:
-    """Objects and rows of an environment."""
-    with hapticdb.open(path, read_only=True) as env:
-        rows = env.store.scan(np.zeros(1, np.int64), np.full(1, 1 << 62))
-        objects = [(o.id, o.name, o.voxels, o.bounds.tolist()) for o in env.objects()]
-        return [objects, rows.keys.tolist(), rows.ids.tolist()]
-
-
-def test_an_earlier_state_of_a_page_is_found(tmp_path: Path) -> None:
-    """Its content contradicts other pages."""
-    path = made(tmp_path / "e.db", "voxel")
-    before = path.read_bytes()
-    with hapticdb.open(path) as env:
-        env.remove(1)
-        write_voxels(env.store, np.argwhere(np.ones((24, 24, 8))) + 60, "c")
-    after = path.read_bytes()
-    truth = everything(path)
-    n_found = n_stale = 0
-    for start in range(PAGE_BYTES, min(len(before), len(after)), PAGE_BYTES):
-        stop = start + PAGE_BYTES
-        if before[start:stop] != after[start:stop]:
-            path.write_bytes(after[:start] + before[start:stop] + after[stop:])
-            n_stale += 1
-            if hapticdb.check_environment(path).is_sound:
-                assert everything(path) == truth  # the page is free, or holds statistics
-            else:
-                n_found += 1
-    assert n_found > n_stale / 2 > 5
-
-
 def test_check_speaks_by_its_exit_code(tmp_path: Path, run: Run) -> None:
     path = made(tmp_path / "sound.db", "brick")
     code, out, _ = run("check", path)
@@ -162,15 +130,6 @@ def test_whatever_a_row_holds_it_is_an_object_or_one_error(row: list[object]) ->
     ):
         said = told(ask)
         assert said == "" or said.startswith("e.db is damaged")
-
-
-def test_a_store_says_how_to_get_checksums(tmp_path: Path, run: Run) -> None:
-    path = made(tmp_path / "e.db", "brick")
-    edited(path, "UPDATE object SET attributes = '{}' WHERE id = 1", "brick")
-    code, out, _ = run("check", path)
-    assert code == 0
-    assert "1 object without checksums: 'hapticdb copy'" in out
-    assert isinstance(SQLiteStore.open(path).objects()[0].attributes, dict)
 
 
 def test_damage_that_a_fetching_process_reads_is_one_line(tmp_path: Path) -> None:

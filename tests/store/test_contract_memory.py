@@ -18,7 +18,7 @@ def new_url(name: str) -> str:
 
 
 class TestMemoryStore(StoreContract):
-    lacks = frozenset({"statement", "caches", "watch", "grouping threshold"})
+    lacks = frozenset({"statement", "caches", "watch"})
 
     def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
         return ENGINE.create(new_url(name), grid, layout)

@@ -13,12 +13,9 @@ from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.query.frame import Strategy
-from hapticdb.store.base import Keys, Layout, Store
+from hapticdb.store.base import Layout, Store
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.store.postgres.tables import statistics as store_statistics
-from hapticdb.store.postgres.tables.histogram import exact_histogram
 from hapticdb.testing import (
     EngineContract,
     StoreContract,
@@ -67,18 +64,6 @@ def url(place: Place) -> str:
     write_voxels(store, floor_voxels(GRID))
     store.close()
     return where
-
-
-def test_creating_never_replaces_an_environment(url: str) -> None:
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
-        hapticdb.create(url, GRID)
-    with hapticdb.open(url) as env:
-        assert len(env.objects()) == 1
-
-
-def test_what_is_not_there_is_told(place: Place) -> None:
-    with pytest.raises(hapticdb.errors.EnvironmentNotFoundError, match="hapticdb import"):
-        hapticdb.open(place())
 
 
 def test_a_foreign_schema_is_told_apart_and_left_alone(
@@ -135,20 +120,6 @@ def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:
     admin.execute(f"DROP TABLE {parse(url).environment}.brick")
     with pytest.raises(hapticdb.errors.DamagedError, match="is damaged"):
         hapticdb.open(url, read_only=True).store.lookup(np.arange(9))
-
-
-def test_a_read_only_environment_refuses_to_be_written(url: str) -> None:
-    env = hapticdb.open(url, read_only=True)
-    with pytest.raises(hapticdb.errors.ReadOnlyError, match="opened to read"):
-        env.remove(1)
-    with pytest.raises(hapticdb.errors.ReadOnlyError):
-        env.store.save_costs("here", {})
-
-
-def test_no_other_thread_may_use_it(url: str) -> None:
-    env = hapticdb.open(url, read_only=True)
-    with ThreadPoolExecutor(1) as pool, pytest.raises(hapticdb.errors.UsageError, match="thread"):
-        pool.submit(env.objects).result(PATIENCE)
 
 
 def test_rows_that_come_without_an_index_are_sorted(url: str, admin: psycopg.Connection) -> None:
@@ -254,31 +225,6 @@ def test_tiny_components_of_normals_end_as_in_the_kernels(url: str) -> None:
     assert len(by_kernel.hits) == 2
     assert by_kernel.force.tobytes() == by_server.force.tobytes()
     assert by_kernel.torque.tobytes() == by_server.torque.tobytes()
-
-
-def test_names_may_be_long(url: str) -> None:
-    store = PostgresStore.open(url)
-    name = "".join(chr(0x4E00 + n % 20000) for n in range(4000))
-    write_voxels(store, blob(1, (30, 30, 30)), name)
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError):
-        write_voxels(store, blob(2, (30, 30, 30)), name)
-
-
-def test_statistics_carry_the_revision_that_they_were_made_at(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store, other = PostgresStore.open(url), PostgresStore.open(url)
-
-    def slow(connection: ServerConnection, layout: Layout, resolution: int) -> tuple[Keys, int]:
-        found = exact_histogram(connection, layout, resolution)
-        write_voxels(other, blob(1, (30, 30, 30)), "meanwhile")
-        return found
-
-    monkeypatch.setattr(store_statistics, "exact_histogram", slow)
-    store.analyze(10)
-    monkeypatch.undo()
-    assert store.freshness(10).changes == 1
-    assert store.quantiles(10).source == "computed"
 
 
 def test_a_database_of_another_encoding_serves(place: Place, admin: psycopg.Connection) -> None:

@@ -15,7 +15,7 @@ from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.histogram import SERVER_RESOLUTION, with_common_values
-from hapticdb.testing import voxel_object, write_voxels
+from hapticdb.testing import write_voxels
 from servers import Place
 
 GRID = Grid(0.005, (0, 0, 0), 8)
@@ -66,14 +66,6 @@ def test_common_values_go_back_to_their_rank(
         assert np.mean(keys < bound) <= share + 2 * bucket + 1e-9
 
 
-def test_without_common_values_the_histogram_stays_as_it_is() -> None:
-    bounds = np.sort(np.random.default_rng(0).integers(0, 2**60, SERVER_RESOLUTION + 1))
-    none = np.empty(0, dtype=np.int64)
-    found = with_common_values(bounds, none, np.empty(0), SERVER_RESOLUTION)
-    # equal up to rounding: float64 cannot hold every key of this size
-    assert np.abs(found - bounds).max() <= np.diff(bounds).max() * 1e-6
-
-
 @pytest.fixture
 def large(place: Place) -> hapticdb.Environment:
     """Two objects of together 130,000 voxels, some of them shared, in the voxel layout."""
@@ -99,24 +91,6 @@ def test_the_default_resolution_comes_from_the_server(large: hapticdb.Environmen
     error = np.abs(ranks - np.arange(SERVER_RESOLUTION + 1) / SERVER_RESOLUTION)
     assert error.max() <= 3 / SERVER_RESOLUTION
     assert large.quantiles(1000).source == "computed"
-
-
-def test_a_resolution_above_the_servers_is_computed(large: hapticdb.Environment) -> None:
-    finer = large.quantiles(20_000)
-    assert (finer.source, finer.resolution) == ("computed", 20_000)
-    keys = np.sort(large.store.scan(*(np.array([b]) for b in (0, 2**62))).keys)
-    ranks = -(-np.arange(1, 20_001) * len(keys) // 20_000)
-    assert finer.bounds[1:].tolist() == keys[ranks - 1].tolist()
-
-
-def test_freshness_follows_the_servers_count(large: hapticdb.Environment) -> None:
-    store = large.store
-    assert store.freshness(DEFAULT_RESOLUTION)[1:] == (0, 0)
-    ijk = np.array([[1, 1, 1], [2, 2, 2]])
-    store.add(voxel_object(GRID, ijk, "two"), store.scan(*(np.array([b]) for b in (0, 0))))
-    assert store.freshness(DEFAULT_RESOLUTION).changes == 1
-    store.analyze(DEFAULT_RESOLUTION)
-    assert store.freshness(DEFAULT_RESOLUTION).changes == 0
 
 
 @pytest.mark.parametrize("form", ["lookup", "scan"])

@@ -15,7 +15,7 @@ import pytest
 
 import hapticdb
 from capabilities import ENGINE_LACKS, STORE_LACKS
-from children import PATIENCE, child, exit_code
+from children import child, exit_code
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import backup_environment
@@ -68,13 +68,6 @@ def path(tmp_path: Path) -> Path:
     return tmp_path / "e.db"
 
 
-def test_the_file_is_marked_as_ours(path: Path) -> None:
-    with closing(sqlite3.connect(path)) as plain, plain:
-        assert plain.execute("PRAGMA application_id").fetchone() == (0x48415054,)
-        assert version_of(path) == FORMAT_VERSION
-        assert plain.execute("PRAGMA journal_mode").fetchone() == ("wal",)
-
-
 def test_a_file_of_format_1_has_no_distances_until_somebody_writes_some(path: Path) -> None:
     make_old(path)
     everywhere = np.array([0]), np.array([2**62])
@@ -111,14 +104,6 @@ def test_a_file_whose_pages_had_checksums_is_read_copied_and_written(
 def version_of(path: Path) -> int:
     with closing(sqlite3.connect(path)) as plain:
         return int(plain.execute("PRAGMA user_version").fetchone()[0])
-
-
-def test_creating_never_replaces_a_file(path: Path) -> None:
-    content = path.read_bytes()
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="exists already"):
-        hapticdb.create(path, GRID)
-    assert path.read_bytes() == content
-    assert sorted(p.name for p in path.parent.iterdir()) == ["e.db"]
 
 
 def write_text(path: Path) -> None:
@@ -191,39 +176,6 @@ def test_pages_overwritten_with_noise_end_in_one_error(
     path.write_bytes(content)
     with pytest.raises(hapticdb.errors.DamagedError, match="restore a copy"):
         hapticdb.open(path).touch(sphere, np.eye(4), "array")
-
-
-def test_a_folder_is_no_environment(tmp_path: Path) -> None:
-    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
-        hapticdb.open(tmp_path)
-
-
-def test_readers_go_on_while_a_writer_commits(path: Path) -> None:
-    script = (
-        "import sys, hapticdb\n"
-        "env = hapticdb.open(sys.argv[1], read_only=True)\n"
-        "seen = {len(env.objects())}\n"
-        "print('ready', flush=True)\n"
-        "while len(env.objects()) < 6: seen.add(len(env.objects()))\n"
-        "print(sorted(seen | {len(env.objects())}))\n"
-    )
-    with child([sys.executable, "-c", script, str(path)]) as reader:
-        assert reader.stdout is not None
-        assert reader.stdout.readline() == "ready\n"
-        store = SQLiteStore.open(path)
-        for n in range(5):
-            write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-        out, _ = reader.communicate(timeout=PATIENCE)
-    assert reader.returncode == 0
-    assert out.strip().endswith("6]")
-
-
-def test_a_read_only_environment_refuses_to_be_written(path: Path) -> None:
-    env = hapticdb.open(path, read_only=True)
-    with pytest.raises(hapticdb.errors.ReadOnlyError, match=r"can only be read|opened to read"):
-        env.remove(1)
-    with pytest.raises(hapticdb.errors.ReadOnlyError):
-        env.store.save_costs("here", {})
 
 
 def test_an_unprivileged_reader_opens_a_read_only_folder(path: Path, tmp_path: Path) -> None:

@@ -13,32 +13,10 @@ import hapticdb
 from children import finished
 from command_line import Run, boxes, poses, refused, run  # noqa: F401 - fixtures
 from hapticdb.errors import UsageError
-from hapticdb.store.engines import BUILT_IN, engine_of
-from hapticdb.store.urls import scheme_of
 from installed import PAGE, install_toy
 
 ROOT = Path(__file__).parent.parent.parent
 CONTRACT, USE = [text for kind, text in PAGE if kind == "python"]
-
-
-@pytest.mark.parametrize(
-    ("url", "scheme"),
-    [
-        ("car.db", ""),
-        ("sqlite:///car.db", "sqlite"),
-        ("PostgreSQL://host/plant", "postgresql"),
-        ("memory://x?y=z://", "memory"),
-    ],
-)
-def test_a_scheme_stands_before_its_slashes(url: str, scheme: str) -> None:
-    assert scheme_of(url) == scheme
-
-
-def test_every_engine_of_this_package_is_found_by_its_schemes(tmp_path: Path) -> None:
-    assert engine_of("car.db") is engine_of("sqlite:///car.db") is engine_of(tmp_path)
-    assert engine_of("postgres://host/plant") is engine_of("postgresql:///plant")
-    titles = {scheme: engine_of(f"{scheme}:///x").title for scheme in BUILT_IN}
-    assert titles == {"sqlite": "SQLite", "postgresql": "PostgreSQL", "postgres": "PostgreSQL"}
 
 
 def test_a_scheme_that_no_engine_has_is_told() -> None:
@@ -89,14 +67,6 @@ def test_an_installed_engine_is_used_from_the_command_line(run: Run, tmp_path: P
     refused(run("grant", url, "anna", "--as", "viewer"), "only this process can reach it")
     refused(run("backup", url, "other.db"), "hapticdb copy")
     refused(run("backup", "copy.db", url), "is on memory, not a file")
-
-
-@pytest.mark.usefixtures("toy_is_installed")
-def test_a_pool_lends_environments_of_an_installed_engine(tmp_path: Path) -> None:
-    url = f"memory://{tmp_path.name}-pool"
-    hapticdb.create(url, hapticdb.Grid(0.01, (0, 0, 0), 5)).close()
-    with hapticdb.Pool(url, size=2) as pool, pool.environment() as one, pool.environment() as two:
-        assert one.store.identity is two.store.identity
 
 
 def test_the_page_shows_the_contract_that_the_toy_passes() -> None:

@@ -102,12 +102,6 @@ def test_a_word_that_chooses_nothing_is_told(car: Environment, word: int | str, 
     assert len(str(told.value)) < 400
 
 
-@pytest.mark.parametrize("word", [True, 1.0, None, b"tyre", ["tyre"]])
-def test_what_is_no_word_is_refused(car: Environment, word: object) -> None:
-    with pytest.raises(UsageError, match="give an id, a name or a pattern"):
-        car.find(word)  # type: ignore[arg-type]
-
-
 def test_a_shell_of_several_objects_lies_on_all_of_them_where_they_sit(car: Environment) -> None:
     shell = car.shell("wheels/rear", 5, points=600, seed=3)
     cubes = np.array([0.4, 0.6, 0.8])  # x of the cubes' centres

@@ -218,16 +218,6 @@ def unfinished_move(url: str) -> Iterator[psycopg.Connection]:
         writer.rollback()
 
 
-def test_a_writer_in_the_middle_stops_no_reader(url: str) -> None:
-    shell = two_tools()
-    with unfinished_move(url), hapticdb.open(url, read_only=True) as reader:
-        for strategy in STRATEGIES:
-            assert reader.touch(shell, np.eye(4), strategy, law="plane").objects
-        assert len(reader.voxels(1)) == reader.object(1).voxels
-        assert reader.size().rows > 0
-        assert reader.quantiles().n_rows > 0
-
-
 def test_a_lock_held_too_long_is_told(url: str) -> None:
     impatient = f"{url}&options=-clock_timeout%3D200"
     with hapticdb.open(impatient) as env:
@@ -239,25 +229,6 @@ def test_a_lock_held_too_long_is_told(url: str) -> None:
             assert len(env.objects()) == 1
         env.move(1, placement(0.18, 0, 0))
         assert_valid(env)
-
-
-def test_of_two_writers_of_one_object_one_waits(url: str) -> None:
-    """Neither write is lost: the second begins where the first has ended."""
-    with unfinished_move(url) as first:
-        second = threading.Thread(target=move_once, daemon=True, args=(url, placement(0.18, 0, 0)))
-        second.start()
-        second.join(0.3)
-        assert second.is_alive()
-        first.rollback()
-        joined(second)
-    with hapticdb.open(url) as env:
-        np.testing.assert_array_equal(env.object(1).transform, placement(0.18, 0, 0))
-        assert_valid(env)
-
-
-def move_once(url: str, transform: np.ndarray[Any, Any]) -> None:
-    with hapticdb.open(url) as env:
-        env.move(1, transform)
 
 
 def test_translations_of_two_writers_both_count(url: str) -> None:

@@ -15,7 +15,7 @@ import psycopg
 import pytest
 
 from children import PATIENCE, child, finished, until
-from hapticdb.errors import DatabaseError, MissingExtraError, UsageError
+from hapticdb.errors import DatabaseError
 from hapticdb.resident.table import is_alive
 from hapticdb.store.postgres import private_server
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
@@ -110,51 +110,12 @@ def test_a_new_folder_becomes_a_private_server(place: Path, binaries: Binaries) 
     assert (server.folder / "data").stat().st_uid == os.geteuid()
 
 
-def test_the_callers_environment_does_not_reach_the_server(
-    place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    for name in ("PGDATA", "PGPORT", "PGHOST", "LC_ALL", "TZ", "LD_LIBRARY_PATH"):
-        monkeypatch.setenv(name, "/nowhere")
-    server = PrivateServer.at(place / "server", binaries, UNSAFE)
-    server.start()
-    assert ask(server, "SHOW lc_messages") == "C"
-
-
-def test_settings_hold_for_a_start(server: PrivateServer) -> None:
-    chosen = PrivateServer.at(server.folder, settings={"work_mem": "7MB", **UNSAFE})
-    chosen.start()
-    assert ask(chosen, "SHOW work_mem") == "7MB"
-    chosen.stop()
-    server.start()
-    assert ask(server, "SHOW work_mem") == "4MB"
-
-
-@pytest.mark.parametrize("name", ["port", "listen_addresses", "unix_socket_directories"])
-def test_no_setting_opens_another_way_in(tmp_path: Path, name: str) -> None:
-    with pytest.raises(UsageError, match=name):
-        PrivateServer.at(tmp_path / "server", settings={name: "5433"})
-
-
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "letter.txt").write_text("dear reader")
     with pytest.raises(DatabaseError, match="holds something else: give the server a new folder"):
         PrivateServer.at(tmp_path)
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "letter.txt"]
-
-
-def test_a_file_is_refused(tmp_path: Path) -> None:
-    (tmp_path / "file").write_text("dear reader")
-    for path in (tmp_path / "file", tmp_path / "file" / "below"):
-        with pytest.raises(DatabaseError, match="cannot hold a server"):
-            PrivateServer.at(path)
-
-
-def test_a_line_break_in_the_name_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="line break") as caught:
-        PrivateServer.at(tmp_path / "line\nbreak")
-    assert "\n" not in str(caught.value)
-    assert list(tmp_path.iterdir()) == []
 
 
 def test_data_of_another_major_are_refused(server: PrivateServer, binaries: Binaries) -> None:
@@ -164,12 +125,6 @@ def test_data_of_another_major_are_refused(server: PrivateServer, binaries: Bina
     (server.folder / "data" / "PG_VERSION").write_text("9\n")
     with pytest.raises(DatabaseError, match="made by PostgreSQL 9, here is"):
         PrivateServer.at(server.folder)
-
-
-def test_each_folder_gets_the_binaries_of_its_major(
-    server: PrivateServer, binaries: Binaries
-) -> None:
-    assert PrivateServer.at(server.folder).binaries == binaries
 
 
 def test_data_that_are_no_database_are_refused(server: PrivateServer) -> None:
@@ -188,32 +143,7 @@ def test_a_half_made_folder_is_made_anew(place: Path, binaries: Binaries) -> Non
     assert not (folder / "data.new").exists()
 
 
-@pytest.mark.long
-def test_a_set_up_that_is_killed_is_done_by_the_next(place: Path) -> None:
-    folder = place / "server"
-    with child(script(START, folder)) as first:
-
-        def is_set_up() -> bool:
-            assert first.poll() is None
-            return (folder / "data.new" / "PG_VERSION").exists()
-
-        until(is_set_up, every=0.001)
-        first.kill()
-    server = PrivateServer.at(folder, settings=UNSAFE)
-    server.start()
-    assert ask(server, "SELECT 1") == 1
-
-
 # --- start, stop, crash -------------------------------------------------------------------------
-
-
-def test_starting_twice_starts_one_server(server: PrivateServer) -> None:
-    assert not server.is_running
-    server.start()
-    first = pid_of(server)
-    server.start()
-    PrivateServer.at(server.folder).start()
-    assert pid_of(server) == first
 
 
 def test_processes_that_start_one_folder_share_one_server(place: Path) -> None:
@@ -300,20 +230,6 @@ def test_a_start_that_fails_says_why(server: PrivateServer) -> None:
     assert not wrong.is_running
 
 
-def test_the_log_does_not_grow_without_end(
-    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server.start()
-    log = server.folder / "log"
-    with log.open("a") as stream:
-        stream.write("x" * 100_000)
-    monkeypatch.setattr(private_server, "LOG_BYTES", 100_000)
-    server.start()
-    assert log.stat().st_size == 0
-    server.stop()
-    assert b"shut down" in log.read_bytes()[:10_000]
-
-
 @pytest.mark.long
 def test_a_server_outlives_the_process_that_started_it(server: PrivateServer) -> None:
     """The process's pipes close as it ends, and Ctrl-C in its group does not reach the server."""
@@ -353,17 +269,6 @@ def test_any_folder_will_do(template: Path, place: Path, name: str) -> None:
     assert not server.is_running
 
 
-def test_a_relative_path_and_a_link_name_the_same_server(
-    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    server.start()
-    (server.folder.parent / "link").symlink_to(server.folder)
-    monkeypatch.chdir(server.folder.parent)
-    for path in ("server", "link"):
-        assert PrivateServer.at(path).is_running
-        assert PrivateServer.at(path).conninfo() == server.conninfo()
-
-
 def test_a_deep_copy_has_a_socket_of_its_own(template: Path, place: Path) -> None:
     first = copy_of(template, place / ("a" * 100))
     second = copy_of(first.folder, place / ("b" * 100))
@@ -371,14 +276,6 @@ def test_a_deep_copy_has_a_socket_of_its_own(template: Path, place: Path) -> Non
     second.start()
     assert first.conninfo() != second.conninfo()
     assert pid_of(first) != pid_of(second)
-
-
-def test_a_lost_socket_folder_is_made_anew(template: Path, place: Path) -> None:
-    server = copy_of(template, place / ("a" * 100))
-    (server.folder / "socket").resolve().rmdir()
-    again = PrivateServer.at(server.folder)
-    again.start()
-    assert ask(again, "SELECT 1") == 1
 
 
 def test_a_socket_folder_that_others_may_enter_is_refused(server: PrivateServer) -> None:
@@ -424,16 +321,6 @@ def test_a_process_that_ends_uses_nothing_any_more(server: PrivateServer) -> Non
     assert not server.is_running
 
 
-def test_a_release_keeps_a_server_without_room_for_its_question(server: PrivateServer) -> None:
-    full = PrivateServer.at(server.folder, settings={"max_connections": "4", **UNSAFE})
-    full.start()
-    clients = [psycopg.connect(full.conninfo()) for _ in range(4)]
-    full.release()
-    assert full.is_running
-    for client in clients:
-        client.close()
-
-
 def test_a_database_is_made_once(server: PrivateServer) -> None:
     server.start()
     names = ["plant", 'it\'s "one" %s', "plant"] * 3
@@ -442,17 +329,3 @@ def test_a_database_is_made_once(server: PrivateServer) -> None:
     for name in names[:2]:
         with psycopg.connect(server.conninfo(name)) as connection:
             assert connection.execute("SELECT current_database()").fetchone() == (name,)
-
-
-def test_a_server_that_does_not_run_answers_in_one_line(server: PrivateServer) -> None:
-    with pytest.raises(DatabaseError, match=str(server.folder)) as caught:
-        server.create_database("plant")
-    assert "\n" not in str(caught.value)
-
-
-def test_without_psycopg_the_error_names_the_extra(
-    server: PrivateServer, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setitem(sys.modules, "psycopg", None)
-    with pytest.raises(MissingExtraError, match=r"hapticdb\[postgres\]"):
-        server.create_database("plant")

@@ -21,7 +21,6 @@ from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
     N_PARTS,
     PLACE,
-    STEPS,
     After,
     Killer,
     _impatient,
@@ -44,6 +43,7 @@ from hapticdb.ingest.files import ImportProgress
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.tables.writing import PostgresWriter
 from validity import Contents, assert_valid, contents, valid_contents
 
 # --- imports ------------------------------------------------------------------------------------
@@ -107,7 +107,7 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
         for (name, edit), after in zip(EDITS, edited, strict=True):
             for step in steps_of(name):
                 with pytest.MonkeyPatch.context() as patch:
-                    After(patch, STEPS[step], step, server.kill)
+                    After(patch, PostgresWriter, step, server.kill)
                     with pytest.raises(
                         hapticdb.errors.ConnectionLostError, match="cannot be reached"
                     ):
@@ -128,7 +128,7 @@ def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
     before = env.store.revision()
     first = env.objects()[0].id
     with pytest.MonkeyPatch.context() as patch:
-        After(patch, STEPS[step], step, lambda: crash(server))
+        After(patch, PostgresWriter, step, lambda: crash(server))
         if name == "move":
             env.move(first, PLACE)
         else:
@@ -199,7 +199,7 @@ def test_the_command_line_says_in_one_line_that_the_server_stays_away(
     tmp_path: Path,
 ) -> None:
     with monkeypatch.context() as patch:
-        After(patch, STEPS["put"], "put", server.kill, 5)
+        After(patch, PostgresWriter, "_put", server.kill, 5)
         refused(run("import", url, file, "--bits", 7), "cannot be reached")
     server.start()
     code, out, _ = run("import", url, file, "--bits", 7)

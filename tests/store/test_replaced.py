@@ -103,21 +103,6 @@ def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
     store.close()
 
 
-@pytest.mark.parametrize("event", [replaced, log_deleted])
-def test_a_write_through_a_link_is_refused_too(
-    path: Path, tmp_path: Path, event: Callable[[Path], None]
-) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "elsewhere" / "link.db"
-    link.symlink_to(path)
-    store = SQLiteStore.open(link)
-    write(store, 1)
-    event(path)
-    with pytest.raises(hapticdb.errors.ConnectionLostError):
-        write(store, 2)
-    store.close()
-
-
 def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
     """A store on the former file changes the new file neither by a write nor by `close`."""
     store = SQLiteStore.open(path)
@@ -131,17 +116,6 @@ def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
     for suffix in ("-wal", "-shm"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
     assert names(path) == ["floor"]
-
-
-def test_a_moved_file_takes_its_log_along_when_both_are_moved(path: Path) -> None:
-    store = SQLiteStore.open(path)
-    write(store, 1)
-    for suffix in ("", "-wal", "-shm"):
-        Path(f"{path}{suffix}").rename(path.with_name(f"elsewhere.db{suffix}"))
-    with pytest.raises(hapticdb.errors.ConnectionLostError, match="cannot be reached"):
-        write(store, 2)
-    store.close()
-    assert names(path.with_name("elsewhere.db")) == ["floor", "blob 1"]
 
 
 @pytest.mark.parametrize("event", [log_deleted, memory_deleted])
@@ -195,18 +169,6 @@ def test_a_copy_put_in_place_by_hand_is_not_written_into_by_the_log_that_was_rem
     assert names(path) == ["floor"]
 
 
-def test_a_reader_of_a_replaced_file_is_told(
-    path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hapticdb.store.sqlite.place.LOOK_SECONDS", 0.0)
-    with hapticdb.open(path, read_only=True) as env:
-        env.touch(sphere, np.eye(4))
-        replaced(path)
-        for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.store.revision):
-            with pytest.raises(hapticdb.errors.ConnectionLostError, match="open it again"):
-                ask()
-
-
 def test_a_reader_never_feels_commits_into_another_file(
     path: Path, sphere: hapticdb.PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -219,15 +181,6 @@ def test_a_reader_never_feels_commits_into_another_file(
             write(other, 1)
             with pytest.raises(hapticdb.errors.ConnectionLostError, match="another file"):
                 env.touch(sphere, np.eye(4))
-
-
-def test_an_empty_environment_that_another_has_replaced_is_not_discarded(path: Path) -> None:
-    store = SQLiteStore.open(path)
-    replaced(path)
-    with pytest.raises(hapticdb.errors.ConnectionLostError):
-        store.discard()
-    assert path.exists()
-    store.close()
 
 
 def test_opening_again_takes_no_locks_from_who_has_it_open(path: Path) -> None:

@@ -153,10 +153,6 @@ def allowed(url: str) -> set[str]:
     return found
 
 
-def test_the_owner_is_allowed_everything_that_is_tried(url: str) -> None:
-    assert allowed(url) == EVERYTHING
-
-
 @pytest.mark.parametrize("right", ALLOWED)
 def test_the_server_holds_a_role_to_its_right(
     url: str, roles: dict[Right, str], right: Right
@@ -208,18 +204,6 @@ def test_a_role_that_no_right_can_hold_back_is_refused(
         grant(url, member, "viewer")
     admin.execute(sql.SQL("REVOKE {} FROM {}").format(*map(sql.Identifier, (owner, member))))
     assert allowed(url) == EVERYTHING
-
-
-def test_a_role_that_is_not_there_is_told(url: str) -> None:
-    for name in ("nobody here", "public", '"; DROP ROLE "'):
-        with pytest.raises(UsageError, match="createuser"):
-            grant(url, name, "viewer")
-
-
-def test_a_file_has_no_roles(tmp_path: Path) -> None:
-    hapticdb.create(tmp_path / "a.db", GRID).close()
-    with pytest.raises(UsageError, match="a file has no roles"):
-        grant(tmp_path / "a.db", "anna", "viewer")
 
 
 # -- through hapticdb ----------------------------------------------------------------------------
@@ -426,17 +410,6 @@ def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) ->
         assert (code, MARK in out + err) == (2, False), (verb, out, err)
 
 
-@pytest.mark.long
-@pytest.mark.parametrize("credentials", [MARK, f"{MARK}%zz", f"5/{MARK}", f"a@{MARK}"])
-@pytest.mark.usefixtures("files")
-def test_no_verb_prints_a_password_with_its_traceback(run: Run, credentials: str) -> None:
-    for verb, args in lines(f"postgresql://anna:{credentials}@{UNREACHABLE}/plant").items():
-        if verb != "demo" or credentials == MARK:
-            code, out, err = run("--debug", verb, *args)
-            assert (code, MARK in out + err) == (2, False), (verb, out, err)
-            assert "Traceback" in err
-
-
 @pytest.fixture(scope="module")
 def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrivateServer]:
     """A server that asks the role `anna` for her password."""
@@ -490,11 +463,3 @@ def test_a_server_without_tls_is_refused_where_tls_is_required(mode: str) -> Non
             hapticdb.open(f"postgresql://anna:{MARK}@{where}?sslmode={mode}")
     assert "\n" not in str(caught.value)
     assert MARK not in str(caught.value)
-
-
-@pytest.mark.parametrize(
-    "wish", ["sslmode=perhaps", "ssl_min_protocol_version=TLSv9", "sslmodus=require"]
-)
-def test_a_wish_for_tls_that_libpq_does_not_know_is_told(wish: str) -> None:
-    with pytest.raises(UsageError, match=wish.partition("=")[0]):
-        hapticdb.open(f"postgresql://anna@{UNREACHABLE}/plant?{wish}")

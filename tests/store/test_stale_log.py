@@ -4,7 +4,6 @@ import os
 import shutil
 import signal
 import sqlite3
-import sys
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -15,7 +14,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import child, exit_code, finished
+from children import exit_code
 from hapticdb import Grid
 from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite import log as sqlite_log
@@ -24,7 +23,6 @@ from hapticdb.testing import blob, floor_voxels, write_voxels
 from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
-ALL = np.array([0]), np.array([2**62])
 
 
 def write(store: SQLiteStore, *numbers: int) -> None:
@@ -90,51 +88,11 @@ def test_an_old_copy_under_a_newer_log_is_refused_and_left_alone(
     assert folder_bytes(stale.parent) == before
 
 
-def test_a_link_to_such_a_file_is_refused_too(stale: Path, tmp_path: Path) -> None:
-    (tmp_path / "elsewhere").mkdir()
-    link = tmp_path / "elsewhere" / "link.db"
-    link.symlink_to(stale)
-    with pytest.raises(hapticdb.errors.DamagedError, match=r"q\.db-wal"):
-        hapticdb.open(link)
-
-
-def test_it_is_the_copy_once_the_log_is_removed(stale: Path) -> None:
-    for suffix in ("-wal", "-shm"):
-        Path(f"{stale}{suffix}").unlink()
-    assert names(stale, read_only=False) == ["floor"]
-
-
-def test_nothing_is_lost_once_the_former_file_is_put_back(stale: Path) -> None:
-    shutil.copy(stale.with_name("former"), stale)
-    assert names(stale) == ["floor", "blob 1", "blob 2", "blob 3", "blob 4"]
-
-
-@pytest.mark.parametrize("other", ["environment", "database"])
-def test_another_database_under_a_log_is_refused(stale: Path, other: str) -> None:
-    stale.unlink()
-    if other == "environment":
-        SQLiteStore.create(stale.with_name("other.db"), GRID).close()
-        stale.with_name("other.db").rename(stale)
-    else:
-        with closing(sqlite3.connect(stale.with_name("other.db"))) as plain, plain:
-            plain.execute("PRAGMA page_size = 8192")
-            plain.execute("CREATE TABLE t (a)")
-        stale.with_name("other.db").rename(stale)
-    with pytest.raises(hapticdb.errors.DatabaseError, match=r"-wal|no hapticdb environment"):
-        hapticdb.open(stale)
-
-
 def test_a_copy_from_before_format_2_is_refused_under_a_newer_log(stale: Path) -> None:
     make_old(stale.with_name("backup"))
     shutil.copy(stale.with_name("backup"), stale)
     with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         hapticdb.open(stale)
-
-
-def test_a_file_without_its_log_is_as_the_last_checkpoint_left_it(path: Path) -> None:
-    killed(path, lambda store: write(store, 1))
-    Path(f"{path}-wal").unlink()
-    assert names(path, read_only=False) == ["floor"]
 
 
 def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_write(
@@ -170,32 +128,6 @@ def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(
     assert sqlite_log.file_mark(path) != sqlite_log.NO_MARK
     with closing(sqlite3.connect(path)) as plain:
         assert plain.execute("PRAGMA user_version").fetchone() == (FORMAT_VERSION,)
-
-
-def test_a_log_of_format_1_is_applied_to_its_file(path: Path) -> None:
-    make_old(path)
-    script = (
-        "import os, sqlite3, sys\n"
-        "plain = sqlite3.connect(sys.argv[1])\n"
-        "plain.execute(\"UPDATE object SET name = 'ground'\")\n"
-        "plain.commit()\n"
-        "os.kill(os.getpid(), 9)\n"
-    )
-    finished([sys.executable, "-c", script, str(path)])
-    assert Path(f"{path}-wal").stat().st_size
-    assert names(path) == ["ground"]
-    assert names(path, read_only=False) == ["ground"]
-
-
-def test_a_log_with_a_vacuum_in_it_is_applied_to_its_file(path: Path) -> None:
-    def work(store: SQLiteStore) -> None:
-        write(store, 1)
-        store._connection.driver.execute("VACUUM")
-        write(store, 2)
-        store._connection.driver.execute("VACUUM")
-
-    killed(path, work)
-    assert names(path, read_only=False) == ["floor", "blob 1", "blob 2"]
 
 
 def test_every_commit_draws_a_new_mark(path: Path) -> None:
@@ -378,28 +310,3 @@ def test_every_older_copy_is_refused(taped: tuple[dict[str, bytes], Tape], tmp_p
                 sqlite_log.check_log(path)
             refused += 1
     assert refused > 5
-
-
-@pytest.mark.long
-def test_nothing_committed_is_refused_or_lost_by_kills_at_random(path: Path) -> None:
-    script = (
-        "import sys\n"
-        "from hapticdb.store.sqlite.store import SQLiteStore\n"
-        "from hapticdb.testing import blob, write_voxels\n"
-        "store = SQLiteStore.open(sys.argv[1])\n"
-        "store._connection.driver.wal_autocheckpoint(20)\n"
-        "for n in range(10**6):\n"
-        "    write_voxels(store, blob(n, (30, 30, 30)), f'{sys.argv[2]} {n}')\n"
-        "    print(n, flush=True)\n"
-    )
-    rng = np.random.default_rng(1)
-    expected = {"floor"}
-    for turn in range(4):
-        with child([sys.executable, "-c", script, str(path), str(turn)]) as writer:
-            assert writer.stdout is not None
-            heard = [writer.stdout.readline() for _ in range(int(rng.integers(1, 60)))]
-            writer.kill()
-            heard += writer.stdout.readlines()
-        expected |= {f"{turn} {line.strip()}" for line in heard if line.endswith("\n")}
-        assert expected <= set(names(path))
-    assert len(expected) > 20

@@ -2,11 +2,9 @@
 
 import contextlib
 import itertools
-import os
 import sys
 import threading
-import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -21,9 +19,9 @@ from children import finished, joined
 from crashes import server, template  # noqa: F401 - fixtures
 from hapticdb import Grid
 from hapticdb.store.base import SupportsWatch
-from hapticdb.store.connect import create_store, grant, open_store
+from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.postgres import watching
-from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
+from hapticdb.store.postgres.address import LONGEST_NAME, parse
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
@@ -83,47 +81,7 @@ def test_a_commit_of_another_process_is_noticed_by_one_that_only_watches(
             assert not reader.has_changed()
 
 
-def test_who_did_not_begin_to_watch_is_told_to_look(file: str, url: str) -> None:
-    for where in (file, url):
-        with contextlib.closing(open_store(where, read_only=True)) as reader:
-            assert isinstance(reader, SupportsWatch)
-            assert reader.has_changed()
-            assert not reader.has_changed()
-
-
-def test_a_closed_reader_is_told_so(file: str, url: str) -> None:
-    for where in (file, url):
-        reader = open_store(where, read_only=True)
-        assert isinstance(reader, SupportsWatch)
-        reader.watch()
-        reader.close()
-        for ask in (reader.watch, reader.has_changed):
-            with pytest.raises(
-                hapticdb.errors.DatabaseError, match="has been closed: open it again"
-            ):
-                ask()
-
-
 # --- SQLite -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("change", [write, lambda path: Path(path).unlink()])
-def test_an_immutable_reader_is_told_by_the_files_stamp(
-    file: str, change: Callable[[str], None], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr("hapticdb.store.sqlite.file.needs_immutable", lambda _: True)
-    reader = SQLiteStore.open(file, read_only=True)
-    monkeypatch.undo()
-    reader.watch()
-    assert not reader.has_changed()
-    change(file)
-    for _ in range(2):  # the reader stays unusable
-        assert reader.has_changed()
-        with pytest.raises(hapticdb.errors.BusyError, match="open it again"):
-            reader.objects()
-        with pytest.raises(hapticdb.errors.BusyError, match="open it again"), reader.snapshot():
-            pass
-    reader.close()
 
 
 @pytest.mark.parametrize("is_replaced", [False, True])
@@ -147,17 +105,6 @@ def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
     kept.replace(file)
     assert not reader.has_changed()
     reader.close()
-
-
-def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_sqlite(file: str) -> None:
-    store = SQLiteStore.open(file)
-    statements: list[str] = []
-    store._connection.driver.trace_v2(1, lambda event: statements.append(event["sql"]))
-    list(store.changes(since=1))
-    (text,) = statements
-    plan = store._connection.driver.execute(f"EXPLAIN QUERY PLAN {text}", (1,)).fetchall()
-    assert [row[3] for row in plan] == ["SEARCH change USING INTEGER PRIMARY KEY (rowid>?)"]
-    store.close()
 
 
 # --- PostgreSQL ---------------------------------------------------------------------------------
@@ -184,19 +131,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(watching.Watch, "_ask", counted)
     return found
-
-
-def test_what_is_noticed_by_a_notification_costs_one_round_trip(
-    url: str, reader: PostgresStore, asked: list[int], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(watching, "HEARING_S", 1e9)
-    reader.watch()
-    asked.clear()
-    for n in range(3):
-        write(url)
-        assert is_noticed(reader)
-        assert not reader.has_changed()
-        assert len(asked) == n + 1
 
 
 def test_notifications_during_reads_neither_disturb_nor_get_lost(
@@ -239,25 +173,6 @@ def test_a_reader_that_lost_its_connection_listens_again(
         assert not reader.has_changed()
         write(url)
         assert is_noticed(reader)
-
-
-def test_a_server_that_comes_back_is_found_within_half_a_second(
-    reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    pauses: list[float] = []
-    connect = ServerConnection.connect
-
-    def refused_at_first(connection: ServerConnection, seconds: float) -> None:
-        if len(pauses) < 8:
-            raise hapticdb.errors.ConnectionLostError("refused")
-        connect(connection, seconds)
-
-    monkeypatch.setattr(ServerConnection, "connect", refused_at_first)
-    monkeypatch.setattr(time, "sleep", pauses.append)
-    reader.connection.driver.close()
-    assert reader.objects() == []
-    assert len(pauses) == 8
-    assert max(pauses) <= 0.5
 
 
 def test_a_writer_that_does_not_notify_is_noticed_too(
@@ -329,68 +244,3 @@ def test_every_environment_has_a_channel_of_its_own_that_the_server_takes(names:
     channels = {channel_of(name) for name in fitting}
     assert len(channels) == len(set(fitting))
     assert all(len(channel.encode()) <= LONGEST_NAME for channel in channels)
-
-
-def test_environments_of_long_and_strange_names_do_not_hear_each_other(
-    database: str, admin: psycopg.Connection
-) -> None:
-    names = [f'{"ü" * 30}"%', f'{"ü" * 30}"s', "Ärger'; --"]
-    urls = [with_environment(database, name) for name in names]
-    readers = []
-    try:
-        for where in urls:
-            create_store(where, GRID).close()
-            readers.append(PostgresStore.open(where, read_only=True))
-            readers[-1].watch()
-        for n, where in enumerate(urls):
-            write(where)
-            assert is_noticed(readers[n])
-            assert not any(reader.has_changed() for reader in readers)
-    finally:
-        for reader in readers:
-            reader.close()
-        for name in names:
-            admin.execute("SET client_min_messages = warning")
-            drop = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(sql.Identifier(name))
-            admin.execute(drop)
-
-
-def test_a_viewer_may_watch(url: str, admin: psycopg.Connection) -> None:
-    role = f"watching {os.getpid()} {next(numbers)}"
-    admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(sql.Identifier(role)))
-    try:
-        grant(url, role, "viewer")
-        reader = PostgresStore.open(url, read_only=True)
-        reader.connection.execute(
-            sql.SQL("SET SESSION AUTHORIZATION {}").format(sql.Identifier(role))
-        )
-        reader.watch()
-        write(url)
-        assert is_noticed(reader)
-        with pytest.raises(hapticdb.errors.ReadOnlyError):
-            reader.save_costs("here", {})
-        reader.close()
-    finally:
-        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(role)))
-        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(role)))
-
-
-def test_the_changes_since_a_revision_are_found_by_the_primary_key_of_postgres(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    store = PostgresStore.open(url)
-    asked: list[str] = []
-    rows = ServerConnection.rows
-
-    def noted(
-        connection: ServerConnection, text: str, parameters: object = ()
-    ) -> list[tuple[object, ...]]:
-        asked.append(text)
-        return rows(connection, text, parameters)  # type: ignore[arg-type]
-
-    monkeypatch.setattr(ServerConnection, "rows", noted)
-    list(store.changes(since=1))
-    (text,) = asked
-    plan = store.connection.execute(f"EXPLAIN {text}", (1,)).fetchall()
-    assert "Index Scan using change_pkey on change" in plan[0][0]
-    store.close()

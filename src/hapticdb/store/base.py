@@ -1,6 +1,6 @@
 """What an engine does for an opened environment: the protocol `Store`, and what crosses it."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
@@ -109,6 +109,26 @@ NO_KEYS = np.empty(0, dtype=np.int64)
 # from bytes, hence read-only: kernels are compiled for the one type that every path gives them
 NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
 NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
+NO_DISTANCES = NO_ROWS.having(Band(NO_OCCUPANCY, NO_KEYS))
+
+
+def no_rows(*, distances: bool) -> Rows:
+    """Build the answer of a read that finds nothing."""
+    return NO_DISTANCES if distances else NO_ROWS
+
+
+def joined(parts: Sequence[Rows], *, distances: bool) -> Rows:
+    """Batches of rows as one, in their order; all with distances or all without."""
+    if not parts:
+        return no_rows(distances=distances)
+    bits = np.frombuffer(b"".join([part.occupancy.tobytes() for part in parts]), np.uint8)
+    bands = [part.distances for part in parts if part.distances is not None]
+    band = None
+    if distances:
+        data = np.frombuffer(b"".join([one.data.tobytes() for one in bands]), np.uint8)
+        band = Band(data, np.cumsum(np.concatenate([one.lengths for one in bands])))
+    keys, ids = (np.concatenate([part[column] for part in parts]) for column in (0, 1))
+    return Rows(keys, ids, bits, band)
 
 
 def row_shift(layout: Layout) -> int:
@@ -218,12 +238,11 @@ class Freshness(NamedTuple):
     """How old the statistics of the keys are, which the strategy `cbgroup` uses.
 
     revision : revision of the environment when the statistics were made, None without statistics;
-    changes : writes committed since; rows : rows that these wrote, if the engine counts them.
+    changes : writes committed since.
     """
 
     revision: int | None
     changes: int
-    rows: int
 
 
 class Size(NamedTuple):
@@ -342,7 +361,20 @@ class _KeepsStatistics(Protocol):
         """Keep the fitted cost figures of a machine."""
 
 
-class Store(_ReadsRows, _ReadsObjects, _WritesObjects, _KeepsStatistics, Protocol):
+class _IsChecked(Protocol):
+    """Answers `hapticdb check`: pages, indexes, and all rows in their order."""
+
+    def findings(self) -> Iterator[str]:
+        """What is wrong with pages, indexes and kept statistics, a line each."""
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first.
+
+        With `distances`, rows of the table of distances, as `_ReadsRows` says.
+        """
+
+
+class Store(_ReadsRows, _ReadsObjects, _WritesObjects, _KeepsStatistics, _IsChecked, Protocol):
     """An opened environment. Methods take and return whole batches.
 
     A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
@@ -400,9 +432,6 @@ class Store(_ReadsRows, _ReadsObjects, _WritesObjects, _KeepsStatistics, Protoco
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision."""
 
-    def checker(self) -> "_Checker":
-        """The checks of this engine for `hapticdb check`."""
-
 
 class LocatedShell(NamedTuple):
     """A shell at its pose, as `SupportsStatement` needs it: arrays in the order of the points.
@@ -431,35 +460,10 @@ class SupportsStatement(Protocol):
 
 @runtime_checkable
 class SupportsCaches(Protocol):
-    """An engine whose caches belong to this process, which can limit and empty them."""
-
-    def limit_cache(self, size_bytes: int) -> None:
-        """Keep at most so many bytes of pages in memory, from now on."""
+    """An engine whose caches belong to this process, which can empty them."""
 
     def drop_caches(self) -> None:
         """Empty the connection's cache, and the operating system's cache of the file."""
-
-
-@runtime_checkable
-class HasGroupingThreshold(Protocol):
-    """An engine that says from how many keys on the strategy `auto` groups a frame's keys."""
-
-    @property
-    def grouping_threshold(self) -> int | None:
-        """Least number of distinct keys; None if a lookup reads each leaf page only once anyway."""
-
-
-class _Checker(Protocol):
-    """Answers of an engine for `hapticdb check`: pages, indexes, and all rows in their order."""
-
-    def findings(self) -> Iterator[str]:
-        """What is wrong with pages, indexes and kept statistics, a line each."""
-
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first.
-
-        With `distances`, rows of the table of distances, as `_ReadsRows` says.
-        """
 
 
 @runtime_checkable

@@ -50,61 +50,43 @@ def damaged(url: str, cause: str) -> DamagedError:
     return DamagedError(f"{url} is damaged ({cause}): restore a copy or import the files again")
 
 
-class RowsChecksum:
-    """CRC-32 of an object's keys and of its bricks, over its rows in ascending order of keys."""
+class Checksum:
+    """CRC-32 of an object's keys, and of its bricks or distances, over its rows in order of keys.
 
-    __slots__ = ("_bricks", "_keys")
+    With distances, keys and lengths are taken as pairs, so that no byte can pass to the next row
+    unseen.
+    """
+
+    __slots__ = ("_contents", "_keys")
 
     def __init__(self) -> None:
-        self._keys = self._bricks = 0
+        self._keys = self._contents = 0
 
-    def update(self, keys: Keys, occupancy: NDArray[np.uint8]) -> None:
-        """Add the next rows."""
+    def add(self, rows: Rows) -> None:
+        """Add the next rows: their distances, or else their bricks."""
+        keys, contents = rows.keys, rows.occupancy
+        if rows.distances is not None:
+            keys = np.stack([keys, rows.distances.lengths], axis=1)
+            contents = rows.distances.data
         self._keys = zlib.crc32(np.ascontiguousarray(keys, "<i8").data, self._keys)
-        if occupancy.size:
-            self._bricks = zlib.crc32(np.ascontiguousarray(occupancy).data, self._bricks)
+        if contents.size:
+            self._contents = zlib.crc32(np.ascontiguousarray(contents).data, self._contents)
 
     def value(self) -> int:
         """The checksum of all rows so far."""
-        return self._keys << 32 | self._bricks
+        return self._keys << 32 | self._contents
 
 
 def rows_crc(rows: Rows) -> int:
     """Checksum of all rows of an object."""
-    checksum = RowsChecksum()
-    checksum.update(rows.keys, rows.occupancy)
+    checksum = Checksum()
+    checksum.add(rows)
     return checksum.value()
-
-
-class BandChecksum:
-    """CRC-32 of keys and lengths, and of packed distances, over an object's rows in order of keys.
-
-    Keys and lengths are taken as pairs of int64, so that no byte can pass to the next row unseen.
-    """
-
-    __slots__ = ("_bytes", "_places")
-
-    def __init__(self) -> None:
-        self._places = self._bytes = 0
-
-    def update(self, keys: Keys, distances: Band) -> None:
-        """Add the next rows."""
-        places = np.stack([keys, distances.lengths], axis=1)
-        self._places = zlib.crc32(np.ascontiguousarray(places, "<i8").data, self._places)
-        self._bytes = zlib.crc32(np.ascontiguousarray(distances.data).data, self._bytes)
-
-    def value(self) -> int:
-        """The checksum of all rows so far."""
-        return self._places << 32 | self._bytes
 
 
 def distances_crc(rows: Rows) -> int | None:
     """Checksum of all distances of an object; None if it has none."""
-    if rows.distances is None:
-        return None
-    checksum = BandChecksum()
-    checksum.update(rows.keys, rows.distances)
-    return checksum.value()
+    return None if rows.distances is None else rows_crc(rows)
 
 
 def attributes_text(record: Object, rows: Rows) -> str:

@@ -11,8 +11,6 @@ from hapticdb.store.base import LAYOUTS, Layout, Store
 from hapticdb.store.engines import (
     BackupCallback,
     BackupReport,
-    Capability,
-    Engine,
     Right,
     SupportsBackup,
     SupportsGrant,
@@ -78,7 +76,10 @@ def grant(url: Url, role: str, right: Right) -> None:
     """
     engine = engine_of(url)
     if not isinstance(engine, SupportsGrant):
-        raise _refusal(engine, url, "grant")
+        raise UsageError(
+            f"{redact(os.fspath(url))} is on {engine.title}, which has no roles: use the file "
+            "system's rights"
+        )
     engine.grant(os.fspath(url), role, right)
 
 
@@ -113,10 +114,7 @@ def backup_environment(
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
-    engine = engine_of(url)
-    if not isinstance(engine, SupportsBackup):
-        raise _refusal(engine, url, "backup")
-    _check_one_engine(engine, file)
+    engine = _engine_of_both(url, file)
     return engine.back_up(os.fspath(url), os.fspath(file), replace=replace, progress=progress)
 
 
@@ -151,23 +149,21 @@ def restore_environment(
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
-    engine = engine_of(url)
-    if not isinstance(engine, SupportsBackup):
-        raise _refusal(engine, url, "restore")
-    _check_one_engine(engine, file)
+    engine = _engine_of_both(url, file)
     return engine.restore(os.fspath(file), os.fspath(url), progress=progress)
 
 
-def _refusal(engine: Engine, url: Url, capability: Capability) -> UsageError:
-    """Build the error for a missing capability; the engine's text says why, and what to use."""
-    return UsageError(f"{redact(os.fspath(url))}{engine.lacks[capability]}")
-
-
-def _check_one_engine(engine: Engine, file: Url) -> None:
-    """Refuse a copy between two different engines."""
-    other = engine_of(file)
+def _engine_of_both(url: Url, file: Url) -> SupportsBackup:
+    """The engine of an environment and of its copy; refuses one that cannot copy, and two."""
+    engine, other = engine_of(url), engine_of(file)
+    if not isinstance(engine, SupportsBackup):
+        raise UsageError(
+            f"{redact(os.fspath(url))} is on {engine.title}, not a file: its own tools copy it, "
+            "such as pg_dump and pg_restore"
+        )
     if other is not engine:
         raise UsageError(f"{redact(os.fspath(file))} is on {other.title}, not a file: give a path")
+    return engine
 
 
 def name_of(url: Url) -> str:

@@ -10,7 +10,7 @@ of a server.
 """
 
 import os
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -22,8 +22,6 @@ from hapticdb.store.base import Layout, Store
 from hapticdb.store.urls import redact, scheme_of
 
 Url = str | os.PathLike[str]
-Capability = Literal["grant", "backup", "restore"]
-"""What only some engines can do with an environment that is not open."""
 Right = Literal["viewer", "toucher", "editor", "nobody"]
 """Rights of a role: read and touch; also keep cost figures; also edit; nothing."""
 GROUP = "hapticdb.engines"
@@ -58,17 +56,10 @@ class Engine(Protocol):
 
     URLs come as the user wrote them. Only the methods that say so connect to anything.
 
-    Attributes
-    ----------
-    title : str
-        Its name in messages: ``PostgreSQL``.
-    lacks : mapping of str to str
-        For each of the capabilities `grant`, `backup` and `restore` that this engine lacks: the
-        text of the refusal after the URL. It says why, and what to use instead.
+    title : its name in messages: ``PostgreSQL``.
     """
 
     title: str
-    lacks: Mapping[Capability, str]
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Open an existing environment.

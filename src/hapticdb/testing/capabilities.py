@@ -7,7 +7,6 @@ import pytest
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import (
-    HasGroupingThreshold,
     LocatedShell,
     Store,
     SupportsCaches,
@@ -23,7 +22,6 @@ STORE_CAPABILITIES: dict[str, Any] = {
     "statement": SupportsStatement,
     "caches": SupportsCaches,
     "watch": SupportsWatch,
-    "grouping threshold": HasGroupingThreshold,
 }
 """Capabilities that only some stores have: the protocol of each, by its name in
 `StoreContract.lacks`."""
@@ -70,19 +68,11 @@ class CapabilitiesContract(StoreCase):
         assert not store.statement(nothing).any()
         assert not len(store.statement_hits(nothing)[0])
 
-    def test_caches_are_emptied_and_limited_without_a_row_lost(self, store: Store) -> None:
-        """With less memory, reads return the same rows."""
+    def test_caches_are_emptied_without_a_row_lost(self, store: Store) -> None:
+        """Reads return the same rows."""
         self.need("caches")
         assert isinstance(store, SupportsCaches)
         before = everything(store)
-        store.limit_cache(1 << 20)
         store.drop_caches()
         for found, expected in zip(everything(store), before, strict=True):
             np.testing.assert_array_equal(found, expected)
-
-    def test_a_grouping_threshold_is_a_number_of_keys(self, store: Store) -> None:
-        """It is None if grouping never saves time."""
-        self.need("grouping threshold")
-        assert isinstance(store, HasGroupingThreshold)
-        threshold = store.grouping_threshold
-        assert threshold is None or threshold > 1

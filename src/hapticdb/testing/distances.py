@@ -1,7 +1,5 @@
 """Tests of distances beside the voxels: written, read and removed with their objects."""
 
-import contextlib
-from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
@@ -201,37 +199,11 @@ class DistancesContract(StoreCase):
         band.remove(1, covering(band))
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
 
-    def test_a_snapshot_sees_the_distances_of_one_revision(self, band: Store) -> None:
-        """A removal and an addition by another connection come after it."""
-        reader = self.reopen(band)
-        reads: list[Callable[[], Rows]] = [
-            lambda: reader.scan(*EVERYWHERE, distances=True),
-            lambda: reader.lookup(self.rows(band, 1).keys, distances=True),
-        ]
-        with reader.snapshot():
-            before = [_content_of(read()) for read in reads]
-            band.remove(1, covering(band))
-            self.write(band, 1)
-            assert [_content_of(read()) for read in reads] == before
-        assert {object_id for _, object_id in _content_of(reads[0]())} == {3, 4}
-        reader.close()
-
-    def test_loading_ends_as_single_writes_do(self, band: Store) -> None:
-        """Also if an error ends the loading."""
-        fresh = self.make(band.grid, "brick", "loaded")
-        with contextlib.suppress(ZeroDivisionError), fresh.loading():
-            for object_id in PLACES:
-                self.write(fresh, object_id)
-            loaded = _content_of(fresh.scan(*EVERYWHERE, distances=True))
-            raise ZeroDivisionError
-        assert loaded == _content_of(fresh.scan(*EVERYWHERE, distances=True))
-        assert loaded == _content_of(band.scan(*EVERYWHERE, distances=True))
-
     def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
         """The pieces together are what a scan returns."""
-        checker, found = band.checker(), {}
+        found = {}
         key, object_id = -1, 0
-        while len(rows := checker.rows_after(key, object_id, 7, distances=True)):
+        while len(rows := band.rows_after(key, object_id, 7, distances=True)):
             assert len(rows) <= 7
             key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
             found.update(_content_of(rows))

@@ -73,17 +73,6 @@ class EngineContract:
             assert store.is_read_only == read_only
             store.close()
 
-    def test_what_wants_distances_says_so_when_it_is_opened(self) -> None:
-        """An environment wants none unless it is made so."""
-        for wanted in (True, False):
-            url = self.url()
-            made = self.engine().create(url, self.grid, "brick", distances=wanted)
-            assert made.wants_distances == wanted
-            made.close()
-            store = open_store(url, read_only=True)
-            assert store.wants_distances == wanted
-            store.close()
-
     def test_what_is_not_there_is_not_opened(self) -> None:
         """Opening a missing environment does not make it."""
         url = self.url()
@@ -119,21 +108,20 @@ class EngineContract:
         has_it = isinstance(self.engine(), ENGINE_CAPABILITIES[capability])
         assert has_it != (capability in self.lacks)
 
-    def test_what_the_engine_lacks_is_refused_with_a_reason(self) -> None:
-        """The message has the URL and then the engine's own reason."""
-        url, engine = self.make(), self.engine()
-        refusals: dict[str, Callable[[], object]] = {
-            "grant": lambda: grant(url, "anna", "viewer"),
-            "backup": lambda: backup_environment(url, "copy.db"),
-            "restore": lambda: restore_environment("copy.db", url),
+    def test_what_the_engine_lacks_is_refused(self) -> None:
+        """The message has the URL."""
+        url = self.make()
+        refusals: dict[str, list[Callable[[], object]]] = {
+            "grant": [lambda: grant(url, "anna", "viewer")],
+            "backup": [
+                lambda: backup_environment(url, "copy.db"),
+                lambda: restore_environment("copy.db", url),
+            ],
         }
-        has_backup = isinstance(engine, SupportsBackup)
-        wanted = {"grant"} - ({"grant"} if isinstance(engine, SupportsGrant) else set())
-        assert set(engine.lacks) == wanted | (set() if has_backup else {"backup", "restore"})
-        for capability, words in engine.lacks.items():
-            with pytest.raises(UsageError) as refused:
-                refusals[capability]()
-            assert str(refused.value).endswith(words)
+        for capability in self.lacks:
+            for refused in refusals[capability]:
+                with pytest.raises(UsageError, match=" is on "):
+                    refused()
 
     def test_a_right_is_given_to_a_role_that_is_there(self) -> None:
         """A grant to a missing role does not make the role."""

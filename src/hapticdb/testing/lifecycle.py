@@ -12,7 +12,6 @@ from hapticdb.errors import (
     ReadOnlyError,
     UsageError,
 )
-from hapticdb.grid import Grid
 from hapticdb.store.base import (
     Rows,
     Store,
@@ -55,16 +54,6 @@ class LifecycleContract(StoreCase):
         assert len(reader.objects()) == 1
         assert reader.version() != version
         reader.close()
-
-    def test_an_environment_is_told_from_another(self) -> None:
-        """Identities differ even if both are alike; all stores of one have the same identity."""
-        grid = Grid(0.01, (0, 0, 0), 5)
-        one, other = self.make(grid, "brick"), self.make(grid, "brick", "other")
-        again = self.reopen(one)
-        assert one.identity == again.identity != other.identity
-        again.close()
-        one.discard()
-        other.discard()
 
     def test_a_store_belongs_to_the_thread_that_opened_it(self, store: Store) -> None:
         """Another thread is refused, and the first can go on."""

@@ -40,11 +40,11 @@ class StatisticsContract(StoreCase):
         """The age is unknown before `analyze`, 0 right after it, and 1 after a removal."""
         assert store.freshness(10).revision is None
         store.analyze(10)
-        assert store.freshness(10) == (2, 0, 0)
+        assert store.freshness(10) == (2, 0)
         store.remove(1, covering(store))
-        assert store.freshness(10)[:2] == (2, 1)
+        assert store.freshness(10) == (2, 1)
         store.analyze(10)
-        assert store.freshness(10)[:2] == (3, 0)
+        assert store.freshness(10) == (3, 0)
 
     def test_costs_are_kept_by_machine(self, store: Store) -> None:
         """Figures return as saved."""

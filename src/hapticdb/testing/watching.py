@@ -68,7 +68,7 @@ class WatchContract(StoreCase):
         reader = self.reopen(store)
         assert isinstance(reader, SupportsWatch)
         voxel = np.array([[1, 2, 3]])
-        for n in range(100):
+        for n in range(30):
             if n % 10 == 0:
                 reader.watch()
             write_voxels(store, voxel, f"{n}")

@@ -1,11 +1,8 @@
 """PostgreSQL as an engine: ``postgresql://...``, one schema an environment."""
 
-from collections.abc import Mapping
-from types import MappingProxyType
-
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.engines import Capability, Right
+from hapticdb.store.engines import Right
 from hapticdb.store.postgres import rights, schema_of
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.store import PostgresStore
@@ -15,12 +12,6 @@ class _PostgresEngine:
     """Environments on servers."""
 
     title = "PostgreSQL"
-    lacks: Mapping[Capability, str] = MappingProxyType(
-        {
-            "backup": " is on PostgreSQL, not a file: pg_dump copies it",
-            "restore": " is on PostgreSQL, not a file: pg_restore puts a copy into it",
-        }
-    )
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""

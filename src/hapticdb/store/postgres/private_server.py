@@ -19,10 +19,13 @@ import threading
 import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import Any
 from urllib.parse import quote
 
-from hapticdb.errors import DatabaseError, MissingExtraError, UsageError
+import psycopg
+from psycopg import sql
+
+from hapticdb.errors import DatabaseError
 from hapticdb.store.postgres.server_binaries import (
     Account,
     Binaries,
@@ -32,9 +35,6 @@ from hapticdb.store.postgres.server_binaries import (
     hand_over,
     run,
 )
-
-if TYPE_CHECKING:
-    from psycopg import Connection
 
 __all__ = ["Binaries", "PrivateServer", "find_binaries", "shared_server"]
 
@@ -100,19 +100,11 @@ class PrivateServer:
 
         Raises
         ------
-        UsageError
-            A setting is for the server's address: only its socket leads to it. Or the folder's name
-            has a line break, which PostgreSQL's own files cannot hold.
         DatabaseError
             The folder holds something else, or data of a major version that is not found; no
             PostgreSQL is found at all; the folder cannot be set up.
         """
         where = Path(folder).expanduser().resolve()
-        for name in settings or {}:
-            if name.lower() in {"port", "listen_addresses"} or "unix_socket" in name.lower():
-                raise UsageError(f"setting {name!r}: a private server has its own socket only")
-        if "\n" in str(where):
-            raise UsageError(f"folder {str(where)!r}: choose a name without a line break")
         if not Path("/proc/self/stat").exists():
             raise DatabaseError("a private server needs Linux: install PostgreSQL, give its URL")
         try:
@@ -189,21 +181,13 @@ class PrivateServer:
     def create_database(self, name: str) -> None:
         """Make a database on the running server, unless it has one of that name."""
         with self._locked(), self._connected() as connection:
-            from psycopg import sql  # noqa: PLC0415 - an extra
-
             asked = connection.execute("SELECT 1 FROM pg_database WHERE datname = %s", [name])
             if asked.fetchone() is None:
                 named = sql.Identifier(name)
                 connection.execute(sql.SQL("CREATE DATABASE {}").format(named))
 
     @contextlib.contextmanager
-    def _connected(self) -> Iterator["Connection"]:
-        try:
-            import psycopg  # noqa: PLC0415 - an extra
-        except ImportError as error:
-            raise MissingExtraError(
-                "PostgreSQL needs an extra; install it with: pip install 'hapticdb[postgres]'"
-            ) from error
+    def _connected(self) -> Iterator[psycopg.Connection[tuple[Any, ...]]]:
         try:
             with psycopg.connect(self.conninfo(), autocommit=True) as connection:
                 yield connection

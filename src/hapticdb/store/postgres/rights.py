@@ -9,7 +9,7 @@ from psycopg import sql
 from hapticdb.errors import AccessError, UsageError
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import check_name
-from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 WITHDRAWN = (
     "REVOKE ALL ON SCHEMA {schema} FROM {role}",
@@ -85,7 +85,7 @@ def grant(connection: ServerConnection, role: str, right: Right) -> None:
             f"{connection.shown}: only the owner of the environment "
             f"{connection.address.environment!r} may grant rights; connect as the owner"
         )
-    names = {"schema": identifier(connection.address.environment), "role": identifier(role)}
+    names = {"schema": sql.Identifier(connection.address.environment), "role": sql.Identifier(role)}
 
     def work() -> None:
         connection.execute("SELECT pg_advisory_xact_lock(%s)", (GRANTERS,))

@@ -21,7 +21,7 @@ from hapticdb.store import believed
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting import failures
-from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.migrations import MIGRATIONS
 from hapticdb.store.postgres.private_server import shared_server
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
@@ -204,7 +204,7 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
 
         def work() -> None:
             try:
-                connection.execute(sql.SQL("CREATE SCHEMA {}").format(identifier(name)))
+                connection.execute(sql.SQL("CREATE SCHEMA {}").format(sql.Identifier(name)))
             except (errors.DuplicateSchema, errors.UniqueViolation) as error:
                 raise EnvironmentExistsError(
                     f"{connection.shown}: schema {name!r} exists already; open it, or name another "
@@ -242,7 +242,7 @@ def _migrate_once(connection: ServerConnection) -> None:
 
 def _migrate(connection: ServerConnection, version: int) -> None:
     """Run the migrations after `version`, inside a transaction."""
-    schema = identifier(connection.address.environment)
+    schema = sql.Identifier(connection.address.environment)
     for migration in migrations_after(version, MIGRATIONS):
         for statement in migration.statements:
             connection.execute(sql.SQL(statement).format(schema=schema))
@@ -252,7 +252,7 @@ def _migrate(connection: ServerConnection, version: int) -> None:
 
 def drop(connection: ServerConnection) -> None:
     """Delete an environment, whatever is in it."""
-    schema = identifier(connection.address.environment)
+    schema = sql.Identifier(connection.address.environment)
     connection.write(
         lambda: connection.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema)),
         lambda: not _has_schema(connection),

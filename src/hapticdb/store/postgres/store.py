@@ -6,7 +6,6 @@ from hapticdb.grid import Grid
 from hapticdb.store.base import Layout
 from hapticdb.store.engines import Lag
 from hapticdb.store.postgres import schema_of
-from hapticdb.store.postgres.checking import PostgresChecker
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
@@ -48,9 +47,10 @@ class PostgresStore:
             connection.close()
             raise
         self.grid, self.layout, self.wants_distances, self.identity = made
-        reader = self._reader = PostgresReader(connection, self.layout)
+        reader = PostgresReader(connection, self.layout)
         self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
         self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
+        self.rows_after = reader.rows_after
         self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.version, self.revision = reader.version, reader.revision
         self.objects, self.object = reader.objects, reader.object
@@ -64,6 +64,7 @@ class PostgresStore:
         known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
+        self.findings = known.findings
         if not self.is_read_only:
             loading.mend()
 
@@ -123,7 +124,3 @@ class PostgresStore:
             return None
         found = self._connection.rows(REPLAYED)
         return Lag(*found[0]) if found else None
-
-    def checker(self) -> PostgresChecker:
-        """Answers of this engine for `hapticdb check`."""
-        return PostgresChecker(self._connection, self.layout, self._reader)

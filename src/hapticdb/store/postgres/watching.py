@@ -16,11 +16,12 @@ import hashlib
 import time
 
 import psycopg
+from psycopg import sql
 
 from hapticdb.errors import ConnectionLostError
 from hapticdb.store.postgres.address import LONGEST_NAME
 from hapticdb.store.postgres.connecting import failures, wire
-from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
@@ -85,7 +86,7 @@ class Watch:
             self._connection.hear()
             return False
         driver.add_notify_handler(self._hear)
-        channel = identifier(channel_of(self._connection.address.environment))
+        channel = sql.Identifier(channel_of(self._connection.address.environment))
         try:
             self._connection.command(f"LISTEN {channel.as_string(driver)}")
             self._is_deaf = False

@@ -30,7 +30,7 @@ class FileConnection:
         self.is_read_only = read_only
         self.is_closed = False
         self._depth = 0
-        self._seen = -1
+        self._seen = self._noticed = -1
         self._thread = this_thread()
 
     def close(self) -> None:
@@ -45,10 +45,6 @@ class FileConnection:
     def check_thread(self) -> None:
         """Refuse a call from any thread but the connection's owner."""
         check_thread(self._thread, self.url)
-
-    def check_outside(self) -> None:
-        """Refuse to look for the commits of others inside a snapshot."""
-        check_outside(self._depth, self.url)
 
     def fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
         """Run one statement to its end."""
@@ -103,3 +99,23 @@ class FileConnection:
             self.file.look()
             self._seen = seen
         return seen
+
+    def watch(self) -> None:
+        """Begin to notice commits from now on; may be called again."""
+        self.has_changed()
+
+    def has_changed(self) -> bool:
+        """Whether another connection has committed since `watch` or the last call.
+
+        The pragma looks at the file's log; apsw's own `data_version` only says what the last read
+        has seen. A file that was opened as immutable is judged by its stamp, and once changed, it
+        stays so. Raises ConnectionLostError when the path leads to another file than before.
+        """
+        check_outside(self._depth, self.url)
+        if self.file.stamp is not None:
+            self.check_thread()
+            return self.file.has_new_stamp()
+        self.file.check()
+        before = self._noticed
+        self._noticed = self.fetch("PRAGMA data_version")[0][0]
+        return self._noticed != before

@@ -1,14 +1,12 @@
 """SQLite as an engine: paths and ``sqlite:///path``, one file an environment."""
 
 import re
-from collections.abc import Mapping
 from pathlib import Path
-from types import MappingProxyType
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.engines import BackupCallback, BackupReport, Capability, unknown_scheme
+from hapticdb.store.engines import BackupCallback, BackupReport, unknown_scheme
 from hapticdb.store.sqlite.store import SQLiteStore
 
 PREFIX = "sqlite:///"
@@ -20,9 +18,6 @@ class _SQLiteEngine:
     """Environments in files."""
 
     title = "SQLite"
-    lacks: Mapping[Capability, str] = MappingProxyType(
-        {"grant": ": a file has no roles: use the file system's rights"}
-    )
 
     def open(self, url: str, *, read_only: bool) -> Store:
         """Open an existing file."""

@@ -11,19 +11,16 @@ from hapticdb.store.refusals import check_distances
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.checking import SQLiteChecker
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.reading import SQLiteReader, read_environment
 from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
-from hapticdb.store.sqlite.watching import SQLiteWatch
 
 
 class SQLiteStore:
     """An environment in one SQLite file. Open with `open`, make with `create`.
 
-    Reading, writing, statistics and watching are classes of their own. The store takes over their
-    methods.
+    Reading, writing and statistics are classes of their own. The store takes over their methods.
     """
 
     def __init__(self, connection: FileConnection) -> None:
@@ -37,10 +34,10 @@ class SQLiteStore:
         self.grid, self.layout, self.wants_distances = read_environment(connection)
         self.snapshot, self.version = connection.snapshot, connection.version
         reader = SQLiteReader(connection, self.grid, self.layout)
-        self._reader = reader
         self.revision = reader.revision
         self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
         self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
+        self.rows_after = reader.rows_after
         self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.objects, self.object = reader.objects, reader.object
         self.removed, self.changes = reader.removed, reader.changes
@@ -50,8 +47,8 @@ class SQLiteStore:
         known = SQLiteStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
-        watch = SQLiteWatch(connection)
-        self.watch, self.has_changed = watch.watch, watch.has_changed
+        self.findings = known.findings
+        self.watch, self.has_changed = connection.watch, connection.has_changed
 
     @classmethod
     def open(cls, path: str | Path, *, read_only: bool = False) -> "SQLiteStore":
@@ -107,16 +104,6 @@ class SQLiteStore:
         check_distances(self.layout, distances=True)
         self._write_wish()
         self.wants_distances = True
-
-    def checker(self) -> SQLiteChecker:
-        """Answers of this engine for `hapticdb check`."""
-        return SQLiteChecker(self.path, self.layout, self._connection.fetch, self._reader)
-
-    # -- caches ------------------------------------------------------------------------------
-
-    def limit_cache(self, size_bytes: int) -> None:
-        """Limit the bytes of pages that the connection keeps in memory, from now on."""
-        self._connection.fetch(f"PRAGMA cache_size = -{max(int(size_bytes) // 1024, 1)}")
 
     def drop_caches(self) -> None:
         """Forget all pages: the connection's, and the file's in the operating system's cache."""

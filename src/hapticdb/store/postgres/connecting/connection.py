@@ -11,7 +11,6 @@ from psycopg import sql
 from hapticdb.errors import ConnectionLostError, DatabaseError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
-from hapticdb.store.postgres.connecting.answering import SilentServerError
 from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS, Link
 from hapticdb.store.postgres.connecting.wire import Parameter
 from hapticdb.store.refusals import check_outside
@@ -30,18 +29,19 @@ WRITE_TRIES = 3
 """Tries of a write whose server goes away. A larger value survives more losses in a row."""
 
 
-class ServerConnection:
-    """One connection to one environment's schema; belongs to the thread that opened it."""
+class ServerConnection(Link):
+    """One connection to one environment's schema; belongs to the thread that opened it.
+
+    is_loading : whether `Loading` is under way; is_closed : whether `close` was called; a lost
+    connection, which comes back by itself, is not closed.
+    """
 
     def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
-        self.address = address
-        self.shown = address.shown
-        self.is_read_only = read_only
         self._thread = this_thread()
         self._depth = 0
         self.is_loading = False
-        self._is_closed = False
-        self._link = Link(address, conninfo, read_only=read_only)
+        self.is_closed = False
+        super().__init__(address, conninfo, read_only=read_only)
 
     def __enter__(self) -> Self:
         return self
@@ -51,33 +51,14 @@ class ServerConnection:
 
     # -- the connection ----------------------------------------------------------------------
 
-    @property
-    def driver(self) -> psycopg.Connection[tuple[Any, ...]]:
-        """Psycopg's present connection; after a loss it is a new one."""
-        return self._link.driver
-
-    @property
-    def server_version(self) -> int:
-        """As libpq counts: 150018 is 15.18."""
-        return self._link.server_version
-
-    @property
-    def is_standby(self) -> bool:
-        """Whether the server that answered last is a standby."""
-        return self._link.is_standby
-
-    def connect(self, seconds: float = CONNECT_SECONDS) -> None:
-        """Connect again, once; seconds : see `Link.connect`."""
-        self._link.connect(seconds)
-
     def close(self) -> None:
         """Close the connection."""
-        self._is_closed = True
-        self._link.close()
+        self.is_closed = True
+        self.drop()
 
     def _reconnect(self) -> None:
         """Connect again and again, for up to `RECONNECT_SECONDS`; then raise the last error."""
-        self._link.close()
+        self.drop()
         deadline = time.monotonic() + RECONNECT_SECONDS
         pause = FIRST_PAUSE_SECONDS
         while True:
@@ -91,11 +72,6 @@ class ServerConnection:
                 pause = min(2 * pause, MOST_PAUSE_SECONDS)
             else:
                 return
-
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called; a lost connection comes back by itself."""
-        return self._is_closed
 
     def give_to(self, thread: int) -> None:
         """Give the connection to another thread, or to `NOBODY`. No call may be under way."""
@@ -115,9 +91,9 @@ class ServerConnection:
         Not inside a snapshot: its earlier reads saw the revision of the lost connection.
         """
         self.check_thread()
-        if self._is_closed:
+        if self.is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
-        if self._link.is_lost and not self._depth:
+        if self.is_lost and not self._depth:
             self._reconnect()
         try:
             with failures.named_errors(self.shown):
@@ -135,7 +111,7 @@ class ServerConnection:
         """First row of a prepared statement, every value in its binary form."""
 
         def read() -> list[bytes | None]:
-            result = self._link.run(text, parameters)
+            result = self.run(text, parameters)
             return [result.get_value(0, column) for column in range(result.nfields)]
 
         return self.again(read)
@@ -150,27 +126,19 @@ class ServerConnection:
         """One statement through psycopg, without a second try."""
         return self.driver.execute(text, parameters or None)
 
-    def command(self, text: str) -> None:
-        """One statement without parameters or rows, through libpq."""
-        self._link.command(text)
-
-    def hear(self) -> None:
-        """Pass notifications that have arrived to psycopg's notify handlers; never waits."""
-        self._link.hear()
-
     # -- transactions ------------------------------------------------------------------------
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
         """All reads inside see one committed revision: REPEATABLE READ. May be nested."""
         if self._depth == 0:
-            self.again(lambda: self.command(_SNAPSHOT))
+            self.again(lambda: self.command("BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY"))
         self._depth += 1
         try:
             yield
         finally:
             self._depth -= 1
-            if self._depth == 0 and not self._link.is_lost:
+            if self._depth == 0 and not self.is_lost:
                 self._end_snapshot()
 
     def write(
@@ -184,12 +152,12 @@ class ServerConnection:
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
-            if self._link.is_lost and not self._is_closed:
+            if self.is_lost and not self.is_closed:
                 self._reconnect()
             try:
                 result, is_certain = self._write_once(work)
             except ConnectionLostError:
-                self._link.close()
+                self.drop()
                 if not tries_left:
                     raise
             else:
@@ -213,9 +181,9 @@ class ServerConnection:
 
     def _write_once(self, work: Callable[[], Result]) -> tuple[Result, bool]:
         """Result of `work`, and whether the server confirmed the commit."""
-        if self._is_closed:
+        if self.is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
-        with failures.named_errors(self.shown), self._link.unhurried():
+        with failures.named_errors(self.shown), self.unhurried():
             self.command("BEGIN ISOLATION LEVEL READ COMMITTED")
             self._depth += 1
             try:
@@ -230,8 +198,6 @@ class ServerConnection:
                 self._depth -= 1
             try:
                 self.command("COMMIT")
-            except SilentServerError:  # it may still be done when the server goes on
-                return result, False
             except psycopg.Error as error:
                 if not failures.is_lost(error):
                     raise
@@ -244,11 +210,11 @@ class ServerConnection:
             with failures.named_errors(self.shown):
                 self.command("COMMIT")
         except ConnectionLostError:
-            self._link.close()
+            self.drop()
 
     def _roll_back(self) -> None:
         with contextlib.suppress(psycopg.Error):
-            if not self._link.is_lost:
+            if not self.is_lost:
                 self.command("ROLLBACK")
 
     @contextlib.contextmanager
@@ -257,13 +223,13 @@ class ServerConnection:
         names = limits or ("statement_timeout",)
         # the connection may have been lost since it was last used
         before = self.again(lambda: [self._shown_setting(name) for name in names])
-        with failures.named_errors(self.shown), self._link.unhurried():
+        with failures.named_errors(self.shown), self.unhurried():
             for name in names:
                 self.command(f"SET {name} = 0")
             try:
                 yield
             finally:
-                if self._link.is_usable():
+                if self.is_usable():
                     for name, value in zip(names, before, strict=True):
                         self.command(f"SET {name} = '{value}'")
 
@@ -278,11 +244,3 @@ class ServerConnection:
             " WHERE oid = 'environment'::regclass"
         )
         return bool(found[0][0])
-
-
-_SNAPSHOT = "BEGIN ISOLATION LEVEL REPEATABLE READ READ ONLY"
-
-
-def identifier(name: str) -> sql.Identifier:
-    """Quote a name for a statement's text."""
-    return sql.Identifier(name)

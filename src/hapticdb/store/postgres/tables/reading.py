@@ -16,17 +16,22 @@ from hapticdb.store.base import (
     Object,
     Rows,
     Table,
+    joined,
+    no_rows,
     row_shift,
 )
-from hapticdb.store.batches import joined, no_rows
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.tables import records, statements
+from hapticdb.store.postgres.tables import statements
 from hapticdb.store.refusals import no_object
 
 MOST_BITS = 1 << 20
 """Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
 larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
+OBJECTS = (
+    "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
+    " FROM object"
+)
 HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
 
 
@@ -75,46 +80,48 @@ class PostgresReader:
             self._has_band = self._connection.rows(HAS_BAND) == [(True,)]
         return self._has_band
 
-    def _table(self, *, distances: bool) -> Table | None:
-        """Table that answers a read; None if it is not there."""
-        if not distances:
-            return self._layout
-        return "band" if self._has_band or self.has_band() else None
-
-    def _fetched(self, text: str, *parameters: wire.Parameter, distances: bool) -> Rows:
+    def _read(
+        self,
+        texts: dict[Table, str],
+        *parameters: wire.Parameter,
+        distances: bool,
+        is_nothing: bool = False,
+    ) -> Rows:
+        """Rows by the statement of the table that answers; none if that table is not there."""
+        if is_nothing or (distances and not self.has_band()):
+            return no_rows(distances=distances)
+        text = texts["band" if distances else self._layout]
         return self.unpacked(self._connection.fetch(text, *parameters), distances=distances)
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
-        table = self._table(distances=distances)
-        if not keys.size or table is None:
-            return no_rows(distances=distances)
-        return self._fetched(statements.LOOKUP[table], wire.int8s(keys), distances=distances)
+        asked = wire.int8s(keys)
+        return self._read(statements.LOOKUP, asked, distances=distances, is_nothing=not keys.size)
 
     def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), one statement a key."""
-        table = self._table(distances=distances)
-        if table is None:
-            return no_rows(distances=distances)
-        text = statements.LOOKUP_ONE[table]
-        parts = [self._fetched(text, wire.int8(key), distances=distances) for key in keys.tolist()]
+        parts = [
+            self._read(statements.LOOKUP_ONE, wire.int8(key), distances=distances)
+            for key in keys.tolist()
+        ]
         return joined([part for part in parts if len(part)], distances=distances)
 
     def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        table = self._table(distances=distances)
-        if not lows.size or table is None:
-            return no_rows(distances=distances)
         ends = wire.int8s(lows), wire.int8s(highs)
-        return self._fetched(statements.SCAN[table], *ends, distances=distances)
+        return self._read(statements.SCAN, *ends, distances=distances, is_nothing=not lows.size)
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        table = self._table(distances=distances)
-        if not lows.size or table is None:
-            return no_rows(distances=distances)
         chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(object_id)
-        return self._fetched(statements.ROWS_OF[table], *chosen, distances=distances)
+        return self._read(
+            statements.ROWS_OF, *chosen, distances=distances, is_nothing=not lows.size
+        )
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most that many rows after (key, id), ascending by both."""
+        place = wire.int8(key), wire.int8(object_id), wire.int8(limit)
+        return self._read(statements.AFTER, *place, distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
@@ -162,12 +169,12 @@ class PostgresReader:
         self.revision()  # first: a write between the two statements is noticed by the next read
         return [
             believed.object_of(self._url, row)
-            for row in self._connection.rows(f"{records.OBJECTS} ORDER BY id")
+            for row in self._connection.rows(f"{OBJECTS} ORDER BY id")
         ]
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
-        rows = self._connection.rows(f"{records.OBJECTS} WHERE id = %s", (object_id,))
+        rows = self._connection.rows(f"{OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
             raise no_object(object_id, self._url)
         return believed.object_of(self._url, rows[0])

@@ -1,12 +1,12 @@
 """Statistics on a server: sizes, quantiles of the keys, cost figures."""
 
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
 from hapticdb.store import believed
 from hapticdb.store.base import Freshness, Histogram, Keys, Layout, Size
-from hapticdb.store.postgres.connecting.connection import ServerConnection, identifier
+from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.histogram import (
     ENOUGH_ROWS,
     SERVER_RESOLUTION,
@@ -65,24 +65,16 @@ class PostgresStatistics:
 
     def freshness(self, resolution: int) -> Freshness:
         """How old the histogram of that resolution is, by the revision stored with it."""
-        ((revision, made, changed, unseen),) = self._connection.rows(
-            "SELECT e.revision, q.revision,"
-            "       (SELECT coalesce(sum(voxels), 0) FROM object WHERE object.revision > "
-            "               coalesce(q.revision, 0)),"
-            "       CASE WHEN q.bounds IS NULL THEN (SELECT n_mod_since_analyze"
-            "         FROM pg_stat_user_tables WHERE schemaname = %s AND relname = %s) END"
+        ((revision, made),) = self._connection.rows(
+            "SELECT e.revision, q.revision"
             "  FROM environment e LEFT JOIN quantile q ON q.resolution = %s",
-            (self._connection.address.environment, self._layout, resolution),
+            (resolution,),
         )
-        since = 0 if made is None else int(made)
-        rows = int(changed if made is None or unseen is None else unseen)
-        changes = int(revision) - since
-        # the server counts with a delay: rows counted after its ANALYZE were written before it
-        return Freshness(None if made is None else since, changes, rows if changes else 0)
+        return Freshness(made, int(revision) - (made or 0))
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
         """Renew the server's statistics, or compute and keep a histogram, unless it is fresh."""
-        if not anew and self.freshness(resolution)[:2] == (self._reader.revision(), 0):
+        if not anew and self.freshness(resolution) == (self._reader.revision(), 0):
             return
         bounds: list[int] | None = None
         with self._connection.snapshot():
@@ -106,6 +98,12 @@ class PostgresStatistics:
     def _exact(self, resolution: int) -> tuple[Keys, int]:
         return exact_histogram(self._connection, self._layout, resolution)
 
+    def findings(self) -> Iterator[str]:
+        """What is wrong with kept statistics, a line each; the server checks its own pages."""
+        kept = self._connection.rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
+        costs = self._connection.rows("SELECT figures::text FROM cost")
+        yield from believed.findings_of_kept(self._connection.shown, kept, costs)
+
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
         kept = self._connection.rows(
@@ -126,12 +124,12 @@ class PostgresStatistics:
 
     def _bytes(self) -> tuple[int, int]:
         """Bytes of all tables and indexes of the schema, and pages of the index of its rows."""
-        schema = identifier(self._connection.address.environment).as_string(self._connection.driver)
         ((total, pages),) = self._connection.execute(
-            "SELECT (SELECT coalesce(sum(pg_total_relation_size(c.oid)), 0) FROM pg_class c"
-            "         WHERE c.relnamespace = to_regnamespace(%s) AND c.relkind = 'r'),"
+            "SELECT (SELECT coalesce(sum(pg_total_relation_size(oid)), 0) FROM pg_class"
+            "         WHERE relkind = 'r'"
+            "           AND relnamespace = quote_ident(current_schema())::regnamespace),"
             "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
             "         / current_setting('block_size')::int",
-            (schema, f"{schema}.{self._layout}_key"),
+            (f"{self._layout}_key",),
         ).fetchall()
         return int(total), int(pages)

@@ -7,24 +7,36 @@ import numpy as np
 from psycopg import errors
 
 from hapticdb.grid import Grid
-from hapticdb.store.base import (
-    Covering,
-    Keys,
-    Layout,
-    Object,
-    Rows,
-    touched_ranges,
-)
+from hapticdb.store import believed
+from hapticdb.store.base import Covering, Keys, Layout, Object, Rows, Table, touched_ranges
+from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.tables import records
+from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
-from hapticdb.store.postgres.tables.placing import PostgresRows
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
 
 Result = TypeVar("Result")
 
+COPY_CHUNK = 1 << 17
+"""Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
+COLUMNS: dict[Table, str] = {
+    "voxel": "z_val, id",
+    "brick": "z_val, id, occupancy",
+    "band": "z_val, id, distances",
+}
+INSERT_OBJECT = """
+INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
+VALUES (CASE WHEN %(id)s > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = %(id)s)
+             THEN %(id)s ELSE %(new_id)s END,
+        %(name)s, %(link)s, %(digest)s, %(transform)s, %(voxels)s, %(bounds)s, %(attributes)s,
+        %(revision)s)
+RETURNING id"""
+UPDATE_OBJECT = """
+UPDATE object SET digest = %(digest)s, transform = %(transform)s, voxels = %(voxels)s,
+       bounds = %(bounds)s, attributes = %(attributes)s, revision = %(revision)s
+ WHERE id = %(id)s"""
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
@@ -48,7 +60,6 @@ class PostgresWriter:
         self._layout = layout
         self._reader = reader
         self._loading = loading
-        self._rows = PostgresRows(connection, layout)
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
 
@@ -58,11 +69,11 @@ class PostgresWriter:
         def work() -> int:
             revision = self._next_revision()
             try:
-                new = {"new_id": self._new_id(revision), **records.contents(record, rows, revision)}
-                object_id = self._execute(records.INSERT_OBJECT, new)[0][0]
+                new = {"new_id": self._new_id(revision), **_contents(record, rows, revision)}
+                object_id = self._execute(INSERT_OBJECT, new)[0][0]
             except errors.UniqueViolation as error:
                 raise present_already(record, self._connection.shown) from error
-            self._rows.put(rows, object_id)
+            self._put(rows, object_id)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)
 
@@ -75,9 +86,9 @@ class PostgresWriter:
             revision = self._next_revision()
             known = self._reader.object(record.id)
             check_unwritten(record, known, self._connection.shown)
-            gone = self._rows.take(known, covering)
-            self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._rows.put(rows, record.id)
+            gone = self._take(known, covering)
+            self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
+            self._put(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
         self._commit(work)
@@ -89,8 +100,8 @@ class PostgresWriter:
             revision = self._next_revision()
             known = self._reader.object(record.id)
             check_without_distances(record, known, self._connection.shown)
-            self._execute(records.UPDATE_OBJECT, records.contents(record, rows, revision))
-            self._rows.put_band(rows, record.id)
+            self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
+            self._copy_into("band", rows, record.id)
             self._log(revision, "move", record.id, rows.keys)
 
         self._commit(work)
@@ -100,7 +111,7 @@ class PostgresWriter:
 
         def work() -> None:
             revision = self._next_revision()
-            gone = self._rows.take(self._reader.object(object_id), covering)
+            gone = self._take(self._reader.object(object_id), covering)
             self._execute("DELETE FROM object WHERE id = %s", (object_id,))
             self._log(revision, "remove", object_id, gone)
 
@@ -149,3 +160,47 @@ class PostgresWriter:
         self._connection.rows("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")
         found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
         return bool(self._connection.rows(found, self._written))
+
+    def _put(self, rows: Rows, object_id: int) -> None:
+        """Write the rows of an object that has none."""
+        self._copy_into(self._layout, rows.occupied(), object_id)
+        if rows.distances is not None:
+            self._copy_into("band", rows, object_id)
+
+    def _take(self, known: Object, covering: Covering) -> Keys:
+        """Delete the rows of an object as it is now, from both tables; returns their keys."""
+        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
+        tables: list[Table] = [self._layout]
+        if known.has_distances:
+            tables.append("band")
+        gone = []
+        for table in tables:
+            (found,) = self._connection.fetch(statements.DELETE_ROWS[table], *chosen)
+            gone.append(wire.read_int8s(found))
+        return np.concatenate(gone)
+
+    def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
+        target = f"{table} ({COLUMNS[table]})"
+        with self._connection.driver.cursor().copy(
+            f"COPY {target} FROM STDIN (FORMAT binary)"
+        ) as copy:
+            copy.write(wire.COPY_HEADER)
+            for at in range(0, len(rows), COPY_CHUNK):
+                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
+            copy.write(wire.COPY_TRAILER)
+
+
+def _contents(record: Object, rows: Rows, revision: int) -> dict[str, Any]:
+    """Bindings of an object's columns."""
+    return {
+        "id": record.id,
+        "name": record.name,
+        "link": record.link,
+        "digest": record.digest,
+        "transform": np.asarray(record.transform, dtype=np.float64).reshape(-1).tolist(),
+        "voxels": int(record.voxels),
+        "bounds": np.asarray(record.bounds, dtype=np.float64).reshape(-1).tolist(),
+        "attributes": believed.attributes_text(record, rows),
+        "revision": revision,
+    }

@@ -15,39 +15,29 @@ from hapticdb.store.base import BRICK_BYTES, Keys, Layout, Table, row_shift
 KEY_BITS = 63
 """Value bits of a non-negative int64."""
 
-# a row of distances, and the occupancy of its brick, zero if the brick holds no voxel. SQLite never
-# reorders a CROSS JOIN, so the rows keep the order of the keys asked for. With a LEFT JOIN a
-# statement of one key takes 10 us instead of 2, even if it finds nothing
-BAND_COLUMNS = f"""z_val, id, coalesce((SELECT occupancy FROM brick
+COLUMNS: dict[Table, str] = {
+    "voxel": "z_val, id",
+    "brick": "z_val, id, occupancy",
+    # a row of distances, and the occupancy of its brick, zero if the brick holds no voxel. With a
+    # LEFT JOIN a statement of one key takes 10 us instead of 2, even if it finds nothing
+    "band": f"""z_val, id, coalesce((SELECT occupancy FROM brick
                           WHERE brick.z_val = band.z_val AND brick.id = band.id),
-                        zeroblob({BRICK_BYTES})), distances"""
+                        zeroblob({BRICK_BYTES})), distances""",
+}
+# SQLite never reorders a CROSS JOIN, so the rows keep the order of the keys asked for
 NARROW: dict[Table, str] = {
-    "voxel": """
-SELECT z_val, id
-  FROM carray(?1) AS range CROSS JOIN voxel
- WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
-    "brick": """
-SELECT z_val, id, occupancy
-  FROM carray(?1) AS range CROSS JOIN brick
- WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
-    "band": f"""
-SELECT {BAND_COLUMNS}
-  FROM carray(?1) AS range CROSS JOIN band
- WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)""",
+    table: f"""
+SELECT {columns}
+  FROM carray(?1) AS range CROSS JOIN {table}
+ WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)"""
+    for table, columns in COLUMNS.items()
 }
 WIDE: dict[Table, str] = {
-    "voxel": """
-SELECT z_val, id
-  FROM carray(?1) AS low CROSS JOIN voxel
- WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
-    "brick": """
-SELECT z_val, id, occupancy
-  FROM carray(?1) AS low CROSS JOIN brick
- WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
-    "band": f"""
-SELECT {BAND_COLUMNS}
-  FROM carray(?1) AS low CROSS JOIN band
- WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)""",
+    table: f"""
+SELECT {columns}
+  FROM carray(?1) AS low CROSS JOIN {table}
+ WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)"""
+    for table, columns in COLUMNS.items()
 }
 
 

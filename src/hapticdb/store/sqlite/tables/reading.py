@@ -15,26 +15,36 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.store import believed
-from hapticdb.store.base import Change, Keys, Layout, LocatedShell, Object, Rows, Table, row_shift
-from hapticdb.store.batches import no_rows
+from hapticdb.store.base import (
+    Change,
+    Keys,
+    Layout,
+    LocatedShell,
+    Object,
+    Rows,
+    Table,
+    no_rows,
+    row_shift,
+)
 from hapticdb.store.refusals import no_object
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
-from hapticdb.store.sqlite.tables.ranges import BAND_COLUMNS, RangeStatements
+from hapticdb.store.sqlite.tables.ranges import COLUMNS, RangeStatements
 
 HAS_BAND = "SELECT count(*) FROM sqlite_master WHERE name = 'band' AND type = 'table'"
 LOOKUP: dict[Table, str] = {
-    "voxel": "SELECT z_val, id FROM carray(?1) AS asked CROSS JOIN voxel ON z_val = asked.value",
-    "brick": """SELECT z_val, id, occupancy
-                  FROM carray(?1) AS asked CROSS JOIN brick ON z_val = asked.value""",
-    "band": f"""SELECT {BAND_COLUMNS}
-                  FROM carray(?1) AS asked CROSS JOIN band ON z_val = asked.value""",
+    table: f"SELECT {columns} FROM carray(?1) AS asked CROSS JOIN {table} ON z_val = asked.value"
+    for table, columns in COLUMNS.items()
 }
 LOOKUP_ONE: dict[Table, str] = {
-    "voxel": "SELECT z_val, id FROM voxel WHERE z_val = ?1",
-    "brick": "SELECT z_val, id, occupancy FROM brick WHERE z_val = ?1",
-    "band": f"SELECT {BAND_COLUMNS} FROM band WHERE z_val = ?1",
+    table: f"SELECT {columns} FROM {table} WHERE z_val = ?1" for table, columns in COLUMNS.items()
+}
+AFTER: dict[Table, str] = {
+    table: f"""
+SELECT {columns} FROM {table}
+ WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3"""
+    for table, columns in COLUMNS.items()
 }
 
 
@@ -85,16 +95,16 @@ class SQLiteReader:
             self._has_band = bool(found[0][0])
         return self._has_band
 
-    def _table(self, *, distances: bool) -> Table | None:
-        """Table that answers a read; None if it is not there."""
-        if not distances:
-            return self._layout
-        return "band" if self._has_band or self.has_band() else None
+    def _table(self, *, distances: bool, is_nothing: bool = False) -> Table | None:
+        """Table that answers a read; None if it is not there, or nothing is asked for."""
+        if is_nothing or (distances and not self.has_band()):
+            return None
+        return "band" if distances else self._layout
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
-        table = self._table(distances=distances)
-        if not keys.size or table is None:
+        table = self._table(distances=distances, is_nothing=not keys.size)
+        if table is None:
             return no_rows(distances=distances)
         found = self._connection.fetch(LOOKUP[table], (apsw.carray(keys),))
         return self.unpacked(found, distances=distances)
@@ -112,26 +122,36 @@ class SQLiteReader:
 
     def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        table = self._table(distances=distances)
-        if not lows.size or table is None:
-            return no_rows(distances=distances)
-        found = self._connection.fetch(*self._ranges.scan(table, lows, highs))
-        return self.unpacked(found, distances=distances)
+        return self._in_ranges(lows, highs, distances=distances)
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        table = self._table(distances=distances)
-        if not lows.size or table is None:
+        return self._in_ranges(lows, highs, object_id, distances=distances)
+
+    def _in_ranges(
+        self, lows: Keys, highs: Keys, object_id: int | None = None, *, distances: bool
+    ) -> Rows:
+        table = self._table(distances=distances, is_nothing=not lows.size)
+        if table is None:
             return no_rows(distances=distances)
         sql, bindings = self._ranges.scan(table, lows, highs)
-        found = self._connection.fetch(f"{sql} AND {table}.id = ?4", (*bindings, object_id))
-        return self.unpacked(found, distances=distances)
+        if object_id is not None:
+            sql, bindings = f"{sql} AND {table}.id = ?4", (*bindings, object_id)
+        return self.unpacked(self._connection.fetch(sql, bindings), distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
         return int(self._connection.fetch(*self._ranges.count(lows, highs))[0][0])
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most that many rows after (key, id), ascending by both."""
+        table = self._table(distances=distances)
+        if table is None:
+            return no_rows(distances=distances)
+        found = self._connection.fetch(AFTER[table], (key, object_id, limit))
+        return self.unpacked(found, distances=distances)
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""

@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.store import believed
-from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, NO_ROWS, Band, Object, Rows
-from hapticdb.store.batches import NO_DISTANCES
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    NO_DISTANCES,
+    NO_OCCUPANCY,
+    NO_ROWS,
+    Band,
+    Object,
+    Rows,
+)
 
 KINDS = """
 SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END

@@ -66,42 +66,20 @@ def with_common_values(
 
     Notes
     -----
-    The share of rows with a key <= x grows linearly within each bucket of the histogram, and jumps
-    at each common key. Bound i of the result is where this share reaches i / R.
+    The rows of a bucket count at its upper bound, those of a common key at that key. Bound i is the
+    least key up to which the share of rows is i / R, right to within a bucket of the histogram.
     """
-    order = np.argsort(common)
-    common, shares = common[order], shares[order]
-    rest = max(1.0 - float(shares.sum()), 0.0)
-    if len(bounds) < 2:
-        bounds, rest = np.concatenate([bounds, bounds])[:2], 0.0
-    places = np.unique(np.concatenate([bounds, common]))
-    if not len(places):
+    keys = np.concatenate([bounds[1:], common])
+    if not len(keys):
         return np.zeros(resolution + 1, dtype=np.int64)
-    smooth = np.zeros(len(places))
-    if len(bounds):
-        # of equal bounds the last one counts: all of their buckets end at or below that key
-        last = np.append(bounds[1:] != bounds[:-1], True)
-        known = np.flatnonzero(last)
-        smooth = rest * np.interp(
-            places.astype(np.float64), bounds[known].astype(np.float64), known / (len(bounds) - 1)
-        )
-        smooth[places < bounds[0]] = 0.0
-    jumps = np.concatenate([[0.0], np.cumsum(shares)])
-    below = smooth + jumps[np.searchsorted(common, places, "left")]
-    up_to = smooth + jumps[np.searchsorted(common, places, "right")]
-    # two corners at each place: the share before its jump, and after it
-    heights = np.stack([below, up_to], axis=1).reshape(-1)
-    corners = np.repeat(places, 2)
-    targets = np.arange(resolution + 1) / resolution * heights[-1]
-    at = np.clip(np.searchsorted(heights, targets, "left"), 1, len(heights) - 1)
-    low, high = heights[at - 1], heights[at]
-    part = np.where(high > low, (targets - low) / np.where(high > low, high - low, 1.0), 1.0)
-    width = (corners[at] - corners[at - 1]).astype(np.float64)
-    # added to the lower corner in whole keys: a float64 cannot hold the last bits of a key
-    found = corners[at - 1] + np.round(np.clip(part, 0.0, 1.0) * width).astype(np.int64)
-    found[0] = places[0]
-    found[-1] = places[-1]
-    return np.asarray(np.maximum.accumulate(found))
+    rest = max(1.0 - float(shares.sum()), 0.0)
+    in_buckets = np.full(len(bounds[1:]), rest / max(len(bounds) - 1, 1))
+    order = np.argsort(keys, kind="stable")
+    up_to = np.cumsum(np.concatenate([in_buckets, shares])[order])
+    targets = np.arange(resolution + 1) / resolution * up_to[-1]
+    found: Keys = keys[order][np.searchsorted(up_to, targets)]
+    found[0] = np.append(keys, bounds[:1]).min()
+    return found
 
 
 def exact_histogram(

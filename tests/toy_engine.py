@@ -42,7 +42,6 @@ from hapticdb.store.believed import distances_crc, rows_crc
 from hapticdb.store.refusals import (
     check_distances,
     check_unwritten,
-    check_without_distances,
     no_object,
     present_already,
 )
@@ -230,11 +229,6 @@ class MemoryStore:
             check_unwritten(record, known, self.url)
             touched = np.concatenate([old.keys, rows.keys])
             self._commit("move", record.id, touched, record, rows)
-
-    def add_distances(self, record: Object, rows: Rows) -> None:
-        with self._contents.write_lock:
-            check_without_distances(record, self._known(record.id)[0], self.url)
-            self._commit("move", record.id, rows.keys, record, rows)
 
     def remove(self, object_id: int, covering: Covering) -> None:
         with self._contents.write_lock:

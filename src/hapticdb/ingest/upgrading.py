@@ -5,7 +5,7 @@ and goes on with the objects that have no distances yet.
 """
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -164,13 +164,17 @@ class _Run:
                     f"object {obj.id} ({obj.name}) cannot be upgraded: its voxels are not those "
                     f"that its file gives now; 'hapticdb remove' it and import {obj.link} again"
                 )
-            self._store.add_distances(obj, rows)
+            self._store.replace(obj, rows, self._covering)
         except (FileError, ConflictError, ObjectNotFoundError) as error:
             self._leave_out((obj,), error)
             return
         self.n_upgraded += 1
         self.voxels += obj.voxels
         self._advance(1)
+
+    def _covering(self, known: Object) -> Iterable[tuple[int, int]]:
+        lows, highs = object_ranges(self._store.grid, self._store.layout, known)
+        return zip(lows.tolist(), highs.tolist(), strict=True)
 
     def _leave_out(self, objects: tuple[Object, ...], error: HapticDBError) -> None:
         self.left_out.append(LeftOut(objects, error))

@@ -329,9 +329,6 @@ class _WritesObjects(Protocol):
         ConflictError when the object has been written since.
         """
 
-    def add_distances(self, record: Object, rows: Rows) -> None:
-        """Give distances to an object without any, whose bricks are among these rows: a move."""
-
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
 

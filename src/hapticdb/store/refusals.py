@@ -38,13 +38,6 @@ def check_unwritten(record: Object, known: Object, url: str) -> None:
         )
 
 
-def check_without_distances(record: Object, known: Object, url: str) -> None:
-    """Refuse distances for an object that has some, or was written after `record` was read."""
-    check_unwritten(record, known, url)
-    if known.has_distances:
-        raise ConflictError(f"object {known.id} ({known.name}) of {url} has distances already")
-
-
 def check_distances(layout: Layout, *, distances: bool) -> None:
     """Refuse distances on the layout voxel: a row of distances belongs to a brick."""
     if distances and layout == "voxel":

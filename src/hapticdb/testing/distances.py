@@ -5,7 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hapticdb.errors import ConflictError, EnvironmentExistsError, UsageError
+from hapticdb.errors import EnvironmentExistsError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import believed
@@ -174,30 +174,6 @@ class DistancesContract(StoreCase):
             for found, column in zip(band.rows_of(1, *EVERYWHERE), voxels, strict=True):
                 np.testing.assert_array_equal(found, column)
             assert _is_touched(list(band.changes())[-1], rows.keys)
-
-    def test_distances_are_added_to_an_object_without_any(self, band: Store) -> None:
-        """Its voxels stay, and it can be removed. Other writes of it in between are conflicts."""
-        union = self.rows(band, 1)
-        band.replace(replace(band.object(1), revision=0), union.occupied(), covering(band))
-        known, voxels = band.object(1), band.scan(*EVERYWHERE)
-        with pytest.raises(ConflictError, match="was written by another"):
-            band.add_distances(replace(known, revision=1), union)
-        band.add_distances(known, union)
-        assert list(band.changes())[-1].action == "move"
-        assert _is_touched(list(band.changes())[-1], union.keys)
-        found = band.object(1)
-        assert found.revision == band.revision() == known.revision + 1
-        assert (found.rows_crc, found.distances_crc) == (
-            known.rows_crc,
-            believed.distances_crc(union),
-        )
-        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 1, 3)
-        for column, was in zip(band.scan(*EVERYWHERE), voxels, strict=True):
-            np.testing.assert_array_equal(column, was)
-        with pytest.raises(ConflictError, match="has distances already"):
-            band.add_distances(found, union)
-        band.remove(1, covering(band))
-        assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
 
     def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
         """The pieces together are what a scan returns."""

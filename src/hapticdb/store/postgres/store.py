@@ -60,7 +60,7 @@ class PostgresStore:
         loading = self._loading = Loading(connection, self.layout)
         writer = PostgresWriter(connection, self.grid, self.layout, reader, loading)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
-        self.add_distances, self._write_wish = writer.add_distances, writer.want_distances
+        self._write_wish = writer.want_distances
         known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

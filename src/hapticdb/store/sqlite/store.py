@@ -43,7 +43,7 @@ class SQLiteStore:
         self.removed, self.changes = reader.removed, reader.changes
         writer = SQLiteWriter(connection, self.grid, self.layout, reader)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
-        self.add_distances, self._write_wish = writer.add_distances, writer.want_distances
+        self._write_wish = writer.want_distances
         known = SQLiteStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

@@ -15,7 +15,7 @@ from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
-from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
+from hapticdb.store.refusals import check_unwritten, present_already
 
 Result = TypeVar("Result")
 
@@ -90,19 +90,6 @@ class PostgresWriter:
             self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
             self._put(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
-
-        self._commit(work)
-
-    def add_distances(self, record: Object, rows: Rows) -> None:
-        """Give distances to an object without any, in one transaction."""
-
-        def work() -> None:
-            revision = self._next_revision()
-            known = self._reader.object(record.id)
-            check_without_distances(record, known, self._connection.shown)
-            self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
-            self._copy_into("band", rows, record.id)
-            self._log(revision, "move", record.id, rows.keys)
 
         self._commit(work)
 

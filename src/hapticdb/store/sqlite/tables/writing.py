@@ -16,7 +16,7 @@ from hapticdb.store.base import (
     Table,
     touched_ranges,
 )
-from hapticdb.store.refusals import check_unwritten, check_without_distances, present_already
+from hapticdb.store.refusals import check_unwritten, present_already
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
@@ -93,16 +93,6 @@ class SQLiteWriter:
             self._insert(rows, record.id)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
-    def add_distances(self, record: Object, rows: Rows) -> None:
-        """Give distances to an object without any, in one transaction."""
-        with self._connection.writing():
-            revision = self._reader.revision() + 1
-            check_without_distances(record, self._reader.object(record.id), self._connection.url)
-            contents = sqlite_rows.contents(record, rows)
-            self._connection.execute(UPDATE_OBJECT, (*contents, revision, record.id))
-            self._insert_distances(rows, record.id)
-            self._log(revision, "move", record.id, rows.keys)
-
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
         with self._connection.writing():
@@ -117,7 +107,7 @@ class SQLiteWriter:
             self._connection.execute("UPDATE environment SET wants_distances = 1")
 
     def _insert(self, union: Rows, object_id: int) -> None:
-        """Insert rows, ascending by key: one statement for up to CHUNK of them."""
+        """Insert rows, ascending by key, and their distances: a statement for each chunk."""
         rows = union.occupied()
         for at in range(0, len(rows), CHUNK):
             keys = apsw.carray(rows.keys[at : at + CHUNK])
@@ -126,22 +116,14 @@ class SQLiteWriter:
             else:
                 part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
-        if union.distances is not None:
-            self._insert_distances(union, object_id)
-
-    def _insert_distances(self, union: Rows, object_id: int) -> None:
-        """Insert distances, ascending by key: one statement for up to BAND_CHUNK rows."""
-        for at in range(0, len(union), BAND_CHUNK):
-            self._insert_band(union.part(at, at + BAND_CHUNK), object_id)
-
-    def _insert_band(self, rows: Rows, object_id: int) -> None:
-        """Insert the distances of rows, by one statement."""
-        assert rows.distances is not None  # noqa: S101 - the caller has looked
-        data, ends = rows.distances
-        lengths = rows.distances.lengths
-        places = (apsw.pyobject((ends - lengths + 1).tolist()), apsw.pyobject(lengths.tolist()))
-        keys = apsw.carray(np.ascontiguousarray(rows.keys))
-        self._connection.execute(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
+        for at in range(0, len(union) if union.distances is not None else 0, BAND_CHUNK):
+            band = union.part(at, at + BAND_CHUNK)
+            assert band.distances is not None  # noqa: S101 - a part of what has some
+            data, ends = band.distances
+            lengths = band.distances.lengths
+            places = (apsw.pyobject((ends - lengths + 1).tolist()), apsw.pyobject(lengths.tolist()))
+            keys = apsw.carray(np.ascontiguousarray(band.keys))
+            self._connection.execute(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
 
     def _delete(self, object_id: int, covering: Covering) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys."""

@@ -3,7 +3,7 @@
 An engine's tests subclass `StoreContract` and say how a store is made and opened again::
 
     class TestMyStore(StoreContract):
-        lacks = frozenset({"caches", "server"})
+        lacks = frozenset({"statement", "caches"})
 
         def make(self, grid, layout, name="environment"):
             return MyStore.create(..., grid, layout)

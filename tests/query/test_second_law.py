@@ -132,11 +132,8 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("n_points", [7, 300])
-def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(
-    env: Environment, n_points: int
-) -> None:
-    shell = shell_of(n_points)
+def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) -> None:
+    shell = shell_of(300)
     n_felt = 0
     with CellTable.create(LEAST_BUDGET) as table:
         frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
@@ -156,6 +153,7 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(
     assert n_felt > 0
 
 
+@pytest.mark.long
 def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> None:
     """A payload of zeros: everything in a brick that holds a voxel is felt, and hits stay hits."""
     shell, pose, law = shell_of(300), poses()[0], NearNumbers(STIFFNESS)

@@ -286,6 +286,6 @@ def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
     server = "postgresql://me:secret@host/plant"
     assert "secret" not in refused(run("backup", server, "copy.db"), "pg_dump")
     refused(run("backup", path, server), "not a file")
-    refused(run("restore", path, server), "pg_restore")
+    refused(run("restore", path, server), "hapticdb copy")
     refused(run("restore", server, path), "not a file")
     assert files(tmp_path) == before

@@ -64,7 +64,7 @@ def test_an_installed_engine_is_used_from_the_command_line(run: Run, tmp_path: P
     assert run("check", url)[0] == 0
     assert run("copy", url, "copy.db")[0] == 0
     assert run("diff", url, "copy.db")[0] == 0
-    refused(run("grant", url, "anna", "--as", "viewer"), "only this process can reach it")
+    refused(run("grant", url, "anna", "--as", "viewer"), "is on memory, which has no roles")
     refused(run("backup", url, "other.db"), "hapticdb copy")
     refused(run("backup", "copy.db", url), "is on memory, not a file")
 

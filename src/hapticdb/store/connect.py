@@ -158,8 +158,8 @@ def _engine_of_both(url: Url, file: Url) -> SupportsBackup:
     engine, other = engine_of(url), engine_of(file)
     if not isinstance(engine, SupportsBackup):
         raise UsageError(
-            f"{redact(os.fspath(url))} is on {engine.title}, not a file: its own tools copy it, "
-            "such as pg_dump and pg_restore"
+            f"{redact(os.fspath(url))} is on {engine.title}, not a file: use its own tools, or "
+            "'hapticdb copy'"
         )
     if other is not engine:
         raise UsageError(f"{redact(os.fspath(file))} is on {other.title}, not a file: give a path")

@@ -284,7 +284,7 @@ def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
     refused(run("backup", tmp_path / "no.db", "copy.db"), "no environment at")
     refused(run("restore", tmp_path / "no.db", path), "no environment at")
     server = "postgresql://me:secret@host/plant"
-    assert "secret" not in refused(run("backup", server, "copy.db"), "pg_dump")
+    assert "secret" not in refused(run("backup", server, "copy.db"), "hapticdb copy")
     refused(run("backup", path, server), "not a file")
     refused(run("restore", path, server), "hapticdb copy")
     refused(run("restore", server, path), "not a file")

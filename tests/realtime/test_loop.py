@@ -102,7 +102,7 @@ def messages(content: bytes) -> Iterator[Message]:
 def test_a_loop_counts_what_it_records(run: Run) -> None:
     answer, frames = run(stroking(0.010, 0.5), seconds=0.6)
     counts = answer.counts
-    assert counts.frames == answer.loop.frames == len(frames)
+    assert answer.loop.frames == len(frames)
     assert counts.hit_frames == np.count_nonzero(frames["hits"]) > 0
     assert counts.contact_frames == np.count_nonzero(frames["contacts"]) > 0
     assert counts.unknown_frames == np.count_nonzero(frames["unknown"])
@@ -151,13 +151,12 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
     hand = Clutched(stroking(0.010, 0.5), 1 << 30, 0.0)
-    answer, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
+    _, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
     is_open = frames["state"] & State.CLUTCH_OPEN > 0
     assert is_open.any()
     assert not is_open.all()
     np.testing.assert_array_equal(is_open, frames["buttons"] & 1 > 0)
     assert not frames["hand_velocity"][is_open].any()
-    assert answer.counts.frames == len(frames)
 
 
 def test_a_kernel_compiled_while_the_loop_runs_is_told(
@@ -227,7 +226,6 @@ def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(
     forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
     assert forces[-1] > 0.0
     assert (forces == 0.0).any()
-    assert counts.frames == len(frames)
 
 
 def test_a_hand_that_is_never_a_rotation_does_not_begin(

@@ -307,7 +307,7 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
         ({"rate": 1e5}, "a rate of"),
         ({"seconds": 0.0}, "0.0 seconds"),
         ({"seconds": math.inf}, "inf seconds"),
-        ({"processor": -1}, "processor -1: give its number"),
+        ({"processor": -1}, "processor -1 is not granted"),
         ({"staleness": 0.0}, "a staleness of 0.0 s"),
         ({"exclude": [1]}, "give a URL instead"),
         ({"budget_bytes": 1 << 20}, "give a URL instead"),

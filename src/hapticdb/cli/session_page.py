@@ -117,9 +117,8 @@ def _force_facts(report: "Report") -> Facts:
             ("force law", "plane: tangent planes of voxels"),
             ("rendering", "direct, without coupling: each frame's wrench goes to the device"),
         ]
-        if spring is not None:
-            caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
-            facts.append(("at most", caps))
+        caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
+        facts.append(("at most", caps))
         return [*facts, ("peak", _peak_text(report))]
     facts = [
         ("force law", "smooth: distances to surfaces"),

@@ -5,7 +5,6 @@ import ctypes
 import gc
 import os
 import sys
-import threading
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -22,8 +21,6 @@ value is 5e-3, five periods at 1 kHz; a smaller one costs more switches."""
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30
 """Numbers of two operations of Linux's prctl."""
-MOST_PROCESSORS = 4096
-"""Processor numbers are below this; the loop cannot be bound to higher ones."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +39,7 @@ class Timing:
     Raises
     ------
     UsageError
-        If no processor can have that number.
+        If this process may not run on that processor.
     """
 
     rate: float = 1000.0
@@ -50,21 +47,12 @@ class Timing:
     processor: int | None = None
 
     def __post_init__(self) -> None:
-        if self.processor is not None and not 0 <= self.processor < MOST_PROCESSORS:
+        granted = os.sched_getaffinity(0)
+        if self.processor is not None and self.processor not in granted:
+            shown = ", ".join(map(str, sorted(granted)))
             raise UsageError(
-                f"processor {self.processor:.10g}: give its number, 0 to {MOST_PROCESSORS - 1}"
+                f"processor {self.processor:.10g} is not granted: this process may run on {shown}"
             )
-
-    def check_granted(self) -> None:
-        """Refuse a processor that this process may not use; the message names those it may.
-
-        Raises
-        ------
-        UsageError
-            If the processor does not exist, or is not in this container's or cpuset's set.
-        """
-        if self.processor is not None and self.processor not in (allowed := _allowed()):
-            raise _not_granted(self.processor, allowed)
 
 
 class Deadlines:
@@ -158,8 +146,8 @@ def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
 def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
     """Disable garbage collection, shorten thread switches, sleep exactly, and apply `timing`.
 
-    Yields a description of what the system granted; at the end all settings are restored. A
-    processor that is not granted is a UsageError; SCHED_FIFO that is not granted is no error.
+    Yields a description of what the system granted; at the end all settings are restored.
+    SCHED_FIFO that is not granted is no error.
     """
     granted: dict[str, str] = {}
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
@@ -168,74 +156,29 @@ def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
     gc.disable()
     sys.setswitchinterval(SWITCH_INTERVAL)
     slack = _set_slack(1)
-    processors = os.sched_getaffinity(0) if hasattr(os, "sched_getaffinity") else None
+    processors = os.sched_getaffinity(0)
     policy = None
     try:
         if timing.processor is not None:
-            granted["processor"] = _bind(timing.processor)
+            os.sched_setaffinity(0, {timing.processor})
+            granted["processor"] = f"bound to processor {timing.processor}"
         if timing.is_fifo:
             policy = _ask_for_fifo(granted)
         yield granted
     finally:
         if policy is not None:
             os.sched_setscheduler(0, *policy)
-        if processors is not None and timing.processor is not None:
+        if timing.processor is not None:
             os.sched_setaffinity(0, processors)
-        if slack is not None:
-            _set_slack(slack)
+        _set_slack(slack)
         sys.setswitchinterval(switch)
         gc.unfreeze()
         if was_enabled:
             gc.enable()
 
 
-def _bind(processor: int) -> str:
-    try:
-        if hasattr(os, "sched_setaffinity"):
-            os.sched_setaffinity(0, {processor})
-            return f"bound to processor {processor}"
-    except OSError as error:
-        raise _not_granted(processor, _allowed()) from error
-    raise _not_granted(processor, set())
-
-
-def _allowed() -> set[int]:
-    """Processors that a thread of this process may be bound to; empty if the system binds none."""
-    if not hasattr(os, "sched_setaffinity"):
-        return set()
-    found: set[int] = set()
-
-    def ask() -> None:  # in a thread of its own, so the other threads keep their processors
-        with contextlib.suppress(OSError):  # a sandbox may forbid the call
-            os.sched_setaffinity(0, range(MOST_PROCESSORS))
-        found.update(os.sched_getaffinity(0))
-
-    asking = threading.Thread(target=ask)
-    asking.start()
-    asking.join()
-    return found
-
-
-def _not_granted(processor: int, allowed: set[int]) -> UsageError:
-    if not allowed:
-        return UsageError(
-            f"processor {processor}: this system binds no process to a processor; leave it out"
-        )
-    runs: list[list[int]] = []
-    for number in sorted(allowed):
-        if runs and number == runs[-1][1] + 1:
-            runs[-1][1] = number
-        else:
-            runs.append([number, number])
-    shown = ", ".join(f"{low}" if low == high else f"{low} to {high}" for low, high in runs)
-    return UsageError(f"processor {processor} is not granted: this process may run on {shown}")
-
-
 def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
     """Ask for SCHED_FIFO; returns the former policy if it was granted, else None."""
-    if not hasattr(os, "sched_setscheduler"):
-        granted["scheduling"] = "SCHED_FIFO not on this system"
-        return None
     before = os.sched_getscheduler(0), os.sched_getparam(0)
     try:
         os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
@@ -246,10 +189,8 @@ def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
     return before
 
 
-def _set_slack(nanoseconds: int) -> int | None:
-    """Set how late the system may wake this thread; returns the value before, None off Linux."""
-    if sys.platform != "linux":
-        return None
+def _set_slack(nanoseconds: int) -> int:
+    """Set how late the system may wake this thread; returns the value before."""
     libc = ctypes.CDLL(None, use_errno=True)
     before = libc.prctl(_PR_GET_TIMERSLACK, 0, 0, 0, 0)
     libc.prctl(_PR_SET_TIMERSLACK, nanoseconds, 0, 0, 0)

@@ -101,7 +101,34 @@ class _Feeling:
         )  # fmt: skip
 
 
-class DirectDrive:
+class _Drive:
+    """What both drives have: the tool's state, and a copy of it to step back to.
+
+    Attributes
+    ----------
+    radius : float
+        Distance of the tool's farthest point from its centre, m.
+    """
+
+    def __init__(self, scene: _DriveInputs, cells: Cells, law: ForceLaw, radius: float) -> None:
+        self.radius = radius
+        self._scene, self._feeling = scene, _Feeling(scene, cells, law)
+        self._tool, self._sent = scene.servo["tool"], scene.servo["sent"]
+        self._tool_before = self._tool.copy()
+        self._left_out = self._sent["left_out"]
+
+    def remember(self) -> None:
+        """Store the state, so that `step_back` can return to it."""
+        self._tool_before[()] = self._tool
+
+    def step_back(self, *, from_zero: bool) -> None:
+        """Return to the remembered state; `from_zero`: the force rises again from zero."""
+        self._tool[()] = self._tool_before  # a coupling's own state stays, as its kernel asks
+        if from_zero:
+            self._tool["risen"] = 0.0
+
+
+class DirectDrive(_Drive):
     """The tool at the hand: the wrench of each frame goes to the device, up to its caps.
 
     Parameters
@@ -119,14 +146,15 @@ class DirectDrive:
     def __init__(
         self, scene: _DriveInputs, terms: direct.DirectTerms, radius: float, law: ForceLaw
     ) -> None:
-        self._scene, self._terms = scene, terms
-        self.radius, self.hold, self.least_share = radius, terms.hold, 1.0
-        self._feeling = _Feeling(scene, scene.cells.without_distances(), law)
+        super().__init__(scene, scene.cells.without_distances(), law, radius)
+        self._terms = terms
         self._hand_pose, self._at_hand = pose_numbers(scene.servo["hand"])[None], np.eye(4)[None]
         self._felt = np.zeros((1, RESULTS))
-        self._tool = scene.servo["tool"]
-        self._tool_before = self._tool.copy()
-        self._left_out = scene.servo["sent"]["left_out"]
+
+    @property
+    def least_share(self) -> float:
+        """Share of the stiffness that is left: there is no guard."""
+        return 1.0
 
     def step(self, dt: float) -> None:
         """Feel the scene at the hand, a period `dt` (s) later; `sent` then has the wrench."""
@@ -138,16 +166,6 @@ class DirectDrive:
         direct.render(self._terms, scene.clusters.center, scene.servo, self._felt, revision, dt)
         self._left_out[()] = self._feeling.counts[0, LEFT_OUT]
 
-    def remember(self) -> None:
-        """Store the state, so that `step_back` can return to it."""
-        self._tool_before[()] = self._tool
-
-    def step_back(self, *, from_zero: bool) -> None:
-        """Return to the remembered state; `from_zero`: the force rises again from zero."""
-        self._tool[()] = self._tool_before
-        if from_zero:
-            self._tool["risen"] = 0.0
-
     def touching(self, n_hits: int) -> Indices:
         """Indices of the last frame's hits, as many as it had."""
         return self._feeling.met[:n_hits]
@@ -156,7 +174,7 @@ class DirectDrive:
         """Nothing to do: each step is a frame of the law at the tool's pose."""
 
 
-class SmoothDrive:
+class SmoothDrive(_Drive):
     """The quasi-static tool of `Coupling`, over distances to surfaces.
 
     Parameters
@@ -171,19 +189,15 @@ class SmoothDrive:
     """
 
     def __init__(self, scene: _DriveInputs, spring: DeviceSpring, law: ForceLaw) -> None:
-        self._scene, self._spring = scene, spring
-        self._feeling = _Feeling(scene, scene.cells, law)
-        self.radius, self.hold = spring.radius, spring.hold
+        super().__init__(scene, scene.cells, law, spring.radius)
+        self._spring = spring
         n_points = len(scene.clusters.points)
         self._follower = np.zeros((), FOLLOWER)
         self._field = np.zeros((FIELD_ROWS, n_points))
         self._met = np.zeros((MET_ROWS, n_points), dtype=np.int64)
-        self._tool = scene.servo["tool"]
-        self._tool_before = self._tool.copy()
         self._missed_here = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._felt_here = np.zeros((1, RESULTS))
-        self._felt, self._unknown = self._tool["felt"], scene.servo["sent"]["unknown"]
-        self._left_out = scene.servo["sent"]["left_out"]
+        self._felt, self._unknown = self._tool["felt"], self._sent["unknown"]
         is_awake = scene.sleepers is None
         prepare_follower(self._follower, n_points, None if is_awake else scene.budget)
 
@@ -199,16 +213,6 @@ class SmoothDrive:
     def least_share(self) -> float:
         """Share of the stiffness that the guard has left, 1 where it has not acted."""
         return float(self._follower["wanted_share"]) or 1.0
-
-    def remember(self) -> None:
-        """Store the state, so that `step_back` can return to it."""
-        self._tool_before[()] = self._tool
-
-    def step_back(self, *, from_zero: bool) -> None:
-        """Return to the remembered state; `from_zero`: the force rises again from zero."""
-        self._tool[()] = self._tool_before  # the coupling's own state stays, as its kernel asks
-        if from_zero:
-            self._tool["risen"] = 0.0
 
     def touching(self, n_hits: int) -> Indices:
         """Indices of the points that touch, `n_hits`; where it lies in something, those that do.

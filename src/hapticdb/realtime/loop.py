@@ -347,7 +347,6 @@ class Loop:
             if at % look_every == 0 and parent_is_gone():
                 break
         device.apply(np.zeros(6))
-        self.counts.frames = deadlines.frames
         self.counts.least_share = self.drive.least_share
         self.counts.ended_loose = bool(self.sent.marks.item() & quasistatic.IS_LOOSE)
         return deadlines.figures()
@@ -357,7 +356,6 @@ class Loop:
         counts, sent = self.counts, self.sent
         flags = sent.marks.item()
         state = State(0)
-        counts.substeps += sent.n_steps.item()
         if sent.hits or flags:
             wrench = sent.wrench.tolist()  # plain floats: a tenth of the time
             counts.peak_force = max(counts.peak_force, math.hypot(*wrench[:3]))
@@ -370,14 +368,11 @@ class Loop:
         if sent.unknown:
             counts.unknown_frames += 1
             counts.unknown_points += sent.unknown.item()
-        if flags & (holding.IS_HELD | holding.IS_DROPPED):
-            if flags & holding.IS_HELD:
-                counts.held_frames += 1
-                state |= State.HELD
+        if flags & holding.IS_HELD:
+            counts.held_frames += 1
+            state |= State.HELD
             if flags & holding.IS_FADING:
                 state |= State.FADING
-            if flags & holding.IS_DROPPED:
-                counts.dropped_frames += 1
         if flags & holding.IS_CUT:
             counts.cut_frames += 1
         if flags & SMOOTH_FLAGS:

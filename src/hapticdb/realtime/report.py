@@ -73,19 +73,53 @@ class LoopFigures:
         return self.frames / self.seconds if self.seconds else 0.0
 
 
-@dataclass
+@dataclass(kw_only=True)
 class Counts:
-    """Counts of a loop over its frames."""
+    """Counts of a loop over its frames; of these, what a report tells.
 
-    frames: int = 0
+    Attributes
+    ----------
+    hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
+        Numbers of frames: with a hit (a point in a voxel or, with distances, near a surface); with
+        a contact (a point below its tangent plane or, with distances, below the onset); with a
+        point in a cell that was not resident; that kept an earlier wrench; in which the database
+        had not answered for too long.
+    unknown_points : int
+        Points of all frames in cells that were not resident.
+    cut_frames : int
+        Frames in which a surface held the tool back: a step was shortened or left out.
+    nowhere_frames : int
+        Frames with an invalid reading: numbers not finite or too large, or no rotation.
+    bad_reading : str or None
+        One line on the first invalid reading: the device, what it returned, what was expected.
+    peak_force, peak_torque : float
+        Greatest norms sent to the device, N and N m.
+    deepest : float
+        Deepest contact, metres: below the tangent plane, or, with distances, within the distance at
+        which contact begins.
+    loose_frames, first_loose_frame : int
+        With distances. Frames in which the tool lay in an object and felt nothing, since it began
+        there or a part was put upon it; number of the first of them from 0, or -1 without any.
+    ended_loose : bool
+        Whether the tool still lay in something at the end.
+    snapping_frames : int
+        Frames in which the change of the force was softened, as when the tool snaps off an edge.
+    guard_actions : int
+        How often the guard lowered the stiffness because the force went back and forth.
+    least_share : float
+        Share of the stiffness that the guard left.
+    left_out_frames, most_left_out : int
+        Frames in which the budget left out points, and the most points that one frame left out.
+    conditions : dict
+        Conditions of the measurement: points, scheduling, processor.
+    """
+
     hit_frames: int = 0
     contact_frames: int = 0
     unknown_frames: int = 0
     held_frames: int = 0
     stale_frames: int = 0
     unknown_points: int = 0
-    substeps: int = 0
-    dropped_frames: int = 0
     cut_frames: int = 0
     nowhere_frames: int = 0
     bad_reading: str | None = None
@@ -113,9 +147,9 @@ class LoopAnswer(NamedTuple):
     is_warm: bool
 
 
-@dataclass(frozen=True)
-class Report:
-    """Report of a session.
+@dataclass(kw_only=True)
+class Report(Counts):
+    """Report of a session: the counts of its frames, and what is told besides.
 
     Attributes
     ----------
@@ -124,50 +158,15 @@ class Report:
     loop, empty : LoopFigures
         Timing of the session's loop, and of an empty loop at the same rate on this machine just
         before. The empty loop shows the machine's own lateness; None if it was not run.
-    hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
-        Numbers of frames: with a hit (a point in a voxel or, with distances, near a surface); with
-        a contact (a point below its tangent plane or, with distances, below the onset); with a
-        point in a cell that was not resident; that kept an earlier wrench; in which the database
-        had not answered for too long.
-    points, unknown_points : int
-        Points looked up in all frames, and those of them in cells that were not resident.
-    substeps : int
-        Substeps of the coupling in all frames.
-    dropped_frames : int
-        Frames whose period was too long to be simulated to its end.
-    cut_frames : int
-        Frames in which a surface held the tool back: a step was shortened or left out.
-    nowhere_frames : int
-        Frames with an invalid reading: numbers not finite or too large, or no rotation.
-    bad_reading : str or None
-        One line on the first invalid reading: the device, what it returned, what was expected.
-    peak_force, peak_torque : float
-        Greatest norms sent to the device, N and N m.
-    deepest : float
-        Deepest contact, metres: below the tangent plane, or, with distances, within the distance at
-        which contact begins.
+    points : int
+        Points looked up in all frames.
     law : str
         The force law: "plane" or "smooth".
-    coupling : SettledCoupling or DirectRendering or None
+    coupling : SettledCoupling or DirectRendering
         The coupling between hand and tool, with what lowered its stiffness; under the plane law
         what bounded the wrench, which went to the device directly.
-    loose_frames, first_loose_frame : int
-        With distances. Frames in which the tool lay in an object and felt nothing, since it began
-        there or a part was put upon it; number of the first of them from 0, or -1 without any.
-    ended_loose : bool
-        Whether the tool still lay in something at the end.
-    loose_objects : tuple of int
-        Ids of the objects that it lay in; sampled a hundred times a second.
-    snapping_frames : int
-        Frames in which the change of the force was softened, as when the tool snaps off an edge.
-    guard_actions : int
-        How often the guard lowered the stiffness because the force went back and forth.
-    least_share : float
-        Share of the stiffness that the guard left.
     budget_points : int or None
         Most points near something that a frame looks at; None: all.
-    left_out_frames, most_left_out : int
-        Frames in which the budget left out points, and the most points that one frame left out.
     warm_up : float
         Seconds until all wanted cells were resident, before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
@@ -175,60 +174,35 @@ class Report:
         Whether all wanted cells were resident before the first frame.
     cache : CacheFigures
         Figures of the fetching process.
-    objects : tuple of int
-        Ids of objects touched; sampled a hundred times a second.
+    objects, loose_objects : tuple of int
+        Ids of objects touched, and of those that the tool lay in; sampled a hundred times a second.
     recorded_frames, lost_records : int
         Frames in the recording, and frames that were overwritten before they were recorded.
     recording_ended : str or None
         One line: why the recording ended before the session; None if it did not.
     database_lost : str or None
         One line: why the database could not be read at the end; None if it could.
-    proportions : Proportions or None
+    proportions : Proportions
         Sizes and places of tool, path and scene at the start, and their misfits.
-    conditions : dict
-        Conditions of the measurement: points, scheduling, processor.
     """
 
     rate: float
     loop: LoopFigures
     empty: LoopFigures | None
-    hit_frames: int
-    contact_frames: int
-    unknown_frames: int
-    held_frames: int
-    stale_frames: int
     points: int
-    unknown_points: int
-    substeps: int
-    dropped_frames: int
-    cut_frames: int
-    peak_force: float
-    peak_torque: float
-    deepest: float
+    law: str
+    coupling: SettledCoupling | DirectRendering
+    budget_points: int | None
     warm_up: float
     is_warm: bool
     cache: CacheFigures
-    objects: tuple[int, ...] = ()
-    recorded_frames: int = 0
-    lost_records: int = 0
-    recording_ended: str | None = None
-    database_lost: str | None = None
-    proportions: Proportions | None = None
-    nowhere_frames: int = 0
-    bad_reading: str | None = None
-    law: str = "plane"
-    coupling: SettledCoupling | DirectRendering | None = None
-    loose_frames: int = 0
-    first_loose_frame: int = -1
-    ended_loose: bool = False
-    snapping_frames: int = 0
-    guard_actions: int = 0
-    least_share: float = 1.0
-    loose_objects: tuple[int, ...] = ()
-    budget_points: int | None = None
-    left_out_frames: int = 0
-    most_left_out: int = 0
-    conditions: dict[str, str] = field(default_factory=dict)
+    objects: tuple[int, ...]
+    loose_objects: tuple[int, ...]
+    recorded_frames: int
+    lost_records: int
+    recording_ended: str | None
+    database_lost: str | None
+    proportions: Proportions
 
     @property
     def hit_rate(self) -> float:
@@ -253,5 +227,5 @@ class Report:
         plain["cache"] = self.cache._asdict()
         plain["hit_rate"], plain["is_direct"] = self.hit_rate, self.is_direct
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
-        plain["proportions"] = None if self.proportions is None else self.proportions.record()
+        plain["proportions"] = self.proportions.record()
         return plain

@@ -147,7 +147,6 @@ class Session:
         self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
-        self.timing.check_granted()
         self._owns_cells = isinstance(cells, str)
         needs_distances = None if law is None else is_smooth(law)
         self.cells = _cells_of(cells, budget_bytes, where, exclude, needs_distances)
@@ -377,7 +376,7 @@ class Session:
         answer = self._answer
         assert answer is not None  # noqa: S101 - asked before
         counts = asdict(answer.counts)
-        n_frames, conditions = counts.pop("frames"), counts.pop("conditions")
+        counts["conditions"] = {"points": str(len(self.shell)), **answer.counts.conditions}
         recording = self._recording
         if recording is not None:
             recording.finish()
@@ -385,7 +384,7 @@ class Session:
             rate=self.timing.rate,
             loop=answer.loop,
             empty=answer.empty,
-            points=n_frames * len(self.shell),
+            points=answer.loop.frames * len(self.shell),
             warm_up=answer.warm_up,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
@@ -399,7 +398,6 @@ class Session:
             law="smooth" if is_smooth(self.law) else "plane",
             coupling=self.coupling,
             budget_points=self.budget_points,
-            conditions={"points": str(len(self.shell)), **conditions},
             **counts,
         )
 

@@ -275,7 +275,7 @@ def _begin_loop(
     from hapticdb.realtime.fork_server import prepare
 
     checked_budget(budget_points)
-    Timing(processor=processor).check_granted()
+    Timing(processor=processor)
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     prepare("hapticdb.realtime.loop:work", ["resident", "feel"])

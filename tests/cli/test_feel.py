@@ -178,8 +178,6 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "path.csv", "--speed", 0], ["speed", "positive"]),
         (["--device", "haply", "--speed", 1], ["real hand"]),
         (["--device", "felt.hdbrec", "--speed", 1], ["--speed", "has its own"]),
-        (["--device", "tumble", "--at", ABOVE, "--speed", 1], ["--speed", "tumble has its own"]),
-        (["--device", "tumble", "--at", ABOVE, "--loop"], ["--loop", "tumble has no end"]),
         (["--device", "random", "--at", ABOVE, "--loop"], ["--loop", "random has no end"]),
         ([*PLAY, "--processor", 10**30], ["processor 1e+30 is not granted", "may run on"]),
         (["--device", "haply", "--policy", "wait"], ["cannot wait"]),

@@ -5,7 +5,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.devices.scripted import Reading
+from hapticdb.devices.protocol import Reading
 
 Change = Callable[[Any], object]
 

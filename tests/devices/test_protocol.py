@@ -1,15 +1,16 @@
 """Which objects count as a device, and a simulated device on a hand without a valid pose."""
 
+import re
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 
-from devices.readings import FAULTS, Change
+from devices.readings import FAULTS, FORMS, MOMENTS, Change
 from hapticdb import PointShell, Session
-from hapticdb.devices.protocol import Reader
-from hapticdb.devices.scripted import Reading, Tumble
+from hapticdb.devices.protocol import Reader, Reading
+from hapticdb.devices.scripted import Line
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import DeviceError, UsageError
 from realtime.hands import Odd, still
@@ -39,7 +40,7 @@ class Rows:
         ("path.csv", r"of the type str .*Path\(file\)$"),
         (Path("path.csv"), r"Path\(file\)$"),
         (Rows(), r"of the type Rows .*Player\(\*recording\.poses\(\)\)$"),
-        (Tumble, r"Tumble is a class"),
+        (Line, r"Line is a class"),
         (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.devices\.scripted"),
         (None, r"None is none, it has no read and no apply"),
     ],
@@ -56,12 +57,30 @@ def test_what_is_no_device_is_refused_with_what_to_pass_instead(
 
 
 @pytest.mark.parametrize(("change", "told"), FAULTS)
-def test_a_simulated_device_believes_no_wrong_hand(change: Change, told: str) -> None:
-    device = SimulatedDevice(Odd(still(0.0), change, first=3))
-    device.read()
-    device.read()
-    with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}"):
-        device.read()
+def test_a_reading_of_the_wrong_kind_is_refused(change: Change, told: str) -> None:
+    hand = Odd(still(0.0), change, first=2)
+    for reader in (Reader(hand), SimulatedDevice(hand)):
+        hand.reads = 0
+        reader.read()
+        with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}"):
+            reader.read()
+
+
+@pytest.mark.parametrize("change", FORMS)
+def test_a_reading_of_another_form_is_taken_as_it_is(change: Change) -> None:
+    reader = Reader(Odd(still(0.015625), change))  # exact in single precision, too
+    pose, velocity, buttons = reader.read()
+    assert pose[:3, 3].tolist() == [0.0, 0.0, 0.015625]
+    assert (velocity.dtype.str, velocity.tolist(), int(buttons)) == ("<f8", [0.0] * 6, 0)
+    assert pose.flags.carray
+    assert reader.complaint() == ""
+
+
+@pytest.mark.parametrize(("change", "told"), MOMENTS)
+def test_a_reading_that_is_no_place_is_told(change: Change, told: str) -> None:
+    reader = Reader(Odd(still(0.01), change))
+    reader.read()
+    assert re.match(rf"Odd\.read\(\) returned {told}; expected ", reader.complaint())
 
 
 def test_a_simulated_device_goes_on_when_its_hand_is_somewhere_again() -> None:

@@ -11,24 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb import HapticDBError, write_poses
-from hapticdb.devices.scripted import (
-    CYCLE,
-    Circle,
-    Device,
-    Line,
-    Path,
-    Player,
-    RandomHand,
-    Reading,
-    SupportsClose,
-    SupportsEnd,
-    SupportsOpen,
-    Tumble,
-    capped,
-    pose_at,
-)
-from hapticdb.errors import DeviceError, FileError, UsageError
+from hapticdb import write_poses
+from hapticdb.devices.protocol import Device, Reading, SupportsClose, SupportsEnd, SupportsOpen
+from hapticdb.devices.scripted import CYCLE, Line, Path, Player, RandomHand, capped, pose_at
+from hapticdb.errors import UsageError
 from hapticdb.poses import quaternion_of, rotation_of
 
 
@@ -56,9 +42,7 @@ TURNED[:3, 3] = 0.2, -0.1, 0.4
 
 MAKERS: dict[str, Callable[[Hands], Device]] = {
     "player": lambda clock: Player([0.0, 0.5, 2.0], [np.eye(4), TURNED, quarter(0)], clock=clock),
-    "line": lambda clock: Line((0, 0, 0), TURNED, 0.3, there_and_back=True, clock=clock),
-    "circle": lambda clock: Circle(TURNED, 0.05, 0.4, (1, 2, -1), clock=clock),
-    "tumble": lambda clock: Tumble(TURNED, 0.7, clock=clock),
+    "line": lambda clock: Line((0, 0, 0), TURNED, 0.3, clock=clock),
     "random": lambda clock: RandomHand(TURNED, 3, 0.5, 4.0, clock=clock),
 }
 
@@ -86,25 +70,16 @@ def read_at(device: Device, clock: Hands, seconds: float) -> Reading:
 @pytest.mark.parametrize("name", MAKERS)
 @given(instant=st.floats(0.01, 40.0))
 @settings(max_examples=40, deadline=None)
-def test_velocities_are_what_the_poses_change_by(name: str, instant: float) -> None:
+def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, instant: float) -> None:
     clock = Hands()
     device = MAKERS[name](clock)
     device.read()
     h = 1e-5
     before, at, after = (read_at(device, clock, instant + d) for d in (-h, 0.0, h))
-    if not np.allclose(before.velocity, after.velocity, atol=0.05):
-        return  # a corner of the path lies between the readings
-    assert np.allclose(difference(before, after, 2 * h), at.velocity, atol=2e-5)
-
-
-@pytest.mark.parametrize("name", MAKERS)
-@given(instant=st.floats(0.0, 100.0))
-@settings(max_examples=20, deadline=None)
-def test_poses_are_rigid(name: str, instant: float) -> None:
-    clock = Hands()
-    device = MAKERS[name](clock)
-    device.read()
-    pose = read_at(device, clock, instant).pose
+    # else a corner of the path lies between the readings
+    if np.allclose(before.velocity, after.velocity, atol=0.05):
+        assert np.allclose(difference(before, after, 2 * h), at.velocity, atol=2e-5)
+    pose = at.pose
     assert np.allclose(pose[:3, :3] @ pose[:3, :3].T, np.eye(3), atol=1e-12)
     assert np.linalg.det(pose[:3, :3]) > 0.0
     assert pose[3].tolist() == [0.0, 0.0, 0.0, 1.0]
@@ -122,12 +97,6 @@ def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
         ours, theirs = read_at(device, clock, seconds), twin.read()
         assert np.array_equal(ours.pose, theirs.pose)
         assert np.array_equal(ours.velocity, theirs.velocity)
-
-
-def test_the_real_clock_can_be_pickled() -> None:
-    for device in (Line((0, 0, 0), (1, 0, 0)), RandomHand((0, 0, 0))):
-        twin = pickle.loads(pickle.dumps(device))  # noqa: S301 - its own
-        assert twin.read().pose.shape == (4, 4)
 
 
 def test_a_script_starts_at_its_first_read() -> None:
@@ -154,15 +123,6 @@ def test_a_path_that_is_over_rests_at_its_last_pose() -> None:
         assert last.velocity.tolist() == [0.0] * 6
 
 
-def test_a_path_meets_each_of_its_poses() -> None:
-    clock = Hands()
-    poses = [np.eye(4), TURNED, quarter(0), quarter(1)]
-    player = Player([0.0, 0.1, 0.5, 2.0], poses, clock=clock)
-    player.read()
-    for seconds, pose in zip([0.0, 0.1, 0.5, 2.0], poses, strict=True):
-        assert np.allclose(read_at(player, clock, seconds).pose, pose, atol=1e-12)
-
-
 def test_turns_between_poses_are_even() -> None:
     clock = Hands()
     player = Player([0.0, 3.0], [np.eye(4), quarter(2)], clock=clock)
@@ -174,7 +134,8 @@ def test_turns_between_poses_are_even() -> None:
 
 def test_a_path_that_loops_is_never_over() -> None:
     clock = Hands()
-    line = Line((0, 0, 0), (1, 0, 0), 1.0, there_and_back=True, clock=clock)
+    places = [pose_at((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.0)]
+    line = Player([0.0, 1.0, 2.0], places, loops=True, clock=clock)
     line.read()
     xs = [read_at(line, clock, s).pose[0, 3] for s in (0.25, 0.75, 1.25, 1.75, 2.25)]
     assert np.allclose(xs, [0.25, 0.75, 0.75, 0.25, 0.25])
@@ -182,44 +143,21 @@ def test_a_path_that_loops_is_never_over() -> None:
     assert not line.is_over
 
 
-def test_a_single_pose_is_a_path_that_is_over() -> None:
-    clock = Hands()
-    player = Player([7.0], [TURNED], clock=clock)
-    player.read()
-    last = read_at(player, clock, 0.1)
-    assert player.is_over
-    assert np.allclose(last.pose, TURNED)
-    assert last.velocity.tolist() == [0.0] * 6
-
-
 @given(speed=st.floats(0.05, 2.0), seed=st.integers(0, 1000))
-@settings(max_examples=15, deadline=None)
+@settings(max_examples=5, deadline=None)
 def test_a_random_hand_peaks_at_the_speed_asked_for(speed: float, seed: int) -> None:
     clock = Hands()
     hand = RandomHand((1, 2, 3), seed, speed, 2.0 * speed, 0.3, clock=clock)
     start = kept(hand.read())
     assert np.allclose(start.pose, pose_at((1, 2, 3)), atol=1e-12)
-    readings = [read_at(hand, clock, s) for s in np.linspace(0.0, CYCLE, 20_001)]
+    readings = [read_at(hand, clock, s) for s in np.linspace(0.0, CYCLE, 4001)]
     speeds = np.linalg.norm([r.velocity[:3] for r in readings], axis=1)
     turning = np.linalg.norm([r.velocity[3:] for r in readings], axis=1)
     ways = np.linalg.norm([r.pose[:3, 3] - (1, 2, 3) for r in readings], axis=1)
-    assert speeds.max() == pytest.approx(speed, rel=1e-3)
-    assert turning.max() == pytest.approx(2.0 * speed, rel=1e-3)
+    assert speeds.max() == pytest.approx(speed, rel=5e-3)
+    assert turning.max() == pytest.approx(2.0 * speed, rel=5e-3)
     assert ways.max() <= 0.3001
     assert np.allclose(readings[-1].pose, start.pose, atol=1e-9)
-
-
-def test_a_random_hand_moves_slowly_more_than_fast() -> None:
-    clock = Hands()
-    hand = RandomHand((0, 0, 0), 5, 0.5, clock=clock)
-    hand.read()
-    n = 4096
-    xs = [read_at(hand, clock, s).pose[0, 3] for s in np.arange(n) * CYCLE / n]
-    power = np.abs(np.fft.rfft(xs)[1:]) ** 2
-    hertz = np.arange(1, n // 2 + 1) / CYCLE
-    assert power[(hertz < 0.299) | (hertz > 8.001)].sum() < 1e-9 * power.sum()
-    assert power[hertz > 2.0].sum() < 0.05 * power.sum()
-    assert power[hertz > 2.0].sum() > 0.0
 
 
 def test_the_same_seed_is_the_same_motion() -> None:
@@ -238,33 +176,6 @@ def test_a_hand_that_would_have_to_shake_faster_than_hands_do_is_refused() -> No
         RandomHand((0, 0, 0), speed=5.0, reach=0.01)
 
 
-def test_a_circle_keeps_its_radius_its_speed_and_its_side() -> None:
-    clock = Hands()
-    circle = Circle((1, 0, 0), 0.25, 0.5, (0, 0, 3), clock=clock)
-    circle.read()
-    turns = 0.0
-    last = read_at(circle, clock, 0.0)
-    for seconds in np.linspace(0.0, math.pi, 101)[1:]:
-        now = read_at(circle, clock, float(seconds))
-        before, arm = (r.pose[:3, 3] - (1, 0, 0) for r in (last, now))
-        assert np.linalg.norm(arm) == pytest.approx(0.25)
-        assert np.linalg.norm(now.velocity) == pytest.approx(0.5)
-        turns += float(np.cross(before, arm)[2]) / 0.25**2 / (2.0 * math.pi)
-        last = now
-    assert turns == pytest.approx(1.0, abs=1e-3)  # counter-clockwise, once in 2 pi r / v
-
-
-def test_a_tumbling_hand_stays_in_place_and_turns_evenly() -> None:
-    clock = Hands()
-    tumble = Tumble(TURNED, 0.5, clock=clock)
-    assert np.allclose(tumble.read().pose, TURNED)
-    for seconds in (0.3, 5.0, 60.0):
-        now = read_at(tumble, clock, seconds)
-        assert np.array_equal(now.pose[:3, 3], TURNED[:3, 3])
-        assert np.linalg.norm(now.velocity[3:]) == pytest.approx(math.pi)
-        assert now.velocity[:3].tolist() == [0.0] * 3
-
-
 def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
     clock = Hands()
     poses = np.tile(np.eye(4), (4, 1, 1))
@@ -275,12 +186,6 @@ def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
     path.read()
     assert read_at(path, clock, 1.7).velocity[0] == pytest.approx(0.1)
     assert Path(tmp_path / "p.csv", speed=0.6).duration == pytest.approx(0.5)
-    assert Path(tmp_path / "p.csv", seconds=7.0).duration == pytest.approx(7.0)
-
-
-def test_a_turn_in_place_takes_its_time(tmp_path: FilePath) -> None:
-    write_poses(tmp_path / "p.csv", [np.eye(4), quarter(0)])
-    assert Path(tmp_path / "p.csv", speed=0.1).duration == pytest.approx(math.pi / 2)
 
 
 def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
@@ -291,10 +196,6 @@ def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
     path.read()
     assert path.duration == 4.0
     assert np.allclose(read_at(path, clock, 1.0).pose[:3, 3], [1, 0, 0])
-    halved = Path(file, seconds=2.0, clock=clock)
-    clock.now = 100.0
-    halved.read()
-    assert np.allclose(read_at(halved, clock, 0.5).pose[:3, 3], [1, 0, 0])
     assert Path(file, speed=1.0).duration == pytest.approx(2.0)
 
 
@@ -308,10 +209,6 @@ def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
         lambda: Line((0, 0, 0), (0, 0, 0)),
         lambda: Line((0, 0, 0), (0, 1)),
         lambda: Line((0, 0, 0), (0, 0, 1), speed=0.0),
-        lambda: Circle((0, 0, 0), -1.0),
-        lambda: Circle((0, 0, 0), 1.0, axis=(0, 0, 0)),
-        lambda: Tumble((0, 0, math.inf)),
-        lambda: Path("p.csv", speed=1.0, seconds=1.0),
     ],
 )
 def test_scripts_that_cannot_be_are_refused(make: Callable[[], Device]) -> None:
@@ -320,23 +217,12 @@ def test_scripts_that_cannot_be_are_refused(make: Callable[[], Device]) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_a_missing_file_is_told(tmp_path: FilePath) -> None:
-    with pytest.raises(FileError, match="no file of poses"):
-        Path(tmp_path / "none.csv")
-
-
 def test_scripts_end_but_need_no_opening() -> None:
     line = Line((0, 0, 0), (1, 0, 0))
     assert isinstance(line, SupportsEnd)
     assert not isinstance(line, SupportsOpen | SupportsClose)
     line.apply(np.ones(6))
     assert line.read().buttons == 0
-
-
-def test_a_device_error_is_an_error_of_the_system_and_of_ours() -> None:
-    assert issubclass(DeviceError, HapticDBError)
-    assert issubclass(DeviceError, OSError)
-    assert str(DeviceError("unplugged")) == "unplugged"
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))

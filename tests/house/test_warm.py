@@ -101,6 +101,7 @@ NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without J
 
 
 @NEEDS_JIT
+@pytest.mark.long
 def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     """Every entry has only its declared signatures, whatever is called after `warm_up`.
 

@@ -8,7 +8,8 @@ from typing import cast
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.devices.scripted import Player, Reading
+from hapticdb.devices.protocol import Reading
+from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
 
 Floats = NDArray[np.float64]

@@ -8,7 +8,7 @@ from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
-    from hapticdb.devices.scripted import Device
+    from hapticdb.devices.protocol import Device
 
 VENDORS = {
     "force-dimension": ("hapticdb.devices.vendors.force_dimension", "ForceDimensionDevice"),
@@ -16,8 +16,6 @@ VENDORS = {
     "haply": ("hapticdb.devices.vendors.haply", "HaplyDevice"),
 }
 """Module and class of each device that can be bought, by its word."""
-MADE_UP = {"random", "tumble"}
-"""Words of the hands whose motion is computed around one place."""
 RANDOM_SPEED = 0.3
 """Greatest speed of a random hand unless --speed is given, m/s."""
 PATH_SPEED = 0.1
@@ -88,13 +86,13 @@ class HandOptions:
             raise UsageError(f"--seed {self.seed}: give 0 or more")
         if self.place is not None:
             self._position()
-        if word in MADE_UP and self.place is None:
-            raise UsageError(f"--device {word}: give --at, where the hand is")
-        if word not in MADE_UP and self.place is not None:
-            raise UsageError(f"--at belongs to random and tumble, not to {word}")
-        if self.loops and word in MADE_UP:
-            raise UsageError(f"--loop: --device {word} has no end; leave it out")
-        if self.speed is not None and (word == "tumble" or self._ends_with(".hdbrec")):
+        if word == "random" and self.place is None:
+            raise UsageError("--device random: give --at, where the hand is")
+        if word != "random" and self.place is not None:
+            raise UsageError(f"--at belongs to random, not to {word}")
+        if self.loops and word == "random":
+            raise UsageError("--loop: --device random has no end; leave it out")
+        if self.speed is not None and self._ends_with(".hdbrec"):
             raise UsageError(f"--speed: --device {word} has its own; leave it out")
         if word in VENDORS and (self.is_simulated or self.loops or self.speed is not None):
             raise UsageError(
@@ -131,14 +129,11 @@ class HandOptions:
         if self.word == "random":
             greatest = RANDOM_SPEED if speed is None else speed
             return scripted.RandomHand(self._position(), self.seed, greatest)
-        if self.word == "tumble":
-            return scripted.Tumble(self._position())
         if self._ends_with(".hdbrec"):
             times, poses = Recording(self.word).poses()
             return scripted.Player(times, poses, loops=self.loops)
         if self._ends_with(".csv"):
             return scripted.Path(self.word, speed=speed, loops=self.loops)
         raise UsageError(
-            f"--device {self.word!r}: give poses in a .csv, a .hdbrec, random, tumble, "
-            f"{', '.join(VENDORS)}"
+            f"--device {self.word!r}: give poses in a .csv, a .hdbrec, random, {', '.join(VENDORS)}"
         )

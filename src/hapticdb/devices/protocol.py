@@ -141,7 +141,7 @@ class Reader:
         if type(reading) is not Reading:
             raise self._refused(
                 f"{_kind_of(reading)}",
-                "a hapticdb.devices.scripted.Reading(pose, velocity, buttons)",
+                "a hapticdb.devices.protocol.Reading(pose, velocity, buttons)",
             )
         pose, velocity, buttons = reading
         if not (

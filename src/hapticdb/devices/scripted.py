@@ -13,35 +13,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.devices.protocol import (
-    Device,
-    Reading,
-    SupportsClose,
-    SupportsEnd,
-    SupportsOpen,
-    SupportsRewind,
-)
+from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
 from hapticdb.kernels.motion import play, survey, sway
 from hapticdb.poses import quaternion_of, read_timed_poses
-
-__all__ = [
-    "Circle",
-    "Clock",
-    "Device",
-    "Line",
-    "Path",
-    "Player",
-    "RandomHand",
-    "Reading",
-    "SupportsClose",
-    "SupportsEnd",
-    "SupportsOpen",
-    "SupportsRewind",
-    "Tumble",
-    "capped",
-    "pose_at",
-]
 
 Clock = Callable[[], float]
 """Returns seconds since some fixed instant; the time never goes back."""
@@ -178,14 +153,10 @@ class Path(Player):
     Parameters
     ----------
     path : path
-        The file. Its column ``t``, if it has one, gives the times (s) unless `speed` or `seconds`
-        is given.
+        The file. Its column ``t``, if it has one, gives the times (s) unless `speed` is given.
     speed : float, optional
-        Metres a second; 0.1 if neither the file nor `seconds` gives a time. A turn counts as the
-        distance that a point 0.1 m from the origin moves; poses that repeat the one before are left
-        out.
-    seconds : float, optional
-        Duration of the whole path.
+        Metres a second; 0.1 if the file gives no time. A turn counts as the distance that a point
+        0.1 m from the origin moves; poses that repeat the one before are left out.
     loops, clock
         As for `Player`.
 
@@ -193,8 +164,6 @@ class Path(Player):
     ------
     FileError
         If the file cannot be read.
-    UsageError
-        If both a speed and a time are given.
     """
 
     def __init__(
@@ -202,17 +171,12 @@ class Path(Player):
         path: str | os.PathLike[str],
         *,
         speed: float | None = None,
-        seconds: float | None = None,
         loops: bool = False,
         clock: Clock = time.perf_counter,
     ) -> None:
-        if speed is not None and seconds is not None:
-            raise UsageError("a path takes a speed or a time in seconds, not both")
         times, poses = read_timed_poses(path)
         if times is None or speed is not None:
             times, poses = _times_at(poses, _positive("speed", 0.1 if speed is None else speed))
-        if seconds is not None and len(times) > 1:
-            times = (times - times[0]) * (_positive("seconds", seconds) / (times[-1] - times[0]))
         super().__init__(times, poses, loops=loops, clock=clock)
 
 
@@ -241,8 +205,6 @@ class Line(Player):
         Points (3,) or poses (4, 4), metres.
     speed : float
         Metres a second; a turn counts as in `Path`.
-    there_and_back : bool
-        Move back and forth without end.
     clock
         As for `Player`.
     """
@@ -253,109 +215,13 @@ class Line(Player):
         end: ArrayLike,
         speed: float = 0.1,
         *,
-        there_and_back: bool = False,
         clock: Clock = time.perf_counter,
     ) -> None:
-        places = [pose_at(start), pose_at(end), *([pose_at(start)] if there_and_back else [])]
-        times, poses = _times_at(np.array(places), _positive("speed", speed))
+        places = np.array([pose_at(start), pose_at(end)])
+        times, poses = _times_at(places, _positive("speed", speed))
         if len(times) == 1:
             raise UsageError("a line needs two different places")
-        super().__init__(times, poses, loops=there_and_back, clock=clock)
-
-
-class Circle(_Scripted):
-    """A hand that moves on a circle around a place, without turning.
-
-    Parameters
-    ----------
-    center : array_like
-        Point (3,) or pose (4, 4), metres.
-    radius : float
-        Metres.
-    speed : float
-        Metres a second.
-    axis : array_like
-        (3,) normal of the circle, of any length; the motion is counter-clockwise seen from its tip.
-    clock
-        As for `Player`.
-    """
-
-    def __init__(
-        self,
-        center: ArrayLike,
-        radius: float,
-        speed: float = 0.1,
-        axis: ArrayLike = (0.0, 0.0, 1.0),
-        *,
-        clock: Clock = time.perf_counter,
-    ) -> None:
-        super().__init__(clock)
-        normal = np.array(axis, dtype=np.float64)
-        length = float(np.linalg.norm(normal)) if normal.shape == (3,) else 0.0
-        if not (length > 0.0 and math.isfinite(length)):
-            raise UsageError(f"an axis is a vector (3,) that is not zero, not {normal.tolist()}")
-        self._pose[:] = pose_at(center)
-        self._radius = _positive("radius", radius)
-        self._speed = _positive("speed", speed)
-        # the world axis farthest from the normal's direction, to construct the circle's axes
-        side = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        side /= np.linalg.norm(side)
-        self._center: list[float] = self._pose[:3, 3].tolist()
-        self._u: list[float] = side.tolist()
-        self._v: list[float] = np.cross(normal / length, side).tolist()
-
-    def read(self) -> Reading:
-        """Pose and velocity now."""
-        angle = self._elapsed() * self._speed / self._radius
-        sine, cosine = math.sin(angle), math.cos(angle)
-        for axis in range(3):
-            u, v = self._u[axis], self._v[axis]
-            self._pose[axis, 3] = self._center[axis] + self._radius * (cosine * u + sine * v)
-            self._velocity[axis] = self._speed * (cosine * v - sine * u)
-        return self._reading
-
-
-class Tumble(_Scripted):
-    """A hand that stays in place and turns about an axis that changes all the time.
-
-    The rotation is Rz(a t) Rx(b t), applied after the center's; b / a is the golden ratio. The hand
-    therefore comes close to every attitude. Its angular speed sqrt(a^2 + b^2) is constant.
-
-    Parameters
-    ----------
-    center : array_like
-        Point (3,) or pose (4, 4), metres.
-    rate : float
-        Turns a second.
-    clock
-        As for `Player`.
-    """
-
-    def __init__(
-        self, center: ArrayLike, rate: float = 0.25, *, clock: Clock = time.perf_counter
-    ) -> None:
-        super().__init__(clock)
-        self._pose[:] = pose_at(center)
-        self._columns: list[list[float]] = self._pose[:3, :3].T.tolist()
-        golden = 0.5 * (1.0 + math.sqrt(5.0))
-        self._about_z = 2.0 * math.pi * _positive("rate", rate) / math.hypot(1.0, golden)
-        self._about_x = golden * self._about_z
-
-    def read(self) -> Reading:
-        """Pose and velocity now."""
-        elapsed = self._elapsed()
-        sz, cz = math.sin(self._about_z * elapsed), math.cos(self._about_z * elapsed)
-        sx, cx = math.sin(self._about_x * elapsed), math.cos(self._about_x * elapsed)
-        pose = self._pose
-        for column, (x, y, z) in enumerate(self._columns):
-            y, z = cx * y - sx * z, sx * y + cx * z  # noqa: PLW2901 - turned about x
-            pose[0, column] = cz * x - sz * y
-            pose[1, column] = sz * x + cz * y
-            pose[2, column] = z
-        self._velocity[3] = self._about_x * cz
-        self._velocity[4] = self._about_x * sz
-        self._velocity[5] = self._about_z
-        return self._reading
+        super().__init__(times, poses, clock=clock)
 
 
 class RandomHand(_Scripted):

@@ -8,8 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.devices.profiles import HAND_CAP, HAND_STIFFNESS, STIFFEST, DeviceProfile
-from hapticdb.devices.protocol import Reader, check_device
-from hapticdb.devices.scripted import Clock, Device, Reading, SupportsEnd, SupportsRewind, capped
+from hapticdb.devices.protocol import (
+    Device,
+    Reader,
+    Reading,
+    SupportsEnd,
+    SupportsRewind,
+    check_device,
+)
+from hapticdb.devices.scripted import Clock, capped
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.motion import pull
@@ -80,7 +87,6 @@ class SimulatedDevice:
         self._inertias = (float(mass), float(inertia))
         self._grips = (float(grip), float(turn_grip))
         self._pending: deque[tuple[float, NDArray[np.float64]]] = deque()
-        self._last = np.zeros(6)
         self._pushing = np.zeros(6)
         self._time: float | None = None
         self._body = np.zeros(13)
@@ -107,11 +113,6 @@ class SimulatedDevice:
         """Whether the hand's script is over."""
         return isinstance(self.hand, SupportsEnd) and self.hand.is_over
 
-    @property
-    def last_wrench(self) -> NDArray[np.float64]:
-        """The last wrench (6,) applied, N and N m, capped; its latency may not be over yet."""
-        return self._last.copy()
-
     def rewind(self) -> None:
         """Start again at the next read, in the hand's pose; the hand rewinds too if it can."""
         if isinstance(self.hand, SupportsRewind):
@@ -122,8 +123,8 @@ class SimulatedDevice:
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push with a wrench (6,), N and N m, capped; it acts after the latency."""
-        self._last = capped(wrench, self.max_force, self.max_torque)
-        self._pending.append((self.clock() + self.latency, self._last))
+        push = capped(wrench, self.max_force, self.max_torque)
+        self._pending.append((self.clock() + self.latency, push))
 
     def read(self) -> Reading:
         """Return pose and velocity of the device now; the next read overwrites its arrays.

@@ -56,16 +56,8 @@ def hand_damping(profile: DeviceProfile) -> float:
 
 
 def delay_of(profile: DeviceProfile, rate: float, delay: float | None = None) -> float:
-    """Delay in seconds: the given one, else the device's, else one period of the loop.
-
-    Raises
-    ------
-    UsageError
-        If the given delay is negative or not finite.
-    """
+    """Delay in seconds: the given one, else the device's, else one period of the loop."""
     if delay is not None:
-        if not (math.isfinite(delay) and delay >= 0.0):
-            raise UsageError(f"a delay of {delay} s: give 0 or more")
         return delay
     return 1.0 / rate if profile.delay is None else profile.delay
 
@@ -97,7 +89,7 @@ def allow(
     Raises
     ------
     UsageError
-        If the stiffness is not a number above `SMALLEST`, or the delay is negative.
+        If the stiffness is not a number above `SMALLEST`.
     """
     wanted = profile.first_stiffness if asked is None else asked
     if not (math.isfinite(wanted) and wanted >= SMALLEST):

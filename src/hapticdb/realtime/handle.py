@@ -5,7 +5,8 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.devices.scripted import Device, Player, RandomHand, Reading, Tumble, pose_at
+from hapticdb.devices.protocol import Device, Reading
+from hapticdb.devices.scripted import Player, RandomHand, pose_at
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
@@ -22,8 +23,8 @@ NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and unit quaternion of no move and no turn."""
 
 SWAY = 1.0
-"""Greatest distance (m) of a `RandomHand` or `Tumble` from its centre. Larger: fewer misfits of the
-path are reported."""
+"""Greatest distance (m) of a `RandomHand` from its centre. Larger: fewer misfits of the path are
+reported."""
 
 
 class Handle:
@@ -129,10 +130,8 @@ def path_of_hand(device: Device, handle: Handle) -> tuple[Floats | None, float]:
         poses[:, :3, 3] = hand._knots[:, 1:4]  # noqa: SLF001
         poses[:, :3, :3] = rotation_of(hand._knots[:, 4:8])  # noqa: SLF001
         sway = 0.0
-    elif isinstance(hand, (RandomHand, Tumble)):
-        poses, sway = np.array(hand._pose)[None].copy(), SWAY * handle.scale  # noqa: SLF001
-        if isinstance(hand, RandomHand):
-            poses[0] = hand._center  # noqa: SLF001
+    elif isinstance(hand, RandomHand):
+        poses, sway = hand._center[None].copy(), SWAY * handle.scale  # noqa: SLF001
     else:
         return None, 0.0
     if handle.starts_elsewhere:

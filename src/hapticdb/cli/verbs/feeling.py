@@ -46,7 +46,7 @@ DeviceOption = Annotated[
     typer.Option(
         metavar="DEVICE",
         help="The hand: poses in a .csv (column t: seconds), a recording .hdbrec, random, "
-        "tumble, force-dimension, openhaptics or haply.",
+        "force-dimension, openhaptics or haply.",
     ),
 ]
 RateOption = Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")]
@@ -59,7 +59,7 @@ SpeedOption = Annotated[
     typer.Option(metavar="M/S", help="Speed along a path, or greatest speed of a random hand."),
 ]
 PlaceOption = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="Where the hands random and tumble are, metres.")
+    str | None, typer.Option(metavar="X,Y,Z", help="Where the hand random is, metres.")
 ]
 SimulateOption = Annotated[
     bool, typer.Option("--simulate", help="Let the force push the hand, as a simulated device.")

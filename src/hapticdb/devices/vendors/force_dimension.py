@@ -12,14 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.devices.profiles import DeviceProfile
-from hapticdb.devices.scripted import Reading, capped
+from hapticdb.devices.protocol import Reading
+from hapticdb.devices.scripted import capped
 from hapticdb.devices.vendors import load
 from hapticdb.errors import DeviceError
 
 TIMEOUT = 7
 """ErrorNum.TIMEOUT: the velocity estimator does not have two positions yet."""
-
-
+TORQUE_CAP = 0.2
+"""Cap, N m, of a device whose profile gives none."""
 PROFILE = DeviceProfile("force-dimension", cap=7.0, stiffness=3000.0, damping=20.0)
 """Profile of a device whose model is not told: no more than every model renders."""
 
@@ -36,10 +37,6 @@ class ForceDimensionDevice:
         Serial number; without one, the first free device is taken.
     profile : DeviceProfile
         The model's profile, as of `hapticdb.devices.profiles.PROFILES`.
-    max_force : float, optional
-        Cap, N; the profile's unless given.
-    max_torque : float
-        Cap, N m.
     """
 
     def __init__(
@@ -47,13 +44,10 @@ class ForceDimensionDevice:
         serial: int | None = None,
         *,
         profile: DeviceProfile = PROFILE,
-        max_force: float | None = None,
-        max_torque: float = 0.2,
     ) -> None:
         self.serial = serial
-        self.max_force = profile.cap if max_force is None else max_force
-        self.max_torque = max_torque
-        self.profile = replace(profile, cap=self.max_force, torque_cap=max_torque or None)
+        self._torque_cap = profile.torque_cap or TORQUE_CAP
+        self.profile = replace(profile, torque_cap=self._torque_cap)
         self._dhd: Any = None
         self._id = -1
         self._has_wrist = self._has_active_wrist = False
@@ -88,7 +82,7 @@ class ForceDimensionDevice:
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push with a wrench (6,), N and N m, capped."""
         dhd = self._opened()
-        push: list[float] = capped(wrench, self.max_force, self.max_torque).tolist()
+        push: list[float] = capped(wrench, self.profile.cap, self._torque_cap).tolist()
         if self._has_active_wrist:
             self._check(dhd.setForceAndTorque(push[:3], push[3:], ID=self._id))
         else:

@@ -12,7 +12,6 @@ import contextlib
 import json
 import math
 import time
-from dataclasses import replace
 from typing import Any
 from urllib.parse import urlsplit
 
@@ -20,7 +19,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.devices.profiles import DeviceProfile
-from hapticdb.devices.scripted import Clock, Reading, capped
+from hapticdb.devices.protocol import Reading
+from hapticdb.devices.scripted import capped
 from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError, UsageError
 from hapticdb.poses import rotation_of
@@ -52,10 +52,6 @@ class HaplyDevice:
         The service's address, on this machine.
     profile : DeviceProfile
         What the device renders; an Inverse3's unless given.
-    max_force : float, optional
-        Cap, N; the profile's unless given.
-    clock : callable
-        Returns seconds; it must be picklable.
 
     Raises
     ------
@@ -69,17 +65,13 @@ class HaplyDevice:
         *,
         url: str = URL,
         profile: DeviceProfile = PROFILE,
-        max_force: float | None = None,
-        clock: Clock = time.perf_counter,
     ) -> None:
         parts = urlsplit(url)
         if parts.scheme != "ws" or parts.hostname not in LOOPBACK:
             raise UsageError(f"the Haply service runs on this machine, as at {URL}, not at {url}")
         self.device_id = device_id
         self.url = url
-        self.max_force = profile.cap if max_force is None else max_force
-        self.profile = replace(profile, cap=self.max_force)
-        self.clock = clock
+        self.profile = profile
         self._socket: Any = None
         self._held = contextlib.ExitStack()
         self._exceptions: Any = None
@@ -138,7 +130,7 @@ class HaplyDevice:
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push with the force of a wrench (6,), N, capped; the torque is ignored."""
-        self._send(capped(wrench, self.max_force, 0.0).tolist()[:3])
+        self._send(capped(wrench, self.profile.cap, 0.0).tolist()[:3])
 
     def close(self) -> None:
         """Set the force to zero and disconnect."""
@@ -194,7 +186,7 @@ class HaplyDevice:
             raise self._lost(f"a state without {error}") from error
         buttons = self._take_grip(state)
         pose[:3, :3] = self._rotation
-        velocity = self._window.measure(self.clock(), pose)
+        velocity = self._window.measure(time.perf_counter(), pose)
         velocity[:3] = linear
         return Reading(pose, velocity, buttons)
 

@@ -10,14 +10,14 @@ that `apply` stored. The package gives neither velocity nor torque: velocities a
 import contextlib
 import io
 import time
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.devices.profiles import PROFILES, DeviceProfile
-from hapticdb.devices.scripted import Clock, Reading, capped
+from hapticdb.devices.protocol import Reading
+from hapticdb.devices.scripted import Clock, capped
 from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError
 
@@ -41,8 +41,6 @@ class OpenHapticsDevice:
         Name of the device in the vendor's setup.
     profile : DeviceProfile
         The model's profile, as of `hapticdb.devices.profiles.PROFILES`; a Touch unless given.
-    max_force : float, optional
-        Cap, N; the profile's unless given.
     clock : callable
         Returns seconds; it must be picklable.
     """
@@ -52,12 +50,10 @@ class OpenHapticsDevice:
         name: str = "Default Device",
         *,
         profile: DeviceProfile = PROFILES["touch"],
-        max_force: float | None = None,
         clock: Clock = time.perf_counter,
     ) -> None:
         self.name = name
-        self.max_force = profile.cap if max_force is None else max_force
-        self.profile = replace(profile, cap=self.max_force)
+        self.profile = profile
         self.clock = clock
         self._hd: Any = None
         self._id = 0
@@ -115,7 +111,7 @@ class OpenHapticsDevice:
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push with the force of a wrench (6,), N, capped; the torque is ignored."""
-        self._push = self.clock(), capped(wrench, self.max_force, 0.0).tolist()[:3]
+        self._push = self.clock(), capped(wrench, self.profile.cap, 0.0).tolist()[:3]
 
     def close(self) -> None:
         """Stop the scheduler and release the device."""

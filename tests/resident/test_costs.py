@@ -7,9 +7,9 @@ import pytest
 
 from hapticdb import Environment
 from hapticdb.query.cost_model import CostModel
-from hapticdb.resident import costs as module
-from hapticdb.resident.costs import ASKED, FAR, costs_at_start
+from hapticdb.resident import source as module
 from hapticdb.resident.residency import Residency
+from hapticdb.resident.source import ASKED, FAR, costs_at_start
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Store
 from realtime.troubled import troubled
@@ -76,12 +76,6 @@ def test_kept_figures_are_taken_and_nothing_is_measured(
     env.store.save_costs(ELSEWHERE, MEASURED.figures())
     line = Line(1.0)
     assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
-    assert (measured, line.trips) == ([], 1)
-
-
-def test_who_has_no_time_measures_nothing(env: Environment, measured: list[Store]) -> None:
-    line = Line(1e-4)
-    assert costs_at_start(line.to(env), lambda: line.now, may_measure=False) == EQUAL
     assert (measured, line.trips) == ([], 1)
 
 

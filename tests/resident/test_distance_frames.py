@@ -78,31 +78,28 @@ def test_both_laws_feel_the_same_in_memory_as_in_the_database(
     env = make(tmp_path, 7, "brick", curve)
     objects = scene(env)
     shell = ball(200, env)
-    poses = poses_in(env.grid, 12)
+    poses = poses_in(env.grid, 5)
     poses[:, :3, 3] *= 0.12  # around the middle, where the objects are
     store = open_store(env.url, read_only=True)
-    for exclude in ([], [2]):
+    for run, exclude in ((0, []), (8, [2])):
         with CellTable.create(BUDGET, distances=True) as table:
             residency = Residency(store, table, exclude)
-            for run in (0, 8):
-                smooth = ResidentFrames(residency, shell, Smooth(), run=run)
-                plane = ResidentFrames(residency, shell, run=run)
-                for _ in range(2):
-                    felt, hits = smooth.wrenches(poses)
-                    flat, flat_hits = plane.wrenches(poses)
-                    assert felt.any(axis=1).sum() > 6
-                    for n, pose in enumerate(poses):
-                        wrench, count = on_database(env, shell, pose, exclude)
-                        assert (felt[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
-                        assert hits[n] == flat_hits[n] == count
-                        touch = env.touch(shell, pose, exclude=exclude, law="plane")
-                        same = np.concatenate([touch.force, touch.torque])
-                        assert (flat[n] + 0.0).tobytes() == (same + 0.0).tobytes()
-                    objects[1] = objects[1] + np.array([1.0, -2.0, 3.5])
-                    move_points(env.store, 1, objects[1])
-                    residency.refresh()
-                smooth.close()
-                plane.close()
+            smooth = ResidentFrames(residency, shell, Smooth(), run=run)
+            plane = ResidentFrames(residency, shell, run=run)
+            for _ in range(2):
+                felt, hits = smooth.wrenches(poses)
+                flat, flat_hits = plane.wrenches(poses)
+                assert felt.any(axis=1).sum() > 2
+                for n, pose in enumerate(poses):
+                    wrench, count = on_database(env, shell, pose, exclude)
+                    assert (felt[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
+                    assert hits[n] == flat_hits[n] == count
+                    touch = env.touch(shell, pose, exclude=exclude, law="plane")
+                    same = np.concatenate([touch.force, touch.torque])
+                    assert (flat[n] + 0.0).tobytes() == (same + 0.0).tobytes()
+                objects[1] = objects[1] + np.array([1.0, -2.0, 3.5])
+                move_points(env.store, 1, objects[1])
+                residency.refresh()
 
 
 def test_a_law_that_reads_distances_demands_cells_that_have_them(tmp_path: Path) -> None:

@@ -68,21 +68,17 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
     return int((slots > 0).sum())
 
 
-@pytest.mark.parametrize("at_once", [7, source.ROWS_AT_ONCE])
-@pytest.mark.parametrize("curve", ["z", "hilbert"])
-@pytest.mark.parametrize("bits", [5, 7])
+@pytest.mark.parametrize(
+    ("bits", "curve", "at_once"), [(5, "z", 7), (6, "z", source.ROWS_AT_ONCE), (6, "hilbert", 7)]
+)
 def test_cells_hold_the_least_distances_of_all_objects(
-    tmp_path: Path,
-    bits: int,
-    curve: CurveName,
-    at_once: int,
-    monkeypatch: pytest.MonkeyPatch,
+    tmp_path: Path, bits: int, curve: CurveName, at_once: int, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Without the excluded ones, and however many rows are unpacked together."""
     monkeypatch.setattr(source, "ROWS_AT_ONCE", at_once)
     env = make(tmp_path, bits, "brick", curve)
     objects = clumps(env)
-    for exclude in ([], [2], [1, 2, 3]):
+    for exclude in ([2], [1, 2, 3]):
         with CellTable.create(BUDGET, distances=True) as fresh:
             assert fresh.cells.payload is not None
             fresh.cells.payload[1:] = 17  # of cells that were here before
@@ -108,16 +104,16 @@ def test_a_cell_without_a_voxel_holds_the_distances_that_reach_into_it(
 
 def test_distances_follow_what_another_user_moves(tmp_path: Path, table: CellTable) -> None:
     """A voxel moves within its cell, next to a border: the cell beside is read again, too."""
-    env = make(tmp_path)
+    env = make(tmp_path, 6)
     objects = clumps(env)
-    near = np.array([[60.5, 40.5, 40.5]])
+    near = np.array([[28.5, 40.5, 40.5]])
     mover = write_points(env.store, near, "mover")
     objects[mover] = near
     residency = Residency(open_store(env.url, read_only=True), table)
     cells = cells_of(env.grid)
     residency.make_resident(cells)
     assert check(residency, objects) > 0
-    for place in ([63.5, 40.5, 40.5], [63.9, 63.9, 63.9], [20.5, 20.5, 20.5]):
+    for place in ([31.5, 40.5, 40.5], [31.9, 31.9, 31.9], [20.5, 20.5, 20.5]):
         objects[mover] = np.array([place])
         move_points(env.store, mover, objects[mover])
         residency.want(cells, residency.slots_of(cells))
@@ -138,11 +134,12 @@ def test_evicted_cells_come_back_with_their_distances(tmp_path: Path) -> None:
     cells = cells_of(env.grid)
     with CellTable.create(1 << 20, distances=True) as table:
         residency = Residency(env.store, table)
-        order = np.random.default_rng(0).permutation(np.tile(np.arange(len(cells)), 4))
+        order = np.random.default_rng(0).permutation(np.tile(np.arange(len(cells)), 2))
         for at in range(0, len(order), 6):
             residency.begin_round()
             residency.load(residency.missing(np.unique(cells[order[at : at + 6]])))
-            check(residency, objects)
+            if at % 24 == 0:
+                check(residency, objects)
         assert residency.writer.n_evicted > 0
 
 
@@ -193,7 +190,7 @@ def test_objects_near_a_voxel_are_those_whose_own_distance_is_small(
     for n in range(4):
         points = rng.uniform(14.0, 34.0, (6, 3))
         objects[write_points(env.store, points, f"points {n}")] = points
-    for _ in range(40):
+    for _ in range(15):
         ijk = rng.integers(12, 36, (2, 3))
         keys = np.unique(env.grid.encode(ijk))
         centres = env.grid.decode(keys) + 0.5

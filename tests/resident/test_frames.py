@@ -15,23 +15,10 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
 from hapticdb.testing import write_voxels
-from realtime.worlds import HIERARCHICAL, expected, ids_by_voxel, make, poses_in, scatter
+from realtime.worlds import HIERARCHICAL, cloud, expected, ids_by_voxel, make, poses_in, scatter
 
 
-def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
-    """A shell of random points about the tool's origin, with random normals."""
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(n_points, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    return PointShell(
-        points=rng.normal(0, extent, (n_points, 3)),
-        normals=normals,
-        center=np.array([0.001, 0.002, -0.003]),
-        is_closed=True,
-    )
-
-
-@pytest.mark.parametrize("bits", [3, 4, 5, 7])
+@pytest.mark.parametrize("bits", [3, 6])
 @pytest.mark.parametrize(("layout", "curve"), HIERARCHICAL)
 def test_frames_are_the_oracles_bit_for_bit(
     tmp_path: Path, layout: Layout, curve: CurveName, bits: int
@@ -41,31 +28,27 @@ def test_frames_are_the_oracles_bit_for_bit(
     scatter(env, n_voxels=min(8**bits // 4, 4000))
     ids = ids_by_voxel(env)
     shell = cloud(150, extent=env.grid.edge / 12)
-    poses = poses_in(env.grid, 12)
-    for exclude in ([], [2]):
-        for run in (0, 8):
-            with CellTable.create(LEAST_BUDGET) as table:
-                frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
-                felt = frames.feel(poses)
-                frames.close()
-            with CellTable.create(LEAST_BUDGET) as table:
-                frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
-                collides = frames.collides(poses)
-                frames.close()
-            assert collides.tolist() == (felt.hits > 0).tolist()
-            assert felt.hits.any()
-            assert not felt.unknown.any()
-            for n, pose in enumerate(poses):
-                naive = expected(ids, env.grid, shell, pose, exclude)
-                wrench = np.array([*naive.force, *naive.torque])
-                assert (felt.wrenches[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
-                assert felt.hits[n] == len(naive.hits)
-                assert felt.contacts[n] == len(naive.contacts)
-                assert felt.deepest[n] == max(naive.depths, default=0.0)
-                touch = env.touch(shell, pose, exclude=exclude)
-                assert (wrench + 0.0).tobytes() == (
-                    np.concatenate([touch.force, touch.torque]) + 0.0
-                ).tobytes()
+    poses = poses_in(env.grid, 6)
+    for run, exclude in ((0, []), (8, [2])):
+        with CellTable.create(LEAST_BUDGET) as table:
+            frames = ResidentFrames(Residency(env.store, table, exclude), shell, run=run)
+            collides = frames.collides(poses)
+            felt = frames.feel(poses)
+            frames.close()
+        assert collides.tolist() == (felt.hits > 0).tolist()
+        assert felt.hits.any()
+        assert not felt.unknown.any()
+        for n, pose in enumerate(poses):
+            naive = expected(ids, env.grid, shell, pose, exclude)
+            wrench = np.array([*naive.force, *naive.torque])
+            assert (felt.wrenches[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
+            assert felt.hits[n] == len(naive.hits)
+            assert felt.contacts[n] == len(naive.contacts)
+            assert felt.deepest[n] == max(naive.depths, default=0.0)
+            touch = env.touch(shell, pose, exclude=exclude)
+            assert (wrench + 0.0).tobytes() == (
+                np.concatenate([touch.force, touch.torque]) + 0.0
+            ).tobytes()
 
 
 @given(st.integers(0, 10_000))
@@ -76,8 +59,6 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
     scatter(env, n_objects=2, n_voxels=600, seed=seed)
     rng = np.random.default_rng(seed)
     shell = cloud(int(rng.integers(1, 400)), seed, float(rng.choice([0.002, 0.01, 0.04])))
-    order = np.argsort(shell.points[:, 0])
-    shell = PointShell(shell.points[order], shell.normals[order], shell.center, is_closed=True)
     poses = poses_in(env.grid, 12, seed)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
@@ -89,15 +70,6 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
             for a, b in zip(plain, found, strict=True):
                 assert (a + 0.0).tobytes() == (b + 0.0).tobytes()
     env.close()
-
-
-def test_an_empty_environment_is_felt_as_empty(tmp_path: Path) -> None:
-    env = make(tmp_path)
-    with CellTable.create(LEAST_BUDGET) as table:
-        felt = ResidentFrames(Residency(env.store, table), cloud(50)).feel(poses_in(env.grid, 5))
-    assert not felt.wrenches.any()
-    assert not felt.hits.any()
-    assert not felt.unknown.any()
 
 
 def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
@@ -113,7 +85,7 @@ def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
         felt = ResidentFrames(residency, shell).feel(poses)
         assert residency.writer.n_evicted > 0
     assert not felt.unknown.any()
-    for n in range(0, 200, 7):
+    for n in range(0, 200, 20):
         touch = env.touch(shell, poses[n])
         assert (felt.wrenches[n, :3] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
 

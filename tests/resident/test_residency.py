@@ -87,7 +87,7 @@ STEPS = st.lists(
 
 
 @given(STEPS)
-@settings(deadline=None, max_examples=15)
+@settings(deadline=None, max_examples=6)
 def test_what_is_resident_is_what_the_database_holds(
     tmp_path_factory: pytest.TempPathFactory, steps: list[tuple[str, int, int]]
 ) -> None:
@@ -117,14 +117,6 @@ def test_what_is_resident_is_what_the_database_holds(
                 check(residency, voxels_by_cell(env))
     store.close()
     env.close()
-
-
-def test_excluded_objects_are_in_no_cell(tmp_path: Path, table: CellTable) -> None:
-    env = make(tmp_path)
-    scatter(env)
-    residency = Residency(env.store, table, [3, 1])
-    residency.load(residency.missing(cells_of(env.grid))[:40])
-    assert check(residency, voxels_by_cell(env, (1, 3))) == 40
 
 
 def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) -> None:
@@ -292,21 +284,6 @@ def test_a_server_that_lost_its_last_commits_makes_all_unknown(
     residency.refresh()
     assert residency.revision == env.store.revision()
     assert (residency.writer.n_resident, residency.writer.n_empty) == (0, 0)
-
-
-def test_after_more_writes_than_one_looks_at_all_is_unknown(
-    tmp_path: Path, table: CellTable, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(changes, "MOST_CHANGES", 2)
-    env = make(tmp_path)
-    scatter(env)
-    residency = Residency(open_store(env.url, read_only=True), table)
-    residency.load(residency.missing(cells_of(env.grid))[:50])
-    for n in range(3):
-        write_voxels(env.store, block((n, 0, 0), (n, 0, 0)), f"new {n}")
-    residency.want(NOTHING, NOTHING)
-    residency.refresh()
-    assert check(residency, voxels_by_cell(env)) == 0
 
 
 def test_slots_of_a_load_that_failed_are_used_again(

@@ -8,10 +8,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
-from hapticdb.resident.empty_cells import EmptyCells
 from hapticdb.resident.slots import ROUNDS_KEPT, CellSlots
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.resident.writer import EmptyCells
 
 
 def ints(*values: int) -> NDArray[np.int64]:
@@ -36,18 +35,6 @@ def filled(table: CellTable) -> CellSlots:
     return slots
 
 
-def test_slots_that_are_looked_at_stay_free_until_they_are_taken(table: CellTable) -> None:
-    slots = CellSlots(table)
-    first = slots.next_free(5)
-    assert slots.n_free == table.n_slots - 1
-    assert (first > EMPTY_SLOT).all()
-    slots.take(first)
-    assert slots.n_free == table.n_slots - 6
-    assert not set(first.tolist()) & set(slots.next_free(table.n_slots).tolist())
-    slots.give_back(np.append(first, [EMPTY_SLOT, UNKNOWN]))
-    assert slots.n_free == table.n_slots - 1
-
-
 def test_a_slot_is_free_once_no_frame_reads_an_older_version(table: CellTable) -> None:
     slots = filled(table)
     slots.clear([3, 4])
@@ -65,18 +52,6 @@ def test_what_frames_use_and_what_is_wanted_leaves_last(table: CellTable) -> Non
     leaving = slots.cells_to_evict(table.n_slots - 5, 0)
     assert len(leaving) == table.n_slots - 5
     assert not set(leaving.tolist()) & {1001, 1002, 1003, 1004}
-
-
-def test_slots_of_a_load_that_failed_are_found_again(table: CellTable) -> None:
-    slots = filled(table)
-    slots.clear([3, 4, 5])
-    slots.retire([3], version=9)
-    slots.free_lost()
-    assert sorted(slots.next_free(9).tolist()) == [4, 5]
-
-
-def test_there_is_nothing_to_evict_while_slots_are_free(table: CellTable) -> None:
-    assert not len(CellSlots(table).cells_to_evict(table.n_slots - 1, 100))
 
 
 @given(

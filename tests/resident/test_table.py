@@ -16,7 +16,6 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, READER_STRIDE
 from hapticdb.resident.table import (
-    FIRST_VERSION,
     LEAST_BUDGET,
     MOST_READERS,
     CellTable,
@@ -55,27 +54,6 @@ def test_the_memory_is_as_large_as_it_says_and_within_the_budget(
 def test_a_budget_beyond_the_machines_memory_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^a budget of \d+ bytes .*: this machine has \d+$"):
         CellTable.create(1 << 50)
-
-
-def test_a_budget_too_small_is_refused() -> None:
-    with pytest.raises(UsageError, match=f"give {LEAST_BUDGET} or more"):
-        CellTable.create(LEAST_BUDGET - 1)
-
-
-def test_all_is_unknown_at_first() -> None:
-    with CellTable.create(LEAST_BUDGET) as table:
-        assert table.version == FIRST_VERSION
-        assert (table.cells.keys == -1).all()
-
-
-def test_who_maps_the_same_memory_sees_the_same() -> None:
-    with CellTable.create(LEAST_BUDGET) as table:
-        other = CellTable(table.descriptor, table.n_slots)
-        table.cells.words[3, 5] = 7
-        other.desk.figures["worst_latency"] = 1.5
-        assert other.cells.words[3, 5] == 7
-        assert table.desk.figures["worst_latency"] == 1.5
-        assert other.cells.payload is None
 
 
 def test_who_maps_a_table_with_distances_finds_them_there() -> None:

@@ -209,7 +209,7 @@ class ResidentFrames:
         self.clusters = clusters_of(shell, size, run or RUN if sleeps else run)
         self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
         self.budget = min(budget_points or len(shell), len(shell))
-        self.met = np.empty(len(shell), dtype=np.int64)
+        self.hits = np.empty(len(shell), dtype=np.int64)
         self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._row = table.join()
@@ -303,12 +303,12 @@ class ResidentFrames:
         elif self.sleepers is not None:
             counts[part] = 0
             done = budgets.feel_within(
-                self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
+                self.cells, self._row, self.clusters, poses[part], place, self.law, self.hits,
                 self.missed, out[part], self.sleepers, self.budget, counts[part],
             )  # fmt: skip
         else:
             done = feel_kernel(
-                self.cells, self._row, self.clusters, poses[part], place, self.law, self.met,
+                self.cells, self._row, self.clusters, poses[part], place, self.law, self.hits,
                 self.missed, out[part],
             )  # fmt: skip
         if done < n_poses:
@@ -326,7 +326,7 @@ class ResidentFrames:
                 counts[n] = 0
                 if not budgets.feel_within(
                     self.cells, self._row, self.clusters, poses[n : n + 1], self.residency.place,
-                    self.law, self.met, missed, out[n : n + 1], self.sleepers, self.budget,
+                    self.law, self.hits, missed, out[n : n + 1], self.sleepers, self.budget,
                     counts[n : n + 1],
                 ):  # fmt: skip
                     return n

@@ -17,7 +17,7 @@ from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
 from hapticdb.resident.changes import known_cells_touched, writes_since
 from hapticdb.resident.left_out import LeftOutObjects
 from hapticdb.resident.source import CellSource
-from hapticdb.resident.table import FIRST_VERSION, LOADING, CellTable
+from hapticdb.resident.table import FIRST_VERSION, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells
 from hapticdb.store.base import NO_KEYS, Change, Keys, Store
 from hapticdb.store.filtering import Filter
@@ -148,7 +148,6 @@ class Residency:
         file may have the same number of writes as the old one.
         """
         self.writer.take_over()
-        self.table.cells.control[LOADING] = 0
         # a third of the table: the cells are read into other slots before the old ones are free
         urgent = urgent[: min(MOST_RENEWED, self.table.n_slots // 3)]
         self.want(urgent, self.slots_of(urgent))
@@ -254,16 +253,12 @@ class Residency:
         """
         cells = cells[: min(BATCH, max(self.table.n_slots // 4, 1))]
         self._make_room(len(cells))
-        self.table.cells.control[LOADING] = len(cells)
         started = self._clock()
-        try:
-            read = self._read_now(cells)
-            if read is None:
-                _, read = self._follow_writes(cells)
-            else:
-                self._publish(NO_KEYS, read)
-        finally:
-            self.table.cells.control[LOADING] = 0
+        read = self._read_now(cells)
+        if read is None:
+            _, read = self._follow_writes(cells)
+        else:
+            self._publish(NO_KEYS, read)
         elapsed = self._clock() - started
         self.n_loaded += len(read.cells)
         return Loaded(len(read.cells), read.n_rows, read.n_ranges, elapsed)

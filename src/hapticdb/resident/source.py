@@ -10,9 +10,10 @@ from hapticdb.errors import DatabaseError
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
+from hapticdb.query.calibration import calibrate
+from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.resident.costs import costs_at_start
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
     BRICK_SHIFT,
@@ -26,6 +27,12 @@ from hapticdb.store.base import (
 ROWS_AT_ONCE = 1024
 """Rows whose distances are unpacked together, into a megabyte. A larger value makes fewer calls; a
 smaller one merges the values while they are still in the processor's cache."""
+
+FAR = 2e-3
+"""Greatest round trip (s) at which a calibration, which takes thousands of round trips, is done at
+the start. Larger: slower starts."""
+ASKED = 3
+"""Number of timed round trips; the shortest counts."""
 
 
 class _CellsRead(NamedTuple):
@@ -124,3 +131,30 @@ class CellSource:
                 part.keys, part.ids, values, self.exclude, on_curve, slots, grid.bits,
                 grid.curve_code, slot, payload, masks,
             )  # fmt: skip
+
+
+def costs_at_start(
+    store: Store, clock: Callable[[], float], *, may_measure: bool = True
+) -> CostModel:
+    """Cost model from the figures that the store keeps for this machine, or else from measurement.
+
+    clock : returns seconds, to time a round trip; may_measure : whether there is time for a
+    measurement, and a row to measure. If not, or if a round trip takes longer than `FAR`, all parts
+    cost the same: results are equal, ranges less efficient.
+    """
+    kept = store.costs(machine_name())
+    if kept:
+        return CostModel.from_figures(kept)
+    if may_measure and _round_trip(store, clock) <= FAR:
+        return calibrate(store)
+    return CostModel.of_equal_parts()
+
+
+def _round_trip(store: Store, clock: Callable[[], float]) -> float:
+    """Seconds until the store answers a small query."""
+    times = []
+    for _ in range(ASKED):
+        started = clock()
+        store.revision()
+        times.append(clock() - started)
+    return min(times)

@@ -33,9 +33,9 @@ MOST_READERS = 80
 Larger: 2.5 KiB of the table for each, and eviction looks at more of them."""
 CONTROL_WORDS = kernels.CHANGED + kernels.CHANGES_KEPT
 """Number of int64 words in the control block."""
-HEARTBEAT, AWAY, LOADING, STOP = 8, 9, 10, 11
+HEARTBEAT, LOST, STOP = 8, 9, 10
 """Indices in the control block, after those of `kernels.cells`: time of the database's last answer
-(ns, CLOCK_MONOTONIC), whether it is away, cells being fetched, whether all processes must end."""
+(ns, CLOCK_MONOTONIC), whether it is lost, whether all processes must end."""
 _PAGE = 4096
 _joining = threading.Lock()
 

@@ -26,6 +26,7 @@ from closed_forms import (
     sheet,
     wedge,
 )
+from draws import is_every
 from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import contact_stiffness
 from hapticdb.kernels.hand.holding import IS_HELD
@@ -347,8 +348,8 @@ def test_no_tool_passes_a_sheet_or_a_plate() -> None:
 
 @NEEDS_JIT
 @pytest.mark.long
-def test_no_tool_of_two_thousand_passes_a_sheet_or_a_plate() -> None:
-    assert min(walls(200, 10, 2)) > 0.9
+def test_no_tool_of_hundreds_passes_a_sheet_or_a_plate() -> None:
+    assert min(walls(200 if is_every() else 40, 10, 2)) > 0.9
 
 
 def globe(radius: float) -> Floats:

@@ -97,14 +97,14 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                             poses,
                             residency.place,
                             first.law,
-                            first.met,
+                            first.hits,
                             out,
                         )
                     else:
                         one = frames[name]
                         feel_kernel(
                             table.cells, row, one.clusters, poses, residency.place, one.law,
-                            one.met, one.missed, out,
+                            one.hits, one.missed, out,
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out

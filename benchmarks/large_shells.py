@@ -131,7 +131,7 @@ def measure(
 
             def plain(one: ResidentFrames) -> Callable[[Floats], object]:
                 return lambda pose: feel_kernel(
-                    one.cells, row, one.clusters, pose, residency.place, one.law, one.met,
+                    one.cells, row, one.clusters, pose, residency.place, one.law, one.hits,
                     one.missed, out,
                 )  # fmt: skip
 
@@ -139,7 +139,7 @@ def measure(
                 def frame(pose: Floats) -> None:
                     counts[:] = 0
                     feel_within(
-                        one.cells, row, one.clusters, pose, residency.place, one.law, one.met,
+                        one.cells, row, one.clusters, pose, residency.place, one.law, one.hits,
                         one.missed, out, one.sleepers, one.budget, counts,
                     )  # fmt: skip
                     looked.append(int(counts[0, LOOKED_AT]) + int(counts[0, LEFT_OUT]))
@@ -186,7 +186,7 @@ def _within_budget(whole: FeltFrames, part: FeltFrames) -> dict[str, Any]:
 
 def bytes_of(frames: ResidentFrames) -> int:
     """Memory of a shell's arrays, bytes."""
-    arrays = [*frames.clusters, *(frames.sleepers or ()), frames.met]
+    arrays = [*frames.clusters, *(frames.sleepers or ()), frames.hits]
     return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
 

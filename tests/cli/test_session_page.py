@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb.cli import session_page
 
-AWAY = SimpleNamespace(is_away=True, url="gone.db")
+AWAY = SimpleNamespace(is_lost=True, url="gone.db")
 """Cells whose database does not answer: ids stand in place of names."""
 
 

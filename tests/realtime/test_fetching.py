@@ -29,7 +29,7 @@ from hapticdb.realtime.fetching import (
 )
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.wishes import Motion, Wish
-from hapticdb.resident.table import AWAY, HEARTBEAT, LEAST_BUDGET, CellTable
+from hapticdb.resident.table import HEARTBEAT, LEAST_BUDGET, LOST, CellTable
 from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
@@ -77,7 +77,7 @@ class Side:
         """Ask for the objects at the last frame's hits."""
         servo.name_voxels(
             self.session, self.reader.clusters, pose, self.reader.place, self.grid.bits,
-            self.grid.curve_code, self.reader.met, n_hits,
+            self.grid.curve_code, self.reader.hits, n_hits,
         )  # fmt: skip
 
     @property
@@ -169,7 +169,7 @@ def world(tmp_path: Path) -> Environment:
 
 
 @given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=60)
+@settings(deadline=None, max_examples=25)
 def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> None:
     """All cells within the hand's reach are wanted, also at the border of the grid."""
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
@@ -213,26 +213,24 @@ def test_a_wish_too_large_keeps_what_is_near() -> None:
 
 def test_a_motion_that_is_none_wants_nothing() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
+    still = Motion.at_rest(np.zeros(3))
     for broken in (np.nan, np.inf):
-        still = Motion.at_rest(np.zeros(3))
-        for name in ("tool", "handle", "velocity"):
-            motion = still._replace(**{name: np.array([0.0, broken, 0.0])})  # type: ignore[arg-type]
+        nowhere = np.array([0.0, broken, 0.0])
+        for motion in (still._replace(velocity=nowhere), still._replace(radius=broken)):
             assert Wish.of_motion(grid, motion, 0.1, 1.0) is None
-        assert Wish.of_motion(grid, still._replace(radius=broken), 0.1, 1.0) is None
 
 
 # --- in lock step -------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("seed", [0, 1])
 def test_a_hand_at_1_m_s_meets_no_unknown_cell_behind_10_ms(
-    world: Environment, sphere: PointShell, seed: int
+    world: Environment, sphere: PointShell
 ) -> None:
-    step = LockStep(world, sphere, latency=0.010, jitter=0.003, seed=seed)
+    step = LockStep(world, sphere, latency=0.010, jitter=0.003)
     step.warm_start()
-    step.hand = RandomHand(step.pose, seed, speed=1.0, angular_speed=3.0, clock=lambda: step.now)
-    step.run(4.0)
-    assert step.frames > 3900
+    step.hand = RandomHand(step.pose, 0, speed=1.0, angular_speed=3.0, clock=lambda: step.now)
+    step.run(3.0)
+    assert step.frames > 2900
     assert step.hit_frames > 0
     assert step.unknown == 0
 
@@ -252,9 +250,8 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
                 step.fetcher.reopen()
             step.round()
             is_lost = False
-            assert not step.table.cells.control[AWAY]
+            assert not step.table.cells.control[LOST]
         except DatabaseError:
-            step.fetcher.count_loss()
             is_lost = True
             n_lost += 1
             before = step.table.cells.control[HEARTBEAT]
@@ -420,9 +417,9 @@ def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
     side = Side(resident.table, world.grid, sphere)
     side.be_at(np.eye(4))
     assert until(lambda: side.is_served)
-    assert not resident.is_away
+    assert not resident.is_lost
     away.touch()
-    assert until(lambda: resident.is_away)
+    assert until(lambda: resident.is_lost)
     silent = int(resident.table.cells.control[HEARTBEAT])
     time.sleep(1.2)
     assert resident.table.cells.control[HEARTBEAT] == silent
@@ -430,7 +427,7 @@ def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
         move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
         naive = expected(ids_by_voxel(editor), world.grid, sphere, np.eye(4))
     away.unlink()
-    assert until(lambda: not resident.is_away)
+    assert until(lambda: not resident.is_lost)
     assert until(lambda: side.reader.feel(np.eye(4))[0] == naive.hits)
     resident.supervise()
     assert resident.restarts == 0

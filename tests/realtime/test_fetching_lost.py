@@ -4,7 +4,7 @@ import contextlib
 import os
 import signal
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -16,11 +16,11 @@ import hapticdb
 from children import PATIENCE, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GridError
-from hapticdb.realtime import fetching, resident_cells
+from hapticdb.realtime import resident_cells
 from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.resident.table import LEAST_BUDGET, STOP, CellTable
+from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.file import remove_file
@@ -72,23 +72,11 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
     side = served(cells, sphere, pose)
     naive = expected(ids_by_voxel(env), env.grid, sphere, pose)
     Path(env.url).rename(tmp_path / "elsewhere")
-    assert until(lambda: cells.is_away)
+    assert until(lambda: cells.is_lost)
     (tmp_path / "elsewhere").rename(env.url)
-    assert until(lambda: not cells.is_away)
+    assert until(lambda: not cells.is_lost)
     assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
     assert cells.figures().losses == 1
-
-
-def test_another_file_of_the_same_grid_is_felt_instead(
-    env: Environment, cells: ResidentCells, sphere: PointShell, tmp_path: Path
-) -> None:
-    pose = np.eye(4)
-    side = served(cells, sphere, pose)
-    before = side.reader.feel(pose)[0]
-    other = replace(env, tmp_path / "other")
-    naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
-    assert naive.hits != before
-    assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
 
 
 def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
@@ -172,60 +160,6 @@ def test_another_grid_ends_the_fetching_and_is_told(
     assert all("another environment than before: start the session again" in t for t in told)
     assert "\n" not in told[0]
     assert (cells.pid, cells.restarts) == (pid, 0)
-
-
-class Listener:
-    """Stands in for a `MessageSender`: records the words sent, then stops the fetching."""
-
-    def __init__(self, table: CellTable) -> None:
-        self.table = table
-        self.sent: list[str] = []
-
-    def send(self, word: str, content: object = None) -> None:
-        assert content
-        self.sent.append(word)
-        self.table.cells.control[STOP] = word == "ready"
-
-
-def test_a_connection_lost_while_warming_up_puts_ready_off(
-    env: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    losses = iter([hapticdb.errors.ConnectionLostError("gone")] * 2)
-    warm_up: Callable[[Fetcher], None] = Fetcher.warm_up
-
-    def lost_at_first(fetcher: Fetcher) -> None:
-        for error in losses:
-            raise error
-        warm_up(fetcher)
-
-    monkeypatch.setattr(Fetcher, "warm_up", lost_at_first)
-    monkeypatch.setattr(fetching, "parent_is_gone", lambda: False)
-    with CellTable.create(LEAST_BUDGET) as table:
-        listener: Any = Listener(table)
-        fetching.fetch(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid), listener)
-        assert listener.sent == ["lost", "ready"]
-        assert next(losses, None) is None
-        assert table.desk.figures["losses"] == 1
-
-
-def test_a_table_goes_when_its_process_does_not_start(
-    env: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    made: list[CellTable] = []
-    create = CellTable.create
-
-    def noted(budget_bytes: int, *, distances: bool) -> CellTable:
-        made.append(create(budget_bytes, distances=distances))
-        return made[-1]
-
-    def refuse(_: ResidentCells) -> Process:
-        raise hapticdb.errors.ConnectionLostError("gone")
-
-    monkeypatch.setattr(CellTable, "create", noted)
-    monkeypatch.setattr(ResidentCells, "_start_process", refuse)
-    with pytest.raises(hapticdb.errors.ConnectionLostError):
-        ResidentCells(env.url)
-    assert [table.descriptor for table in made] == [-1]
 
 
 def test_threads_that_supervise_together_start_one_process(

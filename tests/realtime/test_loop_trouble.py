@@ -6,17 +6,18 @@ import signal
 import tempfile
 import time
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 import hapticdb
 from closed_forms import field_of, plane
-from hapticdb import Environment, Grid, PointShell, TangentPlane
+from hapticdb import Grid, PointShell, TangentPlane
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.devices.scripted import Reading
+from hapticdb.devices.protocol import Reading
 from hapticdb.errors import DeviceError
 from hapticdb.kernels.hand.holding import RISE_FRAMES
 from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells, spread_key
@@ -46,31 +47,20 @@ LATE = 10 * 10**9
 
 
 class World:
-    """Voxels of 5 mm about the world's origin; no cell is resident if `is_known` is false."""
+    """A floor of voxels of 5 mm about the world's origin; all cells are resident."""
 
-    def __init__(self, ijk: ArrayLike = (), *, is_known: bool = True) -> None:
+    def __init__(self) -> None:
         self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
-        self._folder = tempfile.TemporaryDirectory()
-        path = Path(self._folder.name) / "world.db"
-        self.environment: Environment = hapticdb.create(path, self.grid)
-        voxels = np.asarray(ijk, dtype=np.int64).reshape(-1, 3)
-        self.occupied = np.zeros((SIDE,) * 3, dtype=np.bool_)
-        self.occupied[tuple(voxels.T)] = True
-        if len(voxels):
-            write_voxels(self.environment.store, voxels)
         self.table = CellTable.create(4 << 20)
-        self.residency = Residency(self.environment.store, self.table)
-        if is_known:
-            self.load(cells_of(self.grid))
-
-    def load(self, cells: NDArray[np.int64]) -> None:
-        while len(missing := self.residency.missing(cells)):
-            self.residency.load(missing)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            hapticdb.create(Path(folder) / "world.db", self.grid) as env,
+        ):
+            write_voxels(env.store, FLOOR)
+            Residency(env.store, self.table).make_resident(cells_of(self.grid))
 
     def close(self) -> None:
-        self.environment.close()
         self.table.close()
-        self._folder.cleanup()
 
 
 class SmoothWorld:
@@ -129,7 +119,7 @@ def world(
     monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
-    made = World(FLOOR) if request.param == "plane" else SmoothWorld()
+    made = World() if request.param == "plane" else SmoothWorld()
     yield made
     made.close()
     signal.signal(signal.SIGTERM, before)
@@ -138,11 +128,10 @@ def world(
 def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> LoopRequest:
     hold = float(str(options.pop("hold", 0.02)))
     law: ForceLaw = TangentPlane()
-    given_numbers = Coupling(hold=hold)
-    coupling: DirectRendering | SettledCoupling = given_numbers.direct(SCRIPTED, 1.0, 0.01)
+    coupling: DirectRendering | SettledCoupling = Coupling().direct(SCRIPTED, 1.0, 0.01)
     if isinstance(world, SmoothWorld):
         law = DistanceField()
-        coupling = given_numbers.settled(SCRIPTED, 200.0, 1.0, 0.01)
+        coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
     given: dict[str, object] = {"is_waiting": True, "seconds": 1.0}
     return LoopRequest(
         descriptor=world.table.descriptor,
@@ -154,7 +143,7 @@ def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> 
         shell=punch(6),
         device=hand,
         law=law,
-        coupling=coupling,
+        coupling=replace(coupling, hold=hold),
         handle=Handle(),
         timing=Timing(200.0),
         staleness=1e9,
@@ -238,25 +227,6 @@ def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(
     assert not loop.sent.unknown
     assert used.buttons == 2
     assert used.pose[2, 3] == loop.hand["position"][2] == -0.02
-
-
-def test_objects_are_no_longer_asked_for_once_the_tool_has_left_and_was_answered(
-    world: World | SmoothWorld,
-) -> None:
-    hand = Pressing(0.02)
-    loop = pressed(world, hand)
-    asked, control = loop.session["n_asked"], world.table.cells.control
-    loop._ask_or_withdraw(1000)
-    assert asked > 0
-    hand.z = 0.02
-    for _ in range(100):
-        frame(loop, hand)
-    control[HEARTBEAT] = 1000 + WITHDRAWN_NS  # the database may still be looking up the names
-    loop._ask_or_withdraw(2000)
-    assert asked > 0
-    control[HEARTBEAT] += 1
-    loop._ask_or_withdraw(3000)
-    assert asked == 0
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World | SmoothWorld) -> None:

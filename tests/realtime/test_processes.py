@@ -8,12 +8,13 @@ import resource
 import signal
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
 from children import PATIENCE, child, finished
 from hapticdb import HapticDBError
-from hapticdb.errors import DatabaseError
+from hapticdb.errors import DatabaseError, UsageError
 from hapticdb.realtime import processes as module
 from hapticdb.realtime.processes import Message, Process
 from hapticdb.resident.table import is_alive
@@ -74,6 +75,23 @@ def test_what_nobody_expected_is_one_line_here(word: str, cause: str) -> None:
         process.receive(LONG)
 
 
+def test_a_request_of_the_script_itself_is_refused_with_the_way_out(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Mine:
+        pass
+
+    Mine.__module__, Mine.__qualname__ = "of_a_script", "Mine"
+    script = ModuleType("of_a_script")
+    script.Mine = Mine  # type: ignore[attr-defined]
+    monkeypatch.setitem(sys.modules, "of_a_script", script)
+    with (
+        Process(WORKERS, Mine(), []) as process,
+        pytest.raises(UsageError, match=r"of_a_script.*: define devices in a module"),
+    ):
+        process.receive(LONG)
+
+
 def test_silence_is_no_message() -> None:
     with Process(WORKERS, ("wait", None), []) as process:
         assert process.receive(LONG) == Message("waiting")
@@ -103,7 +121,7 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
         assert process.wait(LONG)
 
 
-@pytest.mark.parametrize("share", [0.0, 0.3, 0.9])
+@pytest.mark.parametrize("share", [0.0, 0.5])
 def test_a_request_that_is_cut_ends_it_quietly(share: float, tmp_path: Path) -> None:
     content = pickle.dumps(("echo", list(range(1000))))
     request = tmp_path / "request"

@@ -53,7 +53,7 @@ def check_edits(
     path = tmp_path / "edited.hdbrec"
     with Session(
         edited.url, sphere, stroking(0.010, 0.4, loops=True), law="plane", rate=RATE, record=path,
-        budget_bytes=1 << 20, staleness=NEVER_STALE,
+        staleness=NEVER_STALE,
     ) as session:  # fmt: skip
         for ijk in (down, up, down):
             n_frames = session.n_frames

@@ -123,22 +123,11 @@ def test_a_budget_is_kept_reported_recorded_and_replayed_bit_for_bit(
     assert number == FORMAT_VERSION
 
 
-def test_a_budget_that_is_never_reached_leaves_nothing_out(
-    ground: Ground, plate: PointShell, tmp_path: Path
-) -> None:
-    report = felt(ground, plate, tmp_path / "s.hdbrec", len(plate))
-    assert (report.budget_points, report.left_out_frames) == (len(plate), 0)
-    assert replay(Recording(tmp_path / "s.hdbrec"), ground.env).is_equal
-
-
 @pytest.mark.parametrize(
     ("budget", "words"),
     [
         (0, "a budget of 0 points leaves nothing to feel: give 1 or more"),
-        (-3, "a budget of -3 points leaves nothing to feel"),
         (1.5, r"a budget of 1\.5 points: give a whole number, 1 or more"),
-        (float("nan"), "a budget of nan points: give a whole number"),
-        ("many", "a budget of 'many' points: give a whole number"),
         (True, "a budget of True points: give a whole number"),
     ],
 )

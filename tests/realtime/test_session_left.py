@@ -17,7 +17,7 @@ from hapticdb.realtime import session as module
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recorder, Recording
-from hapticdb.resident.table import MOST_READERS, is_alive
+from hapticdb.resident.table import is_alive
 from realtime.hands import Noted, still
 from realtime.sessions import RATE, floored, until
 from realtime.worlds import make
@@ -44,9 +44,7 @@ def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
     path, record = tmp_path / "wrench", tmp_path / "dropped.hdbrec"
     hand = Noted(still(DEEP), path)
     n_before = n_memories()
-    sessions = [
-        Session(env.url, sphere, hand, law="plane", rate=RATE, budget_bytes=4 << 20, record=record)
-    ]
+    sessions = [Session(env.url, sphere, hand, law="plane", rate=RATE, record=record)]
     pids = sessions[0].pid, sessions[0].cells.pid
     until(lambda: sessions[0].n_frames > 100 and force_in(path) > 0, sessions[0])
     n_frames = sessions[0].n_frames
@@ -67,15 +65,6 @@ def n_memories() -> int:
         with contextlib.suppress(OSError):  # the descriptor of this folder itself
             found.append(link.readlink())
     return sum("hapticdb-" in name.name for name in found)
-
-
-@pytest.mark.long
-def test_dropped_sessions_leave_their_rows_to_others(env: Environment, sphere: PointShell) -> None:
-    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
-        for _ in range(2):
-            Session(cells, sphere, still(0.03), law="plane", rate=RATE)
-            gc.collect()
-            assert cells.table.desk.pids.tolist() == [0] * MOST_READERS
 
 
 def test_cells_that_are_dropped_are_given_back(env: Environment) -> None:
@@ -131,9 +120,7 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
         raise FileError("no space is left: free some")
 
     path = tmp_path / "full.hdbrec"
-    session = Session(
-        env.url, sphere, still(DEEP), law="plane", rate=RATE, budget_bytes=4 << 20, record=path
-    )
+    session = Session(env.url, sphere, still(DEEP), law="plane", rate=RATE, record=path)
     pids = session.pid, session.cells.pid
     with monkeypatch.context() as patch:
         patch.setattr(Recorder, "close", full)
@@ -172,16 +159,6 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
 # -- wrong arguments -----------------------------------------------------------------------------
 
 
-def test_a_budget_of_nothing_is_refused(env: Environment, sphere: PointShell) -> None:
-    with pytest.raises(UsageError, match="budget of 0 bytes"):
-        Session(env.url, sphere, still(0.03), law="plane", budget_bytes=0)
-
-
-def test_a_policy_that_is_none_is_refused(env: Environment, sphere: PointShell) -> None:
-    with pytest.raises(UsageError, match=r"^policy 'Wait': give 'hold' or 'wait'$"):
-        Session(env.url, sphere, still(0.03), law="plane", policy="Wait")  # type: ignore[arg-type]
-
-
 def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell) -> None:
     with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
         pass
@@ -200,4 +177,4 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
 ) -> None:
     monkeypatch.setattr(place, "START_PATIENCE", 0.0)
     with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
-        Session(env.url, sphere, still(0.03), law="plane", budget_bytes=4 << 20)
+        Session(env.url, sphere, still(0.03), law="plane")

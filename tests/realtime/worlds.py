@@ -148,7 +148,7 @@ class Reader:
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.clusters = clusters_of(shell, grid.voxel_size)
         self.row = table.join()
-        self.met = np.empty(len(shell), dtype=np.int64)
+        self.hits = np.empty(len(shell), dtype=np.int64)
         self.missed = np.zeros(64, dtype=np.int64)
         self.out = np.zeros((1, RESULTS))
 
@@ -156,8 +156,8 @@ class Reader:
         """Hits, wrench and number of unknown points."""
         feel_kernel(
             self.cells, self.row, self.clusters, pose[None], self.place,
-            TangentPlaneLaw(1000.0), self.met, self.missed, self.out,
+            TangentPlaneLaw(1000.0), self.hits, self.missed, self.out,
         )  # fmt: skip
         row = self.out[0]
         wrench = row[WRENCH : WRENCH + 6] + 0.0  # turns -0.0 into 0.0
-        return self.met[: int(row[HITS])].tolist(), wrench.tobytes(), int(row[UNKNOWNS])
+        return self.hits[: int(row[HITS])].tolist(), wrench.tobytes(), int(row[UNKNOWNS])

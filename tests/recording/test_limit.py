@@ -116,7 +116,7 @@ def test_where_no_frame_would_fit_nothing_is_begun(
 def test_a_session_goes_on_without_its_recording(sphere: PointShell, tmp_path: Path) -> None:
     path = tmp_path / "short.hdbrec"
     with floored(make(tmp_path, bits=6)) as env, Session(
-        env.url, sphere, still(0.010), law="plane", rate=RATE, seconds=2.0, budget_bytes=4 << 20,
+        env.url, sphere, still(0.010), law="plane", rate=RATE, seconds=2.0,
         record=path, record_limit_bytes=20_000,
     ) as session:  # fmt: skip
         assert session.recording_ended is None

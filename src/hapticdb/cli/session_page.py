@@ -264,7 +264,7 @@ def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
 
     names: dict[int, str] = {}
     with suppress(DatabaseError):
-        if ids and not cells.is_away:
+        if ids and not cells.is_lost:
             with hapticdb.open(cells.url, read_only=True) as env:
                 names = {obj.id: obj.name for obj in env.objects()}
     listed = [names.get(i, f"object {i}") for i in ids]

@@ -260,8 +260,8 @@ class SessionHost:
             shell=asked.shell,
             rate=self.rate,
             law=SMOOTH,
-            where=running.cells.felt.where,
-            exclude=running.cells.felt.exclude,
+            where=running.cells.filter.where,
+            exclude=running.cells.filter.exclude,
             coupling=asdict(asked.coupling),
             budget_points=asked.budget_points,
         )

@@ -58,7 +58,7 @@ class SharedTables:
     def release(self, cells: ResidentCells) -> None:
         """Give a table back; the last session frees it."""
         with self._making:
-            felt = cells.felt
+            felt = cells.filter
             self._uses[felt] -= 1
             if self._uses[felt]:
                 return

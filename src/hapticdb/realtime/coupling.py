@@ -16,6 +16,10 @@ from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.direct import DirectTerms
 from hapticdb.pointshell.shell import PointShell
 
+HOLD = FADE = 0.02
+"""Seconds. In unknown cells the last wrench is kept for `HOLD` and then falls to zero in `FADE`. It
+rises again within `FADE`, in at least four frames; so it does when a session starts and when the
+clutch closes. Larger: a longer gap is bridged, with a force that may be wrong."""
 MOST = 1e9
 """Largest number of a `Coupling`, in its unit: more than any device has."""
 
@@ -30,8 +34,8 @@ class Coupling:
     (`hapticdb.devices.profiles`), and the stiffness is lowered to what stays stable
     (`hapticdb.devices.stability`).
 
-    Without distances there is no spring: `cap`, `torque_cap`, `profile`, `hold` and `fade` then
-    bound what is rendered directly, and the other numbers are refused.
+    Without distances there is no spring: `cap`, `torque_cap` and `profile` then bound what is
+    rendered directly, and the other numbers are refused.
 
     Attributes
     ----------
@@ -53,10 +57,6 @@ class Coupling:
         none, one period of the loop.
     profile : DeviceProfile or None
         Takes the place of the device's own profile.
-    hold, fade : float
-        In unknown cells the last wrench is kept for `hold` seconds and then falls to zero in `fade`
-        seconds. It rises again within `fade`, in at least four frames. It rises in the same way
-        when a session starts, and falls and rises when the clutch opens and closes.
 
     Raises
     ------
@@ -71,8 +71,6 @@ class Coupling:
     damping: float | None = None
     delay: float | None = None
     profile: DeviceProfile | None = None
-    hold: float = 0.02
-    fade: float = 0.02
 
     def __post_init__(self) -> None:
         for name, unit in (
@@ -80,8 +78,6 @@ class Coupling:
             ("cap", "N"),
             ("turn_stiffness", "N m/rad"),
             ("torque_cap", "N m"),
-            ("hold", "s"),
-            ("fade", "s"),
         ):
             value = getattr(self, name)
             if value is not None and not 0.0 < value <= MOST:
@@ -133,8 +129,6 @@ class Coupling:
             delay=allowed.delay,
             scale=scale,
             radius=radius,
-            hold=self.hold,
-            fade=self.fade,
         )
 
     def direct(self, profile: DeviceProfile, scale: float, radius: float) -> "DirectRendering":
@@ -159,8 +153,6 @@ class Coupling:
             torque_cap=_first(self.torque_cap, profile.torque_cap, cap * radius / scale),
             scale=scale,
             radius=radius,
-            hold=self.hold,
-            fade=self.fade,
         )
 
 
@@ -176,12 +168,14 @@ class SettledCoupling:
         K, N/m at the device, and the one that was asked for.
     lowered : str or None
         One line: what lowered the stiffness; None if nothing did.
-    cap, turn_stiffness, torque_cap, damping, delay, hold, fade : float
+    cap, turn_stiffness, torque_cap, damping, delay : float
         As for `Coupling`.
     scale : float
         S, metres of the scene for one metre of the device.
     radius : float
         Distance of the tool's farthest point from its centre, metres of the scene.
+    hold, fade : float
+        See `HOLD`.
     """
 
     profile: str
@@ -195,8 +189,8 @@ class SettledCoupling:
     delay: float
     scale: float
     radius: float
-    hold: float
-    fade: float
+    hold: float = HOLD
+    fade: float = FADE
 
     def spring(self) -> DeviceSpring:
         """Return the numbers in the kernel's form."""
@@ -235,8 +229,8 @@ class DirectRendering:
     torque_cap: float
     scale: float
     radius: float
-    hold: float
-    fade: float
+    hold: float = HOLD
+    fade: float = FADE
 
     def terms(self) -> DirectTerms:
         """Return the numbers in the kernel's form."""

@@ -78,25 +78,25 @@ class _Feeling:
 
     def __init__(self, scene: _DriveInputs, cells: Cells, law: ForceLaw) -> None:
         self._scene, self._cells, self._law = scene, cells, law.for_kernels
-        self.met = np.empty(len(scene.clusters.points), dtype=np.int64)
+        self.hits = np.empty(len(scene.clusters.points), dtype=np.int64)
         self.counts = counts_of(1)
 
     def frame(self, poses: Floats, missed: Indices, out: Floats) -> None:
         """Compute the frame at poses (1, 4, 4) into out (1, RESULTS), unless the pose is NaN.
 
-        `met` takes the indices of the hits, `missed` the unknown cells, and `counts` what the
+        `hits` takes the indices of the hits, `missed` the unknown cells, and `counts` what the
         budget left out.
         """
         scene = self._scene
         if scene.sleepers is None:
             feeling.feel_kernel(
-                self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.met,
+                self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.hits,
                 missed, out,
             )  # fmt: skip
             return
         self.counts[:] = 0
         budget.feel_within(
-            self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.met,
+            self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.hits,
             missed, out, scene.sleepers, scene.budget, self.counts,
         )  # fmt: skip
 
@@ -168,7 +168,7 @@ class DirectDrive(_Drive):
 
     def touching(self, n_hits: int) -> Indices:
         """Indices of the last frame's hits, as many as it had."""
-        return self._feeling.met[:n_hits]
+        return self._feeling.hits[:n_hits]
 
     def feel(self) -> None:
         """Nothing to do: each step is a frame of the law at the tool's pose."""
@@ -194,7 +194,7 @@ class SmoothDrive(_Drive):
         n_points = len(scene.clusters.points)
         self._follower = np.zeros((), FOLLOWER)
         self._field = np.zeros((FIELD_ROWS, n_points))
-        self._met = np.zeros((MET_ROWS, n_points), dtype=np.int64)
+        self._near_points = np.zeros((MET_ROWS, n_points), dtype=np.int64)
         self._missed_here = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._felt_here = np.zeros((1, RESULTS))
         self._felt, self._unknown = self._tool["felt"], self._sent["unknown"]
@@ -206,7 +206,7 @@ class SmoothDrive(_Drive):
         scene = self._scene
         quasistatic.advance(
             scene.cells, scene.row, scene.clusters, scene.place, self._spring, scene.servo,
-            self._follower, dt, self._field, self._met, scene.missed,
+            self._follower, dt, self._field, self._near_points, scene.missed,
         )  # fmt: skip
 
     @property
@@ -220,10 +220,10 @@ class SmoothDrive(_Drive):
         The voxels of these points may be free: the fetching process looks around them.
         """
         if not self._follower["is_loose"]:
-            return self._met[FELT_POINTS, :n_hits]
+            return self._near_points[FELT_POINTS, :n_hits]
         side, n_near = int(self._follower["side"]), int(self._follower["n_near"])
         distances = self._field[NEAR + side * NEAR_ROWS + U, :n_near]
-        return self._met[NEAR_POINTS + side, :n_near][distances < FLOOR]
+        return self._near_points[NEAR_POINTS + side, :n_near][distances < FLOOR]
 
     def feel(self) -> None:
         """Compute the law's frame at the tool's pose for the recording, after `step`.

@@ -20,9 +20,9 @@ from hapticdb.realtime.tracking import SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
-    AWAY,
     FIRST_VERSION,
     HEARTBEAT,
+    LOST,
     STOP,
     CellTable,
 )
@@ -65,8 +65,6 @@ RETRY = (0.05, 0.5)
 
 Wrap = Callable[[Store], Store]
 """Takes the store that a fetching process has opened, and returns the store that it uses."""
-Clock = Callable[[], float]
-"""Returns seconds since some fixed instant; the time never goes back."""
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,7 @@ class FetchRequest:
     """Request to a fetching process.
 
     url, grid : of the environment, which must have that grid; descriptor, n_slots : file descriptor
-    and number of slots of the table's memory; felt : which objects are felt; wrap : a hook for
+    and number of slots of the table's memory; filter : which objects are felt; wrap : a hook for
     tests.
     """
 
@@ -82,7 +80,7 @@ class FetchRequest:
     descriptor: int
     n_slots: int
     grid: Grid
-    felt: Filter = ALL
+    filter: Filter = ALL
     wrap: Wrap | None = None
 
 
@@ -104,7 +102,9 @@ class Fetcher:
         If the environment cannot be opened.
     """
 
-    def __init__(self, request: FetchRequest, *, clock: Clock = time.monotonic) -> None:
+    def __init__(
+        self, request: FetchRequest, *, clock: Callable[[], float] = time.monotonic
+    ) -> None:
         self.request = request
         self.table = CellTable(request.descriptor, request.n_slots)
         self.tracker = SessionTracker(self.table, request.grid)
@@ -117,7 +117,7 @@ class Fetcher:
             # if an earlier fetching process has died, sessions already use the table
             self.tracker.read_desk(0.0, self.lookahead)
             self.residency = Residency(
-                self.store, self.table, request.felt.exclude, where=request.felt.where,
+                self.store, self.table, request.filter.exclude, where=request.filter.where,
                 urgent=self.tracker.urgent_cells(), clock=clock,
             )  # fmt: skip
         except BaseException:
@@ -189,7 +189,7 @@ class Fetcher:
         control = self.table.cells.control
         if self._is_confirmed:
             self._confirmed_at = self._now
-            control[AWAY] = 0
+            control[LOST] = 0
             control[HEARTBEAT] = begun
 
     def _note_lag(self) -> None:
@@ -236,12 +236,6 @@ class Fetcher:
         figures["evicted"] = self._evicted_before + writer.n_evicted
         figures["resident"] = writer.n_resident
         figures["empty"] = writer.n_empty
-
-    # -- when the database is away -----------------------------------------------------------
-
-    def count_loss(self) -> None:
-        """Count that the database was lost."""
-        self._figures["losses"] += 1
 
     def reopen(self) -> None:
         """Open the database again, and follow the writes made meanwhile."""
@@ -301,9 +295,9 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                 raise
             if not is_lost:
                 sender.send("lost", str(error))  # first, so that who sees the mark finds the cause
-                table.cells.control[AWAY] = 1
+                table.cells.control[LOST] = 1
                 if fetcher is not None:
-                    fetcher.count_loss()
+                    table.desk.figures["losses"] += 1
             is_lost = True
             time.sleep(patience)
             patience = min(2 * patience, at_most)

@@ -70,10 +70,9 @@ class _ForkServer:
     """The fork server of this process, from its own side."""
 
     def __init__(self) -> None:
-        self._owner = os.getpid()
         self._channel, theirs = socket.socketpair()
         self._channel.settimeout(ANSWER_PATIENCE)
-        call = f"from {__name__} import serve; serve({theirs.fileno()}, {self._owner})"
+        call = f"from {__name__} import serve; serve({theirs.fileno()}, {os.getpid()})"
         with theirs:
             self._popen = subprocess.Popen(  # noqa: S603 - our own module, by this interpreter
                 [sys.executable, "-c", call],
@@ -83,11 +82,6 @@ class _ForkServer:
                 # Ctrl-C in a terminal goes to a whole process group; only the owner handles it
                 start_new_session=True,
             )
-
-    @property
-    def is_ours(self) -> bool:
-        """Whether it serves this process, and not the one that this one was forked from."""
-        return self._owner == os.getpid()
 
     def give(self, wanted: Order, descriptors: Sequence[int] = ()) -> None:
         """Give an order, with the descriptors of its process."""
@@ -116,18 +110,18 @@ _server: _ForkServer | None = None
 _lock = threading.Lock()
 
 
-def _forget_lock() -> None:
-    """In a forked copy: a thread that is not copied may hold it."""
-    global _lock  # noqa: PLW0603 - one a process
-    _lock = threading.Lock()
+def _forget() -> None:
+    """In a forked copy: the server is its parent's, whose other threads may hold the lock."""
+    global _server, _lock
+    _server, _lock = None, threading.Lock()
 
 
-os.register_at_fork(after_in_child=_forget_lock)
+os.register_at_fork(after_in_child=_forget)
 
 
 def _known() -> _ForkServer:
     global _server  # noqa: PLW0603 - one a process
-    if _server is None or not _server.is_ours:
+    if _server is None:
         _server = _ForkServer()
     return _server
 
@@ -135,7 +129,7 @@ def _known() -> _ForkServer:
 @atexit.register
 def _end() -> None:
     global _server  # noqa: PLW0603 - one a process
-    if _server is not None and _server.is_ours:
+    if _server is not None:
         _server.end()
     _server = None
 
@@ -158,21 +152,10 @@ def start(
 ) -> tuple[int, int]:
     """Start a process that runs a function.
 
-    Parameters
-    ----------
-    work : str
-        The function, as ``package.module:function``.
-    purposes : sequence of str
-        What is loaded before: the function's module and the kernels of these purposes.
-    streams : sequence of int
-        Descriptors of its standard input, output and errors.
-    numbers : sequence of int
-        More descriptors, which it has under the same numbers.
+    work, purposes : as for `Order`; streams : descriptors of its standard input, output and errors;
+    numbers : more descriptors, which it has under the same numbers.
 
-    Returns
-    -------
-    tuple
-        Process id, and a descriptor that stands for the process.
+    Returns its process id, and a descriptor that stands for it.
 
     Raises
     ------

@@ -42,7 +42,7 @@ from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
 from hapticdb.resident.sleepers import sleepers_of
-from hapticdb.resident.table import AWAY, HEARTBEAT, STOP, CellTable
+from hapticdb.resident.table import HEARTBEAT, LOST, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
@@ -151,7 +151,7 @@ class Loop:
         control = self.cells.control
         self._place()
         while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
-            if control[AWAY]:
+            if control[LOST]:
                 break
             if asked and session["heard"] >= asked:
                 if session["n_missing"] == 0:

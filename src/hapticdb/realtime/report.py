@@ -209,11 +209,6 @@ class Report(Counts):
         """Share of the looked-up points whose cell was resident."""
         return 1.0 - self.unknown_points / self.points if self.points else 1.0
 
-    @property
-    def is_direct(self) -> bool:
-        """Whether the frames' wrenches went to the device directly, without a coupling."""
-        return isinstance(self.coupling, DirectRendering)
-
     def figures(self) -> dict[str, object]:
         """All fields as plain numbers and strings, for JSON; times in seconds."""
         plain = asdict(self)
@@ -225,7 +220,7 @@ class Report(Counts):
             for times in ("lateness", "elapsed"):
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
-        plain["hit_rate"], plain["is_direct"] = self.hit_rate, self.is_direct
+        plain["hit_rate"] = self.hit_rate
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = self.proportions.record()
         return plain

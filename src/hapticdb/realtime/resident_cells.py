@@ -14,7 +14,7 @@ from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells, check_distances
-from hapticdb.resident.table import AWAY, DEFAULT_BUDGET, HEARTBEAT, STOP, CellTable
+from hapticdb.resident.table import DEFAULT_BUDGET, HEARTBEAT, LOST, STOP, CellTable
 from hapticdb.store.connect import open_store, redact
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
@@ -110,7 +110,7 @@ class ResidentCells:
 
     Attributes
     ----------
-    felt : Filter
+    filter : Filter
         The words of `where` and `exclude`.
     first_objects, left_out : tuple
         All objects when the cells were made, and the ids of those that were not felt.
@@ -130,14 +130,14 @@ class ResidentCells:
         wrap: Wrap | None = None,
     ) -> None:
         self.url = url
-        self.felt = Filter(where, exclude)
+        self.filter = Filter(where, exclude)
         prepare(FETCH, PURPOSES)  # while the environment is read
         self.grid, has_distances = self._read_environment(distances)
         compile_missing(entries_for(*PURPOSES))  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(
-            url, self.table.descriptor, self.table.n_slots, self.grid, self.felt, wrap
+            url, self.table.descriptor, self.table.n_slots, self.grid, self.filter, wrap
         )
         try:
             self._process = self._start_process()
@@ -164,7 +164,7 @@ class ResidentCells:
         try:
             check_cells(store)
             self.first_objects = tuple(store.objects())
-            left_out = self.felt.left_out(self.first_objects, store.url)
+            left_out = self.filter.left_out(self.first_objects, store.url)
             for error in left_out.missing:
                 raise error
             if distances:
@@ -212,15 +212,15 @@ class ResidentCells:
         return self._process.pid
 
     @property
-    def is_away(self) -> bool:
+    def is_lost(self) -> bool:
         """Whether the database does not answer now."""
         control = self.table.cells.control
-        return bool(control[AWAY]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
+        return bool(control[LOST]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
 
     @property
     def database_lost(self) -> str | None:
         """One line: why the database cannot be read now; None while it can. As of `supervise`."""
-        is_lost = bool(self.table.cells.control[AWAY])
+        is_lost = bool(self.table.cells.control[LOST])
         return (self._lost_by or f"{redact(self.url)} does not answer") if is_lost else None
 
     def supervise(self) -> None:

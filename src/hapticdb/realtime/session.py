@@ -26,8 +26,7 @@ from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import sleeps_by_itself
-from hapticdb.resident.table import DEFAULT_BUDGET, anonymous_memory
-from hapticdb.store.finding import Words
+from hapticdb.resident.table import anonymous_memory
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
@@ -56,7 +55,8 @@ class Session:
     Parameters
     ----------
     cells : ResidentCells or str
-        The environment: its resident cells, which several sessions may share, or its URL.
+        The environment: its resident cells, which several sessions may share, or its URL. With a
+        URL all objects are felt, and cells take the default budget.
     shell : PointShell
         The tool.
     device : Device
@@ -85,10 +85,6 @@ class Session:
         one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has
         clusters that sleep far from everything, which changes no result (docs/realtime.md, Large
         tools).
-    budget_bytes : int or None
-    where, exclude : iterable of int or str
-        As for `ResidentCells`; only with a URL, because sessions that share cells feel the same
-        objects.
     record : path or None
         A file for the recording; see `hapticdb.recording.file.Recorder`.
     append_recording, replace_recording : bool
@@ -131,9 +127,6 @@ class Session:
         policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
         budget_points: int | None = None,
-        budget_bytes: int | None = None,
-        where: Words = (),
-        exclude: Words = (),
         record: str | os.PathLike[str] | None = None,
         append_recording: bool = False,
         replace_recording: bool = False,
@@ -149,7 +142,11 @@ class Session:
         self.timing = Timing(rate, is_fifo, processor)
         self._owns_cells = isinstance(cells, str)
         needs_distances = None if law is None else is_smooth(law)
-        self.cells = _cells_of(cells, budget_bytes, where, exclude, needs_distances)
+        if isinstance(cells, str):
+            cells = ResidentCells(cells, distances=needs_distances)
+        elif cells.is_closed:
+            raise UsageError("these cells are closed: make others")
+        self.cells = cells
         self.law = as_law(law) or SMOOTH
         self._check_distances(law)
         self.coupling = self._settled(coupling or Coupling(), device)
@@ -255,8 +252,8 @@ class Session:
             shell=self.shell,
             rate=self.timing.rate,
             law=self.law,
-            where=self.cells.felt.where,
-            exclude=self.cells.felt.exclude,
+            where=self.cells.filter.where,
+            exclude=self.cells.filter.exclude,
             coupling=asdict(self.coupling),
             budget_points=self.budget_points,
         )
@@ -429,26 +426,6 @@ class Session:
         if self._memory >= 0:
             os.close(self._memory)
             self._memory = -1
-
-
-def _cells_of(
-    cells: ResidentCells | str,
-    budget_bytes: int | None,
-    where: Words,
-    exclude: Words,
-    distances: bool | None,  # noqa: FBT001 - as of ResidentCells
-) -> ResidentCells:
-    """Return the given resident cells, or make new ones for the environment at a URL."""
-    if isinstance(cells, str):
-        budget_bytes = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
-        return ResidentCells(
-            cells, budget_bytes=budget_bytes, where=where, exclude=exclude, distances=distances
-        )
-    if budget_bytes is not None or tuple(where) or tuple(exclude):
-        raise UsageError("these cells have a budget and a filter already: give a URL instead")
-    if cells.is_closed:
-        raise UsageError("these cells are closed: make others")
-    return cells
 
 
 def _check_choices(rate: float, seconds: float | None, staleness: float, policy: str) -> None:

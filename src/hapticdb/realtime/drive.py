@@ -21,10 +21,8 @@ from hapticdb.kernels.hand.near_points import (
     NEAR_ROWS,
     U,
 )
-from hapticdb.kernels.large import budget
 from hapticdb.kernels.large.sleeping import LEFT_OUT, Sleepers
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS, pose_numbers
-from hapticdb.kernels.resident import feeling
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     REVISION,
@@ -36,6 +34,7 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import ForceLaw
+from hapticdb.resident.frames import feel_at
 from hapticdb.resident.sleepers import counts_of
 
 MERGES_FROM = 4096
@@ -73,36 +72,8 @@ class _DriveInputs(Protocol):
     """Most points near something that a frame looks at."""
 
 
-class _Feeling:
-    """Frames of the law at one pose, and the memory that they need."""
-
-    def __init__(self, scene: _DriveInputs, cells: Cells, law: ForceLaw) -> None:
-        self._scene, self._cells, self._law = scene, cells, law.for_kernels
-        self.hits = np.empty(len(scene.clusters.points), dtype=np.int64)
-        self.counts = counts_of(1)
-
-    def frame(self, poses: Floats, missed: Indices, out: Floats) -> None:
-        """Compute the frame at poses (1, 4, 4) into out (1, RESULTS), unless the pose is NaN.
-
-        `hits` takes the indices of the hits, `missed` the unknown cells, and `counts` what the
-        budget left out.
-        """
-        scene = self._scene
-        if scene.sleepers is None:
-            feeling.feel_kernel(
-                self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.hits,
-                missed, out,
-            )  # fmt: skip
-            return
-        self.counts[:] = 0
-        budget.feel_within(
-            self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self.hits,
-            missed, out, scene.sleepers, scene.budget, self.counts,
-        )  # fmt: skip
-
-
 class _Drive:
-    """What both drives have: the tool's state, and a copy of it to step back to.
+    """Frames of the law at one pose, and the tool's state, with a copy of it to step back to.
 
     Attributes
     ----------
@@ -112,10 +83,25 @@ class _Drive:
 
     def __init__(self, scene: _DriveInputs, cells: Cells, law: ForceLaw, radius: float) -> None:
         self.radius = radius
-        self._scene, self._feeling = scene, _Feeling(scene, cells, law)
+        self._scene, self._cells, self._law = scene, cells, law.for_kernels
+        self._hits = np.empty(len(scene.clusters.points), dtype=np.int64)
+        self._counts = counts_of(1)
         self._tool, self._sent = scene.servo["tool"], scene.servo["sent"]
         self._tool_before = self._tool.copy()
         self._left_out = self._sent["left_out"]
+
+    def _frame(self, poses: Floats, missed: Indices, out: Floats) -> int:
+        """Compute the frame at poses (1, 4, 4) into out (1, RESULTS), unless the pose is NaN.
+
+        `_hits` takes the indices of the hits, `missed` the unknown cells. Returns how many points
+        the budget left out.
+        """
+        scene = self._scene
+        feel_at(
+            self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self._hits,
+            missed, out, scene.sleepers, scene.budget, self._counts,
+        )  # fmt: skip
+        return int(self._counts[0, LEFT_OUT])
 
     def remember(self) -> None:
         """Store the state, so that `step_back` can return to it."""
@@ -162,13 +148,13 @@ class DirectDrive(_Drive):
         # read before the frame: what is written meanwhile is then felt under an older revision
         revision = control[REVISION + control[VERSION] % BUFFERS]
         poses_of(self._hand_pose, self._at_hand)
-        self._feeling.frame(self._at_hand, scene.missed, self._felt)
+        left_out = self._frame(self._at_hand, scene.missed, self._felt)
         direct.render(self._terms, scene.clusters.center, scene.servo, self._felt, revision, dt)
-        self._left_out[()] = self._feeling.counts[0, LEFT_OUT]
+        self._left_out[()] = left_out
 
     def touching(self, n_hits: int) -> Indices:
         """Indices of the last frame's hits, as many as it had."""
-        return self._feeling.hits[:n_hits]
+        return self._hits[:n_hits]
 
     def feel(self) -> None:
         """Nothing to do: each step is a frame of the law at the tool's pose."""
@@ -232,7 +218,7 @@ class SmoothDrive(_Drive):
         by now: `sent.unknown` counts them, and a replay leaves the frame out.
         """
         felt = self._felt_here[0]
-        self._feeling.frame(self._scene.pose[None], self._missed_here, self._felt_here)
-        self._left_out[()] = max(self._left_out, self._feeling.counts[0, LEFT_OUT])
+        left_out = self._frame(self._scene.pose[None], self._missed_here, self._felt_here)
+        self._left_out[()] = max(self._left_out, left_out)
         self._felt[:] = felt
         self._unknown += np.int64(felt[UNKNOWNS])

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.large import budget as budgets
 from hapticdb.kernels.large import sleeping
+from hapticdb.kernels.large.sleeping import Sleepers
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
@@ -23,7 +24,9 @@ from hapticdb.kernels.resident.cells import (
     UNKNOWN,
     UNKNOWNS,
     WRENCH,
+    Cells,
     Clusters,
+    Place,
 )
 from hapticdb.kernels.resident.feeling import bounding_spheres, feel_kernel
 from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
@@ -153,6 +156,26 @@ def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Su
     places[is_point] = clusters.points[np.repeat(~is_small, clusters.run)[:n_points], :3]
     reach = min(float(radii[is_small].max()) + beyond, SMALL)
     return Surroundings(places, reach, clusters.run, first)
+
+
+def feel_at(
+    cells: Cells, row: int, clusters: Clusters, poses: Floats, place: Place, law: object,
+    hits: NDArray[np.int64], missed: NDArray[np.int64], out: Floats, sleepers: Sleepers | None,
+    budget: int, counts: NDArray[np.int64],
+) -> int:  # fmt: skip
+    """Compute the frames at poses (M, 4, 4) -> how many are done: the others are not rigid.
+
+    The parameters are those of `kernels.large.budget.feel_within`. Without `sleepers` all runs are
+    tested, and `counts` stays as it is.
+    """
+    if sleepers is None:
+        return int(feel_kernel(cells, row, clusters, poses, place, law, hits, missed, out))
+    counts[:] = 0
+    return int(
+        budgets.feel_within(
+            cells, row, clusters, poses, place, law, hits, missed, out, sleepers, budget, counts
+        )
+    )
 
 
 class ResidentFrames:
@@ -297,24 +320,18 @@ class ResidentFrames:
     ) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
-        place = self.residency.place
-        if self.budget < len(self.shell):
-            done = self._run_within_budget(poses[part], out[part], counts[part])
-        elif self.sleepers is not None:
-            counts[part] = 0
-            done = budgets.feel_within(
-                self.cells, self._row, self.clusters, poses[part], place, self.law, self.hits,
-                self.missed, out[part], self.sleepers, self.budget, counts[part],
-            )  # fmt: skip
-        else:
-            done = feel_kernel(
-                self.cells, self._row, self.clusters, poses[part], place, self.law, self.hits,
-                self.missed, out[part],
-            )  # fmt: skip
+        feel = self._feel_within_budget if self.budget < len(self.shell) else self._feel
+        done = feel(poses[part], out[part], counts[part])
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")
 
-    def _run_within_budget(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
+    def _feel(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
+        return feel_at(
+            self.cells, self._row, self.clusters, poses, self.residency.place, self.law, self.hits,
+            self.missed, out, self.sleepers, self.budget, counts,
+        )  # fmt: skip
+
+    def _feel_within_budget(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
         """Compute frames with a budget; returns the number done.
 
         Which points a frame beyond its budget looks at depends on all cells beside its near runs,
@@ -322,13 +339,9 @@ class ResidentFrames:
         """
         missed = self.missed
         for n in range(len(poses)):
+            one = slice(n, n + 1)
             for _ in range(MOST_ROUNDS):
-                counts[n] = 0
-                if not budgets.feel_within(
-                    self.cells, self._row, self.clusters, poses[n : n + 1], self.residency.place,
-                    self.law, self.hits, missed, out[n : n + 1], self.sleepers, self.budget,
-                    counts[n : n + 1],
-                ):  # fmt: skip
+                if not self._feel(poses[one], out[one], counts[one]):
                     return n
                 if not out[n, UNKNOWNS]:
                     break

@@ -69,7 +69,7 @@ def read_at(device: Device, clock: Hands, seconds: float) -> Reading:
 
 @pytest.mark.parametrize("name", MAKERS)
 @given(instant=st.floats(0.01, 40.0))
-@settings(max_examples=40, deadline=None)
+@settings(max_examples=10, deadline=None)
 def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, instant: float) -> None:
     clock = Hands()
     device = MAKERS[name](clock)

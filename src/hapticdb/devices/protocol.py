@@ -43,28 +43,18 @@ class Reading(NamedTuple):
 
 
 class Device(Protocol):
-    """A haptic device: it reports where the hand is, and pushes the hand."""
+    """A haptic device: it reports where the hand is, and pushes the hand.
+
+    Both methods raise `DeviceError` if the device does not answer or was unplugged.
+    """
 
     def read(self) -> Reading:
-        """Return where the hand is now; a pose of NaN while the device does not know.
-
-        `Reader` checks the reading in every frame; a reading of the wrong kind ends the session.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not answer or was unplugged.
-        """
+        """Return where the hand is now; a pose of NaN while the device does not know."""
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push the hand with a wrench (6,), N and N m in the device's frame, until the next call.
 
         The device reduces the wrench to what its motors can do.
-
-        Raises
-        ------
-        DeviceError
-            If the device does not answer or was unplugged.
         """
 
 
@@ -73,15 +63,7 @@ class SupportsOpen(Protocol):
     """A device that is opened once, in the process that uses it."""
 
     def open(self) -> None:
-        """Connect to the hardware.
-
-        Raises
-        ------
-        DeviceError
-            If there is no such device.
-        MissingExtraError
-            If the package that drives the device is not installed.
-        """
+        """Connect to the hardware; raises `DeviceError` or `MissingExtraError`."""
 
 
 @runtime_checkable
@@ -116,11 +98,7 @@ class Reader:
     integers), of another memory order or read-only are copied; lists, masked arrays, objects and
     complex numbers are refused.
 
-    Notes
-    -----
-    The check adds 2 to 4 us to a frame: a fifth for the arrays' type, shape and layout, the rest
-    for the rotation. It adds 11 us where arrays are copied (one virtual processor of a shared Xeon,
-    with the host idle and busy).
+    The check adds 2 to 4 us to a frame, and 11 us where arrays are copied (a shared Xeon).
     """
 
     def __init__(self, device: Device) -> None:

@@ -59,12 +59,8 @@ def test_what_no_mesh_uses_is_not_read(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("key", "value"),
     [
-        ("buffers", [7]),
         ("buffers", {"a": 1}),
-        ("bufferViews", "x"),
         ("accessors", [None]),
-        ("meshes", [[]]),
-        ("nodes", [1]),
         ("scenes", 3),
     ],
 )
@@ -213,7 +209,7 @@ def _laz(path: Path, point_format: int, n_points: int) -> Path:
     return path
 
 
-@pytest.mark.parametrize("point_format", [1, 3, 6, 7, 8, 9, 10])
+@pytest.mark.parametrize("point_format", [3, 6, 10])
 def test_packed_points_of_every_kind_are_read_in_their_chunks(
     tmp_path: Path, point_format: int
 ) -> None:
@@ -222,7 +218,7 @@ def test_packed_points_of_every_kind_are_read_in_their_chunks(
     assert len(file.parts[0].vertices) == n_points
 
 
-@pytest.mark.parametrize("layer", [0, 1, 5, 8, 18])
+@pytest.mark.parametrize("layer", [0, 8])
 def test_a_layer_that_is_longer_than_its_chunk_is_refused(tmp_path: Path, layer: int) -> None:
     """A layer length of 2^28 in a file of 787 bytes once took 244 MiB of memory."""
     path = _laz(tmp_path / "a.laz", 6, 40)

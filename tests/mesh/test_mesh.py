@@ -262,15 +262,6 @@ def test_las_points_keep_their_place(tmp_path: Path) -> None:
         np.testing.assert_allclose(part.bounds, np.array([[1, 10.5, -4], [2, 20, 3]]))
 
 
-def test_defects_add_and_describe() -> None:
-    total = Defects(degenerate=12) + Defects(non_finite=3)
-    assert total.describe() == "12 degenerate, 3 non-finite"
-    assert total.as_dict()["degenerate"] == 12
-    assert Defects().describe() == ""
-    assert not Defects()
-    assert total
-
-
 @given(
     st.lists(
         st.tuples(st.integers(-2, 6), st.integers(-2, 6), st.integers(-2, 6)),
@@ -292,10 +283,10 @@ def test_what_stays_is_sound_and_everything_is_accounted_for(
     parsed = Parsed([Shape(vertices, faces)], [Placement("p", 0, np.eye(4))])
     if not sound:
         with pytest.raises(UnreadableError):
-            clean(parsed, 1.0)
+            clean(parsed, 1.0, "p.obj")
         return
-    cleaned = clean(parsed, 1.0)
-    kept, indices = cleaned.geometries[0]
+    cleaned = clean(parsed, 1.0, "p.obj")
+    kept, indices = cleaned.parts[0].vertices, cleaned.parts[0].faces
     assert indices is not None
     np.testing.assert_array_equal(kept[indices], vertices[np.array(sound)])
     assert cleaned.defects.out_of_range == len(corners) - len(inside)

@@ -81,27 +81,29 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
             # The files that it refers to are listed under the limit of this file alone.
             _limit_memory(allowance(path, _bytes_beside(path)), None)
-        cleaned = parse(path, request["metres"])
+        file = parse(path, request["metres"])
     except (UnreadableError, MemoryError, ImportError) as error:
         if before is not None:
             resource.setrlimit(_memory_kind(), before)
         cause = str(error) if isinstance(error, UnreadableError) else cause_of(error)
         out.write(json.dumps({"error": cause}).encode() + b"\n")
         return
-    arrays = [a for geometry in cleaned.geometries for a in geometry if a is not None]
+    first = {id(part.shared): part for part in file.parts}  # one for each geometry
+    number = {key: n for n, key in enumerate(first)}
     head = {
         "geometries": [
-            [len(vertices), None if faces is None else len(faces)]
-            for vertices, faces in cleaned.geometries
+            [len(part.vertices), None if part.faces is None else len(part.faces)]
+            for part in first.values()
         ],
         "parts": [
-            [part.name, part.geometry, part.world_from_part.tolist(), part.defects.as_dict()]
-            for part in cleaned.parts
+            [part.name, number[id(part.shared)], part.world_from_part.tolist(), vars(part.defects)]
+            for part in file.parts
         ],
-        "defects": cleaned.defects.as_dict(),
-        "names_unit": cleaned.names_unit,
-        "up": cleaned.up,
+        "defects": vars(file.defects),
+        "names_unit": file.names_unit,
+        "up": file.up,
     }
+    arrays = [a for part in first.values() for a in (part.vertices, part.faces) if a is not None]
     out.write(json.dumps(head).encode() + b"\n")
     out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in arrays)
 

@@ -1,76 +1,48 @@
 """Checks every number that a reader found, counts what is wrong, and returns only sound parts."""
 
 import unicodedata
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.part import Defects
+from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
 
 Scalar = TypeVar("Scalar", bound=np.generic)
-Geometry = tuple[NDArray[np.float64], NDArray[np.int64] | None]
 
 _FLAT = 1e-12
 """A triangle is degenerate when twice its area is at most this times its longest edge squared:
 rounding errors of float64 edges are smaller. A larger value also counts thin triangles."""
 
 
-@dataclass(frozen=True)
-class CleanPart:
-    """A part without its arrays: `geometry` is an index into `Cleaned.geometries`."""
+def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
+    """Refuse and count geometry of the file `link` that cannot be used; the rest in metres.
 
-    name: str
-    geometry: int
-    world_from_part: NDArray[np.float64]
-    defects: Defects
-
-
-@dataclass(frozen=True)
-class Cleaned:
-    """Sound parts of a file in metres, the arrays that they share, and the defects of the file.
-
-    names_unit : whether the file names its unit; up : the axis that points up by the file, or None.
-    """
-
-    geometries: list[Geometry]
-    parts: list[CleanPart]
-    defects: Defects
-    names_unit: bool = False
-    up: str | None = None
-
-
-def clean(parsed: Parsed, metres: float | None) -> Cleaned:
-    """Refuse and count geometry that cannot be used; convert the rest to metres.
-
-    Parameters
-    ----------
-    parsed : Parsed
-        Contents of a file.
-    metres : float or None
-        Length of the unit of a file without a unit of its own; None if none was given.
+    metres : length of the unit of a file without a unit of its own; None if none was given.
     """
     said = (parsed.metres, metres, parsed.likely_metres)
     scale = next((length for length in said if length is not None), 1.0)
     if not (np.isfinite(scale) and scale > 0):
         raise UnreadableError(f"its unit of length is {scale} metres")
     checked = [_checked(shape, scale) for shape in parsed.shapes]
-    parts: list[CleanPart] = []
+    shared: list[dict[str, str]] = [{} for _ in checked]
+    parts: list[Part] = []
     total = parsed.defects
     names = _Names()
-    worlds, is_near = _worlds(parsed.placements, [geometry for geometry, _ in checked], scale)
+    worlds, is_near = _worlds(parsed.placements, [vertices for vertices, _, _ in checked], scale)
     is_flat = _are_flat(worlds)
     for n, placement in enumerate(parsed.placements):
-        (vertices, faces), defects = checked[placement.shape]
+        vertices, faces, defects = checked[placement.shape]
         n_found = len(vertices if faces is None else faces)
         if n_found and is_near[n]:
             if faces is not None and is_flat[n]:
                 flattened = _count_degenerate(vertices, faces, worlds[n, :3, :3])
                 defects = replace(defects, degenerate=flattened)
             name = names.unique(_printable(placement.name))
-            parts.append(CleanPart(name, placement.shape, worlds[n], defects))
+            known = shared[placement.shape]
+            parts.append(Part(name, vertices, faces, worlds[n], defects, known))
             if defects:
                 total += defects
         elif n_found:
@@ -82,19 +54,14 @@ def clean(parsed: Parsed, metres: float | None) -> Cleaned:
         raise UnreadableError(
             f"it holds no usable triangle or point ({found})" if found else "it holds no triangles"
         )
-    used = sorted({part.geometry for part in parts})
-    number = {old: new for new, old in enumerate(used)}
-    return Cleaned(
-        [checked[old][0] for old in used],
-        [replace(part, geometry=number[part.geometry]) for part in parts],
-        total,
-        names_unit=not (parsed.metres is None and parsed.likely_metres is None),
-        up=parsed.up,
-    )
+    names_unit = not (parsed.metres is None and parsed.likely_metres is None)
+    return MeshFile(link, parts, total, names_unit, parsed.up)
 
 
-def _checked(shape: Shape, scale: float) -> tuple[Geometry, Defects]:
-    """Sound geometry of a shape in metres, and the shape's defects."""
+def _checked(
+    shape: Shape, scale: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Defects]:
+    """Sound vertices in metres and faces of a shape, read-only, and the shape's defects."""
     vertices = np.asarray(shape.vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise UnreadableError("its vertices do not have three coordinates each")
@@ -103,7 +70,7 @@ def _checked(shape: Shape, scale: float) -> tuple[Geometry, Defects]:
             points = _metric(vertices, scale)
             finite = np.isfinite(points).all(axis=1)
             lost = Defects(non_finite=int((~finite).sum()))
-            return (points[finite], None), shape.defects + lost
+            return read_only(points[finite]), None, shape.defects + lost
         faces = np.asarray(shape.faces).astype(np.int64, copy=False).reshape(-1, 3)
         inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
         out_of_range = len(faces) - int(inside.sum())
@@ -116,7 +83,13 @@ def _checked(shape: Shape, scale: float) -> tuple[Geometry, Defects]:
             positions, faces = _compact(positions, faces[sound])
         degenerate = _count_degenerate(positions, faces, np.eye(3))
     lost = Defects(degenerate=degenerate, non_finite=non_finite, out_of_range=out_of_range)
-    return (positions, faces), shape.defects + lost
+    return read_only(positions), read_only(faces), shape.defects + lost
+
+
+def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
+    """Array itself, which parts share and nobody may write from now on."""
+    array.flags.writeable = False
+    return array
 
 
 def _metric(vertices: NDArray[np.generic], scale: float) -> NDArray[np.float64]:
@@ -130,8 +103,7 @@ def _compact(
 ) -> tuple[NDArray[Scalar], NDArray[np.int64]]:
     """Drop the vertices that no face uses; their order stays.
 
-    Pieces of a file may share one large array of vertices, so a small piece sorts its own indices
-    and does not sweep the array.
+    Pieces of a file may share one large array of vertices: a small piece sorts its own indices.
     """
     if faces.size * 8 < len(vertices):
         used, renumbered = np.unique(faces, return_inverse=True)
@@ -161,12 +133,11 @@ def _count_degenerate(
 
 
 def _squares(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Squared length of each row (N, 3)."""
     return np.asarray(np.einsum("ij,ij->i", rows, rows), dtype=np.float64)
 
 
 def _worlds(
-    placements: list[Placement], geometries: list[Geometry], scale: float
+    placements: list[Placement], geometries: list[NDArray[np.float64]], scale: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Transforms (P, 4, 4) in metres, and whether all points of a placement are finite there."""
     worlds = np.array([p.world_from_part for p in placements], dtype=np.float64).reshape(-1, 4, 4)
@@ -176,7 +147,7 @@ def _worlds(
         name = _printable(placements[bent[0]].name)
         raise UnreadableError(f"the transform of '{name}' is not affine")
     # Once for each geometry, also when many placements share it.
-    farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v, _ in geometries]).reshape(-1, 3)
+    farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v in geometries]).reshape(-1, 3)
     with np.errstate(over="ignore", invalid="ignore"):
         worlds[:, :3, 3] *= scale
         corners = farthest[[placement.shape for placement in placements]]
@@ -210,7 +181,7 @@ class _Names:
         self._count: dict[str, int] = {}
 
     def unique(self, name: str) -> str:
-        """Name, with a number if the same name was given before."""
+        """Name, with a number if it was given before."""
         candidate = name
         while candidate in self._taken:
             self._count[name] = self._count.get(name, 1) + 1

@@ -7,7 +7,8 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
-from hapticdb.mesh.clean import Cleaned, clean
+from hapticdb.mesh.clean import clean
+from hapticdb.mesh.part import MeshFile
 from hapticdb.mesh.raw import Parsed, UnreadableError
 
 READERS = {
@@ -34,27 +35,15 @@ def reader_of(path: Path) -> Callable[[Path], Parsed]:
     return reader
 
 
-def parse(path: Path, metres: float | None) -> Cleaned:
-    """Sound parts of a file, read in this process.
+def parse(path: Path, metres: float | None) -> MeshFile:
+    """Sound parts of a file, read in this process; every failure is an `UnreadableError`.
 
-    Parameters
-    ----------
-    path : Path
-        A file with one of the suffixes in `READERS`.
-    metres : float or None
-        Length of the unit of a file without a unit of its own; None if none was given.
-
-    Raises
-    ------
-    UnreadableError
-        For every reason, of this package or of a library.
+    metres : length of the unit of a file without a unit of its own; None if none was given.
     """
     read = reader_of(path)
     try:
-        return clean(read(path), metres)
-    except UnreadableError:
-        raise
-    except KeyboardInterrupt:
+        return clean(read(path), metres, str(path))
+    except (UnreadableError, KeyboardInterrupt):
         raise
     except BaseException as error:  # parsers raise errors of every kind; Rust parsers panic
         raise UnreadableError(cause_of(error)) from error

@@ -19,37 +19,25 @@ _WORDS = {
 
 @dataclass(frozen=True)
 class Defects:
-    """Counts of the defects of a file or a part; `+` adds them.
-
-    Parameters
-    ----------
-    degenerate : int
-        Triangles without area after placement. They are kept and mark the voxels that they touch.
-    non_finite : int
-        Triangles and points with a coordinate that is NaN or infinite. Refused.
-    out_of_range : int
-        Triangles with an index outside the vertices. Refused.
-    incomplete : int
-        Faces of fewer than three corners. Refused.
-    unsupported : int
-        Pieces of a kind that has no surface or is not read: lines, triangle fans, curves.
-    empty : int
-        Nodes, solids and meshes without any triangle or point.
-    """
+    """Counts of the defects of a file or a part; `+` adds them."""
 
     degenerate: int = 0
+    """Triangles without area after placement. They are kept and mark the voxels that they touch."""
     non_finite: int = 0
+    """Triangles and points with a coordinate that is NaN or infinite. Refused."""
     out_of_range: int = 0
+    """Triangles with an index outside the vertices. Refused."""
     incomplete: int = 0
+    """Faces of fewer than three corners. Refused."""
     unsupported: int = 0
+    """Pieces of a kind that has no surface or is not read: lines, triangle fans, curves."""
     empty: int = 0
+    """Nodes, solids and meshes without any triangle or point."""
 
     def __add__(self, other: "Defects") -> "Defects":
-        """Sum, count by count."""
         return Defects(**{name: getattr(self, name) + getattr(other, name) for name in _WORDS})
 
     def __bool__(self) -> bool:
-        """Whether anything was wrong."""
         return self != _NONE
 
     def as_dict(self) -> dict[str, int]:
@@ -66,30 +54,19 @@ _NONE = Defects()
 
 @dataclass(frozen=True, eq=False)
 class Part:
-    """One instance in a file: a triangle mesh or a point cloud, and its placement.
-
-    Parameters
-    ----------
-    name : str
-        Node path below the root, joined by '/'; unique within the file.
-    vertices : NDArray[float64]
-        (V, 3) metres, part frame, finite. A mesh has only vertices that a triangle uses. Instances
-        of one mesh share the array.
-    faces : NDArray[int64] | None
-        (F, 3) indices of vertices; None for a point cloud.
-    world_from_part : NDArray[float64]
-        (4, 4) affine transform, metres; it may mirror, scale or flatten.
-    defects : Defects
-        Defects of this instance.
-    """
+    """One instance in a file: a triangle mesh or a point cloud, and its placement."""
 
     name: str
+    """Node path below the root, joined by '/'; unique within the file."""
     vertices: NDArray[np.float64]
+    """(V, 3) metres, part frame, finite, each used; instances of one mesh share the array."""
     faces: NDArray[np.int64] | None
+    """(F, 3) indices of vertices; None for a point cloud."""
     world_from_part: NDArray[np.float64]
+    """(4, 4) affine transform, metres; it may mirror, scale or flatten."""
     defects: Defects = field(default_factory=Defects)
-    # Instances of one mesh share this, so the digest is computed once.
     shared: dict[str, str] = field(default_factory=dict, repr=False)
+    """The digest, once it is computed; instances of one mesh share the dictionary."""
 
     @property
     def is_cloud(self) -> bool:
@@ -120,13 +97,7 @@ class Part:
         return np.asarray(self.vertices @ placed[:3, :3].T + placed[:3, 3], dtype=np.float64)
 
     def triangles(self, world_from_part: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
-        """Corners (F, 3, 3), metres, world frame; (0, 3, 3) for a point cloud.
-
-        Parameters
-        ----------
-        world_from_part : NDArray[float64], optional
-            (4, 4) placement to use instead of the file's.
-        """
+        """Corners (F, 3, 3) as `world_points`; (0, 3, 3) for a point cloud."""
         if self.faces is None:
             return np.empty((0, 3, 3))
         return self.world_points(world_from_part)[self.faces]
@@ -140,27 +111,17 @@ class Part:
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """All usable parts of one file, in the order of the file.
-
-    Parameters
-    ----------
-    link : str
-        Absolute path of the file, symbolic links resolved.
-    parts : list[Part]
-        At least one; each has at least one triangle or point.
-    defects : Defects
-        Sum over the parts, and over refused or empty geometry that became no part.
-    names_unit : bool
-        Whether the file names the unit of its lengths.
-    up : {'x', 'y', 'z'} or None
-        Axis that points up; None if neither the format nor the file says it.
-    """
+    """All usable parts of one file, in the order of the file; at least one."""
 
     link: str
+    """Absolute path of the file, symbolic links resolved."""
     parts: list[Part]
     defects: Defects
+    """Sum over the parts, and over refused or empty geometry that became no part."""
     names_unit: bool = False
+    """Whether the file names the unit of its lengths."""
     up: str | None = None
+    """Axis that points up, x, y or z; None if neither the format nor the file says it."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:

@@ -28,14 +28,8 @@ class UnreadableError(Exception):
 class Shape:
     """Geometry as read: indices may be out of range, coordinates may be NaN.
 
-    Parameters
-    ----------
-    vertices : NDArray
-        (V, 3) in the file's unit, any number type.
-    faces : NDArray | None
-        (F, 3) of any integer type; None for a point cloud.
-    defects : Defects
-        Defects that the reader itself dropped.
+    vertices (V, 3), the file's unit, any number type; faces (F, 3) of any integer type, or None for
+    a point cloud; defects : what the reader itself dropped.
     """
 
     vertices: NDArray[np.generic]

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, MissingExtraError
-from hapticdb.mesh.clean import Cleaned, CleanPart
+from hapticdb.mesh.clean import read_only
 from hapticdb.mesh.parse import READERS, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import UnreadableError
@@ -62,21 +62,13 @@ def read_file(
         GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); LAS, LAZ (extra
         `pointcloud`). The suffix says which.
     unit : str, optional
-        One of `hapticdb.mesh.UNITS`: the unit of a file whose format has none (OBJ, STL, PLY, OFF,
-        LAS, LAZ). By default the unit of the reference system that a LAS or LAZ file names, else
-        metres. A glTF, 3MF, DAE or STEP file has its own unit, which is always used.
+        One of `hapticdb.mesh.UNITS`: the unit of a file that has none of its own (OBJ, STL, PLY,
+        OFF, LAS, LAZ). By default that of the reference system that a LAS or LAZ file names, else
+        metres.
     memory_limit : int, optional
-        Bytes that parsing may take. By default 512 MiB plus a multiple of the size of the file and
-        of the files that it refers to (each counts once), but at most three quarters of the
-        machine's free memory.
+        Bytes that parsing may take; by default in proportion to the file, see `child.allowance`.
     time_limit : float, optional
-        Seconds that parsing may take. By default 20, plus 5 for each MiB of the file (10 for a 3MF
-        file, 20 for a STEP file).
-
-    Returns
-    -------
-    MeshFile
-        Parts in the order of the file, and counts of the defects.
+        Seconds that parsing may take; by default in proportion to the file.
 
     Raises
     ------
@@ -99,7 +91,7 @@ def read_file(
         "sys_path": sys.path,
     }
     try:
-        return _mesh_file(file, _ask_child(request, seconds))
+        return _ask_child(request, seconds)
     except UnreadableError as error:
         raise FileError(_one_line(path, error)) from None
 
@@ -108,13 +100,12 @@ def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -
     """`read_file` without a child process and without limits, for files known to be sound."""
     metres, file = _checked(path, unit)
     try:
-        return _mesh_file(file, parse(file, metres))
+        return parse(file, metres)
     except UnreadableError as error:
         raise FileError(_one_line(path, error)) from None
 
 
 def _seconds_for(file: Path) -> float:
-    """Seconds that parsing a file may take."""
     each = _SECONDS_PER_MIB_OF.get(READERS[file.suffix.lower()], _SECONDS_PER_MIB)
     return _SECONDS + each * file.stat().st_size / (1 << 20)
 
@@ -135,7 +126,7 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | No
 
 
 def _refusal(file: Path) -> str | None:
-    """Reason to refuse a file before it is parsed; None if there is none."""
+    """Reason to refuse a file before it is parsed."""
     if file.is_dir():
         return "it is a directory; name the files in it"
     if not file.exists():
@@ -167,7 +158,7 @@ def _one_line(path: str | os.PathLike[str], cause: object) -> str:
     return "".join(c if c.isprintable() else " " for c in text)
 
 
-def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
+def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
     """Start a child, send the request, take its answer; no child outlives this call."""
     # One arena and one thread: memory reserved per thread would count as the file's.
     settings = {
@@ -192,7 +183,7 @@ def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
         timer.daemon = True
         timer.start()
         try:
-            cleaned = _talk(child, request)
+            found = _talk(child, request)
         finally:
             timer.cancel()
             child.kill()
@@ -200,20 +191,19 @@ def _ask_child(request: dict[str, Any], seconds: float) -> Cleaned:
             for pipe in (child.stdin, child.stdout):
                 if pipe is not None:
                     pipe.close()
-        if cleaned is None:
+        if found is None:
             if late.is_set():
                 raise UnreadableError(f"reading it took longer than {seconds:.3g} s; {_MORE_TIME}")
             raise UnreadableError(_why_ended(child.returncode, words, request["path"]))
-        return cleaned
+        return found
 
 
 def _end(child: subprocess.Popen[bytes], late: threading.Event) -> None:
-    """End a child that took too long, and set `late`."""
     late.set()
     child.kill()
 
 
-def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> Cleaned | None:
+def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> MeshFile | None:
     """Send the request and take the answer; None if the child ended before it had answered."""
     if child.stdin is None or child.stdout is None:  # both are pipes: for the type checker
         return None
@@ -221,15 +211,15 @@ def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> Cleaned | 
         child.stdin.write(json.dumps(request).encode())
         child.stdin.close()
         line = child.stdout.readline()
-        cleaned = _received(json.loads(line), child.stdout) if line.endswith(b"\n") else None
+        if line.endswith(b"\n"):
+            return _received(json.loads(line), child.stdout, request["path"])
     except (BrokenPipeError, EOFError):
         return None
-    if cleaned is None:
-        child.wait()
-    return cleaned
+    child.wait()
+    return None
 
 
-def _received(head: dict[str, Any], stream: IO[bytes]) -> Cleaned:
+def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
     """Answer of the child: parts from its head, arrays from the stream behind it."""
     if "error" in head:
         raise UnreadableError(head["error"])
@@ -242,21 +232,23 @@ def _received(head: dict[str, Any], stream: IO[bytes]) -> Cleaned:
             faces = np.empty((n_faces, 3), dtype=np.int64)
             _fill(faces, stream)
         geometries.append((vertices, faces))
+    shared: list[dict[str, str]] = [{} for _ in geometries]
     parts = [
-        CleanPart(name, geometry, np.array(transform, dtype=np.float64), Defects(**defects))
-        for name, geometry, transform, defects in head["parts"]
+        Part(name, *geometries[int(n)], np.array(transform), Defects(**defects), shared[n])
+        for name, n, transform, defects in head["parts"]
     ]
-    return Cleaned(geometries, parts, Defects(**head["defects"]), head["names_unit"], head["up"])
+    return MeshFile(link, parts, Defects(**head["defects"]), head["names_unit"], head["up"])
 
 
 def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
-    """Read an array's bytes."""
+    """Read an array's bytes; nobody may write it afterwards."""
     view = memoryview(array.data).cast("B")
     while view.nbytes:
         n_read = stream.readinto(view)  # type: ignore[attr-defined]
         if not n_read:
             raise EOFError
         view = view[n_read:]
+    read_only(array)
 
 
 def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
@@ -275,23 +267,3 @@ def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
     lines = words.read()[-4096:].decode("utf-8", "replace").split("\n")
     last = next((line for line in reversed(lines) if line.strip()), "no word of why")
     return f"its parser ended with status {returncode}: {last}"
-
-
-def _mesh_file(file: Path, cleaned: Cleaned) -> MeshFile:
-    """Parts with their arrays."""
-    shared: list[dict[str, str]] = [{} for _ in cleaned.geometries]
-    for vertices, faces in cleaned.geometries:
-        vertices.flags.writeable = False
-        if faces is not None:
-            faces.flags.writeable = False
-    parts = [
-        Part(
-            part.name,
-            *cleaned.geometries[part.geometry],
-            part.world_from_part,
-            part.defects,
-            shared[part.geometry],
-        )
-        for part in cleaned.parts
-    ]
-    return MeshFile(str(file), parts, cleaned.defects, cleaned.names_unit, cleaned.up)

@@ -23,7 +23,7 @@ _BIN = b"BIN\0"
 
 
 def objects_of(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
-    """List of objects that a glTF has under a key; empty if the key is missing."""
+    """List of objects under a key; empty if the key is missing."""
     found = tree.get(key, [])
     if not isinstance(found, list) or not all(isinstance(one, dict) for one in found):
         raise UnreadableError(f"it is damaged: its '{key}' is no list of objects")
@@ -93,14 +93,8 @@ def chunks_of(content: bytes) -> list[memoryview]:
 class Accessors:
     """Arrays of a glTF file's accessors: made when they are needed, and views if possible.
 
-    Parameters
-    ----------
-    tree : dict
-        The file's JSON.
-    chunks : list of memoryview
-        Binary chunks: the n-th is the n-th buffer without a URI.
-    folder : Path
-        Folder of the files that the glTF refers to.
+    tree : the file's JSON; chunks : binary chunks, the n-th is the n-th buffer without a URI;
+    folder : of the files that the glTF refers to.
     """
 
     def __init__(self, tree: dict[str, Any], chunks: list[memoryview], folder: Path) -> None:

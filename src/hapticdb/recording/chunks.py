@@ -50,17 +50,12 @@ class Chunk(NamedTuple):
 
 
 class Scan(NamedTuple):
-    """Whole chunks of a file.
+    """Whole chunks of a file."""
 
-    chunks : start of each payload in the file (bytes), and the chunk's head; n_frames : number of
-    frames in all chunks; end : end of the last chunk (bytes); damaged : index of the first frame
-    that is lost although whole chunks follow, or -1.
-    """
-
-    chunks: list[tuple[int, Chunk]]
-    n_frames: int
-    end: int
-    damaged: int
+    chunks: list[tuple[int, Chunk]]  # start of each payload in the file (bytes), and its head
+    n_frames: int  # in all chunks
+    end: int  # of the last chunk, bytes
+    damaged: int  # first frame that is lost although whole chunks follow, or -1
 
 
 def scan(file: io.RawIOBase, start: int, size: int) -> Scan:

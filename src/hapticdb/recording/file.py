@@ -39,15 +39,8 @@ LEFT_FREE = 64 << 20
 class Recording:
     """A recorded session, to be read. The file is open only during a call.
 
-    Parameters
-    ----------
-    path : path
-        The file. Frames that are added to the file later are not read.
-
-    Raises
-    ------
-    FileError
-        If the file is missing, is no recording, or is cut off within its header.
+    Frames that are added to the file later are not read. Raises `FileError` if the file is missing,
+    is no recording, or is cut off within its header.
 
     Attributes
     ----------
@@ -72,12 +65,8 @@ class Recording:
         """Path of the recorded environment: an SQLite file in the recording's own folder.
 
         Whoever wrote the recording chose what its header names. So nothing else is opened from it:
-        no server's address, no file in another folder, no symbolic link to one.
-
-        Raises
-        ------
-        UsageError
-            If the header names anything else.
+        no server's address, no file in another folder, no symbolic link to one. `UsageError` if the
+        header names anything else.
         """
         name = self.header.environment
         if not re.search(r"[/\\?:\0]", name):
@@ -101,22 +90,9 @@ class Recording:
         return 0 if self._scan.damaged >= 0 else self._size - self._scan.end
 
     def frames(self, *, until_damage: bool = False) -> Iterator[Frames]:
-        """Yield the frames in order, chunk by chunk.
+        """Yield the frames in order, chunk by chunk: (n,) of `FRAME`, n at most `MOST_FRAMES`.
 
-        Parameters
-        ----------
-        until_damage : bool
-            End at a damaged chunk as if the file ended there.
-
-        Yields
-        ------
-        (n,) structured array
-            Frames of dtype `FRAME`; n is at most `MOST_FRAMES`.
-
-        Raises
-        ------
-        FileError
-            At a damaged chunk, after all frames before it.
+        At a damaged chunk `FileError` is raised, or the frames end with `until_damage`.
         """
         for columns in self._chunks(FRAME.names or (), until_damage=until_damage):
             frames = np.empty(len(columns[0]), dtype=FRAME)
@@ -127,12 +103,7 @@ class Recording:
     def columns(self, *names: str, until_damage: bool = False) -> tuple[NDArray[np.generic], ...]:
         """Read whole columns, (M,) or (M, k) each, in the order of `names`; see `FRAME`.
 
-        Raises
-        ------
-        UsageError
-            If there is no such column.
-        FileError
-            If a chunk is damaged, unless `until_damage`.
+        Raises `UsageError` if there is no such column, and `FileError` as `frames`.
         """
         unknown = [name for name in names if name not in (FRAME.names or ())]
         if unknown or not names:
@@ -228,15 +199,13 @@ class Recorder:
         If the file exists and neither `append` nor `replace` is given, the header to append has
         other values, another recorder writes the file, or the limit leaves no room for a frame.
     FileError
-        If the file cannot be written or appended to, the disk has no room, or the file to be
-        replaced is no recording.
+        If the file cannot be written, the disk has no room, or the file to append to or to replace
+        is no whole recording.
 
     Attributes
     ----------
-    path : Path
-        The file.
-    header : Header
-        The header in the file.
+    path, header
+        The file, and the header in it.
     ended : str or None
         One line: why the recorder stopped by itself; None while it takes frames. The file is whole
         and closed when this is set.
@@ -278,19 +247,13 @@ class Recorder:
         self.close()
 
     def __len__(self) -> int:
-        """Count the frames in the file and those that wait in memory."""
         return self._n_written + self._n_waiting
 
     def append(self, frames: Frames) -> None:
         """Add frames (n,) of `FRAME`, and write each full chunk; does nothing if `ended` is set.
 
-        Raises
-        ------
-        UsageError
-            If `frames` has another dtype or shape, or the recorder is closed.
-        FileError
-            If the disk is full or fails; the recorder is then closed, and the chunks written
-            before stay whole.
+        Raises `UsageError` for another dtype or shape, or if the recorder is closed. If the disk is
+        full or fails, `FileError`: the recorder is then closed, and the chunks written before stay.
         """
         if self.ended is None:
             self._check_open()

@@ -26,16 +26,7 @@ from hapticdb.store.finding import Words
 MAGIC = b"HDBREC\r\n"
 """First bytes of each recording."""
 FORMAT_VERSION = 4
-"""Newest version of the format; files of later versions are refused. A recording under the tangent
-plane is written as version 1, which earlier releases read; under another law as version 2; under a
-filter by words, which earlier releases would not see, as version 3; with a budget of points, with
-which earlier releases would compute other wrenches, as version 4."""
-PLANE_VERSION = 1
-"""Version of recordings under the tangent plane: their header names no law."""
-LAW_VERSION = 2
-"""Version of recordings under another law that feel all objects but some ids."""
-WORDS_VERSION = 3
-"""Version of recordings without a budget whose filter has words."""
+"""Version of the format; files of later versions are refused. Earlier ones lack some keys."""
 PREAMBLE = struct.Struct("<8sIIII")
 """First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
 MOST_TEXT = 1 << 24
@@ -52,50 +43,29 @@ def _now() -> str:
 class Header:
     """Environment, tool and settings of a recorded session.
 
-    Attributes
-    ----------
-    environment : str
-        URL of the environment, without a password.
-    grid : Grid
-        Grid of the environment.
-    revision : int
-        Revision of the environment when the session began.
-    shell : PointShell
-        The tool.
-    law : ForceLaw
-        The force law of the recorded wrenches.
-    rate : float
-        Frames a second that the session was set to.
-    where, exclude : iterable of int or str
-        Which objects were felt: see `hapticdb.store.filtering.Filter`. The words and no ids, since
-        during the session others may have added objects that the words do not choose.
-    budget_points : int or None
-        Most points near something that a frame looked at; None: all.
-    coupling : mapping
-        Parameters of the virtual coupling by their names; the values are those of JSON.
-    version : str
-        Version of hapticdb.
-    started : str
-        When the session began: ISO 8601, UTC. The frames' times count from this instant.
-
-    Raises
-    ------
-    UsageError
-        If the rate is no positive number or the parameters cannot be written as JSON.
+    Raises `UsageError` if the rate is no positive number or the parameters cannot be JSON.
     """
 
     environment: str
+    """URL of the environment, without a password."""
     grid: Grid
     revision: int
+    """Of the environment when the session began."""
     shell: PointShell
     rate: float
+    """Frames a second that the session was set to."""
     law: ForceLaw = field(default_factory=TangentPlane)
     exclude: Words = ()
     coupling: Mapping[str, Value] = field(default_factory=dict)
+    """Parameters of the virtual coupling by their names."""
     version: str = field(default_factory=lambda: version("hapticdb"))
     started: str = field(default_factory=_now)
+    """When the session began: ISO 8601, UTC. The frames' times count from this instant."""
     where: Words = ()
+    """With `exclude`, which objects were felt: words as of `hapticdb.store.filtering.Filter`, since
+    others may have added objects during the session that the words do not choose."""
     budget_points: int | None = None
+    """Most points near something that a frame looked at; None: all."""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "budget_points", checked_budget(self.budget_points))
@@ -118,43 +88,25 @@ class Header:
 
     def differing(self, other: "Header") -> list[str]:
         """Names of the fields that differ from another header's; time, revision, version aside."""
-        names = [
-            name
-            for name in (
-                "environment",
-                "grid",
-                "law",
-                "rate",
-                "where",
-                "exclude",
-                "coupling",
-                "budget_points",
-            )
-            if getattr(self, name) != getattr(other, name)
-        ]
+        fields = "environment grid law rate where exclude coupling budget_points"
+        names = [name for name in fields.split() if getattr(self, name) != getattr(other, name)]
         return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
 
     def packed(self) -> bytes:
-        """Return the header's bytes.
-
-        Raises
-        ------
-        UsageError
-            If the JSON text is longer than `MOST_TEXT`.
-        """
-        shell, is_plane = self.shell, isinstance(self.law, TangentPlane)
+        """Return the header's bytes; `UsageError` if the JSON is longer than `MOST_TEXT`."""
+        shell = self.shell
         text = json.dumps(
-            ({} if is_plane else {"law": "smooth"})
-            | ({"where": self.where} if self.where else {})
-            | ({} if self.budget_points is None else {"budget_points": self.budget_points})
-            | {
+            {
                 "environment": self.environment,
                 "grid": asdict(self.grid),
                 "revision": self.revision,
                 "shell": {"is_closed": shell.is_closed, "link": shell.link, "seed": shell.seed},
+                "law": "plane" if isinstance(self.law, TangentPlane) else "smooth",
                 "stiffness": self.law.stiffness,
                 "rate": self.rate,
+                "where": self.where,
                 "exclude": self.exclude,
+                "budget_points": self.budget_points,
                 "coupling": self.coupling,
                 "version": self.version,
                 "started": self.started,
@@ -165,22 +117,15 @@ class Header:
                 f"a recording's header of {len(text)} bytes: filter objects by fewer words"
             )
         body = text + _arrays(self.shell)
-        number = PLANE_VERSION if is_plane else LAW_VERSION
-        if not Filter(self.where, self.exclude).is_fixed:
-            number = WORDS_VERSION
-        if self.budget_points is not None:
-            number = FORMAT_VERSION
-        counts = PREAMBLE.pack(MAGIC, number, len(text), len(shell), 0)[:-4]
+        counts = PREAMBLE.pack(MAGIC, FORMAT_VERSION, len(text), len(shell), 0)[:-4]
         return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
 
     @classmethod
     def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
         """Read the header of an open recording; return it and the start of the chunks (bytes).
 
-        Raises
-        ------
-        FileError
-            If the file is no recording, has a newer format, or is cut off or damaged in its header.
+        Raises `FileError` if the file is no recording, has a newer format, or is cut off or damaged
+        in its header.
         """
         size = file.seek(0, os.SEEK_END)
         file.seek(0)

@@ -30,10 +30,7 @@ def unpack(
 ) -> Iterator[NDArray[np.generic]]:
     """Unpack the columns `names` from the bytes of `pack`: arrays (n_rows, ...), in that order.
 
-    Raises
-    ------
-    ValueError
-        If the bytes are not those of `n_rows` rows.
+    Raises `ValueError` if the bytes are not those of `n_rows` rows.
     """
     every = _names(layout)
     sizes = np.frombuffer(content[: 4 * len(every)], dtype="<u4")

@@ -28,20 +28,15 @@ Feel = Callable[[Floats], tuple[Floats, NDArray[np.int64]]]
 
 
 class Parting(NamedTuple):
-    """The first frame whose wrench or number of hits differs from the recorded one.
-
-    frame : its index; time : s since the session's start; recorded, present : wrenches (6,), N and
-    N m; hits_recorded, hits_present : numbers of shell points inside a voxel; revision_recorded,
-    revision_present : revisions of the database, then and now.
-    """
+    """The first frame whose wrench or number of hits differs from the recorded one."""
 
     frame: int
-    time: float
-    recorded: Floats
+    time: float  # s since the session's start
+    recorded: Floats  # wrenches (6,), N and N m
     present: Floats
-    hits_recorded: int
+    hits_recorded: int  # numbers of shell points inside a voxel
     hits_present: int
-    revision_recorded: int
+    revision_recorded: int  # of the database
     revision_present: int
 
     def describe(self) -> str:
@@ -56,30 +51,19 @@ class Parting(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Replayed:
-    """Result of a replay.
-
-    Attributes
-    ----------
-    n_compared : int
-        Frames whose wrench was computed again.
-    n_skipped : int
-        Frames that were not compared: they had unknown points or held an earlier wrench.
-    n_differing : int
-        Frames compared whose wrench or number of hits is not the same.
-    parting : Parting or None
-        The first differing frame.
-    revision : int
-        Revision of the database at the end.
-    is_same_revision : bool
-        Whether all frames were recorded at the database's present revision.
-    """
+    """Result of a replay."""
 
     n_compared: int
+    """Frames whose wrench was computed again."""
     n_skipped: int
+    """Frames that were not compared: they had unknown points or held an earlier wrench."""
     n_differing: int
+    """Frames compared whose wrench or number of hits is not the same."""
     parting: Parting | None
     revision: int
+    """Of the database at the end."""
     is_same_revision: bool
+    """Whether all frames were recorded at the database's present revision."""
 
     @property
     def is_equal(self) -> bool:
@@ -139,15 +123,9 @@ def resident(
 ) -> Iterator[Feel]:
     """Provide a function that uses resident cells, fetched before their use: as fast as a session.
 
-    Its wrenches and hits are those of `touching`, bit for bit, unless `budget_points` bounds the
-    points of a frame: then they are those of a session with that budget. The memory is freed at the
-    end.
-
-    Raises
-    ------
-    UsageError
-        If the environment is in lexicographic order, which has no cells, or if the law is by
-        distances and an object has none.
+    Its wrenches and hits are those of `touching`, bit for bit, or of a session with that budget.
+    Raises `UsageError` if the environment is in lexicographic order, which has no cells, or if the
+    law is by distances and an object has none.
     """
     sleeps = sleeps_by_itself(shell, budget_points)
     if sleeps:
@@ -162,16 +140,12 @@ def resident(
 
 
 def replay(
-    recording: Recording,
-    environment: Environment,
-    feel: Feel | None = None,
-    *,
-    until_damage: bool = False,
-    progress: Callable[[int], None] | None = None,
+    recording: Recording, environment: Environment, *, until_damage: bool = False
 ) -> Replayed:
     """Compute the contact wrench of every recorded frame again, at the recorded pose of the tool.
 
-    Frames that held an earlier wrench, or had points in unknown cells, are not compared.
+    Frames that held an earlier wrench, or had points in unknown cells, are not compared. Cells are
+    resident in 256 MiB of memory at most; in lexicographic order each frame is a query.
 
     Parameters
     ----------
@@ -179,14 +153,8 @@ def replay(
         The session.
     environment : Environment
         The environment of the session; its revision may differ.
-    feel : callable or None
-        Computes wrenches and hits with the recording's shell, law and filter. None:
-        resident cells in 256 MiB of memory at most; in lexicographic order, which has no cells,
-        one query a frame.
     until_damage : bool
         Stop at a damaged chunk instead of raising an error.
-    progress : callable or None
-        Called after each chunk with the number of frames done.
 
     Raises
     ------
@@ -203,23 +171,20 @@ def replay(
             f"{recording.path} was recorded on {header.grid.describe()}, and {environment.url} "
             f"has {environment.grid.describe()}: give the environment of {header.environment}"
         )
+    felt = (environment, header.shell, header.law, header.exclude, header.where)
+    budget = header.budget_points
     with ExitStack() as stack:
-        if feel is None:
-            felt = (environment, header.shell, header.law, header.exclude, header.where)
-            budget = header.budget_points
-            if environment.grid.is_hierarchical:
-                feel = stack.enter_context(resident(*felt, budget_points=budget))
-            elif budget is None:
-                feel = touching(*felt)
-            else:
-                raise UsageError(
-                    f"{environment.url} in lexicographic order has no cells: a budget needs them"
-                )
+        if environment.grid.is_hierarchical:
+            feel = stack.enter_context(resident(*felt, budget_points=budget))
+        elif budget is None:
+            feel = touching(*felt)
+        else:
+            raise UsageError(
+                f"{environment.url} in lexicographic order has no cells: a budget needs them"
+            )
         comparison = _Comparison(environment, feel)
         for frames in recording.frames(until_damage=until_damage):
             comparison.add(frames)
-            if progress is not None:
-                progress(comparison.n_done)
         return comparison.result()
 
 
@@ -229,7 +194,7 @@ class _Comparison:
     def __init__(self, environment: Environment, feel: Feel) -> None:
         self._environment = environment
         self._feel = feel
-        self._n_compared = self._n_differing = self.n_done = 0
+        self._n_compared = self._n_differing = self._n_done = 0
         self._parting: Parting | None = None
         self._revisions: set[int] = set()
 
@@ -250,18 +215,18 @@ class _Comparison:
                 self._part(known, indices, wrenches, n_hits, int(np.argmax(differs)))
             self._n_differing += int(differs.sum())
         self._n_compared += len(indices)
-        self.n_done += len(frames)
+        self._n_done += len(frames)
 
     def result(self) -> Replayed:
         """Result over all frames."""
         revision = self._environment.store.revision()
         return Replayed(
-            n_compared=self._n_compared,
-            n_skipped=self.n_done - self._n_compared,
-            n_differing=self._n_differing,
-            parting=self._parting,
-            revision=revision,
-            is_same_revision=self._revisions <= {revision},
+            self._n_compared,
+            self._n_done - self._n_compared,
+            self._n_differing,
+            self._parting,
+            revision,
+            self._revisions <= {revision},
         )
 
     def _part(
@@ -273,7 +238,7 @@ class _Comparison:
         at: int,
     ) -> None:
         self._parting = Parting(
-            frame=self.n_done + int(indices[at]),
+            frame=self._n_done + int(indices[at]),
             time=float(known["time"][at]),
             recorded=known["wrench"][at].copy(),
             present=np.array(wrenches[at]),

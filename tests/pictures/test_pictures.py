@@ -11,9 +11,8 @@ from matplotlib.figure import Figure
 import hapticdb
 from hapticdb import Grid, PointShell
 from hapticdb.pictures.demo import PAPER, SCENE, SIZE, TOWARDS, mixed
-from hapticdb.pictures.lettering import extent_of, in_lines, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat, turned
-from hapticdb.pictures.sweep import compose_sweep
+from hapticdb.pictures.sweep import compose_sweep, extent_of
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.units import length_text, readable_unit
 
@@ -76,37 +75,6 @@ def test_a_scene_that_goes_on_fades_and_is_not_cut() -> None:
     assert (edge < 0.2).all()
     assert (image[20:-20, 20:-20] == 1.0).all()
     assert np.abs(np.diff(image, axis=0)).max() < 0.1
-
-
-@pytest.mark.parametrize("words", ["", "short", LONG, "W" * 300])
-@pytest.mark.parametrize("most", [60.0, 380.0])
-def test_words_are_shortened_in_the_middle_until_they_fit(words: str, most: float) -> None:
-    figure = Figure(figsize=(16, 10), dpi=100)
-    found = shortened(figure, words, 12, most)
-    assert width_of(figure, found, 12) <= most
-    assert not figure.texts
-    if found != words:
-        head, _, tail = found.partition("…")
-        assert words.startswith(head)
-        assert words.endswith(tail)
-        assert abs(len(head) - len(tail)) <= 3
-
-
-@pytest.mark.parametrize("words", ["", "short", LONG, "W" * 300 + " " + LONG])
-@pytest.mark.parametrize("count", [1, 2, 20])
-def test_long_words_are_broken_into_lines_and_only_their_end_is_left_out(
-    words: str, count: int
-) -> None:
-    figure = Figure(figsize=(16, 10), dpi=100)
-    lines = in_lines(figure, words, 12, 380.0, count)
-    assert len(lines) <= count
-    assert all(width_of(figure, line, 12) <= 380.0 for line in lines)
-    assert not figure.texts
-    if "W" not in words:
-        told = " ".join(lines)
-        assert told == " ".join(words.split()) or (
-            len(lines) == count and told.endswith("…") and words.startswith(told[:-1])
-        )
 
 
 @pytest.mark.parametrize(

@@ -18,7 +18,6 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
-from hapticdb.pictures.lettering import shortened
 from hapticdb.pictures.splat import Camera, Depths, Image, shade, splat
 from hapticdb.store.attributes import up_axis
 
@@ -43,8 +42,8 @@ TOOLS_SHOWN = 9
 """Poses at which the tool is drawn."""
 HITS_SHOWN = 30_000
 """Hits drawn at most, evenly along the path."""
-LEGEND = 1480.0
-"""Pixels that all names of objects may take together, in a line above the force."""
+LEGEND = 130
+"""Letters that all names of objects may take together, in a line above the force."""
 TOWARDS = (0.50, 0.76, 0.44)
 """Direction from the scene to the eye: ahead, to the left, above."""
 
@@ -57,7 +56,6 @@ class _Palette:
     names: dict[int, str]
 
     def of(self, object_id: int) -> str:
-        """Colour of an object."""
         return self.colors.get(object_id, REST)
 
 
@@ -71,9 +69,7 @@ def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> 
     """Lay out the figure: the scene above, the force along the path below."""
     trace = comparison.trace
     palette = _palette(env, trace)
-    figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    above = figure.add_axes((0.0, 1 - SCENE[1] / SIZE[1], 1.0, SCENE[1] / SIZE[1]))
+    figure, above = new_figure()
     camera = _camera(env)
     _draw_scene(above, env, camera, palette)
     _draw_path(above, camera, scene, trace, palette)
@@ -81,6 +77,19 @@ def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> 
     below = figure.add_axes((0.055, 0.085, 0.925, 0.165))
     _draw_force(below, trace, palette)
     return figure
+
+
+def new_figure() -> tuple[Figure, Axes]:
+    """An empty picture, and the axes of the scene in its upper part."""
+    figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=PAPER)
+    FigureCanvasAgg(figure)
+    return figure, figure.add_axes((0.0, 1 - SCENE[1] / SIZE[1], 1.0, SCENE[1] / SIZE[1]))
+
+
+def shortened(words: str, most: int) -> str:
+    """Words of at most `most` letters; the middle of longer ones is left out."""
+    half = (most - 1) // 2
+    return words if len(words) <= most else f"{words[:half].rstrip()}…{words[-half:].lstrip()}"
 
 
 def _palette(env: Environment, trace: "Trace") -> _Palette:
@@ -222,25 +231,15 @@ def _draw_force(axes: Axes, trace: "Trace", palette: _Palette) -> None:
     main = _hit_most(trace)
     for object_id in np.unique(main).tolist():
         color = palette.of(object_id) if object_id >= 0 else PAPER
-        axes.fill_between(
-            time,
-            0,
-            np.where(main == object_id, trace.force, 0),
-            step="mid",
-            color=color,
-            alpha=0.38,
-            linewidth=0,
-        )
+        force = np.where(main == object_id, trace.force, 0)
+        axes.fill_between(time, 0, force, step="mid", color=color, alpha=0.38, linewidth=0)
     axes.plot(time, trace.force, color="white", linewidth=0.8)
     axes.set_xlim(0, max(len(time) - 1, 1))
     axes.set_ylim(0, 1.08 * top)
     axes.set_xlabel("time at 1000 frames a second, ms", color=FAINT, fontsize=11)
     axes.set_ylabel("force, N", color=FAINT, fontsize=11)
-    room = LEGEND / (len(palette.names) + 1) - 45.0
-    labels = [
-        (shortened(axes.figure, name, 11, room), palette.colors[i])
-        for i, name in palette.names.items()
-    ]
+    room = LEGEND // max(len(palette.names), 1)
+    labels = [(shortened(name, room), palette.colors[i]) for i, name in palette.names.items()]
     if len(set(trace.ids.tolist())) > len(labels):
         labels.append(("other parts", REST))
     marks = [
@@ -248,17 +247,10 @@ def _draw_force(axes: Axes, trace: "Trace", palette: _Palette) -> None:
         for words, color in labels
     ]
     axes.legend(
-        handles=marks,
-        loc="lower right",
-        bbox_to_anchor=(1.0, 1.02),
-        ncol=len(marks),
-        frameon=False,
-        labelcolor=INK,
-        fontsize=11,
-        handletextpad=0.2,
-        columnspacing=1.3,
+        handles=marks, loc="lower right", bbox_to_anchor=(1.0, 1.02), ncol=len(marks),
+        frameon=False, labelcolor=INK, fontsize=11, handletextpad=0.2, columnspacing=1.3,
         borderaxespad=0.0,
-    )
+    )  # fmt: skip
 
 
 def _hit_most(trace: "Trace") -> NDArray[np.int64]:

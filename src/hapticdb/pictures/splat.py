@@ -23,21 +23,16 @@ CHUNK = 1_000_000
 
 @dataclass(frozen=True)
 class Camera:
-    """A pinhole camera.
+    """A pinhole camera."""
 
-    eye (3,) metres, world frame; axes (3, 3), rows right, down, ahead; focal length and middle (2,)
-    in pixels; size (width, height); near and far, metres ahead of the eye; up: which axis of the
-    world points up, 0 to 2.
-    """
-
-    eye: Floats
-    axes: Floats
-    focal: float
-    middle: Floats
-    size: tuple[int, int]
-    near: float
+    eye: Floats  # (3,) metres, world frame
+    axes: Floats  # (3, 3), rows right, down, ahead
+    focal: float  # length, pixels
+    middle: Floats  # (2,) pixels
+    size: tuple[int, int]  # width, height
+    near: float  # metres ahead of the eye
     far: float
-    up: int = 2
+    up: int = 2  # axis of the world that points up
 
     @classmethod
     def looking_at(
@@ -82,20 +77,10 @@ class Depths(NamedTuple):
 
 
 def splat(depths: Depths, camera: Camera, centers: Floats, size: float, number: int) -> None:
-    """Put voxels into the buffer as squares that face the eye.
+    """Put voxels into the buffer, in place, as squares that face the eye.
 
-    Parameters
-    ----------
-    depths : Depths
-        Changed in place.
-    camera : Camera
-        What sees them.
-    centers : (V, 3) float64
-        Of the voxels, metres.
-    size : float
-        Edge of a voxel, metres.
-    number : int
-        What they are entered as, below 2^20.
+    centers (V, 3) of the voxels, and size, their edge, in metres; number : what they are entered
+    as, below 2^20.
     """
     width, height = camera.size
     flat = depths.nearest.reshape(-1)
@@ -114,25 +99,11 @@ def splat(depths: Depths, camera: Camera, centers: Floats, size: float, number: 
 
 
 def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: float) -> Image:
-    """Light a buffer -> image (height, width, 3), 0 to 1.
+    """Light a buffer that `splat` filled -> image (height, width, 3), 0 to 1.
 
-    Parameters
-    ----------
-    depths : Depths
-        What `splat` filled.
-    camera : Camera
-        What saw it.
-    tints : (K, 3) float64
-        Colours by the number that a voxel was entered as.
-    paper : (3,) float64
-        Colour behind the scene.
-    size : float
-        Edge of a voxel, metres.
-
-    Notes
-    -----
-    Steps of a few voxels are smoothed; larger ones are edges and stay. Places behind their
-    surroundings are darkened (unsharp masking of the depths).
+    tints (K, 3) : colours by the number of a voxel; paper (3,) : colour behind the scene; size :
+    edge of a voxel, metres. Steps of a few voxels are smoothed; larger ones are edges and stay.
+    Places behind their surroundings are darkened (unsharp masking of the depths).
     """
     image = _backdrop(camera, paper)
     rows, columns = np.nonzero(depths.nearest != FAR)
@@ -166,16 +137,13 @@ def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: fl
 def turned(direction: Floats, up: int) -> Floats:
     """Direction (3,), ahead, left and up, in a world whose axis `up` points up.
 
-    The axes are turned about, none is mirrored: with y up, z is ahead and x is left, as in glTF.
+    None is mirrored: with y up, z is ahead and x is left, as in glTF.
     """
     return np.roll(direction, up - 2)
 
 
 def faded(image: Image, camera: Camera, paper: Floats, margin: int) -> Image:
-    """Image (height, width, 3) that fades into the backdrop within `margin` pixels of its edges.
-
-    A scene that continues beyond the picture is then not cut off.
-    """
+    """Image (height, width, 3) that fades into the backdrop within `margin` pixels of its edges."""
     height, width = image.shape[:2]
     across = np.minimum(np.arange(width), np.arange(width)[::-1])
     down = np.minimum(np.arange(height), np.arange(height)[::-1])
@@ -197,7 +165,6 @@ def _unoccluded(metres: Image, blur: float, depth: float) -> Image:
 
 
 def _backdrop(camera: Camera, paper: Floats) -> Image:
-    """Backdrop a little lighter behind the scene."""
     width, height = camera.size
     x = (np.arange(width) / width - 0.5)[None, :, None] / 0.62
     y = (np.arange(height) / height - 0.52)[:, None, None] / 0.60

@@ -1,6 +1,6 @@
 """The picture of a sweep: the tool's path through the voxels, its hits, the clearance along it."""
 
-import os
+import textwrap
 from collections.abc import Iterable
 from typing import Any, Literal
 
@@ -9,7 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
+from matplotlib.text import Text
 from matplotlib.ticker import MaxNLocator
+from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
@@ -24,11 +26,11 @@ from hapticdb.pictures.demo import (
     SIZE,
     TOWARDS,
     mixed,
-    save,
+    new_figure,
+    shortened,
     show_scene,
     style,
 )
-from hapticdb.pictures.lettering import extent_of, in_lines, shortened, width_of
 from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import AXES, up_axis
@@ -44,10 +46,10 @@ FADE = 90
 """Pixels from the edges within which a scene fades that continues beyond them."""
 LEFT, RIGHT, TOP, LINE = 35, 1565, 45, 24
 """Places of the words, pixels from the upper left corner; LINE: from one name to the next."""
-VERDICT_LINES = 3
-"""Lines that a verdict takes at most; the end of a longer one is left out."""
-LEGEND = 380
-"""Pixels that the name of an object takes at most."""
+LEGEND = 38
+"""Letters that the name of an object takes at most."""
+VERDICT = {17: 80, 13: 104}
+"""Letters of a line of the verdict, by the size of its font."""
 ROOM = 0.1
 """Room around the tool at each pose, as a share of the whole path's extent."""
 MOST_VOXELS = 30_000_000
@@ -74,39 +76,6 @@ BEHIND = {"facecolor": PAPER, "alpha": 0.55, "linewidth": 0, "pad": 1.5}
 Floats = NDArray[np.float64]
 
 
-def draw_sweep(
-    path: str | os.PathLike[str],
-    env: Environment,
-    shell: PointShell,
-    found: Swept,
-    *,
-    exclude: Iterable[int] = (),
-    verdict: str = "",
-    up: str | None = None,
-) -> None:
-    """Draw a sweep and write it as a PNG.
-
-    Parameters
-    ----------
-    path : path
-        The file; one that is there is replaced.
-    env, shell, exclude :
-        What was swept; excluded objects are not drawn.
-    found : Swept
-        With its profile of clearances.
-    verdict : str
-        One line of words.
-    up : {'x', 'y', 'z'} or None
-        Axis that points up; what most of the objects' files say unless given.
-
-    Raises
-    ------
-    FileError
-        When the file cannot be written.
-    """
-    save(compose_sweep(env, shell, found, exclude=exclude, verdict=verdict, up=up), path)
-
-
 def compose_sweep(
     env: Environment,
     shell: PointShell,
@@ -116,14 +85,17 @@ def compose_sweep(
     verdict: str = "",
     up: str | None = None,
 ) -> Figure:
-    """Lay out the figure: words, the scene, the clearance along the path; as `draw_sweep`."""
+    """Lay out the figure of a sweep: words, the scene, the clearance along the path.
+
+    env, shell, exclude : what was swept; excluded objects are not drawn; found : with its profile
+    of clearances; verdict : one line of words; up : axis that points up, x, y or z; what most of
+    the objects' files say unless given.
+    """
     left_out = set(exclude)
-    figure = Figure(figsize=(SIZE[0] / 100, SIZE[1] / 100), dpi=100, facecolor=PAPER)
-    FigureCanvasAgg(figure)
-    above = figure.add_axes((0.0, 1 - SCENE[1] / SIZE[1], 1.0, SCENE[1] / SIZE[1]))
+    figure, above = new_figure()
     colors = dict(zip((one.object.id for one in found.objects), COLORS, strict=False))
     legend = _draw_legend(figure, found, colors)
-    _write_verdict(figure, verdict, _words(env, shell, found), legend - 2 * LEFT - LINE)
+    _write_verdict(figure, verdict, _words(env, shell, found))
     axis = up_axis(env.objects()) if up is None else AXES.index(up)
     camera = _camera(env, shell, found, left_out, axis, legend)
     _draw_scene(above, env, camera, colors, left_out)
@@ -134,15 +106,15 @@ def compose_sweep(
     return figure
 
 
-def _write_verdict(figure: Figure, verdict: str, words: str, room: float) -> None:
+def _write_verdict(figure: Figure, verdict: str, words: str) -> None:
     """Write the verdict, a long one smaller and in lines; below it what was swept."""
-    size = 17 if width_of(figure, verdict, 17) <= room else 13
-    lines = in_lines(figure, verdict, size, room, VERDICT_LINES)
+    size = 17 if len(verdict) <= VERDICT[17] else 13
+    lines = textwrap.wrap(verdict, VERDICT[size], max_lines=3, placeholder="…")
     down = TOP - 10 * (len(lines) > 1)
     for line in lines:
         _write(figure, down, line, color="white", fontsize=size)
         down += LINE
-    _write(figure, down + 6, shortened(figure, words, 12, room), color=FAINT, fontsize=12)
+    _write(figure, down + 6, words, color=FAINT, fontsize=12)
 
 
 def _write(figure: Figure, down: float, words: str, **style: Any) -> None:  # noqa: ANN401 - matplotlib's
@@ -224,15 +196,9 @@ def _in_view(env: Environment, camera: Camera, exclude: set[int]) -> list[Object
     which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
     for obj in sorted(env.objects(), key=lambda obj: (obj.voxels, obj.id)):
         seen = camera.project(obj.bounds[which, np.arange(3)])
-        is_ahead = seen[:, 2].max() > camera.near and seen[:, 2].min() < camera.far
-        width, height = camera.size
-        is_inside = (
-            seen[:, 0].max() > 0
-            and seen[:, 0].min() < width
-            and seen[:, 1].max() > 0
-            and seen[:, 1].min() < height
-        )
-        if obj.id not in exclude and is_ahead and is_inside:
+        is_begun = (seen.max(axis=0) > (0, 0, camera.near)).all()
+        is_ended = (seen.min(axis=0) >= (*camera.size, camera.far)).any()
+        if obj.id not in exclude and is_begun and not is_ended:
             total += obj.voxels
             if total > MOST_VOXELS:
                 break
@@ -287,21 +253,23 @@ def _middle_at(camera: Camera, middle: Floats, moment: Moment) -> Floats:
     return np.asarray(camera.project(_placed(middle, moment.pose))[0, :2] / SAMPLES)
 
 
+def extent_of(text: Text) -> Bbox:
+    """Box of a text as it is drawn, pixels from the lower left corner."""
+    figure = text.get_figure(root=True)
+    assert figure is not None  # noqa: S101 - it was drawn on one
+    assert isinstance(figure.canvas, FigureCanvasAgg)  # noqa: S101 - of `new_figure`
+    return text.get_window_extent(figure.canvas.get_renderer())  # type: ignore[no-untyped-call]
+
+
 def _mark(axes: Axes, at: Floats, text: str, color: str) -> None:
     """Mark a place, its words beside it where they run over no others."""
     axes.scatter([at[0]], [at[1]], s=46, c=color, edgecolors=PAPER, linewidths=1.2, zorder=5)
     figure = axes.figure
     taken = [extent_of(other) for other in (*figure.texts, *axes.texts)]
     label = axes.annotate(
-        text,
-        (float(at[0]), float(at[1])),
-        xytext=BESIDE[0][:2],
-        textcoords="offset points",
-        color=color,
-        fontsize=11,
-        zorder=6,
-        bbox=BEHIND,
-    )
+        text, (float(at[0]), float(at[1])), xytext=BESIDE[0][:2], textcoords="offset points",
+        color=color, fontsize=11, zorder=6, bbox=BEHIND,
+    )  # fmt: skip
     for right, lift, side in BESIDE:
         label.set_position((right, lift))
         label.set_horizontalalignment(side)
@@ -341,20 +309,14 @@ def _draw_legend(figure: Figure, found: Swept, colors: dict[int, str]) -> float:
     Where nothing is hit, that is the right edge of the words.
     """
     names = {one.object.id: one.object.name for one in found.objects}
-    lines = [(shortened(figure, names[i], 12, LEGEND), color) for i, color in colors.items()]
+    lines = [(shortened(names[i], LEGEND), color) for i, color in colors.items()]
     if len(names) > len(colors):
         lines.append((f"and {len(names) - len(colors)} more", FAINT))
     begins = float(RIGHT + LEFT)
     for number, (words, color) in enumerate(lines):
+        x, y = RIGHT / SIZE[0], 1.0 - (TOP + LINE * number) / SIZE[1]
         text = figure.text(
-            RIGHT / SIZE[0],
-            1.0 - (TOP + LINE * number) / SIZE[1],
-            words,
-            color=color,
-            fontsize=12,
-            ha="right",
-            va="center",
-            bbox=BEHIND,
+            x, y, words, color=color, fontsize=12, ha="right", va="center", bbox=BEHIND
         )
         begins = min(begins, float(extent_of(text).x0))
     return begins
@@ -367,18 +329,10 @@ def _draw_profile(figure: Figure, found: Swept) -> None:
     top = figure.add_axes((0.055, 0.165, 0.925, 0.085))
     farthest = float(np.nanmax(profile.clearances, initial=0.0)) or found.voxel_size
     size, unit = readable_unit(farthest)
-    near = profile.clearances / size
-    top.step(share, np.append(near, near[-1:]), where="post", color=COLORS[1], linewidth=1.2)
+    near = np.append(profile.clearances, profile.clearances[-1:]) / size
+    top.step(share, near, where="post", color=COLORS[1], linewidth=1.2)
     if found.clearance is not None and np.isfinite(near).all():
-        top.fill_between(
-            share,
-            0,
-            np.append(near, near[-1:]),
-            step="post",
-            color=COLORS[1],
-            alpha=0.2,
-            linewidth=0,
-        )
+        top.fill_between(share, 0, near, step="post", color=COLORS[1], alpha=0.2, linewidth=0)
         top.set_ylim(0, 1.08 * farthest / size)
     bottom = figure.add_axes((0.055, 0.06, 0.925, 0.085))
     hits = np.append(profile.hits, profile.hits[-1:])

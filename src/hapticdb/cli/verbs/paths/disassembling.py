@@ -70,12 +70,14 @@ def write(
     tell()
     for n, (found, excluded) in enumerate(ways):
         if asked.picture is not None and found.way is not None:
-            from hapticdb.pictures.sweep import draw_sweep
+            from hapticdb.pictures.demo import save
+            from hapticdb.pictures.sweep import compose_sweep
 
-            draw_sweep(
-                name_of(asked.picture, n), env, found.shell, found.way.swept, exclude=excluded,
+            figure = compose_sweep(
+                env, found.shell, found.way.swept, exclude=excluded,
                 verdict=extraction_line(found), up=asked.up,
             )  # fmt: skip
+            save(figure, name_of(asked.picture, n))
     if asked.animation is not None and ways:
         from hapticdb.page.animation import animate
 

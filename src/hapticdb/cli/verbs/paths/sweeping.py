@@ -249,8 +249,10 @@ def _draw(
     excluded: list[int],
     up: UpName | None,
 ) -> None:
-    from hapticdb.pictures.sweep import draw_sweep
+    from hapticdb.pictures.demo import save
+    from hapticdb.pictures.sweep import compose_sweep
     from hapticdb.sweeps.verdict import verdict_line
 
     verdict = verdict_line(found, shell)
-    draw_sweep(picture, env, shell, found, exclude=excluded, verdict=verdict, up=up)
+    figure = compose_sweep(env, shell, found, exclude=excluded, verdict=verdict, up=up)
+    save(figure, picture)

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
+from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
@@ -15,7 +15,6 @@ from hapticdb.errors import GridError, UsageError
 from hapticdb.grid import CURVE_CODES, CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
 from hapticdb.kernels import curves
 
-few = settings(max_examples=200, deadline=None)
 BOUNDS = np.array([[-1.0, 0.5, 2.0], [3.0, 1.5, 4.0]])  # sides 4, 1 and 2 m
 LONGEST = 4.0
 CENTER = (1.0, 1.0, 3.0)
@@ -30,7 +29,6 @@ def center_of(grid: Grid) -> NDArray[np.float64]:
 
 
 @pytest.mark.parametrize("curve", CURVE_NAMES)
-@few
 @given(
     bits=st.integers(1, MAX_BITS),
     unit=st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=9),
@@ -43,7 +41,6 @@ def test_voxels_return_from_their_keys(
     np.testing.assert_array_equal(grid.decode(grid.encode(voxels)), voxels)
 
 
-@few
 @given(
     ijk=st.lists(st.integers(0, 2**12 - 1), min_size=3, max_size=3),
     corner=st.lists(st.integers(-(2**12), 2**12), min_size=3, max_size=3),
@@ -60,7 +57,6 @@ def test_voxels_are_half_open(ijk: list[int], corner: list[int], place: list[int
     assert grid.voxels_of(low - size / 256).tolist() == [[v - 1 for v in ijk]]
 
 
-@few
 @given(
     size=st.floats(1e-5, 10),
     origin=st.tuples(*[st.floats(-100, 100)] * 3),
@@ -78,18 +74,6 @@ def test_points_outside_have_voxels_outside() -> None:
     voxels = grid.voxels_of([[0.9, 1.0, 1.0], [5.0, 1.0, 1.0], [4.99, 4.99, 4.99]])
     assert voxels.tolist() == [[-1, 0, 0], [8, 0, 0], [7, 7, 7]]
     assert grid.contains(voxels).tolist() == [False, False, True]
-
-
-def test_a_grid_knows_its_size() -> None:
-    grid = Grid(0.25, (-1, 0, 1), 4)
-    assert (grid.side, grid.edge, grid.curve) == (16, 4.0, "z")
-    np.testing.assert_array_equal(grid.bounds, [[-1, 0, 1], [3, 4, 5]])
-    assert grid.describe().startswith("16^3 voxels of 250 mm, origin (-1, 0, 1) m")
-
-
-def test_only_lexicographic_order_is_not_hierarchical() -> None:
-    flags = {c: Grid(1, (0, 0, 0), 4, c).is_hierarchical for c in CURVE_NAMES}
-    assert flags == {"z": True, "hilbert": True, "lexicographic": False}
 
 
 @pytest.mark.parametrize("bits", [1, 21])
@@ -175,34 +159,6 @@ def test_bits_voxel_size_and_extent_contradict_one_another(given_options: dict[s
         GridOptions(**given_options)
 
 
-@few
-@given(
-    low=st.tuples(*[st.floats(-100, 100)] * 3),
-    sides=st.tuples(*[st.floats(0.001, 50)] * 3),
-    extent=st.floats(1.001, 5),
-    bits=st.integers(1, 21),
-)
-def test_an_extent_is_the_edge_in_longest_sides_about_the_middle(
-    low: tuple[float, float, float],
-    sides: tuple[float, float, float],
-    extent: float,
-    bits: int,
-) -> None:
-    bounds = np.array([low, np.add(low, sides)])
-    longest = float((bounds[1] - bounds[0]).max())
-    grid = GridOptions(bits=bits, extent=extent).fit(bounds)
-    assert grid.edge == pytest.approx(extent * longest, rel=1e-14)
-    np.testing.assert_allclose(center_of(grid), bounds.mean(axis=0), atol=1e-11)
-    assert grid.contains(grid.voxels_of(bounds)).all()
-
-
-def test_without_options_the_file_fits_with_room_around_it() -> None:
-    grid = GridOptions().fit(BOUNDS)
-    assert (grid.bits, grid.edge) == (10, ROOM * LONGEST)
-    room = np.stack([BOUNDS[0] - grid.bounds[0], grid.bounds[1] - BOUNDS[1]])
-    assert (room >= 0.29 * LONGEST).all()
-
-
 def test_a_voxel_size_too_small_for_the_scene_is_refused() -> None:
     with pytest.raises(GridError, match=r"needs 23 bits an axis .* the most is 21"):
         GridOptions(voxel_size=1e-6).fit(BOUNDS)
@@ -242,13 +198,6 @@ def test_a_single_point_needs_a_voxel_size() -> None:
         grid = options.fit(point)
         np.testing.assert_allclose(center_of(grid), point[0])
         assert grid.contains(grid.voxels_of(point)).all()
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-def test_a_flat_or_thin_scene_takes_its_longest_side(axis: int) -> None:
-    bounds = np.zeros((2, 3))
-    bounds[1, axis] = 2.0
-    assert GridOptions(bits=4).fit(bounds).edge == pytest.approx(2.0 * ROOM)
 
 
 def test_bounds_that_overflow_are_refused() -> None:

@@ -164,15 +164,6 @@ def test_what_only_looks_like_ids_excludes_nothing(env: Environment, sphere: Poi
         env.object(True)
 
 
-def test_keys_are_integers(env: Environment) -> None:
-    for wrong in ([1.5], ["1"], [1j], [True]):
-        with pytest.raises(hapticdb.errors.GridError, match="keys of type"):
-            env.grid.decode(wrong)
-    with pytest.raises(hapticdb.errors.GridError, match="outside the curve"):
-        env.grid.decode(np.array([2**63], dtype=np.uint64))
-    assert env.grid.decode([]).shape == (0, 3)
-
-
 def test_a_grid_ends_somewhere() -> None:
     with pytest.raises(hapticdb.errors.GridError, match="far end"):
         Grid(1e308, (0, 0, 0), 4)

@@ -12,97 +12,57 @@ from typing import TYPE_CHECKING
 from hapticdb import errors as errors
 
 if TYPE_CHECKING:
-    from hapticdb.batches.feeler import Feeler
-    from hapticdb.batches.result import ClearanceBatch, TouchBatch
-    from hapticdb.check import CheckReport, check_environment
-    from hapticdb.difference import Difference, diff_environments
-    from hapticdb.environment import Environment, create, open  # noqa: A004 - as in tarfile.open
-    from hapticdb.errors import HapticDBError
-    from hapticdb.extraction.disassembly.result import Disassembly
-    from hapticdb.extraction.disassembly.run import disassemble
-    from hapticdb.extraction.result import Extraction
-    from hapticdb.extraction.run import extract
-    from hapticdb.grid import Grid, GridOptions
-    from hapticdb.ingest.files import FileReport, ImportOptions, import_files
-    from hapticdb.ingest.upgrading import UpgradeReport, upgrade_environment
-    from hapticdb.pointshell.shell import PointShell
-    from hapticdb.pool import Pool
-    from hapticdb.poses import read_poses, write_poses
-    from hapticdb.proportions import Proportions, compare_proportions
-    from hapticdb.query.cost_model import CostModel
-    from hapticdb.query.frame import Query
-    from hapticdb.query.law import DistanceField, TangentPlane
-    from hapticdb.query.quantiles import QuantileVector
-    from hapticdb.query.touches import Touch
-    from hapticdb.realtime.coupling import Coupling
-    from hapticdb.realtime.handle import Handle
-    from hapticdb.realtime.report import Report
-    from hapticdb.realtime.resident_cells import ResidentCells
-    from hapticdb.realtime.session import Session
-    from hapticdb.recording.file import Recording
-    from hapticdb.recording.replay import Replayed, replay
-    from hapticdb.store.base import Object
-    from hapticdb.store.connect import (
-        backup_environment,
-        restore_environment,
-    )
-    from hapticdb.sweeps.result import Swept
-    from hapticdb.sweeps.run import sweep
-    from hapticdb.transfer import CopyReport, copy_environment
-    from hapticdb.warm import warm_up
+    from hapticdb.batches.feeler import Feeler as Feeler
+    from hapticdb.batches.result import ClearanceBatch as ClearanceBatch
+    from hapticdb.batches.result import TouchBatch as TouchBatch
+    from hapticdb.check import CheckReport as CheckReport
+    from hapticdb.check import check_environment as check_environment
+    from hapticdb.difference import Difference as Difference
+    from hapticdb.difference import diff_environments as diff_environments
+    from hapticdb.environment import Environment as Environment
+    from hapticdb.environment import create as create
+    from hapticdb.environment import open as open  # noqa: A004 - as in tarfile.open
+    from hapticdb.errors import HapticDBError as HapticDBError
+    from hapticdb.extraction.disassembly.result import Disassembly as Disassembly
+    from hapticdb.extraction.disassembly.run import disassemble as disassemble
+    from hapticdb.extraction.result import Extraction as Extraction
+    from hapticdb.extraction.run import extract as extract
+    from hapticdb.grid import Grid as Grid
+    from hapticdb.grid import GridOptions as GridOptions
+    from hapticdb.ingest.files import FileReport as FileReport
+    from hapticdb.ingest.files import ImportOptions as ImportOptions
+    from hapticdb.ingest.files import import_files as import_files
+    from hapticdb.ingest.upgrading import UpgradeReport as UpgradeReport
+    from hapticdb.ingest.upgrading import upgrade_environment as upgrade_environment
+    from hapticdb.pointshell.shell import PointShell as PointShell
+    from hapticdb.pool import Pool as Pool
+    from hapticdb.poses import read_poses as read_poses
+    from hapticdb.poses import write_poses as write_poses
+    from hapticdb.proportions import Proportions as Proportions
+    from hapticdb.proportions import compare_proportions as compare_proportions
+    from hapticdb.query.cost_model import CostModel as CostModel
+    from hapticdb.query.frame import Query as Query
+    from hapticdb.query.law import DistanceField as DistanceField
+    from hapticdb.query.law import TangentPlane as TangentPlane
+    from hapticdb.query.quantiles import QuantileVector as QuantileVector
+    from hapticdb.query.touches import Touch as Touch
+    from hapticdb.realtime.coupling import Coupling as Coupling
+    from hapticdb.realtime.handle import Handle as Handle
+    from hapticdb.realtime.report import Report as Report
+    from hapticdb.realtime.resident_cells import ResidentCells as ResidentCells
+    from hapticdb.realtime.session import Session as Session
+    from hapticdb.recording.file import Recording as Recording
+    from hapticdb.recording.replay import Replayed as Replayed
+    from hapticdb.recording.replay import replay as replay
+    from hapticdb.store.base import Object as Object
+    from hapticdb.store.connect import backup_environment as backup_environment
+    from hapticdb.store.connect import restore_environment as restore_environment
+    from hapticdb.sweeps.result import Swept as Swept
+    from hapticdb.sweeps.run import sweep as sweep
+    from hapticdb.transfer import CopyReport as CopyReport
+    from hapticdb.transfer import copy_environment as copy_environment
+    from hapticdb.warm import warm_up as warm_up
 
-__all__ = [
-    "CheckReport",
-    "ClearanceBatch",
-    "CopyReport",
-    "CostModel",
-    "Coupling",
-    "Difference",
-    "Disassembly",
-    "DistanceField",
-    "Environment",
-    "Extraction",
-    "Feeler",
-    "FileReport",
-    "Grid",
-    "GridOptions",
-    "Handle",
-    "HapticDBError",
-    "ImportOptions",
-    "Object",
-    "PointShell",
-    "Pool",
-    "Proportions",
-    "QuantileVector",
-    "Query",
-    "Recording",
-    "Replayed",
-    "Report",
-    "ResidentCells",
-    "Session",
-    "Swept",
-    "TangentPlane",
-    "Touch",
-    "TouchBatch",
-    "UpgradeReport",
-    "backup_environment",
-    "check_environment",
-    "compare_proportions",
-    "copy_environment",
-    "create",
-    "diff_environments",
-    "disassemble",
-    "extract",
-    "import_files",
-    "open",
-    "read_poses",
-    "replay",
-    "restore_environment",
-    "sweep",
-    "upgrade_environment",
-    "warm_up",
-    "write_poses",
-]
 __version__ = "0.1.0"
 
 _HOMES = {
@@ -145,6 +105,7 @@ _HOMES = {
 """Modules of the public names, which are imported when the name is first used: a program pays for
 what it uses, and ``hapticdb --help`` for nothing."""
 _HOME_OF = {name: module for module, names in _HOMES.items() for name in names.split()}
+__all__ = [*sorted(_HOME_OF)]  # noqa: PLE0604 - they are strings
 
 
 def __getattr__(name: str) -> object:

@@ -44,20 +44,17 @@ ALONG_VOXELS = 10_000_000
 
 
 class Imported(NamedTuple):
-    """One environment of the demo.
-
-    seconds : the import took; is_new : whether the import added anything.
-    """
+    """One environment of the demo."""
 
     layout: Layout
     url: str
     engine: str
-    seconds: float
+    seconds: float  # that the import took
     objects: int
     voxels: int
     rows: int
     bytes: int
-    is_new: bool
+    is_new: bool  # whether the import added anything
 
 
 @dataclass(frozen=True)
@@ -112,18 +109,13 @@ class LayoutFigures:
 
 @dataclass
 class Trace:
-    """What the tool felt along the path, for the picture; the same for every strategy.
+    """What the tool felt along the path, for the picture; the same for every strategy."""
 
-    force (M,) newtons and hits (M,), a number a pose; points (H, 3) metres, world frame, of the
-    hits, ids (H,) of the object that each hit (the lowest where several share a voxel), and frames
-    (H,) the pose of each.
-    """
-
-    force: NDArray[np.float64]
-    hits: NDArray[np.int64]
-    points: NDArray[np.float64]
-    ids: NDArray[np.int64]
-    frames: NDArray[np.int64]
+    force: NDArray[np.float64]  # (M,) newtons
+    hits: NDArray[np.int64]  # (M,) number at each pose
+    points: NDArray[np.float64]  # (H, 3) of the hits, metres, world frame
+    ids: NDArray[np.int64]  # (H,) object that each hit, the lowest where several share a voxel
+    frames: NDArray[np.int64]  # (H,) pose of each
 
 
 @dataclass(frozen=True)
@@ -166,20 +158,9 @@ def prepare(
 ) -> DemoScene:
     """Write the sample and import it in both layouts.
 
-    Parameters
-    ----------
-    folder : path
-        Where everything goes; made when it does not exist.
-    url : str or None
-        Environment beside which the demo's are made; it is not changed. None: in `folder`.
-    bits : int
-        Bits an axis of the grid.
-    frames : int
-        Poses of the path.
-    points : int
-        Points of the tool's shell.
-    progress : callable or None
-        As for `hapticdb.import_files`.
+    folder : where everything goes; url : environment beside which the demo's are made instead;
+    bits : of an axis of the grid; frames : poses of the path; points : of the tool's shell;
+    progress : as for `hapticdb.import_files`.
     """
     options = GridOptions(bits=bits)
     home = Path(folder)
@@ -204,10 +185,9 @@ def _import(
     url: str, car: Path, layout: Layout, grid: GridOptions, progress: ImportCallback | None
 ) -> Imported:
     started = time.perf_counter()
+    options = ImportOptions(grid=grid, layout=layout)
     try:
-        report: FileReport = import_files(
-            url, [car], ImportOptions(grid=grid, layout=layout), progress
-        )[0]
+        report: FileReport = import_files(url, [car], options, progress)[0]
     except GridError as error:
         raise UsageError(
             f"{redact(url)} is of another demo: give another folder or --url ({error})"
@@ -219,17 +199,11 @@ def _import(
         if env.store.size().rows:
             env.calibrate()
         size, objects = env.size(), env.objects()
+    n_voxels = sum(obj.voxels for obj in objects)
     return Imported(
-        layout,
-        url,
-        env.engine,
-        seconds,
-        len(objects),
-        sum(obj.voxels for obj in objects),
-        size.rows,
-        size.bytes,
+        layout, url, env.engine, seconds, len(objects), n_voxels, size.rows, size.bytes,
         bool(report.added),
-    )
+    )  # fmt: skip
 
 
 def compare(scene: DemoScene) -> Comparison:

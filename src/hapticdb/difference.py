@@ -48,27 +48,20 @@ class VoxelDifference(NamedTuple):
 
 
 class DistanceDifference(NamedTuple):
-    """One part in both environments, with other distances to its surface in each.
-
-    n_rows : number of bricks whose distances differ, or that only one environment has.
-    """
+    """One part in both environments, with other distances to its surface in each."""
 
     a: Object
     b: Object
-    n_rows: int
+    n_rows: int  # bricks whose distances differ, or that only one environment has
 
 
 class _Totals(NamedTuple):
-    """Voxels that only a has, that only b has, and that both have, summed over all objects.
-
-    A voxel with two objects counts twice. n_changed : objects that only one environment has, or
-    that differ between them.
-    """
+    """Numbers of voxels summed over all objects; a voxel with two objects counts twice."""
 
     only_in_a: int
     only_in_b: int
     shared: int
-    n_changed: int
+    n_changed: int  # objects that only one environment has, or that differ between them
 
 
 def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
@@ -83,55 +76,37 @@ def farthest_corner(a: Object, b: Object) -> float:
 
 @dataclass(frozen=True)
 class Difference:
-    """How two environments differ. Objects with the same link and name are the same part.
-
-    Attributes
-    ----------
-    a, b : str
-        The environments, as messages name them.
-    grids : tuple of two Grid
-        Their grids; voxels are compared only if `is_same_grid`.
-    only_in_a, only_in_b : tuple of Object
-        Parts that the other environment lacks.
-    changed : tuple of pairs of Object
-        The same part with another geometry (`digest`).
-    moved : tuple of pairs of Object
-        The same geometry in another place (`transform`).
-    voxels : tuple of VoxelDifference
-        The same geometry in the same place, but with other voxels.
-    elsewhere : tuple of VoxelDifference
-        The voxels of the changed and moved parts; empty if the grids are not the same.
-    renumbered, described : tuple of pairs of Object
-        The same part with another id, or with other attributes or another bounding box. These
-        differences change no wrench.
-    compared, n_voxels : int
-        Number of objects with the same geometry in the same place, whose voxels were compared,
-        and number of these voxels.
-    n_shared : int
-        Number of voxels of all compared objects that both environments have.
-    distances : tuple of DistanceDifference
-        The same geometry in the same place, with distances in both environments that differ.
-    with_distances : tuple of two int
-        Number of compared objects that have distances in a, and in b. An object that has them in
-        one environment alone is no difference: its voxels are the same.
-    """
+    """How two environments differ. Objects with the same link and name are the same part."""
 
     a: str
     b: str
     grids: tuple[Grid, Grid]
+    """Voxels are compared only if `is_same_grid`."""
     only_in_a: tuple[Object, ...]
     only_in_b: tuple[Object, ...]
+    """Parts that the other environment lacks."""
     changed: tuple[Pair, ...]
+    """The same part with another geometry (`digest`)."""
     moved: tuple[Pair, ...]
+    """The same geometry in another place (`transform`)."""
     voxels: tuple[VoxelDifference, ...]
+    """The same geometry in the same place, but with other voxels."""
     elsewhere: tuple[VoxelDifference, ...]
+    """The voxels of the changed and moved parts; empty if the grids are not the same."""
     renumbered: tuple[Pair, ...]
     described: tuple[Pair, ...]
+    """The same part with another id, or with other attributes or another bounding box, which change
+    no wrench."""
     compared: int
     n_voxels: int
+    """Objects with the same geometry in the same place, whose voxels were compared, and these."""
     n_shared: int
+    """Voxels of all compared objects that both environments have."""
     distances: tuple[DistanceDifference, ...]
+    """The same geometry in the same place, with distances in both environments that differ."""
     with_distances: tuple[int, int]
+    """Compared objects that have distances in a, and in b. An object that has them in one
+    environment alone is no difference: its voxels are the same."""
 
     @property
     def is_same_grid(self) -> bool:
@@ -166,19 +141,8 @@ def diff_environments(
 
     Distances to surfaces are compared where both environments have them for an object in the same
     place. Engines, layouts and curves may differ. Each environment is read at one revision, and
-    voxels in batches, whatever the size of an object.
-
-    Parameters
-    ----------
-    a_url, b_url : str or path
-        The environments.
-    progress : callable or None
-        Called after each object whose voxels were compared.
-
-    Raises
-    ------
-    DatabaseError
-        When one of them cannot be opened or read.
+    voxels in batches, whatever the size of an object. `progress` is called after each object whose
+    voxels were compared. Raises `DatabaseError` when one of them cannot be opened or read.
     """
     with (
         closing(open_store(a_url, read_only=True)) as a,

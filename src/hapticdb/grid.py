@@ -30,27 +30,18 @@ more room around the file, and makes voxels larger."""
 class Grid:
     """A cube of ``2^bits`` voxels on each axis, and the order of its keys.
 
-    Attributes
-    ----------
-    voxel_size : float
-        Edge s of a voxel, metres.
-    origin : tuple of 3 floats
-        Lower corner of voxel (0, 0, 0), metres, world frame.
-    bits : int
-        Bits on each axis, 1 to 21.
-    curve : {"z", "hilbert", "lexicographic"}
-        Order of the keys; see `hapticdb.kernels.curves`.
-
-    Notes
-    -----
     Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin. The interval is
     half-open, so that each point has one voxel. Surfaces are voxelized with closed boxes.
     """
 
     voxel_size: float
+    """Edge s of a voxel, metres."""
     origin: tuple[float, float, float]
+    """Lower corner of voxel (0, 0, 0), metres, world frame."""
     bits: int
+    """Bits on each axis, 1 to 21."""
     curve: CurveName = "z"
+    """Order of the keys; see `hapticdb.kernels.curves`."""
 
     def __post_init__(self) -> None:
         if not (math.isfinite(self.voxel_size) and self.voxel_size > 0):
@@ -115,13 +106,7 @@ class Grid:
         return inside
 
     def encode(self, ijk: ArrayLike) -> NDArray[np.int64]:
-        """Keys (N,) of voxels (N, 3).
-
-        Raises
-        ------
-        GridError
-            When a voxel lies outside the grid, or is not of integers.
-        """
+        """Keys (N,) of voxels (N, 3); `GridError` when one lies outside, or is not of integers."""
         given = np.asarray(ijk)
         if given.dtype.kind not in "iu" and given.size:
             raise GridError(f"voxels of type {given.dtype}: give integers, as voxels_of returns")
@@ -133,13 +118,7 @@ class Grid:
         return curves.encode(voxels, self.bits, self.curve_code)
 
     def decode(self, keys: ArrayLike) -> NDArray[np.int64]:
-        """Voxels (N, 3) of keys (N,).
-
-        Raises
-        ------
-        GridError
-            When a key lies outside ``[0, 8^bits)``.
-        """
+        """Voxels (N, 3) of keys (N,); `GridError` when a key lies outside ``[0, 8^bits)``."""
         given = np.asarray(keys)
         if given.dtype.kind not in "iu" and given.size:
             raise GridError(f"keys of type {given.dtype}: give integers, as encode returns")
@@ -160,27 +139,18 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """Options of a user for a grid. All others are fitted to the first file.
-
-    Attributes
-    ----------
-    bits : int or None
-        Bits on each axis; 10 unless the other options determine them.
-    voxel_size : float or None
-        Edge of a voxel, metres.
-    extent : float or None
-        Edge of the grid in longest sides of the first file's bounding box.
-    origin : sequence of 3 floats or None
-        Lower corner, metres; the grid is centred on the first file without it.
-    curve : curve name or None
-        Z-order unless given.
-    """
+    """Options of a user for a grid. All others are fitted to the first file."""
 
     bits: int | None = None
+    """Bits on each axis; 10 unless the other options determine them."""
     voxel_size: float | None = None
+    """Edge of a voxel, metres."""
     extent: float | None = None
+    """Edge of the grid in longest sides of the first file's bounding box."""
     origin: Sequence[float] | None = None
+    """Lower corner, metres; the grid is centred on the first file without it."""
     curve: CurveName | None = None
+    """Z-order unless given."""
 
     def __post_init__(self) -> None:
         if None not in (self.bits, self.voxel_size, self.extent):

@@ -30,13 +30,6 @@ class Pool:
     timeout : float
         Seconds that a borrower waits when all members are lent.
 
-    Raises
-    ------
-    UsageError
-        When the size or the timeout is out of range.
-    DatabaseError
-        When the environment cannot be opened.
-
     Examples
     --------
     >>> pool = hapticdb.Pool("postgresql:///plant", size=4)       # doctest: +SKIP
@@ -92,17 +85,9 @@ class Pool:
     def environment(self, timeout: float | None = None) -> Iterator[Environment]:
         """Lend an environment to this thread inside a ``with``. Do not use it afterwards.
 
-        Parameters
-        ----------
-        timeout : float or None
-            Seconds to wait when all members are lent; by default the pool's.
-
-        Raises
-        ------
-        BusyError
-            When no member was given back in that time.
-        DatabaseError
-            When the pool is closed, or a new member cannot be opened.
+        timeout : seconds to wait when all members are lent, by default the pool's. `BusyError` when
+        no member was given back in that time, `DatabaseError` when the pool is closed, or a new
+        member cannot be opened.
         """
         env = self._taken(self._timeout if timeout is None else timeout)
         is_sound = True

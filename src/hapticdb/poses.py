@@ -28,11 +28,8 @@ _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Values as a C-contiguous array of float64. Such an array is returned itself.
 
-    Raises
-    ------
-    UsageError
-        When the conversion would invent or lose something: complex numbers, masked arrays, text,
-        lists of unequal lengths.
+    Raises `UsageError` when the conversion would invent or lose something: complex numbers, masked
+    arrays, text, lists of unequal lengths.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values if values.flags.c_contiguous else np.ascontiguousarray(values)
@@ -83,14 +80,9 @@ def quaternion_of(rotations: ArrayLike) -> NDArray[np.float64]:
 
 
 def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
-    """Write poses to a file, whole or not at all.
+    """Write poses (M, 4, 4), rigid transforms `world_from_tool` in metres, whole or not at all.
 
-    Parameters
-    ----------
-    path : path
-        The file. An existing file is replaced.
-    poses : array_like
-        (M, 4, 4) rigid transforms `world_from_tool`, metres.
+    An existing file is replaced.
     """
     matrices = as_floats(poses, "poses")
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
@@ -113,12 +105,7 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
 def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.float64]:
     """Poses (M, 4, 4) `world_from_tool` of a file, in the file's order, in metres.
 
-    Parameters
-    ----------
-    path : path
-        The file.
-    unit : str
-        Unit of the file's positions, one of `hapticdb.mesh.UNITS`.
+    unit : of the file's positions, one of `hapticdb.mesh.UNITS`.
     """
     metres = metres_of(unit)
     poses = _poses_of(_read_rows(Path(path)))
@@ -131,10 +118,8 @@ def read_timed_poses(
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
     """Times (M,) in seconds, or None, and poses (M, 4, 4) `world_from_tool` of a file.
 
-    Raises
-    ------
-    FileError
-        If the file has a column ``t`` whose numbers do not increase, or cannot be read.
+    Raises `FileError` if the file has a column ``t`` whose numbers do not increase, or cannot be
+    read.
     """
     rows = _read_rows(Path(path), optional="t")
     if rows.shape[1] == len(COLUMNS):

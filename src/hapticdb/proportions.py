@@ -34,43 +34,32 @@ LIKELY = ("mm", "in", "cm", "ft", "m", "um", "yd", "km")
 
 
 class Misfit(NamedTuple):
-    """A tool, path or scene that does not fit the others.
-
-    what : which of the three; factor : its lengths are this many times too large (below 1: too
-    small) if its numbers are in another unit than assumed; unit : that other unit; both None if no
-    unit explains the misfit; text : one line for people.
-    """
+    """A tool, path or scene that does not fit the others."""
 
     what: What
     factor: float | None
+    """If its numbers are in another unit than assumed, they are this many times too large."""
     unit: str | None
+    """That other unit; both None if no unit explains the misfit."""
     text: str
+    """One line for people."""
 
 
 @dataclass(frozen=True)
 class Proportions:
-    """Sizes of tool, path and scene, and the distance between path and scene.
-
-    Attributes
-    ----------
-    scene : (2, 3) float64 or None
-        Lower and upper corner of the objects that can be hit, metres; None if there are none.
-    tool : float
-        Longest side of the tool's box, metres.
-    path : (2, 3) float64 or None
-        Corners of the box that the tool's middle moves in, metres; None if the path is unknown.
-    gap : float or None
-        Lower bound of the distance from the tool to the box of any object, metres; 0 if boxes meet,
-        None without a path or a scene.
-    misfits : tuple of Misfit
-        Sizes and places that do not fit; empty if all fit or too little is known.
-    """
+    """Sizes of tool, path and scene, and the distance between path and scene, in metres."""
 
     scene: Floats | None
+    """(2, 3) lower and upper corner of the objects that can be hit; None if there are none."""
     tool: float
+    """Longest side of the tool's box."""
     path: Floats | None
+    """(2, 3) corners of the box that the tool's middle moves in; None if the path is unknown."""
     gap: float | None
+    """Lower bound of the distance from the tool to the box of any object; 0 if boxes meet, None
+    without a path or a scene."""
     misfits: tuple[Misfit, ...]
+    """Empty if all fit or too little is known."""
 
     @property
     def text(self) -> str:
@@ -104,10 +93,8 @@ def compare_proportions(
 
     Parameters
     ----------
-    objects : iterable of Object
-        Objects of the environment.
-    voxel_size : float
-        Edge of its voxels, metres.
+    objects, voxel_size
+        Of the environment; metres.
     shell : PointShell
         The tool, metres.
     poses : (M, 4, 4) array or None
@@ -147,15 +134,11 @@ def compare_proportions(
 
 
 class _Tool(NamedTuple):
-    """A tool's box, metres.
+    """A tool's box, metres."""
 
-    middle (3,) : of the box, tool frame; radius : distance from the middle to the farthest point;
-    length : longest side.
-    """
-
-    middle: Floats
-    radius: float
-    length: float
+    middle: Floats  # (3,) tool frame
+    radius: float  # from the middle to the farthest point
+    length: float  # longest side
 
     @classmethod
     def of(cls, shell: PointShell) -> "_Tool":
@@ -167,17 +150,13 @@ class _Tool(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """Boxes to compare, metres.
+    """Boxes to compare, metres; is_moving, margin as for `compare_proportions`."""
 
-    boxes (O, 2, 3) : of the objects; scene (2, 3) : of all objects; centers (M, 3) : places of the
-    tool's middle, or None; is_moving, margin : as for `compare_proportions`.
-    """
-
-    boxes: Floats
-    scene: Floats
+    boxes: Floats  # (O, 2, 3) of the objects
+    scene: Floats  # (2, 3) of all objects
     voxel_size: float
     tool: _Tool
-    centers: Floats | None
+    centers: Floats | None  # (M, 3) places of the tool's middle
     is_moving: bool
     margin: float
 

@@ -45,13 +45,7 @@ def readable_unit(length: float) -> tuple[float, str]:
 
 
 def metres_of(unit: str) -> float:
-    """Length of a unit, metres.
-
-    Raises
-    ------
-    UsageError
-        When it is none of `UNITS`.
-    """
+    """Length of a unit, metres; `UsageError` when it is none of `UNITS`."""
     if unit not in UNITS:
         raise UsageError(f"unknown unit '{unit}'; choose one of {', '.join(UNITS)}")
     return UNITS[unit]

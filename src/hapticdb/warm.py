@@ -9,14 +9,9 @@ def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
     """Compile every kernel that this machine has not compiled yet, and load all of them.
 
     Half a minute on two processors where nothing is compiled yet, a process for each; about a
-    second later. Afterwards no import, touch, session or sweep of this process compiles anything
-    (`tests/house/test_warm.py`).
-
-    Parameters
-    ----------
-    progress : callable or None
-        Called with the number of kernels that are compiled and the number of those that were
-        missing: at the start and after each few; not at all when none was missing.
+    second later. Afterwards no import, touch, session or sweep of this process compiles anything.
+    `progress` is called with the numbers of kernels that are compiled and that were missing, at the
+    start and after each few; not at all when none was missing.
     """
     compile_missing(NAMES, progress)
     load(NAMES)

@@ -93,14 +93,6 @@ def test_a_cloud_has_distances_to_its_points(tmp_path: Path) -> None:
     assert values.min() < 0.9 * 254 / 2.75
 
 
-def test_shares_grow_over_voxels_and_distances(tmp_path: Path) -> None:
-    part, grid = a_part(tmp_path), Grid(0.002, (-0.3, -0.3, -0.3), 10)
-    shares: list[float] = []
-    rows_of_part(part, grid, "brick", progress=shares.append, distances=True)
-    assert shares == sorted(shares)
-    assert 0.0 < shares[0] < shares[-1] < 1.0
-
-
 def test_distances_that_do_not_fit_into_memory_are_refused(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

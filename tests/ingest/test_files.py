@@ -176,32 +176,6 @@ def test_a_unit_scales_files_that_carry_none(tmp_path: Path, unit: str) -> None:
 # --- the grid -----------------------------------------------------------------------------------
 
 
-def test_a_grid_fits_the_first_file_with_room_around_it(tmp_path: Path) -> None:
-    block = write_obj(tmp_path / "block.obj", {"block": box((1, 2, 3), (3, 6, 4))})
-    for options, edge, bits in [
-        (None, ROOM * 4, 10),
-        (ImportOptions(grid=GridOptions(extent=2.5, bits=6)), 10, 6),
-        (ImportOptions(grid=GridOptions(voxel_size=0.09)), 0.09 * 128, 7),
-        (ImportOptions(grid=GridOptions(extent=1, bits=4)), 4, 4),
-    ]:
-        database = tmp_path / f"{edge}.db"
-        assert import_one(database, block, options).status == "imported"
-        with hapticdb.open(database) as env:
-            assert env.grid.edge == pytest.approx(edge)
-            assert env.grid.bits == bits
-            np.testing.assert_allclose(env.grid.bounds.mean(axis=0), [2, 4, 3.5])
-
-
-def test_a_second_file_uses_the_grid_of_the_first(tmp_path: Path) -> None:
-    first = write_obj(tmp_path / "first.obj", {"one": ball((0, 0, 0), 0.1)})
-    second = write_obj(tmp_path / "second.obj", {"two": ball((0.02, 0, 0), 0.01)})
-    database = tmp_path / "e.db"
-    import_one(database, first, ImportOptions(grid=GridOptions(bits=5)))
-    before = rows_of(database, "environment")
-    assert import_one(database, second).status == "imported"
-    assert rows_of(database, "environment") == before
-
-
 def test_equal_grid_options_are_accepted_and_differing_ones_refused(
     tmp_path: Path, file: Path
 ) -> None:
@@ -227,24 +201,6 @@ def test_equal_grid_options_are_accepted_and_differing_ones_refused(
     with pytest.raises(hapticdb.errors.UsageError, match="layout voxel, not brick"):
         hapticdb.import_files(database, [file], ImportOptions(layout="brick"))
     assert rows_of(database) == before
-
-
-def test_the_curve_of_an_environment_is_accepted_without_its_layout(
-    tmp_path: Path, file: Path
-) -> None:
-    database = tmp_path / "e.db"
-    import_one(database, file, small_options("lexicographic", "voxel"))
-    options = ImportOptions(grid=GridOptions(curve="lexicographic"))
-    assert import_one(database, file, options).status == "complete"
-
-
-def test_the_same_command_again_is_accepted_with_its_extent(tmp_path: Path, file: Path) -> None:
-    database = tmp_path / "e.db"
-    options = ImportOptions(grid=GridOptions(bits=5, extent=2.0))
-    import_one(database, file, options)
-    assert import_one(database, file, options).status == "complete"
-    with pytest.raises(hapticdb.errors.GridError, match="extent 3"):
-        import_one(database, file, ImportOptions(grid=GridOptions(bits=5, extent=3.0)))
 
 
 def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
@@ -361,14 +317,6 @@ def test_nothing_usable_leaves_no_database_behind(
     assert left_behind(tmp_path) == []
 
 
-def test_an_existing_environment_into_which_nothing_went_stays(tmp_path: Path) -> None:
-    database = tmp_path / "e.db"
-    hapticdb.create(database, small_grid()).close()
-    (tmp_path / "bad.obj").write_text("v 0 0\n")
-    assert import_one(database, tmp_path / "bad.obj").status == "failed"
-    assert hapticdb.open(database).objects() == []
-
-
 def test_a_complete_file_is_left_as_it_is(tmp_path: Path, file: Path) -> None:
     database = tmp_path / "e.db"
     added = import_one(database, file, small_options()).added
@@ -393,16 +341,6 @@ def test_geometry_that_has_changed_is_told(tmp_path: Path) -> None:
     assert "both.obj" in line
     assert "'box 1' has changed" in line
     assert rows_of(database) == before
-
-
-def test_parts_that_a_file_has_gained_go_in(tmp_path: Path) -> None:
-    database = tmp_path / "e.db"
-    growing = write_obj(tmp_path / "growing.obj", assembly(2))
-    import_one(database, growing, small_options())
-    write_obj(growing, assembly(4))
-    report = import_one(database, growing)
-    assert (report.status, report.present) == ("imported", 2)
-    assert [o.id for o in report.added] == [3, 4]
 
 
 def test_rows_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:

@@ -75,16 +75,6 @@ def test_bricks_have_them_by_default_and_voxels_do_not(file: Path, tmp_path: Pat
             assert env.store.wants_distances == new.store.wants_distances == (layout == "brick")
 
 
-def test_without_them_the_plane_is_felt(file: Path, tmp_path: Path) -> None:
-    import_files(tmp_path / "e.db", [file], options(distances=False))
-    with hapticdb.open(tmp_path / "e.db") as env:
-        assert not env.has_distances
-        shell = PointShell(
-            points=np.zeros((1, 3)), normals=np.array([[1.0, 0, 0]]), center=np.zeros(3)
-        )
-        assert env.touch(shell, np.eye(4)).law == hapticdb.TangentPlane()
-
-
 @pytest.mark.parametrize("made_with", [False, True])
 def test_an_existing_environment_keeps_to_its_kind(
     file: Path, tmp_path: Path, made_with: bool

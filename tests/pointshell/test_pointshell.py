@@ -10,13 +10,10 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.pointshell import orientation
 from hapticdb.pointshell.shell import PointShell
 
 Floats = NDArray[np.float64]
@@ -201,13 +198,6 @@ def test_points_next_to_each_other_by_index_are_close_in_space(
     assert mean_step(points) < mean_step(shuffled) / 8.0
     nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
     assert mean_step(points) < 3.0 * nearest.mean()
-
-
-def test_a_frame_finds_the_same_brick_many_times_in_a_row() -> None:
-    points = PointShell.from_mesh(*torus(), 5000).points
-    bricks = np.floor(points / 0.8).astype(np.int64)
-    n_runs = 1 + int((np.diff(bricks, axis=0) != 0).any(axis=1).sum())
-    assert n_runs < 5000 / 5  # in random order, nearly one run a point
 
 
 def test_a_rounding_of_the_frame_leaves_the_order() -> None:
@@ -450,20 +440,3 @@ def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
         PointShell.from_file(cloud)
     with pytest.raises(FileError, match=r"missing\.stl"):
         PointShell.from_file(tmp_path / "missing.stl")
-
-
-@given(
-    n=st.integers(1, 40),
-    ends=st.lists(st.tuples(st.integers(0, 39), st.integers(0, 39)), max_size=60),
-)
-def test_components_are_those_of_scipy(n: int, ends: list[tuple[int, int]]) -> None:
-    pairs = np.array(ends, dtype=np.int64).reshape(-1, 2) % n
-    graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=(n, n))
-    wanted = connected_components(graph, directed=False)[1]
-    assert orientation._components(pairs, n).tolist() == wanted.tolist()
-
-
-def test_the_components_of_a_long_chain_are_one() -> None:
-    order = np.random.default_rng(1).permutation(20_000)
-    pairs = np.stack([order[:-1], order[1:]], axis=1)
-    assert not orientation._components(pairs, len(order)).any()

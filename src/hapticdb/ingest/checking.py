@@ -38,10 +38,7 @@ def bounds_inside(
 ) -> NDArray[np.float64]:
     """Bounds (2, 3) of a part in metres, world frame, at a given placement or at the file's.
 
-    Raises
-    ------
-    OutsideGridError
-        If the part leaves the grid.
+    Raises `OutsideGridError` if the part leaves the grid.
     """
     points = part.world_points(world_from_part)
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])

@@ -22,16 +22,9 @@ def with_distances(
 ) -> Bricks:
     """Bricks of a part with distances to its surface, and the bricks near it that it does not meet.
 
-    Parameters
-    ----------
-    bricks : Bricks
-        Those that the part meets.
-    corners : NDArray[np.float64]
-        (T, 3, 3) triangles, or (P, 1, 3) points of a cloud, in voxels from the grid's origin.
-    check_room : callable
-        Called with the bytes that the result needs at least; raises if they are too many.
-    progress : callable or None
-        Called with the share that is done, 0 to 1.
+    bricks : those that the part meets; corners (T, 3, 3) of triangles, or (P, 1, 3) points of a
+    cloud, in voxels from the grid's origin; check_room : called with the bytes that the result
+    needs at least, raises if they are too many; progress : called with the share that is done.
     """
     keys: list[Keys] = []
     packed: list[NDArray[np.uint8]] = []

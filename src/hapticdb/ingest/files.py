@@ -50,83 +50,51 @@ ImportCallback = Callable[[ImportProgress], None]
 
 @dataclass(frozen=True)
 class FileReport:
-    """Result of the import of one file.
-
-    Attributes
-    ----------
-    link : str
-        The file.
-    status : {"imported", "complete", "failed"}
-        Objects were written; all objects were in the environment already; the file was skipped, see
-        `error`.
-    added : tuple of Object
-        Objects written now, in the file's order.
-    present : int
-        Number of objects that were in the environment already.
-    restored : int
-        Number of added parts that had been removed from the environment before.
-    kept_removed : int
-        Number of removed parts that were skipped: `ImportOptions.keep_removed`.
-    replaced, dropped : int
-        Numbers of objects replaced and removed: `ImportOptions.replace`.
-    defects : Defects
-        Defects of the file.
-    error : HapticDBError or None
-        Why the file was skipped.
-    is_unit_assumed : bool
-        Whether neither the file nor the options give a unit, so its numbers were read as metres.
-    """
+    """Result of the import of one file."""
 
     link: str
     status: Literal["imported", "complete", "failed"]
+    """Objects were written; all objects were there already; the file was skipped, see `error`."""
     added: tuple[Object, ...] = ()
+    """Objects written now, in the file's order."""
     present: int = 0
+    """Objects that were in the environment already."""
     restored: int = 0
+    """Added parts that had been removed from the environment before."""
     kept_removed: int = 0
+    """Removed parts that were skipped: `ImportOptions.keep_removed`."""
     replaced: int = 0
     dropped: int = 0
+    """Objects replaced and removed: `ImportOptions.replace`."""
     defects: Defects = field(default_factory=Defects)
     error: HapticDBError | None = None
     is_unit_assumed: bool = False
+    """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
 
 
 @dataclass(frozen=True)
 class ImportOptions:
-    """Options of reading and voxelizing files.
-
-    Attributes
-    ----------
-    unit : str or None
-        Unit of files that name none, one of `hapticdb.mesh.UNITS`; metres unless given.
-    grid : GridOptions
-        Grid of a new environment; must agree with an existing one.
-    layout : {"voxel", "brick"} or None
-        Layout of a new environment (bricks unless given); must agree with an existing one.
-    jobs : int or None
-        Threads that voxelize; one for each processor unless given.
-    keep_removed : bool
-        Skip parts that were removed from the environment; otherwise they are added again.
-    time_limit, memory_limit : float, int or None
-        Greatest time (s) and memory (bytes) for reading one file; in proportion to the file unless
-        given, see `hapticdb.mesh.read_file`.
-    replace : bool
-        Make the environment agree with the file: replace objects, under their ids, whose parts have
-        another geometry, placement or unit now, and remove objects whose parts the file lacks.
-    distances : bool or None
-        Whether parts of a new environment get distances to their surfaces, which the smooth force
-        law needs; must agree with an existing one. Unless given, they do in the layout brick. The
-        layout voxel has none.
-    """
+    """Options of reading and voxelizing files."""
 
     unit: str | None = None
+    """Unit of files that name none, one of `hapticdb.mesh.UNITS`; metres unless given."""
     grid: GridOptions = field(default_factory=GridOptions)
+    """Grid of a new environment; must agree with an existing one, as layout and distances must."""
     layout: Layout | None = None
+    """Bricks unless given."""
     jobs: int | None = None
+    """Threads that voxelize; one for each processor unless given."""
     keep_removed: bool = False
+    """Skip parts that were removed from the environment; otherwise they are added again."""
     time_limit: float | None = None
     memory_limit: int | None = None
+    """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
     replace: bool = False
+    """Make the environment agree with the file: replace objects, under their ids, whose parts have
+    another geometry, placement or unit now, and remove objects whose parts the file lacks."""
     distances: bool | None = None
+    """Whether parts of a new environment get distances to their surfaces, which the smooth force
+    law needs. Unless given, they do in the layout brick. The layout voxel has none."""
 
     def __post_init__(self) -> None:
         for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
@@ -164,12 +132,12 @@ def import_files(
     options : ImportOptions or None
         Units, grid, layout, jobs.
     progress : callable or None
-        Called after each part with an `ImportProgress`.
+        Called with an `ImportProgress`.
 
     Returns
     -------
     list of FileReport
-        One for each file, in order. If a report's `status` is ``failed``, its `error` says why.
+        One for each file, in order.
 
     Raises
     ------
@@ -210,34 +178,21 @@ def _import_file(
 
 
 class _Target:
-    """The environment that files are imported into: opened, or made for the first usable file.
-
-    Attributes
-    ----------
-    store : Store or None
-        None until the environment exists.
-    loading : ExitStack
-        Keeps `Store.loading` active from the first usable file on.
-    is_first_file, has_written : bool
-        Whether this is the first file; whether any object was written.
-    """
+    """The environment that files are imported into: opened, or made for the first usable file."""
 
     def __init__(self, url: str | os.PathLike[str], options: ImportOptions) -> None:
         self._url, self._options = url, options
+        self._layout: Layout = options.layout or "brick"
         self._is_new = self._is_loading = False
         self.loading = contextlib.ExitStack()
+        """Keeps `Store.loading` active from the first usable file on."""
         self.is_first_file, self.has_written = True, False
         self.store: Store | None = None
-        if not exists(url):
-            layout = options.layout or "brick"
-            check_curve(options.grid.curve or "z", layout)
-            wants_distances(layout, options.distances)
-            return
-        self.store = open_store(url)
-        with _closing_on_error(self.store):
-            _check_layout(self.store, options.layout)
-            _check_wish(self.store, options.distances)
-            options.grid.check_matches(self.store.grid)
+        if exists(url):
+            self._join(options.layout, options.grid)
+        else:
+            check_curve(options.grid.curve or "z", self._layout)
+            wants_distances(self._layout, options.distances)
 
     def __enter__(self) -> Self:
         return self
@@ -268,20 +223,24 @@ class _Target:
 
     def _create_or_join(self, grid: Grid) -> None:
         """Make the environment, or open the one that another process has made meanwhile."""
-        layout = self._options.layout or "brick"
         try:
-            wanted = wants_distances(layout, self._options.distances)
-            self.store = create_store(self._url, grid, layout, distances=wanted)
+            wanted = wants_distances(self._layout, self._options.distances)
+            self.store = create_store(self._url, grid, self._layout, distances=wanted)
             self._is_new = True
         except EnvironmentExistsError:
-            store = open_store(self._url)
-            with _closing_on_error(store):
-                _check_layout(store, layout)
-                _check_wish(store, self._options.distances)
-                GridOptions(
-                    bits=grid.bits, voxel_size=grid.voxel_size, origin=grid.origin, curve=grid.curve
-                ).check_matches(store.grid)
-            self.store = store
+            same = GridOptions(grid.bits, grid.voxel_size, None, grid.origin, grid.curve)
+            self._join(self._layout, same)
+
+    def _join(self, layout: Layout | None, grid: GridOptions) -> None:
+        """Open the environment; refuse options that are not its own."""
+        store = open_store(self._url)
+        try:
+            _check_options(store, layout, self._options.distances)
+            grid.check_matches(store.grid)
+        except BaseException:
+            store.close()
+            raise
+        self.store = store
 
 
 def ingest_file(
@@ -297,8 +256,7 @@ def ingest_file(
     OutsideGridError
         If a part leaves the grid; then no part of the file is written.
     GeometryChangedError
-        If the environment has a part of the same name with another geometry, unless it is to be
-        replaced.
+        If a part has another geometry than the object of its name, which is not to be replaced.
     """
     plan = _planned(store, mesh_file, options)
     jobs = options.jobs or os.cpu_count() or 1
@@ -325,17 +283,12 @@ def ingest_file(
 
 
 class _Plan(NamedTuple):
-    """Planned changes for a file's parts.
+    """Planned changes for a file's parts."""
 
-    known : parts that the environment has; missing : parts to add, in the file's order; removed :
-    names of the file's parts that were removed from the environment; changed : new parts, by the
-    ids of the objects that they replace.
-    """
-
-    known: KnownParts
-    missing: list[Part]
-    removed: set[str]
-    changed: dict[int, Part]
+    known: KnownParts  # that the environment has
+    missing: list[Part]  # to add, in the file's order
+    removed: set[str]  # names of the file's parts that were removed from the environment
+    changed: dict[int, Part]  # new parts, by the ids of the objects that they replace
 
 
 def _planned(store: Store, mesh_file: MeshFile, options: ImportOptions) -> _Plan:
@@ -393,15 +346,12 @@ def _add_missing(
     return added
 
 
-def _check_layout(store: Store, layout: Layout | None) -> None:
+def _check_options(store: Store, layout: Layout | None, distances: bool | None) -> None:  # noqa: FBT001 - an option as given
+    """Refuse a wish about layout or distances that is not the environment's."""
     if layout is not None and layout != store.layout:
         raise UsageError(
             f"{store.url} has the layout {store.layout}, not {layout}; leave --layout out"
         )
-
-
-def _check_wish(store: Store, distances: bool | None) -> None:  # noqa: FBT001 - an option as given
-    """Refuse a wish about distances that is not the environment's."""
     if distances is None or distances == store.wants_distances:
         return
     if distances:
@@ -415,13 +365,3 @@ def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | No
     if first is None or first.link == mesh_file.link:
         return mesh_file.bounds
     return None
-
-
-@contextlib.contextmanager
-def _closing_on_error(store: Store) -> Iterator[None]:
-    """Close a store if the block raises an error."""
-    try:
-        yield
-    except BaseException:
-        store.close()
-        raise

@@ -17,19 +17,10 @@ from hapticdb.store.base import Object
 
 
 def parts_of(objects: Sequence[Object], to_be: str, instead: str) -> Iterator[tuple[Object, Part]]:
-    """Yield objects with their geometry, checked against the imported one; reads each file once.
+    """Yield objects, ordered by file, with their geometry as it was imported; reads each file once.
 
-    Parameters
-    ----------
-    objects : sequence of Object
-        In any order; they are yielded ordered by file.
-    to_be, instead : str
-        Words for messages: the failed action (``moved``), and what to do instead.
-
-    Raises
-    ------
-    GeometryChangedError
-        If an object's file is missing or has another geometry now.
+    to_be, instead : words for messages: the failed action (``moved``), and what to do instead.
+    Raises `GeometryChangedError` if an object's file is missing or has another geometry now.
     """
     for some, part in found_parts(objects, to_be, instead):
         if not isinstance(part, Part):

@@ -37,27 +37,15 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class UpgradeReport:
-    """Result of `upgrade_environment`.
-
-    Attributes
-    ----------
-    url : str
-        The environment, as messages name it.
-    upgraded : int
-        Number of objects that got distances now.
-    present : int
-        Number of objects that had distances already.
-    voxels : int
-        Number of voxels of the upgraded objects.
-    left_out : tuple of LeftOut
-        Objects that stay without, and why.
-    """
+    """Result of `upgrade_environment`: numbers of objects, and of the upgraded ones' voxels."""
 
     url: str
     upgraded: int
     present: int
+    """Objects that had distances already."""
     voxels: int
     left_out: tuple[LeftOut, ...]
+    """Objects that stay without, and why."""
 
     @property
     def is_complete(self) -> bool:
@@ -81,7 +69,7 @@ def upgrade_environment(
     jobs : int or None
         Threads that compute distances; one for each processor unless given.
     progress : callable or None
-        Called after each object with an `ImportProgress`.
+        Called with an `ImportProgress`.
 
     Raises
     ------

@@ -49,22 +49,13 @@ def rows_of_part(
 ) -> tuple[Rows, int]:
     """Voxelize a part; returns its rows, ascending by key, and the number of its voxels.
 
-    Parameters
-    ----------
-    part : Part
-        A triangle marks every voxel whose closed box it meets; a point marks its voxel.
-    world_from_part : (4, 4) float64 or None
-        Placement in metres; the file's unless given.
-    progress : callable or None
-        Called with the share of a large part that is done.
-    distances : bool
-        Whether the rows get distances to the part's surface, or to the points of a cloud. Then
-        there are rows for all bricks near it. Bricks only.
+    A triangle marks every voxel whose closed box it meets; a point marks its voxel.
 
-    Raises
-    ------
-    FileError
-        If its voxels or distances would take more memory than the machine has left.
+    world_from_part (4, 4) : placement in metres, the file's unless given; progress : called with
+    the share of a large part that is done; distances : whether the rows get distances to the
+    part's surface, or to the points of a cloud: then there are rows for all bricks near it.
+
+    Raises `FileError` if this would take more memory than the machine has left.
     """
     what = f"part {part.name!r}"
     voxels_alone = _VOXELS_SHARE if distances else 1.0
@@ -114,12 +105,8 @@ def bricks_of_pieces(
 ) -> Bricks:
     """Bricks of a part from pieces with the share that is done, keys and occupancy.
 
-    Needs memory for twice the result and one piece. what : the name in errors.
-
-    Raises
-    ------
-    FileError
-        If the bricks would take more memory than the machine has left.
+    Needs memory for twice the result and one piece. what : the name in the `FileError` that is
+    raised if the machine has less.
     """
     pieces: list[Bricks] = []
     n_waiting, merge_from = 0, _MERGE_FROM
@@ -166,18 +153,10 @@ def voxelize_parts(
     jobs: int,
     progress: ShareCallback = lambda _share: None,
 ) -> Generator[tuple[Object, Rows], None, None]:
-    """Yield objects and rows of parts, in order; threads voxelize a few parts in advance.
+    """Yield objects and rows of parts, in order; `jobs` threads voxelize a few parts in advance.
 
-    Threads suffice because the voxelizer runs without the interpreter lock.
-
-    Parameters
-    ----------
-    unit : str or None
-        Unit in which the file was read; stored with the objects.
-    jobs : int
-        Threads that voxelize.
-    progress : callable
-        Called in the caller's thread with the share of the part that it waits for.
+    Threads suffice because the voxelizer runs without the interpreter lock. unit : in which the
+    file was read, stored with the objects; progress : as for `in_threads`.
     """
     given = {"unit": unit, "up": file.up}
     attributes = {name: value for name, value in given.items() if value}
@@ -194,18 +173,11 @@ def in_threads(
     jobs: int,
     progress: ShareCallback = lambda _share: None,
 ) -> Generator[Done, None, None]:
-    """Yield the results of `work` on items, in order; threads compute a few in advance.
+    """Yield the results of `work` on items, in order; `jobs` threads compute a few in advance.
 
-    When this generator ends early, so does the work: the next call with a share raises an error.
-
-    Parameters
-    ----------
-    work : callable
-        Called in a thread with an item, and with what it calls often with the share that is done.
-    jobs : int
-        Number of threads.
-    progress : callable
-        Called in the caller's thread with the share of the item that it waits for.
+    `work` is called in a thread with an item, and with what it calls often with the share that is
+    done; `progress` in the caller's thread, with the share of the item that it waits for. When this
+    generator ends early, so does the work: the next call with a share raises an error.
     """
     shares: dict[int, float] = {}
     ended = Event()

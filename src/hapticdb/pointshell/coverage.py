@@ -45,9 +45,8 @@ def covering_radius(triangles: Floats, points: Floats) -> float:
     """Bound the covering radius of points (N, 3) on triangles (F, 3, 3) from above, metres.
 
     The distance to a point is convex, so no position in a triangle is farther from a point than the
-    triangle's farthest corner. Triangles are halved across their longest side until that bound,
-    for the point nearest to their middle, is within `CLOSE` of a distance that occurs. The result
-    is raised by a millionth, which is more than its rounding errors.
+    triangle's farthest corner. Triangles are halved across their longest side until that bound is
+    within `CLOSE` of a distance that occurs. The result is raised by more than its rounding errors.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for sweeps alone
 
@@ -90,9 +89,8 @@ class Ball(NamedTuple):
     def covering_radius(self, points: Floats) -> float:
         """Bound the covering radius of points (N, 3) on the sphere from above, metres.
 
-        The faces of the points' convex hull cut caps off the sphere; the farthest positions are the
-        middles of these caps. If the points have no hull, or all lie on one side, the bound is the
-        sphere's diameter.
+        The farthest positions are the middles of the caps that the faces of the points' convex hull
+        cut off. If the points have no hull, or all lie on one side, it is the sphere's diameter.
         """
         from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - as above
 
@@ -106,12 +104,9 @@ class Ball(NamedTuple):
 
 
 class Interior:
-    """The inside of a surface's closed bodies.
+    """The inside of the closed bodies of a result of `orient`, or of a ball.
 
-    Parameters
-    ----------
-    surface : Surface or Ball
-        A result of `orient`, or a ball. Open bodies enclose nothing, and a void is outside.
+    Open bodies enclose nothing, and a void is outside.
     """
 
     def __init__(self, surface: "Surface | Ball") -> None:
@@ -132,7 +127,6 @@ class Interior:
             self._boxes[body] = corners.min(axis=0), corners.max(axis=0)
 
     def __bool__(self) -> bool:
-        """Whether there is any closed body."""
         return self._ball is not None or bool(self._bodies)
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:

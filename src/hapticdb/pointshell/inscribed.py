@@ -25,19 +25,15 @@ SLACK = 0.01
 """Share of its radius by which surface may reach into a ball that counts as empty. A larger value
 draws points in over flatter edges: at 0.01, over convex edges of more than 172 degrees."""
 NEARLY = 0.05
-"""Share of its radius by which surface may be off a ball and still count as touching it, when its
-facing is asked for. A larger value finds the opposite wall of rounder meshes, and drops fewer
-points along the edges of thin walls."""
+"""Share of its radius by which surface may be off a ball and still count as touching it. A larger
+value finds the opposite wall of rounder meshes, and drops fewer points on edges of thin walls."""
 ALIGNED = 0.96
 """Cosine between a plane's normal and the direction to its nearest point above which the ball
-touches the plane and not its border: 16 degrees. A larger value finds fewer opposite walls of round
-tools."""
+touches the plane and not its border: 16 degrees. Larger: fewer opposite walls of round tools."""
 MOST_PIECES = 20_000
-"""Pieces into which long triangles are cut, about. A larger value makes searches more selective,
-and cutting slower."""
+"""Pieces into which long triangles are cut, about. Larger: slower cutting, faster searches."""
 MOST_PAIRS = 2_000_000
-"""Pairs of a ball and a triangle that are measured at a time, about. Larger: more memory, up to
-0.5 kB a pair."""
+"""Pairs of a ball and a triangle that are measured at a time, about: up to 0.5 kB each."""
 SMALL = 0.1
 """Size of a piece, in radii of a ball, up to which the nearest of the middles of pieces find what
 is in a ball. A larger value is faster and errs more, by the size of a piece at most."""
@@ -51,12 +47,10 @@ SCALES = 4
 """Sizes of smaller balls, each `2 SLACK` of the one before, that find walls too thin for larger
 ones: the last is 1.6e-7 of the wanted radius, and finds walls of a hundredth of that."""
 LINES = 12
-"""Lines that vote whether an open surface has matter at a position. A larger value decides more
-exactly and takes longer."""
+"""Lines that vote whether an open surface has matter at a position."""
 MATTER = 0.5
 """Share of lines that must cross an open surface on both sides of a position for matter to be
-there. The share is 2 w - 1 for a winding number w. A larger value lets fewer open surfaces count
-as solids with a hole."""
+there: 2 w - 1 for a winding number w. Larger: fewer open surfaces count as solids with a hole."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -83,17 +77,10 @@ class _Octave(NamedTuple):
 
 
 class InscribedBalls:
-    """Finds balls inside the solids of a surface; see the module.
+    """Finds balls inside the solids of a surface, of radii up to `greatest` metres; see the module.
 
     A solid is a closed body with its voids; all open surfaces together count as one. A solid's
     balls stop at its own surface alone: what lies outside a solid is behind its surface.
-
-    Parameters
-    ----------
-    surface : Surface
-        Triangles with known inner sides.
-    greatest : float
-        Greatest radius that will be asked for, metres.
     """
 
     def __init__(self, surface: "Surface", greatest: float) -> None:
@@ -129,10 +116,7 @@ class InscribedBalls:
         ]
 
     def _cut_to(self, longest: float) -> tuple[Floats, Ints]:
-        """Pieces (P, 3, 3) of the triangles with sides up to `longest` metres, and their solids.
-
-        A piece that is short enough is looked at once.
-        """
+        """Pieces (P, 3, 3) of the triangles with sides up to `longest` metres, and their solids."""
         pieces, solids = self._triangles, self._solids
         done: list[tuple[Floats, Ints]] = []
         n_done = 0
@@ -170,9 +154,8 @@ class InscribedBalls:
     ) -> None:
         """Shrink balls through walls thinner than their slack, which only smaller ones see.
 
-        Beside a sharp edge of a closed body there is no thinnest wall. A ball that meets something
-        other than its own plane and has its middle outside its solid is tried smaller and smaller.
-        Where none of these meets a wall, the body crosses itself, and the ball stays.
+        A ball that meets something other than its own plane and has its middle outside its solid is
+        tried smaller and smaller. Where none meets a wall, the body crosses itself: the ball stays.
         """
         some = np.arange(len(local))
         for _ in range(SCALES):
@@ -253,10 +236,9 @@ class InscribedBalls:
     ) -> tuple[Ints, Floats]:
         """Pairs of a ball and a piece that may meet it: ball (P,), (P, 3, 3).
 
-        radii (Q,), ascending, are results of `_preshrunk`. It is exact for pieces that are small
-        beside a ball. So whole balls, which have not shrunk, need none of them, and the others a
-        few, for their facings. A ball lies on the inner side of the plane that touches the surface
-        at its position.
+        radii (Q,), ascending, are results of `_preshrunk`, which is exact for pieces that are small
+        beside a ball. So whole balls need none of them, and the others a few, for their facings. A
+        ball lies on the inner side of the plane that touches the surface at its position.
         """
         from scipy.spatial import cKDTree  # noqa: PLC0415 - as above
 
@@ -371,8 +353,8 @@ def _facings(
 ) -> Floats:
     """Cosines (P,) between the normals (P, 3) and those of the pieces that touch the balls.
 
-    Beside the touching point a plane's nearest points lie in tilted directions, so the plane's own
-    normal counts. An edge has none: there the direction counts, but only where the ball touches.
+    Where the nearest points lie in tilted directions, the plane's own normal counts. At an edge the
+    direction counts, but only where the ball touches.
     """
     away = centers - touched
     distance = np.linalg.norm(away, axis=1)
@@ -386,18 +368,14 @@ def _facings(
 
 
 def _longest_of(vectors: Floats) -> Floats:
-    """Greatest of the lengths of three vectors each, (P, 3, 3): (P,)."""
+    """Greatest length of three vectors each, (P, 3, 3): (P,)."""
     squares = np.einsum("pck,pck->pc", vectors, vectors)
     a, b, c = squares[:, 0], squares[:, 1], squares[:, 2]
     return np.asarray(np.sqrt(np.maximum(np.maximum(a, b), c)))
 
 
 def _nearest_on(triangles: Floats, positions: Floats) -> Floats:
-    """Nearest point (P, 3) of each triangle (P, 3, 3) to its position (P, 3); degenerate ones too.
-
-    The nearest point lies in the triangle's plane, if the foot of the perpendicular is in the
-    triangle, else on one of its sides.
-    """
+    """Nearest point (P, 3) of each triangle (P, 3, 3) to its position (P, 3), degenerate or not."""
     a, b, c = triangles[:, 0], triangles[:, 1], triangles[:, 2]
     best, nearest = np.full(len(positions), np.inf), np.empty_like(positions)
     for tail, head in ((a, b), (b, c), (c, a)):

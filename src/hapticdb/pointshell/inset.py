@@ -22,22 +22,17 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 SAMPLES = 5
-"""Samples for each wanted point, at first. A larger value spreads the points more evenly and takes
-longer."""
+"""Samples for each wanted point, at first."""
 ENOUGH = 3
-"""Images for each wanted point, below which more samples are drawn. A larger value spreads the
-points of small tools more evenly."""
+"""Images for each wanted point, below which more samples are drawn. Larger: more even, slower."""
 MOST_SAMPLES = 10
-"""Most samples for each wanted point. A larger value helps tools that keep few of their images, and
-takes longer."""
+"""Most samples for each wanted point. Larger: slower for tools that keep few of their images."""
 SHARP = -0.5
 """Cosine between the inward normals of two faces below which they form a thin wall or a sharp
-wedge: minus the cosine of a wedge's angle of 60 degrees. A larger value keeps the points of wider
-wedges, which then touch early."""
+wedge, of less than 60 degrees. A larger value keeps points of wider wedges, which touch early."""
 LATEST = 2.0
 """Distance from a sample to the nearest image, in insets, above which the sample's own image is
-kept: so no position touches late by more than one inset. A wedge of 60 degrees has this distance. A
-larger value leaves more corners without points."""
+kept: so no position touches late by more than one inset. Larger: more corners without points."""
 
 Floats = NDArray[np.float64]
 
@@ -103,8 +98,7 @@ def _spread(
     """Choose `n_points` images (M, 3), as far from one another as elimination makes them.
 
     share : of all samples that the images are; it estimates the area that they lie on. Images of a
-    small ball or rod coincide, and elimination needs distinct places, so each place is moved back
-    a little towards its sample.
+    small ball or rod coincide, so each place is moved back a little towards its sample.
     """
     places = images + 1e-3 * (samples - images)
     spacing = spacing_of(share * float(surface.areas.sum()), n_points)

@@ -105,8 +105,7 @@ def _sides_of(faces: Ints, triangles: Floats) -> tuple[_Sides, bool]:
 def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> NDArray[np.bool_]:
     """Whether each dropped wall (W, 3) lies inside a closed body of the kept faces that it joins.
 
-    It does where two bodies are glued together. Where one body is inside another, and a face of
-    both is the same, that face is border: without it the outer body would be open there.
+    If not, one body is inside another, and without the wall the outer body would be open there.
     """
     is_within = np.zeros(len(walls), dtype=bool)
     if not len(walls):
@@ -129,9 +128,8 @@ def _edges_of(faces: Ints) -> _Edges:
 def _join_corners(triangles: Floats) -> Ints:
     """Number the corners (F, 3) so that corners that coincide have one number.
 
-    Some formats, such as STL, do not share corners between faces. Corners with equal bits are one.
-    If edges stay open, their corners are also joined within `JOIN`, because two faces may store one
-    edge with different rounding errors.
+    Corners with equal bits are one. If edges stay open, their corners are also joined within
+    `JOIN`, because two faces may store one edge with different rounding errors.
     """
     corners = triangles.reshape(-1, 3) + 0.0  # -0.0 is 0.0
     order = np.lexsort(corners.T)
@@ -158,10 +156,8 @@ def _join_corners(triangles: Floats) -> Ints:
 def _components(pairs: Ints, n: int) -> Ints:
     """Component (n,) of each node of a graph, numbered by lowest node. pairs (E, 2) are its edges.
 
-    In each round every root with a lower neighbour becomes a child of the lowest one, and every
-    node is linked to its root, until each edge has one root at both ends. A round leaves at most
-    half of a component's roots. scipy has this too, but importing it would cost every shell a third
-    of a second.
+    In each round every root with a lower neighbour becomes a child of the lowest one, which leaves
+    at most half of a component's roots. Importing scipy's would cost every shell 0.3 s.
     """
     root = np.arange(n, dtype=np.int64)
     tail, head = root[pairs[:, 0]], root[pairs[:, 1]]
@@ -181,13 +177,11 @@ def _neighbours(number: Ints, sides: Ints) -> Ints:
 
 
 def _drop_repeated(faces: Ints) -> tuple[Ints, Ints]:
-    """Numbers of the faces to keep, ascending: one of the faces with the same corners.
+    """Numbers of the faces to keep, one of those with the same corners, and of walls not kept.
 
-    Then those of the walls that are not kept, one of each pair.
-
-    Two bodies that are glued together may have the wall between them twice. If the wall is kept
-    once, its border edges have an odd number of faces, so they are open. So a patch of repeated
-    faces is dropped completely if more of its border edges would be open than closed.
+    Two bodies that are glued together may have the wall between them twice. Kept once, its border
+    edges would have an odd number of faces, so be open: a patch of repeated faces is dropped
+    completely if more of its border edges would be open than closed.
     """
     is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     whole = np.flatnonzero(is_face)
@@ -214,10 +208,9 @@ def _drop_repeated(faces: Ints) -> tuple[Ints, Ints]:
 
 
 def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
-    """Form patches of faces across edges with two faces, with one winding in each patch.
+    """Patch (F,) of each face, across edges with two faces, and whether to flip the face (F,).
 
-    Returns the patch (F,) of each face, and whether to flip the face (F,). A patch with only one
-    side (a Moebius strip) is split into single faces.
+    A patch with only one side (a Moebius strip) is split into single faces.
     """
     n = len(faces)
     pairs = _neighbours(edges.number, np.flatnonzero((edges.uses == 2)[edges.number]))

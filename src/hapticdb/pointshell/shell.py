@@ -59,47 +59,31 @@ class PointShell:
     `from_mesh` and `from_file` sort the points along a Z-order curve, so neighbours by index are
     mostly close in space. Given arrays and saved shells keep their order.
 
-    Parameters
-    ----------
-    points : (N, 3)
-        Metres, tool's frame, which is the file's own, not re-centred.
-    normals : (N, 3)
-        Unit normals, into the tool.
-    center : (3,)
-        Centre of mass, metres, the same frame. For a closed surface, of a solid of uniform density
-        (overlaps of bodies count twice); for an open one, of the surface.
-    is_closed : bool
-        False if the surface has open edges, so its inside is a guess.
-    link : str
-        Absolute path of the file that the shell was made from; empty if there is none.
-    seed : int
-        Random seed of the points.
-    defects : str
-        Defects of that file, in words; not saved.
-    cover : float, optional
-        Covering radius, metres: no position on the tool's surface is farther from the nearest
-        point. None if it is not known; `with_cover` computes it for shells made of a mesh.
-    surface : Surface or Ball, optional
-        Surface on which the points lie, or from which they were drawn inward; not saved.
-    inset : (N,), optional
-        How far each point was drawn inward from the surface, metres; zeros unless given.
-
-    Raises
-    ------
-    UsageError
-        Arrays of another shape, not finite, or normals that are not of unit length.
+    Raises `UsageError` for arrays of another shape, not finite, or normals that are not of unit
+    length.
     """
 
     points: Floats
+    """(N, 3) metres, tool's frame, which is the file's own, not re-centred."""
     normals: Floats
+    """(N, 3) unit normals, into the tool."""
     center: Floats
+    """(3,) centre of mass, metres: of a solid of uniform density for a closed surface (overlaps of
+    bodies count twice), of the surface for an open one."""
     is_closed: bool = True
+    """False if the surface has open edges, so its inside is a guess."""
     link: str = ""
+    """Absolute path of the file that the shell was made from."""
     seed: int = 0
     defects: str = ""
+    """Defects of that file, in words; not saved."""
     cover: float | None = None
+    """Covering radius, metres: no position on the tool's surface is farther from the nearest
+    point. None if it is not known; `with_cover` computes it."""
     surface: Surface | Ball | None = field(default=None, repr=False)
+    """On which the points lie, or from which they were drawn inward; not saved."""
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
+    """(N,) how far each point was drawn inward from the surface, metres; zeros unless given."""
 
     def __post_init__(self) -> None:
         if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
@@ -136,10 +120,9 @@ class PointShell:
 
     @property
     def outline(self) -> Floats:
-        """Positions (P, 3), metres, that span the tool's surface.
+        """Positions (P, 3), metres, that span the tool's surface: its corners, if it is known.
 
-        The corners of the surface's triangles, if it is known; else the points, put back onto the
-        surface that they were drawn inward from.
+        Else the points, put back onto the surface that they were drawn inward from.
         """
         if isinstance(self.surface, Surface):
             return self.surface.triangles.reshape(-1, 3)
@@ -161,8 +144,7 @@ class PointShell:
         Parameters
         ----------
         path : path
-            A mesh file, or a shell saved as `.npz`; a saved shell is loaded unchanged, whatever
-            `points`, `spacing`, `seed` and `inset` say.
+            A mesh file, or a shell saved as `.npz`, which is loaded unchanged.
         points : int, optional
             Number of points, 1 to 10^7; 300 unless given. With a spacing, the greatest number;
             200,000 unless given.
@@ -175,8 +157,7 @@ class PointShell:
         inset : float
             How far the points are drawn inward, metres. Give the smooth law's onset, 1.5 voxels,
             for contact that begins at the surface; 0 for points on it, so that clearance is kept.
-            Thin walls, sharp edges and tips are drawn in as far as they can be:
-            `hapticdb.pointshell.inset`.
+            Thin walls, sharp edges and tips are drawn in as far as they can be.
 
         Raises
         ------
@@ -215,19 +196,9 @@ class PointShell:
     ) -> "PointShell":
         """Make the shell of a triangle mesh.
 
-        Parameters
-        ----------
-        vertices : (V, 3)
-            Metres; they define the shell's frame.
-        faces : (F, 3)
-            Vertices of each triangle, in any order and winding.
-        points, spacing, seed, inset
-            As for `from_file`.
-
-        Raises
-        ------
-        UsageError
-            Numbers out of range, vertices not finite, faces that name no vertex, no area.
+        vertices (V, 3), metres, define the shell's frame; faces (F, 3) are integers, in any order
+        and winding; the others are as for `from_file`. Raises `UsageError` for numbers out of
+        range, vertices that are not finite, faces that name no vertex, and meshes without area.
         """
         _check_request(DEFAULT_POINTS if points is None else points, spacing, seed, inset)
         corners = _as_floats(vertices, "vertices", finite=False)
@@ -242,19 +213,9 @@ class PointShell:
 
     @classmethod
     def sphere(cls, radius: float, points: int = 300) -> "PointShell":
-        """Make the shell of a sphere about the origin, its points spread evenly.
+        """Make the shell of a sphere about the origin; radius in metres, points spread evenly.
 
-        Parameters
-        ----------
-        radius : float
-            Metres.
-        points : int
-            Number of points, 1 to 10^7.
-
-        Raises
-        ------
-        UsageError
-            Numbers out of range.
+        Raises `UsageError` for numbers out of range.
         """
         _check_request(points, None, 0)
         if not (np.isfinite(radius) and radius > 0):
@@ -294,9 +255,9 @@ class PointShell:
         )  # fmt: skip
 
     def with_cover(self) -> "PointShell":
-        """Return the shell with its covering radius, if it was made of a mesh or is a sphere.
+        """Return the shell with its covering radius, if its surface is known.
 
-        This takes about as long as making the shell. Any other shell is returned unchanged.
+        This takes about as long as making the shell.
         """
         if self.cover is not None or self.surface is None:
             return self
@@ -305,13 +266,7 @@ class PointShell:
         return replace(self, cover=covering_radius(self.surface.triangles, self.points))
 
     def save(self, path: str | PathLike[str]) -> None:
-        """Write the shell to a `.npz` file of exactly that name.
-
-        Raises
-        ------
-        FileError
-            The file cannot be written.
-        """
+        """Write the shell to a `.npz` file of exactly that name; `FileError` if that fails."""
         try:
             with Path(path).open("wb") as file:
                 np.savez(
@@ -331,13 +286,7 @@ class PointShell:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "PointShell":
-        """Read a shell that `save` wrote.
-
-        Raises
-        ------
-        FileError
-            The file is missing, damaged, or no saved shell.
-        """
+        """Read a shell that `save` wrote; `FileError` if the file is missing, damaged or other."""
         try:
             with Path(path).open("rb") as file:
                 _check_members(file, path)
@@ -430,10 +379,7 @@ def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
 
 
 def _curve_order(points: Floats) -> NDArray[np.intp]:
-    """Indices (N,) that put points (N, 3) in order along a Z-order curve over their bounding box.
-
-    Steps of the curve are cubes, for a box of any proportions.
-    """
+    """Indices (N,) that put points (N, 3) in order along a Z-order curve of cubic steps."""
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max()) or 1.0
     # Half a step less than 2^ORDER_BITS. Planes of a tool often lie at its box's ends, middle and
@@ -451,13 +397,7 @@ def fibonacci_sphere(n_points: int) -> Floats:
 
 
 def checked_budget(points: int | None) -> int | None:
-    """Check a budget of points: None, or 1 or more.
-
-    Raises
-    ------
-    UsageError
-        If it is no whole number, or below one point.
-    """
+    """Budget of points: None, or a whole number of 1 or more; else `UsageError`."""
     if points is None:
         return None
     if isinstance(points, bool) or not isinstance(points, SupportsIndex):

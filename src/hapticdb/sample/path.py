@@ -127,27 +127,13 @@ def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
 def slide_over_voxels(
     centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000, seed: int = 0
 ) -> Floats:
-    """Poses that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
+    """Poses (count, 4, 4) that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
 
     A step is a voxel or two: in a scene too long for that, the path keeps to its middle.
 
-    Parameters
-    ----------
-    centers : array_like
-        (V, 3) centres of voxels, metres.
-    voxel_size : float
-        Metres.
-    tool_points : array_like
-        (N, 3) points of the tool's surface, metres, tool frame; its underside towards -z.
-    count : int
-        How many poses.
-    seed : int
-        Chooses where the path sways.
-
-    Returns
-    -------
-    ndarray
-        (count, 4, 4) `world_from_tool`; neighbours are nearly equally far apart.
+    centers (V, 3) of voxels and voxel_size in metres; tool_points (N, 3) of the tool's surface,
+    metres, tool frame, its underside towards -z; seed : chooses where the path sways. Neighbouring
+    poses are nearly equally far apart.
     """
     if not voxel_size > 0.0:
         raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")

@@ -199,9 +199,7 @@ def make(number: int, seed: int, known: list[bytes]) -> bytes:
     return mutated(random, suffix, random.choice(known), random.choice(known))
 
 
-def run(
-    suffix: str, numbers: Sequence[int], seed: int, folder: Path, kept: Path | None = None
-) -> Counter[str]:
+def run(suffix: str, numbers: Sequence[int], seed: int, folder: Path) -> Counter[str]:
     """Read damaged files of one format; return the counts of results."""
     known = seeds(suffix, folder)
     (folder / "beside.bin").write_bytes(bytes(48))
@@ -221,9 +219,6 @@ def run(
             if found not in SOUND or len(numbers) == 1:
                 size = path.stat().st_size
                 print(f"file {n} ({suffix}, {size} bytes): {found}: {line[-1500:]}", flush=True)
-                if kept is not None:
-                    kept.mkdir(parents=True, exist_ok=True)
-                    (kept / f"{n}{suffix}").write_bytes(path.read_bytes())
     finally:
         reader.subprocess.Popen = popen  # type: ignore[attr-defined]
     return counts
@@ -232,7 +227,7 @@ def run(
 def _run_apart(n_format: int, given: argparse.Namespace) -> Counter[str]:
     """Run one format in a process of its own; return its counts."""
     command = [sys.executable, __file__, str(given.files), f"--format={n_format}"]
-    command += [f"--seed={given.seed}", *([f"--keep={given.keep}"] if given.keep else [])]
+    command.append(f"--seed={given.seed}")
     # a limit for a run that hangs, far above what the slowest files may take
     limit = 60 + SLOWEST * given.files
     ended = finished(command, stderr=None, patience=limit)
@@ -245,21 +240,8 @@ def _run_apart(n_format: int, given: argparse.Namespace) -> Counter[str]:
 
 
 def table(counts: Counter[Any]) -> str:
-    """The counts as text, one line for each format."""
-    words = [*SOUND, *sorted({word for _, word in counts} - set(SOUND))]
-    lines = ["  ".join([f"{'format':8}", *(f"{word:>10}" for word in words)])]
-    for suffix in (*sorted({suffix for suffix, _ in counts}), "all"):
-        each = [sum(n for (s, w), n in counts.items() if w == word and suffix in {s, "all"})
-                for word in words]  # fmt: skip
-        lines.append(
-            "  ".join(
-                [
-                    f"{suffix:8}",
-                    *(f"{n:{max(10, len(w))},}" for n, w in zip(each, words, strict=True)),
-                ]
-            )
-        )
-    return "\n".join(lines)
+    """The counts as text, one line for each format and result."""
+    return "\n".join(f"{suffix:8}{word:30}{n:>10,}" for (suffix, word), n in counts.items())
 
 
 def main() -> int:
@@ -269,7 +251,6 @@ def main() -> int:
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--only", type=int, help="number of one file to make and read again")
     parser.add_argument("--format", type=int, help="number of one format to run")
-    parser.add_argument("--keep", type=Path, help="folder for the files that were found out")
     given = parser.parse_args()
     warnings.simplefilter("ignore")
     n_format = given.format if given.only is None else given.only % len(FORMATS)
@@ -277,7 +258,7 @@ def main() -> int:
     if n_format is not None:
         numbers = range(n_format, given.files, len(FORMATS)) if given.only is None else [given.only]
         with tempfile.TemporaryDirectory(prefix="hapticdb-mutated-") as folder:
-            print(json.dumps(run(FORMATS[n_format], numbers, given.seed, Path(folder), given.keep)))
+            print(json.dumps(run(FORMATS[n_format], numbers, given.seed, Path(folder))))
         return 0
     counts: Counter[Any] = Counter()
     for n, suffix in enumerate(FORMATS):

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 
 from hapticdb import Grid
 from hapticdb.errors import GridError, UsageError
-from hapticdb.grid import CURVE_CODES, CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
-from hapticdb.kernels import curves
+from hapticdb.grid import CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
 
 BOUNDS = np.array([[-1.0, 0.5, 2.0], [3.0, 1.5, 4.0]])  # sides 4, 1 and 2 m
 LONGEST = 4.0
@@ -255,8 +254,3 @@ def test_the_options_of_a_grid_match_it_again(extent: float) -> None:
     """An import can be finished by the same command, also with both extent and voxel size."""
     options = GridOptions(voxel_size=0.01, extent=extent)
     options.check_matches(options.fit(BOUNDS), BOUNDS)
-
-
-def test_the_numbers_of_the_curves_are_those_of_the_kernels() -> None:
-    named = {"lexicographic": curves.LEXICOGRAPHIC, "z": curves.Z_ORDER, "hilbert": curves.HILBERT}
-    assert named == CURVE_CODES

@@ -96,12 +96,6 @@ def test_a_transform_that_flattens_is_refused(env: Environment) -> None:
         env.move(1, np.diag([1.0, 1.0, 0.0, 1.0]))
 
 
-def test_what_is_shown_in_a_session_is_one_line(env: Environment, sphere: PointShell) -> None:
-    for thing in (env, sphere, env.touch(sphere, np.eye(4))):
-        assert "\n" not in repr(thing)
-        assert len(repr(thing)) < 300
-
-
 BOXES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + "".join(
     f"o part{n}\nf 1 2 3\nf 1 2 4\nf 2 3 4\n" for n in range(40)
 )

@@ -184,20 +184,6 @@ def test_a_member_that_cannot_be_opened_takes_no_place(
             assert env.objects()
 
 
-@pytest.mark.parametrize("size", [0, -1])
-def test_a_pool_has_a_member_at_least(url: str, size: int) -> None:
-    with pytest.raises(hapticdb.errors.UsageError, match="give 1 or more"):
-        Pool(url, size=size)
-    with pytest.raises(hapticdb.errors.UsageError, match="timeout"):
-        Pool(url, timeout=-1)
-
-
-def test_what_is_not_there_is_told_when_the_pool_is_made(tmp_path: Path, place: Place) -> None:
-    for where in (str(tmp_path / "none.db"), place()):
-        with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
-            Pool(where)
-
-
 def test_members_outlive_the_loss_of_their_connections(
     place: Place, admin: psycopg.Connection, sphere: PointShell
 ) -> None:

@@ -89,14 +89,6 @@ def test_a_tool_in_another_unit_is_named(
     assert f"(factor {factor:g})" in misfit.text
 
 
-def test_a_tool_of_metres_read_as_millimetres_is_named() -> None:
-    (misfit,) = found(car(), wrench(0.25e-3), along(*SLIDE), tool_unit="mm").misfits
-    assert misfit.what == "tool"
-    assert "(factor " in misfit.text
-    assert misfit.factor is not None
-    assert misfit.factor < 1.0
-
-
 @pytest.mark.parametrize(
     ("numbers", "taken"), [("mm", "m"), ("mm", "in"), ("in", "m"), ("cm", "m"), ("mm", "ft")]
 )
@@ -110,13 +102,6 @@ def test_a_path_in_another_unit_is_named(numbers: str, taken: str, *, is_moving:
     assert misfit.unit == numbers
     assert misfit.factor == pytest.approx(factor)
     assert misfit.text.startswith("the path never comes within ")
-
-
-def test_a_path_in_feet_is_named_where_the_tool_should_touch() -> None:
-    path = along(*SLIDE, factor=1 / 0.3048)
-    (misfit,) = found(car(), wrench(), path, is_moving=False).misfits
-    assert (misfit.what, misfit.unit) == ("path", "ft")
-    assert "(factor 3.281)" in misfit.text
 
 
 def test_a_scene_in_millimetres_is_named_when_tool_and_path_agree() -> None:
@@ -249,10 +234,3 @@ def test_feel_says_what_does_not_fit(run: Run, scene: Path) -> None:
     assert "(factor 1000); give --scale 0.001 if so" in err
     assert json.loads(out)["proportions"]["misfits"][0]["what"] == "path"
     assert "factor" not in run(*args, "--scale", 0.001)[2]
-
-
-def test_a_unit_of_a_path_that_is_none_is_refused(run: Run, scene: Path) -> None:
-    line = refused(
-        run("touch", scene, *TOOL, "--poses", "path.csv", "--path-unit", "furlong"), "--path-unit"
-    )
-    assert "ft" in line

@@ -17,7 +17,6 @@ from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
 from command_line import tool as stl
 from hapticdb.mesh import parse_in_process, read_file
 from hapticdb.store.base import scene_bounds
-from hapticdb.units import NAMES, UNITS
 
 FEET = 1200.0 / 3937.0
 PROJECTED = 'PROJCS["somewhere",GEOGCS["g",UNIT["degree",0.0174532925199433]],UNIT["{}",{}]]'
@@ -43,11 +42,6 @@ def cloud(path: Path, wkt: str = "") -> Path:
         las.header.vlrs.append(WktCoordinateSystemVlr(wkt))
     las.write(path)
     return path
-
-
-def test_every_unit_has_a_name() -> None:
-    assert set(NAMES) == set(UNITS)
-    assert pytest.approx(UNITS["ft"]) == 12 * UNITS["in"] == pytest.approx(UNITS["yd"] / 3)
 
 
 def test_feet_are_taken_wherever_a_unit_is(run: Run, tmp_path: Path) -> None:

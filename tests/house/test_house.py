@@ -51,7 +51,7 @@ NARROW: dict[str, set[str]] = {
     "interrupting": set(),
     "poses": {"errors", "units"},
     "protocol": {"errors"},
-    "mesh": {"errors", "units"},
+    "mesh": {"errors", "poses", "units"},
     "devices": {"errors", "kernels", "poses"},
     "sample": {"errors"},
 }

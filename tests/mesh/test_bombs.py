@@ -157,6 +157,7 @@ def _shell(path: Path, **changes: Any) -> Path:  # noqa: ANN401 - arrays
     shell = PointShell.sphere(0.1, 8)
     arrays = {"points": shell.points, "normals": shell.normals, "center": shell.center}
     arrays |= {"format": np.array(FORMAT), "is_closed": np.array(True), "seed": np.array(0)}
+    arrays |= {"cover": np.array(np.nan), "inset": np.zeros(8)}
     np.savez_compressed(path, **(arrays | {"link": np.array("")} | changes))
     return path
 

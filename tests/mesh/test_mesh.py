@@ -8,8 +8,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb.errors import UsageError
-from hapticdb.mesh import UNITS, Defects, parse_in_process, read_file
+from hapticdb.mesh import UNITS, Defects, parse_in_process
 from hapticdb.mesh.clean import clean
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan
 from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
@@ -179,11 +178,6 @@ def test_a_file_with_a_unit_keeps_it(tmp_path: Path) -> None:
     np.testing.assert_allclose(
         parse_in_process(inches, unit="mm").parts[0].bounds[1], [101 * 0.0254, 0.0254, 0]
     )
-
-
-def test_an_unknown_unit_is_refused(tmp_path: Path) -> None:
-    with pytest.raises(UsageError, match="furlong"):
-        read_file(gltf({}, tmp_path / "a.gltf"), unit="furlong")
 
 
 # --- counts of defects ------------------------------------------------------------------------

@@ -77,7 +77,7 @@ def scaled_tool(env: Environment, folder: Path) -> tuple[PointShell, NDArray[np.
         points=whole.points * scale, normals=whole.normals, center=whole.center * scale
     )
     centers = env.grid.centers(np.array(sorted(all_voxels(env))))
-    poses = slide_over_voxels(centers, env.grid.voxel_size, shell.points, count=5, seed=1)
+    poses = slide_over_voxels(centers, env.grid.voxel_size, shell.points, count=5)
     return shell, np.asarray(poses)
 
 

@@ -15,7 +15,7 @@ from hapticdb import demo
 from hapticdb.cli import main
 from hapticdb.errors import UsageError
 from hapticdb.pictures import demo as demo_picture
-from hapticdb.pictures.splat import Camera, Depths, shade, splat
+from hapticdb.pictures.splat import Camera, empty_depths, shade, splat
 from hapticdb.poses import read_poses
 
 
@@ -171,10 +171,10 @@ def test_the_nearer_voxel_is_seen_whatever_the_order() -> None:
     pixel = tuple(camera.project(near)[0, :2].astype(int)[::-1])
     seen = []
     for order in ((0, 1), (1, 0)):
-        depths = Depths.empty(camera)
+        depths = empty_depths(camera)
         for number in order:
             splat(depths, camera, (near, far)[number], 0.1, number)
-        seen.append(int(depths.nearest[pixel] & 0xFFFFF))
+        seen.append(int(depths[pixel] & 0xFFFFF))
     assert seen == [0, 0]
 
 
@@ -184,7 +184,7 @@ def test_a_surface_towards_the_light_is_brighter() -> None:
     x, y = xy.reshape(-1, 2).T
     brightness = []
     for slope in (-1.0, 1.0):  # the light comes from +y
-        depths = Depths.empty(camera)
+        depths = empty_depths(camera)
         splat(depths, camera, np.stack([x, y, 0.3 * slope * y], axis=1), 0.02, 0)
         image = shade(depths, camera, np.full((1, 3), 0.5), np.zeros(3), 0.02)
         row, column = camera.project(np.zeros((1, 3)))[0, 1::-1].astype(int)

@@ -11,7 +11,7 @@ from matplotlib.figure import Figure
 import hapticdb
 from hapticdb import Grid, PointShell
 from hapticdb.pictures.demo import PAPER, SCENE, SIZE, TOWARDS, mixed
-from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat, turned
+from hapticdb.pictures.splat import Camera, empty_depths, faded, shade, splat, turned
 from hapticdb.pictures.sweep import compose_sweep, extent_of
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.units import length_text, readable_unit
@@ -41,7 +41,7 @@ def test_a_scene_looks_the_same_whichever_axis_is_up(up: int) -> None:
         box = np.stack([points.min(axis=0), points.max(axis=0)])[None]
         window = np.array([[20.0, 20.0], [180.0, 130.0]])
         camera = Camera.looking_at(box, np.array(TOWARDS), (200, 150), window, axis)
-        depths = Depths.empty(camera)
+        depths = empty_depths(camera)
         splat(depths, camera, points, 0.05, 0)
         images.append(shade(depths, camera, np.full((1, 3), 0.5), np.zeros(3), 0.05))
     np.testing.assert_allclose(images[0], images[1], atol=0.02)

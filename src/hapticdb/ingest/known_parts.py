@@ -72,10 +72,7 @@ class KnownParts:
 def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) -> int | None:
     """Add a part; returns its id, or None if another process has added the same part meanwhile.
 
-    Raises
-    ------
-    EnvironmentExistsError
-        If the environment has a part of the same name with another geometry.
+    Raises `EnvironmentExistsError` if there is a part of that name with another geometry.
     """
     for attempt in range(MOST_ATTEMPTS):
         try:
@@ -98,7 +95,7 @@ def replace_changed(
     n_replaced = 0
     for part, rows in anew:
         with contextlib.suppress(ObjectNotFoundError):  # another process has removed it
-            store.replace(dataclasses.replace(part, id=id_of[part.name]), rows, _covering(store))
+            store.replace(dataclasses.replace(part, id=id_of[part.name]), rows, covering(store))
             n_replaced += 1
     return n_replaced
 
@@ -110,12 +107,13 @@ def drop_others(store: Store, mesh_file: MeshFile) -> int:
     for obj in store.objects():
         if obj.link == mesh_file.link and obj.name not in names:
             with contextlib.suppress(ObjectNotFoundError):
-                store.remove(obj.id, _covering(store))
+                store.remove(obj.id, covering(store))
                 n_dropped += 1
     return n_dropped
 
 
-def _covering(store: Store) -> Covering:
+def covering(store: Store) -> Covering:
+    """Ranges of keys that cover an object of a store."""
     def ranges(obj: Object) -> Iterable[tuple[int, int]]:
         lows, highs = object_ranges(store.grid, store.layout, obj)
         return zip(lows.tolist(), highs.tolist(), strict=True)

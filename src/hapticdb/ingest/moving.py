@@ -15,11 +15,7 @@ from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
 from hapticdb.store.base import Covering, Object, Store
 
-RESTORE = "restore the file, or remove the object and import it again"
-"""Advice in messages about an object whose file has changed."""
-
-IMPORT_AGAIN = "import the file again"
-"""Advice in messages about a removed object whose file has changed."""
+_RESTORE = "restore the file, or remove the object and import it again"
 
 Floats = NDArray[np.float64]
 
@@ -29,13 +25,13 @@ def move_object(
 ) -> None:
     """Move an object; see `Environment.move`."""
     placed = _as_transform(transform)
-    ((_, part),) = parts_of([old], "moved", RESTORE)
+    ((_, part),) = parts_of([old], "moved", _RESTORE)
     _write_moved(store, old, part, placed, revision or 0, covering)
 
 
 def restore_object(store: Store, record: Object) -> int:
     """Write an object that was removed, at its place and with its id; see `Environment.restore`."""
-    ((_, part),) = parts_of([record], "put back", IMPORT_AGAIN)
+    ((_, part),) = parts_of([record], "put back", "import the file again")
     bounds = bounds_inside(part, record.link, store.grid, record.transform)
     rows, n_voxels = rows_of_part(
         part, store.grid, store.layout, record.transform, distances=record.has_distances
@@ -52,7 +48,7 @@ def shift_objects(
     """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
-    pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", RESTORE))
+    pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", _RESTORE))
     for obj, part in pairs:
         bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
     for known, part in pairs:

@@ -5,7 +5,7 @@ and goes on with the objects that have no distances yet.
 """
 
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -14,6 +14,7 @@ import numpy as np
 
 from hapticdb.errors import ConflictError, FileError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.files import ImportCallback, ImportProgress
+from hapticdb.ingest.known_parts import covering
 from hapticdb.ingest.originals import found_parts
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part
@@ -118,23 +119,27 @@ class _Run:
         """Give distances to objects, in the order of their files."""
         grid = self._store.grid
 
-        def measured(pair: tuple[Object, Part], share: ShareCallback) -> "_Measured":
+        def measured(
+            pair: tuple[Object, Part], share: ShareCallback
+        ) -> tuple[Object, Rows | HapticDBError]:
             obj, part = pair
             try:
-                rows, _ = rows_of_part(
+                return obj, rows_of_part(
                     part, grid, "brick", obj.transform, progress=share, distances=True
-                )
+                )[0]
             except FileError as error:  # too large for the memory that is left
-                return _Measured(obj, error)
-            return _Measured(obj, rows)
+                return obj, error
 
         with closing(in_threads(self._found(objects), measured, jobs, self._tell)) as done:
             for obj, found in done:
                 self._link = obj.link
-                if isinstance(found, HapticDBError):
-                    self._leave_out((obj,), found)
-                else:
-                    self._write(obj, found)
+                error = found if isinstance(found, HapticDBError) else self._write(obj, found)
+                if error is not None:
+                    self._leave_out((obj,), error)
+                    continue
+                self.n_upgraded += 1
+                self.voxels += obj.voxels
+                self._advance(1)
 
     def _found(self, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
         """Objects with their parts; objects whose part is not found are left out."""
@@ -144,25 +149,18 @@ class _Run:
             else:
                 self._leave_out(some, part)
 
-    def _write(self, obj: Object, rows: Rows) -> None:
-        """Write the distances of an object if its voxels are those that are stored."""
+    def _write(self, obj: Object, rows: Rows) -> HapticDBError | None:
+        """Write the distances of an object, unless its voxels are not those that are stored."""
         try:
             if not is_as_stored(self._store, obj, rows):
-                raise FileError(  # noqa: TRY301 - told as the other reasons are
+                return FileError(
                     f"object {obj.id} ({obj.name}) cannot be upgraded: its voxels are not those "
                     f"that its file gives now; 'hapticdb remove' it and import {obj.link} again"
                 )
-            self._store.replace(obj, rows, self._covering)
-        except (FileError, ConflictError, ObjectNotFoundError) as error:
-            self._leave_out((obj,), error)
-            return
-        self.n_upgraded += 1
-        self.voxels += obj.voxels
-        self._advance(1)
-
-    def _covering(self, known: Object) -> Iterable[tuple[int, int]]:
-        lows, highs = object_ranges(self._store.grid, self._store.layout, known)
-        return zip(lows.tolist(), highs.tolist(), strict=True)
+            self._store.replace(obj, rows, covering(self._store))
+        except (ConflictError, ObjectNotFoundError) as error:
+            return error
+        return None
 
     def _leave_out(self, objects: tuple[Object, ...], error: HapticDBError) -> None:
         self.left_out.append(LeftOut(objects, error))
@@ -176,13 +174,6 @@ class _Run:
         if self._progress is not None:
             done = ImportProgress(self._link, self._n_done, self._n_objects, self.voxels, share)
             self._progress(done)
-
-
-class _Measured(NamedTuple):
-    """An object, and its rows with distances or the reason why there are none."""
-
-    obj: Object
-    found: Rows | HapticDBError
 
 
 def is_as_stored(store: Store, obj: Object, rows: Rows) -> bool:

@@ -12,12 +12,12 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
-from hapticdb.ingest.distances import with_distances
 from hapticdb.ingest.layout import Bricks, rows_of_bricks
+from hapticdb.kernels.surfaces import distances as kernels
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.mesh import MeshFile, Part
 from hapticdb.mesh.child import bytes_available
-from hapticdb.store.base import BRICK_BYTES, Layout, Object, Rows, Store
+from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, Store
 
 Item = TypeVar("Item")
 Done = TypeVar("Done")
@@ -28,6 +28,8 @@ SHARE_EVERY_S = 0.2
 """Seconds between two calls with the share of a long part. Larger: fewer calls."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
 """Memory of a brick, bytes: its key and its occupancy."""
+_BYTES_A_ROW = 8 + 8 + BRICK_BYTES
+"""Memory of a row with distances but for their packed bytes: its key, their end, its occupancy."""
 POINTS_AT_ONCE = 1 << 22
 """Points of a cloud that one call marks: less than a second of work. A larger value reports
 progress less often."""
@@ -71,8 +73,41 @@ def rows_of_part(
     if distances:
         measuring = _portion(progress, voxels_alone, 1.0)
         room = partial(check_room, what=what)
-        bricks = with_distances(bricks, corners, grid.bits, room, measuring)
+        bricks = _with_distances(bricks, corners, grid.bits, room, measuring)
     return rows_of_bricks(bricks, grid, layout)
+
+
+def _with_distances(
+    bricks: Bricks,
+    corners: NDArray[np.float64],
+    bits: int,
+    check_room: Callable[[int], None],
+    progress: ShareCallback | None,
+) -> Bricks:
+    """Bricks of a part with distances to its surface, and the bricks near it that it does not meet.
+
+    bricks : those that the part meets; corners (T, 3, 3) of triangles, or (P, 1, 3) points of a
+    cloud, in voxels from the grid's origin; check_room : called with the bytes that the result
+    needs at least, raises if they are too many; progress : called with the share that is done.
+    """
+    keys: list[Keys] = []
+    packed: list[NDArray[np.uint8]] = []
+    ends: list[NDArray[np.int64]] = []
+    n_rows, n_bytes = 0, 0
+    for share, some, data, ends_of_some in kernels.band_pieces(corners, bits):
+        keys.append(some)
+        packed.append(data)
+        ends.append(ends_of_some + n_bytes)
+        n_rows, n_bytes = n_rows + len(some), n_bytes + len(data)
+        check_room(2 * (_BYTES_A_ROW * n_rows + n_bytes))
+        if progress is not None and share < 1.0:
+            progress(share)
+    if not keys:
+        return Bricks(bricks.keys, bricks.occupancy, Band(np.empty(0, np.uint8), bricks.keys[:0]))
+    near = np.concatenate(keys)
+    occupancy = np.zeros((n_rows, BRICK_BYTES), dtype=np.uint8)
+    occupancy[np.searchsorted(near, bricks.keys)] = bricks.occupancy
+    return Bricks(near, occupancy, Band(np.concatenate(packed), np.concatenate(ends)))
 
 
 def _portion(progress: ShareCallback | None, low: float, high: float) -> ShareCallback | None:

@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
-from hapticdb.pictures.splat import Camera, Depths, Image, shade, splat
+from hapticdb.pictures.splat import Camera, Image, empty_depths, shade, splat
 from hapticdb.store.attributes import up_axis
 
 if TYPE_CHECKING:
@@ -114,7 +114,7 @@ def _camera(env: Environment) -> Camera:
 
 def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: _Palette) -> None:
     """Shade the voxels as the database holds them, object by object."""
-    depths = Depths.empty(camera)
+    depths = empty_depths(camera)
     tints = []
     for number, obj in enumerate(env.objects()):
         centers = env.grid.centers(env.voxels(obj.id))

@@ -1,7 +1,6 @@
 """Voxels to pixels: a camera, a buffer of depths, and shading from the depths alone."""
 
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,15 +64,13 @@ class Camera:
         return np.asarray(seen)
 
 
-class Depths(NamedTuple):
-    """Nearest voxel behind each pixel: depth and number, packed, (height, width)."""
+Depths = NDArray[np.int64]
+"""Nearest voxel behind each pixel: depth and number, packed, (height, width)."""
 
-    nearest: NDArray[np.int64]
 
-    @classmethod
-    def empty(cls, camera: Camera) -> "Depths":
-        """Buffer without voxels."""
-        return cls(np.full(camera.size[::-1], FAR, dtype=np.int64))
+def empty_depths(camera: Camera) -> Depths:
+    """Buffer without voxels."""
+    return np.full(camera.size[::-1], FAR, dtype=np.int64)
 
 
 def splat(depths: Depths, camera: Camera, centers: Floats, size: float, number: int) -> None:
@@ -83,7 +80,7 @@ def splat(depths: Depths, camera: Camera, centers: Floats, size: float, number: 
     as, below 2^20.
     """
     width, height = camera.size
-    flat = depths.nearest.reshape(-1)
+    flat = depths.reshape(-1)
     for start in range(0, len(centers), CHUNK):
         seen = camera.project(centers[start : start + CHUNK])
         scaled = (seen[:, 2] - camera.near) / (camera.far - camera.near)
@@ -106,14 +103,14 @@ def shade(depths: Depths, camera: Camera, tints: Floats, paper: Floats, size: fl
     Places behind their surroundings are darkened (unsharp masking of the depths).
     """
     image = _backdrop(camera, paper)
-    rows, columns = np.nonzero(depths.nearest != FAR)
+    rows, columns = np.nonzero(depths != FAR)
     if len(rows) == 0:
         return image
     # only the part that holds voxels, and twice the widest blur around it
     seen = tuple(
         slice(max(int(index.min()) - 80, 0), int(index.max()) + 80) for index in (rows, columns)
     )
-    nearest = depths.nearest[seen]
+    nearest = depths[seen]
     is_hit = nearest != FAR
     number = np.where(is_hit, nearest & ((1 << NUMBER_BITS) - 1), 0)
     depth = (nearest >> NUMBER_BITS) * ((camera.far - camera.near) / DEPTH_STEPS)

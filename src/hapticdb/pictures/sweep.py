@@ -31,7 +31,7 @@ from hapticdb.pictures.demo import (
     show_scene,
     style,
 )
-from hapticdb.pictures.splat import Camera, Depths, faded, shade, splat
+from hapticdb.pictures.splat import Camera, empty_depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
@@ -174,7 +174,7 @@ def _draw_scene(
     axes: Axes, env: Environment, camera: Camera, colors: dict[int, str], exclude: set[int]
 ) -> None:
     """Shade the voxels in view, objects that are hit in their colours."""
-    depths = Depths.empty(camera)
+    depths = empty_depths(camera)
     tints = [mixed(BODY, BODY, 0.0)]
     for obj in _in_view(env, camera, exclude):
         centers = env.grid.centers(env.voxels(obj.id))

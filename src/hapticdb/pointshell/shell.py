@@ -292,7 +292,9 @@ class PointShell:
                 _check_members(file, path)
                 file.seek(0)
                 saved = np.load(file, allow_pickle=False)
-                _check_format(saved, path)
+                if str(saved.get("format")) != FORMAT:
+                    raise FileError(f"{path}: not a saved shell, or of another version")  # noqa: TRY301 - told as it is
+                cover = float(saved["cover"])
                 return cls(
                     saved["points"],
                     saved["normals"],
@@ -300,8 +302,8 @@ class PointShell:
                     bool(saved["is_closed"]),
                     str(saved["link"]),
                     int(saved["seed"]),
-                    cover=_saved_cover(saved),
-                    inset=saved["inset"] if "inset" in saved else np.zeros(0),
+                    cover=None if np.isnan(cover) else cover,
+                    inset=saved["inset"],
                 )
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None
@@ -357,17 +359,6 @@ def _promised_bytes(stream: IO[bytes]) -> int:
         raise ValueError(f"an array of version {version[0]}.{version[1]}")
     shape, _, dtype = np.lib.format.read_array_header_1_0(stream)
     return math.prod(shape) * int(dtype.itemsize)
-
-
-def _check_format(saved: object, path: str | PathLike[str]) -> None:
-    if not isinstance(saved, np.lib.npyio.NpzFile) or str(saved.get("format")) != FORMAT:
-        raise FileError(f"{path}: not a saved shell, or of another version")
-
-
-def _saved_cover(saved: "np.lib.npyio.NpzFile") -> float | None:
-    """Covering radius; None if it was not known, or if an older version saved the shell."""
-    cover = float(saved["cover"]) if "cover" in saved else np.nan
-    return None if np.isnan(cover) else cover
 
 
 def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:

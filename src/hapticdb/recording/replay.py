@@ -212,7 +212,17 @@ class _Comparison:
             present = np.ascontiguousarray(wrenches, dtype=np.float64).view(np.uint64)
             differs = (recorded != present).any(axis=1) | (known["hits"] != n_hits)
             if differs.any() and self._parting is None:
-                self._part(known, indices, wrenches, n_hits, int(np.argmax(differs)))
+                at = int(np.argmax(differs))
+                self._parting = Parting(
+                    self._n_done + int(indices[at]),
+                    float(known["time"][at]),
+                    known["wrench"][at].copy(),
+                    np.array(wrenches[at]),
+                    int(known["hits"][at]),
+                    int(n_hits[at]),
+                    int(known["revision"][at]),
+                    self._environment.store.revision(),
+                )
             self._n_differing += int(differs.sum())
         self._n_compared += len(indices)
         self._n_done += len(frames)
@@ -227,23 +237,4 @@ class _Comparison:
             self._parting,
             revision,
             self._revisions <= {revision},
-        )
-
-    def _part(
-        self,
-        known: Frames,
-        indices: NDArray[np.intp],
-        wrenches: Floats,
-        n_hits: NDArray[np.int64],
-        at: int,
-    ) -> None:
-        self._parting = Parting(
-            frame=self._n_done + int(indices[at]),
-            time=float(known["time"][at]),
-            recorded=known["wrench"][at].copy(),
-            present=np.array(wrenches[at]),
-            hits_recorded=int(known["hits"][at]),
-            hits_present=int(n_hits[at]),
-            revision_recorded=int(known["revision"][at]),
-            revision_present=self._environment.store.revision(),
         )

@@ -54,12 +54,12 @@ def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> _HeightMap:
     return _HeightMap(corner, voxel_size, top)
 
 
-def _walk(map_: _HeightMap, reach: float, count: int, seed: int, longest: float) -> Floats:
+def _walk(map_: _HeightMap, reach: float, count: int, longest: float) -> Floats:
     """Places (count, 2) along a swaying line over the longer side of the map.
 
     It keeps half the tool's reach off the ends, and is cut about its middle to `longest` metres.
     """
-    phase = np.random.default_rng(seed).uniform(0.0, 2.0 * np.pi)
+    phase = np.random.default_rng(0).uniform(0.0, 2.0 * np.pi)
     size: Floats = np.array(map_.top.shape) * map_.step
     major = int(np.argmax(size))
     span = min(max(float(size[major]) - reach, 0.5 * float(size[major])), longest)
@@ -125,15 +125,14 @@ def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
 
 
 def slide_over_voxels(
-    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000, seed: int = 0
+    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000
 ) -> Floats:
     """Poses (count, 4, 4) that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
 
     A step is a voxel or two: in a scene too long for that, the path keeps to its middle.
 
     centers (V, 3) of voxels and voxel_size in metres; tool_points (N, 3) of the tool's surface,
-    metres, tool frame, its underside towards -z; seed : chooses where the path sways. Neighbouring
-    poses are nearly equally far apart.
+    metres, tool frame, its underside towards -z. Neighbouring poses are nearly equally far apart.
     """
     if not voxel_size > 0.0:
         raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")
@@ -144,7 +143,7 @@ def slide_over_voxels(
     if len(tool) == 0:
         raise UsageError("the tool has no points")
     reach = float(np.ptp(tool[:, :2], axis=0).max())
-    places = _walk(map_, reach, DENSER * count, seed, count * voxel_size)
+    places = _walk(map_, reach, DENSER * count, count * voxel_size)
     run = float(np.linalg.norm(places[1] - places[0]))
     blur = max(0.35 * reach / max(run, 1e-12), 1.0)
     blur = min(blur, 0.05 * len(places))

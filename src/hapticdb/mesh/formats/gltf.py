@@ -23,6 +23,7 @@ from hapticdb.mesh.formats.accessors import (
 )
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, walk
+from hapticdb.poses import rotation_of
 
 _MAGIC = b"glTF"
 _POINTS, _TRIANGLES, _STRIP = 0, 4, 5
@@ -238,24 +239,12 @@ def _parent_from_node(node: dict[str, Any]) -> NDArray[np.float64]:
         return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
     transform = np.eye(4)
     if "rotation" in node:
-        transform[:3, :3] = _rotation(np.array(node["rotation"], dtype=np.float64).reshape(4))
+        xyzw = np.array(node["rotation"], dtype=np.float64).reshape(4)
+        length = np.linalg.norm(xyzw)
+        if length != 0:
+            transform[:3, :3] = rotation_of(np.roll(xyzw / length, 1))[0]
     if "scale" in node:
         transform[:3, :3] *= np.array(node["scale"], dtype=np.float64).reshape(3)
     if "translation" in node:
         transform[:3, 3] = np.array(node["translation"], dtype=np.float64).reshape(3)
     return transform
-
-
-def _rotation(xyzw: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rotation (3, 3) of a quaternion x, y, z, w of any length; the identity for a zero one."""
-    length = np.linalg.norm(xyzw)
-    if length == 0:
-        return np.eye(3)
-    x, y, z, w = xyzw / length
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
-            [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
-            [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
-        ]
-    )

@@ -29,10 +29,10 @@ import records
 from batch_peers import PEERS, Open3DBatch, PeerMissingError
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.batches.feeler import Feeler
-from hapticdb.demo import write_along
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
+from slide_paths import write_along
 
 Floats = NDArray[np.float64]
 MODEL = "assembly_vw_t1/vw_t1.glb"

@@ -14,10 +14,12 @@ from pathlib import Path
 from typing import Any, Literal
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import ArrayLike
 
 import hapticdb
-from bits_inputs import Floats, Place, Tool, command
+from bits_inputs import Place, Tool, command
+from hapticdb.kernels.rigid import poses_of
+from hapticdb.recording.file import State
 
 Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
 STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
@@ -138,19 +140,18 @@ def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
 
 
 def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Results) -> None:
-    """Replay a recording three ways: frames together, frame by frame, and in resident cells."""
+    """Feel a recording's frames together, and replay it in this process and by the verb."""
     recording, digest = hapticdb.Recording(file), Digest()
-    header, felt_again = recording.header, []
-
-    def feel(poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        felt = env.touch(header.shell, poses=poses, exclude=header.exclude, law=header.law)
-        wrenches = np.hstack([felt.forces, felt.torques])
-        felt_again.append(np.column_stack([wrenches, felt.hits]))
-        return wrenches, felt.hits
-
+    header = recording.header
+    tools, unknown, state = recording.columns("tool", "unknown", "state")
+    is_known = (unknown == 0) & (np.asarray(state, np.int64) & State.HELD.value == 0)
+    known = np.ascontiguousarray(tools[is_known], np.float64)
+    poses = np.empty((len(known), 4, 4))
+    poses_of(known, poses)
+    felt = env.touch(header.shell, poses=poses, exclude=header.exclude, law=header.law)
     of = f"of {len(recording)} recorded frames compared"
-    found = hapticdb.replay(recording, env, feel)
-    digest.feed(np.concatenate(felt_again))  # chunk sizes depend on the load
+    found = hapticdb.replay(recording, env)
+    digest.feed(np.column_stack([felt.forces, felt.torques, felt.hits]))
     results[f"{place.name}/replay"] = digest.entry(found.n_compared, of, found.n_differing)
     found = hapticdb.replay(recording, env)
     (digest := Digest()).feed(found.n_compared, found.n_skipped)

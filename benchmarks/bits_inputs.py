@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
+from slide_paths import write_along
 
 Floats = NDArray[np.float64]
 Layout = Literal["brick", "voxel"]
@@ -103,8 +104,8 @@ def import_car(folder: Path) -> list[Place]:
 
 def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:
     """Write the sample's wrench and its path along the environment, and choose the poses."""
-    command("sample", folder / "sample", "--along", place.url)
-    mesh, path, hand = (folder / "sample" / name for name in ("wrench.stl", "path.csv", "hand.csv"))
+    mesh, path = write_along(folder / "sample", place.url, 1000)
+    hand = path.with_name("hand.csv")
     slide = hapticdb.read_poses(path)
     hapticdb.write_poses(hand, slide[HAND])
     shell = hapticdb.PointShell.from_file(mesh, N_POINTS)

@@ -31,7 +31,6 @@ from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.demo import write_along
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.poses import read_poses, write_poses
@@ -43,6 +42,7 @@ from hapticdb.sample import write_sample
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import find_binaries
 from places import serving
+from slide_paths import write_along
 
 CAR = "demo_vintage_car/vintage_car.glb"
 EXTENT = 1.6

@@ -10,8 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import FileError, UsageError
 from hapticdb.mesh import Defects, parse_in_process
 from hapticdb.poses import read_poses
-from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
-from hapticdb.sample.path import heights_of_voxels
+from hapticdb.sample import SampleFiles, write_sample
 
 Floats = NDArray[np.float64]
 
@@ -47,12 +46,11 @@ def test_the_car_is_read_as_closed_parts_of_distinct_names(files: SampleFiles) -
     assert np.ptp(car.bounds, axis=0) == pytest.approx([4.28, 2.04, 1.72], abs=0.02)
 
 
-@pytest.mark.parametrize("scale", [1.0, 3.0])
-def test_the_wrench_is_one_closed_piece_of_any_size(tmp_path: Path, scale: float) -> None:
-    mesh = trimesh.load_mesh(write_wrench(tmp_path, scale))
+def test_the_wrench_is_one_closed_piece(files: SampleFiles) -> None:
+    mesh = trimesh.load_mesh(files.wrench)
     assert mesh.is_volume
     assert mesh.body_count == 1
-    assert mesh.extents / scale == pytest.approx([0.25, 0.054, 0.010], abs=0.003)
+    assert mesh.extents == pytest.approx([0.25, 0.054, 0.010], abs=0.003)
 
 
 def test_the_path_is_smooth_and_comes_down_from_above(files: SampleFiles, wrench: Floats) -> None:
@@ -82,39 +80,3 @@ def test_what_cannot_be_written_is_told(tmp_path: Path) -> None:
     for count in (0, 1001):
         with pytest.raises(UsageError, match="1 to 1,000"):
             write_sample(tmp_path, count)
-
-
-def plane_of_voxels(size: float) -> Floats:
-    i, j = np.meshgrid(np.arange(300), np.arange(120), indexing="ij")
-    return size * np.stack([i.ravel() + 0.5, j.ravel() + 0.5, np.full(i.size, 7.5)], axis=1)
-
-
-def test_over_a_plane_of_voxels_the_tool_lies_flat_and_pressed_in(wrench: Floats) -> None:
-    size = 0.004
-    poses = slide_over_voxels(plane_of_voxels(size), size, wrench, 200)
-    assert_rigid(poses)
-    lowest = moved_points(wrench, poses)[..., 2].min(axis=1)
-    press = 8.0 * size - lowest
-    assert press.min() == pytest.approx(0.5 * size)
-    assert press.max() == pytest.approx(1.5 * size, rel=1e-2)
-    steps = np.linalg.norm(np.diff(moved_points(wrench, poses), axis=0), axis=2)
-    assert steps.max() < 2.5 * size
-
-
-def test_one_voxel_is_enough_and_none_is_told(wrench: Floats) -> None:
-    assert_rigid(slide_over_voxels([[0.5, 0.5, 0.5]], 0.01, wrench, 10))
-    with pytest.raises(UsageError, match="no voxels"):
-        slide_over_voxels(np.zeros((0, 3)), 0.01, wrench, 10)
-    with pytest.raises(UsageError, match="two poses"):
-        slide_over_voxels([[0.5, 0.5, 0.5]], 0.01, wrench, 1)
-    with pytest.raises(UsageError, match="positive"):
-        slide_over_voxels([[0.5, 0.5, 0.5]], 0.0, wrench, 10)
-    with pytest.raises(UsageError, match="no points"):
-        slide_over_voxels([[0.5, 0.5, 0.5]], 0.01, np.zeros((0, 3)), 10)
-
-
-def test_heights_of_voxels_are_the_tops_of_their_columns() -> None:
-    map_ = heights_of_voxels([[0.5, 0.5, 0.5], [0.5, 0.5, 4.5], [2.5, 0.5, 1.5]], 1.0)
-    assert map_.top.tolist() == [[5.0], [-np.inf], [2.0]]
-    beyond = map_.at(np.array([0.1, 2.9, 3.1, -0.1]), np.full(4, 0.5))
-    assert beyond.tolist() == [5.0, 2.0, -np.inf, -np.inf]

@@ -12,9 +12,9 @@ from feel.couplings import RATE, SmoothHand, Terms, drive, posed, straight
 from feel.figures import largest_step
 from feel.ground import Ground
 from feel.tools import ball
-from hapticdb.demo import slide_along
 from hapticdb.environment import Environment
 from hapticdb.kernels.field.law import ONSET
+from slide_paths import slide_along
 
 Floats = NDArray[np.float64]
 

@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticdb.demo import slide_along
 from hapticdb.environment import Environment
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.grouping import box_ranges
 from hapticdb.store.base import row_shift
+from slide_paths import slide_along
 
 POINTS = 300
 """The paper's PointShell."""

@@ -17,15 +17,15 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
-from hapticdb.errors import FileError, GridError, UsageError
+from hapticdb.errors import GridError, UsageError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.poses import read_poses, write_poses
+from hapticdb.poses import read_poses
 from hapticdb.query.frame import Strategy
 from hapticdb.query.touches import Touch
-from hapticdb.sample import SampleFiles, slide_over_voxels, write_sample, write_wrench
+from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import beside, name_of, redact
 
@@ -34,13 +34,6 @@ YARDSTICK: Strategy = "points"
 """The paper's point query sequence, to which the other strategies are compared."""
 WARM_POSES = 20
 """Untimed poses of each strategy. More take longer and change little."""
-MAP_CELLS = 4096
-"""Cells an axis of the map of heights from which a path is made. More follow finer shapes and take
-more memory."""
-SAMPLE_LENGTH = 4.28
-"""Length of the sample car, metres."""
-ALONG_VOXELS = 10_000_000
-"""Voxels that are read at most to make a path: a gigabyte. The largest objects come first."""
 
 
 class Imported(NamedTuple):
@@ -276,56 +269,3 @@ def _trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -
         np.concatenate(ids),
         np.concatenate(frames),
     )
-
-
-def write_along(
-    folder: str | os.PathLike[str], url: str | os.PathLike[str], frames: int
-) -> tuple[Path, Path]:
-    """Write wrench.stl, scaled to an environment, and path.csv that slides it over that."""
-    home = Path(folder)
-    with open_environment(url, read_only=True) as env:
-        try:
-            home.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise FileError(f"cannot make the folder {home}: {error.strerror}") from error
-        # the same share of the scene's length as of the sample car's
-        bounds = np.array([obj.bounds for obj in env.objects()] or [np.zeros((2, 3))])
-        longest = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-        wrench = write_wrench(home, longest / SAMPLE_LENGTH or 1.0)
-        # the shell's points, not the mesh: where only the mesh touches, no point would hit
-        poses = slide_along(env, PointShell.from_file(wrench).points, frames)
-    write_poses(home / "path.csv", poses)
-    return wrench, home / "path.csv"
-
-
-def slide_along(
-    env: Environment, tool_points: NDArray[np.float64], frames: int
-) -> NDArray[np.float64]:
-    """Poses (frames, 4, 4) that slide a tool over the largest objects of an environment.
-
-    The path follows a map of the voxels' heights, whose size does not depend on the grid.
-    """
-    chosen, total = [], 0
-    for obj in sorted(env.objects(), key=lambda obj: (-obj.voxels, obj.id)):
-        if total + obj.voxels <= ALONG_VOXELS:
-            chosen.append(obj)
-            total += obj.voxels
-    if not chosen:
-        raise UsageError(f"{env.url} has no objects small enough to slide over")
-    bounds = np.array([obj.bounds for obj in chosen])
-    span = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
-    size = env.grid.voxel_size
-    step = size * max(1, 2 ** int(np.ceil(np.log2(max(span / (size * MAP_CELLS), 1.0)))))
-    tops = [_tops(env.grid.centers(env.voxels(obj.id)), step) for obj in chosen]
-    centers = np.concatenate(tops)
-    centers[:, 2] -= 0.5 * (step - size)  # the map adds half a cell: the tops stay where they are
-    return slide_over_voxels(centers, step, tool_points, frames)
-
-
-def _tops(centers: NDArray[np.float64], step: float) -> NDArray[np.float64]:
-    """Highest of the centres (V, 3) in each column of a map of that step, metres."""
-    columns = np.floor(centers[:, :2] / step).astype(np.int64)
-    order = np.lexsort((centers[:, 2], columns[:, 1], columns[:, 0]))
-    ranked = columns[order]
-    is_last = np.append((ranked[1:] != ranked[:-1]).any(axis=1), True)
-    return np.asarray(centers[order[is_last]])

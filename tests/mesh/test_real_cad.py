@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, PointShell
 from hapticdb.query.frame import STRATEGIES
-from hapticdb.sample import slide_over_voxels, write_sample, write_wrench
+from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout
 from naive_frame import touch as naive_touch
 
@@ -69,16 +69,17 @@ def all_voxels(env: Environment) -> dict[tuple[int, int, int], set[int]]:
 
 
 def scaled_tool(env: Environment, folder: Path) -> tuple[PointShell, NDArray[np.float64]]:
-    """The sample's wrench, 24 voxels long, and a path that slides it over the scene."""
-    whole = PointShell.from_file(write_wrench(folder), points=300)
+    """The sample's wrench, 24 voxels long, and poses in which it lies across voxels."""
+    whole = PointShell.from_file(write_sample(folder, 2).wrench, points=300)
     length = float(np.ptp(whole.points, axis=0).max())
     scale = 24 * env.grid.voxel_size / length
     shell = PointShell(
         points=whole.points * scale, normals=whole.normals, center=whole.center * scale
     )
     centers = env.grid.centers(np.array(sorted(all_voxels(env))))
-    poses = slide_over_voxels(centers, env.grid.voxel_size, shell.points, count=5)
-    return shell, np.asarray(poses)
+    poses = np.tile(np.eye(4), (5, 1, 1))
+    poses[:, :3, 3] = centers[np.linspace(0, len(centers) - 1, 7).astype(int)[1:-1]]
+    return shell, poses
 
 
 def test_every_instance_becomes_an_object_that_touches_voxels(

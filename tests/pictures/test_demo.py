@@ -8,7 +8,6 @@ from pathlib import Path
 import matplotlib.image
 import numpy as np
 import pytest
-import trimesh
 
 import hapticdb
 from hapticdb import demo
@@ -117,30 +116,6 @@ def test_sample_writes_three_files(tmp_path: Path, capsys: pytest.CaptureFixture
     assert [Path(line).name for line in written] == ["car.glb", "wrench.stl", "path.csv"]
     assert all(Path(line).parent == folder for line in written)
     assert len(read_poses(folder / "path.csv")) == 10
-
-
-def test_a_path_along_any_environment_touches_it(tmp_path: Path) -> None:
-    plate = trimesh.creation.box((2.0, 1.0, 0.001))
-    (tmp_path / "plate.stl").write_bytes(plate.export(file_type="stl"))
-    url = str(tmp_path / "plate.db")
-    options = ["--bits", "14", "--extent", "80"]
-    assert main(["import", url, str(tmp_path / "plate.stl"), *options]) == 0
-    assert main(["sample", str(tmp_path), "--along", url, "--frames", "40"]) == 0
-    assert not (tmp_path / "car.glb").exists()
-    shell = hapticdb.PointShell.from_file(tmp_path / "wrench.stl")
-    with hapticdb.open(url, read_only=True) as env:
-        hits = [len(env.touch(shell, pose).hits) for pose in read_poses(tmp_path / "path.csv")]
-    assert np.mean(np.array(hits) > 0) > 0.9
-
-
-def test_a_path_along_nothing_is_refused(
-    tmp_path: Path, capsys: pytest.CaptureFixture[str]
-) -> None:
-    hapticdb.create(tmp_path / "a.db", hapticdb.Grid(0.01, (0, 0, 0), 6)).close()
-    assert main(["sample", str(tmp_path), "--along", str(tmp_path / "a.db")]) == 2
-    assert "no objects" in capsys.readouterr().err
-    assert main(["sample", str(tmp_path), "--along", str(tmp_path / "b.db")]) == 2
-    assert "no environment" in capsys.readouterr().err
 
 
 # -- voxels to pixels ------------------------------------------------------------------------------

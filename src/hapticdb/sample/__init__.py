@@ -5,7 +5,6 @@ share its triangles. World frame of the car: metres, x forward, y left, z up; th
 ground between the wheels.
 """
 
-from hapticdb.sample.path import slide_over_voxels
-from hapticdb.sample.write import SampleFiles, write_sample, write_wrench
+from hapticdb.sample.write import SampleFiles, write_sample
 
-__all__ = ["SampleFiles", "slide_over_voxels", "write_sample", "write_wrench"]
+__all__ = ["SampleFiles", "write_sample"]

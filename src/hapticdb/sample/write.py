@@ -10,11 +10,6 @@ import numpy as np
 
 from hapticdb.errors import FileError, UsageError
 
-HEADER = 84
-"""Bytes of a binary STL before its triangles."""
-TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
-"""Triangle of a binary STL."""
-
 
 class SampleFiles(NamedTuple):
     """Where the sample was written."""
@@ -43,23 +38,15 @@ def _write(path: Path, content: bytes) -> Path:
     return path
 
 
-def write_wrench(folder: Path, scale: float = 1.0) -> Path:
-    """Write wrench.stl, metres, into a folder; 0.25 m long at scale 1.
-
-    Tool frame: the handle along x with the ring at +x, the flat sides towards -z and +z, the origin
-    halfway along and halfway through.
-    """
-    content = bytearray(_content("wrench.stl"))
-    np.frombuffer(content, TRIANGLE, offset=HEADER)["corners"][:] *= scale
-    return _write(folder / "wrench.stl", bytes(content))
-
-
 def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFiles:
     """Write car.glb, wrench.stl and path.csv into a folder, made when missing.
 
     The path slides the wrench over hood, windscreen, roof, rear window and boot. It comes down from
     above. Then its deepest point is 1 mm below the surface, so that it touches whatever the edge of
     the voxels that the car is imported with. `count` of its poses are written, evenly spread.
+
+    The wrench is 0.25 m long: its handle lies along x with the ring at +x, the flat sides towards
+    -z and +z, the origin halfway along and halfway through.
     """
     header, *poses = _content("path.csv").splitlines(keepends=True)
     if not 1 <= count <= len(poses):
@@ -72,6 +59,6 @@ def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFil
     chosen = np.linspace(0, len(poses) - 1, count).round().astype(np.int64)
     return SampleFiles(
         _write(target / "car.glb", _content("car.glb")),
-        write_wrench(target),
+        _write(target / "wrench.stl", _content("wrench.stl")),
         _write(target / "path.csv", header + b"".join(poses[index] for index in chosen)),
     )

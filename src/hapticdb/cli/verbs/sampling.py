@@ -18,32 +18,15 @@ FramesOption = Annotated[
 
 
 def sample(
-    folder: FolderArgument,
-    *,
-    along: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URL", help="Slide the wrench over this environment instead of the sample."
-        ),
-    ] = None,
-    frames: FramesOption = 1000,
-    json: JsonOption = False,
+    folder: FolderArgument, *, frames: FramesOption = 1000, json: JsonOption = False
 ) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
-    With --along, a path over another environment, and wrench.stl scaled to its size.
-
     Example: hapticdb sample sample
     """
-    if along is None:
-        from hapticdb.sample import write_sample
+    from hapticdb.sample import write_sample
 
-        written: tuple[Path, ...] = write_sample(folder, frames)
-    else:
-        from hapticdb.demo import write_along
-
-        render.compile_kernels("copy", "shell")
-        written = write_along(folder, along, frames)
+    written = write_sample(folder, frames)
     if json:
         render.say_json({"files": [str(path) for path in written], "poses": frames})
         return

@@ -5,15 +5,31 @@ over it, turns slowly, is tilted to lie along the surface, and at every pose is 
 first point touches, then pressed in.
 """
 
+import os
+from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from hapticdb.errors import UsageError
+import hapticdb
+from hapticdb import Environment, PointShell
+from hapticdb.poses import write_poses
+from hapticdb.sample import write_sample
 
 Floats = NDArray[np.float64]
+HEADER = 84
+"""Bytes of a binary STL before its triangles."""
+TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
+"""Triangle of a binary STL."""
+MAP_CELLS = 4096
+"""Cells an axis of the map of heights from which a path is made. More follow finer shapes and take
+more memory."""
+SAMPLE_LENGTH = 4.28
+"""Length of the sample car, metres."""
+ALONG_VOXELS = 10_000_000
+"""Voxels that are read at most to make a path: a gigabyte. The largest objects come first."""
 
 STEEPEST = 1.2
 """Slope of the tool's own way, rise over run: where the scene falls off faster, it glides down."""
@@ -45,8 +61,6 @@ class _HeightMap(NamedTuple):
 def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> _HeightMap:
     """Map of the tops of voxels; centers (V, 3) and voxel_size in metres."""
     points = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
-    if len(points) == 0:
-        raise UsageError("there are no voxels to slide over")
     corner = points[:, :2].min(axis=0) - 0.5 * voxel_size
     cell = np.floor((points[:, :2] - corner) / voxel_size).astype(np.int64)
     top = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
@@ -134,14 +148,8 @@ def slide_over_voxels(
     centers (V, 3) of voxels and voxel_size in metres; tool_points (N, 3) of the tool's surface,
     metres, tool frame, its underside towards -z. Neighbouring poses are nearly equally far apart.
     """
-    if not voxel_size > 0.0:
-        raise UsageError(f"a voxel's edge must be positive, not {voxel_size}")
     map_ = heights_of_voxels(centers, voxel_size)
-    if count < 2:
-        raise UsageError(f"a path needs two poses or more, not {count}")
     tool = np.asarray(tool_points, dtype=np.float64).reshape(-1, 3)
-    if len(tool) == 0:
-        raise UsageError("the tool has no points")
     reach = float(np.ptp(tool[:, :2], axis=0).max())
     places = _walk(map_, reach, DENSER * count, count * voxel_size)
     run = float(np.linalg.norm(places[1] - places[0]))
@@ -152,8 +160,6 @@ def slide_over_voxels(
     swings = min(1.5, 0.08 * run * len(places) / max(reach, 1e-12))
     rotations = _rotations(slopes, 0.5 * np.pi + 0.9 * np.sin(2.0 * np.pi * swings * u))
     heights = _let_down(map_, places, rotations, tool)
-    if not np.isfinite(heights).any():
-        raise UsageError("there is nothing to slide over under the path")
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, :3] = rotations
     poses[:, :3, 3] = np.column_stack([places, _gliding(heights, STEEPEST * run)])
@@ -161,3 +167,54 @@ def slide_over_voxels(
     press = 1.0 - 0.5 * np.cos(np.linspace(0.0, 10.0 * np.pi, count))
     chosen[:, 2, 3] -= voxel_size * press
     return np.asarray(chosen)
+
+
+def write_along(
+    folder: str | os.PathLike[str], url: str | os.PathLike[str], frames: int
+) -> tuple[Path, Path]:
+    """Write wrench.stl, scaled to an environment, and path.csv that slides it over that."""
+    home = Path(folder)
+    wrench = write_sample(home).wrench
+    with hapticdb.open(url, read_only=True) as env:
+        # the same share of the scene's length as of the sample car's
+        bounds = np.array([obj.bounds for obj in env.objects()] or [np.zeros((2, 3))])
+        longest = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+        content = bytearray(wrench.read_bytes())
+        triangles = np.frombuffer(content, TRIANGLE, offset=HEADER)
+        triangles["corners"][:] *= longest / SAMPLE_LENGTH or 1.0
+        wrench.write_bytes(content)
+        # the shell's points, not the mesh: where only the mesh touches, no point would hit
+        poses = slide_along(env, PointShell.from_file(wrench).points, frames)
+    write_poses(home / "path.csv", poses)
+    return wrench, home / "path.csv"
+
+
+def slide_along(
+    env: Environment, tool_points: NDArray[np.float64], frames: int
+) -> NDArray[np.float64]:
+    """Poses (frames, 4, 4) that slide a tool over the largest objects of an environment.
+
+    The path follows a map of the voxels' heights, whose size does not depend on the grid.
+    """
+    chosen, total = [], 0
+    for obj in sorted(env.objects(), key=lambda obj: (-obj.voxels, obj.id)):
+        if total + obj.voxels <= ALONG_VOXELS:
+            chosen.append(obj)
+            total += obj.voxels
+    bounds = np.array([obj.bounds for obj in chosen])
+    span = float((bounds[:, 1].max(axis=0) - bounds[:, 0].min(axis=0)).max())
+    size = env.grid.voxel_size
+    step = size * max(1, 2 ** int(np.ceil(np.log2(max(span / (size * MAP_CELLS), 1.0)))))
+    tops = [_tops(env.grid.centers(env.voxels(obj.id)), step) for obj in chosen]
+    centers = np.concatenate(tops)
+    centers[:, 2] -= 0.5 * (step - size)  # the map adds half a cell: the tops stay where they are
+    return slide_over_voxels(centers, step, tool_points, frames)
+
+
+def _tops(centers: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+    """Highest of the centres (V, 3) in each column of a map of that step, metres."""
+    columns = np.floor(centers[:, :2] / step).astype(np.int64)
+    order = np.lexsort((centers[:, 2], columns[:, 1], columns[:, 0]))
+    ranked = columns[order]
+    is_last = np.append((ranked[1:] != ranked[:-1]).any(axis=1), True)
+    return np.asarray(centers[order[is_last]])

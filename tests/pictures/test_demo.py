@@ -78,6 +78,7 @@ def test_hits_of_the_trace_lie_in_voxels_of_their_objects(
             assert np.isin(hit, mine).all()
 
 
+@pytest.mark.long
 def test_the_picture_shows_the_scene(
     scene: demo.DemoScene, comparison: demo.Comparison, tmp_path: Path
 ) -> None:

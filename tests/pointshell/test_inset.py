@@ -99,7 +99,7 @@ def test_images_of_a_sphere_lie_on_a_smaller_one() -> None:
     assert np.einsum("nk,nk->n", outward, shell.normals).max() < -0.99
 
 
-@pytest.mark.parametrize("degrees", [64.0, 75.0, 90.0, 120.0])
+@pytest.mark.parametrize("degrees", [64.0, 120.0])
 def test_a_wide_wedge_touches_late_by_the_formula(degrees: float) -> None:
     shell = PointShell.from_mesh(*wedge(degrees), 2000, inset=INSET)
     edge = np.stack([np.zeros(40), np.linspace(0.3, 1.2, 40), np.zeros(40)], axis=1)
@@ -109,7 +109,7 @@ def test_a_wide_wedge_touches_late_by_the_formula(degrees: float) -> None:
     assert late.max() <= np.hypot(wanted + 0.01, 0.08)
 
 
-@pytest.mark.parametrize("degrees", [15.0, 30.0, 55.0])
+@pytest.mark.parametrize("degrees", [15.0, 55.0])
 def test_a_sharp_wedge_keeps_its_points_as_far_in_as_they_can_go(degrees: float) -> None:
     corners, faces = wedge(degrees)
     shell = PointShell.from_mesh(corners, faces, 2000, inset=INSET)
@@ -194,7 +194,7 @@ def test_points_stay_in_the_wall_around_a_void(wall: float, inset: float) -> Non
 @given(seed=st.integers(0, 2**32), n=st.integers(4, 30), share=st.floats(0.05, 0.9))
 @example(seed=1, n=4, share=0.5)  # an edge below 8 degrees
 @example(seed=152, n=4, share=0.5)  # samples that lie 4e-5 insets from the other side of an edge
-@settings(max_examples=12, deadline=None)
+@settings(max_examples=6, deadline=None)
 def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
     seed: int, n: int, share: float
 ) -> None:
@@ -214,7 +214,7 @@ def test_random_convex_bodies_keep_the_inset_and_leave_no_part_without_points(
     assert nearest_to(shell.points, on_surface.points).max() <= 2.0 * inset + 2.5 * covering
 
 
-@pytest.mark.parametrize("degrees", [0.2, 1.0, 3.0, 7.0])
+@pytest.mark.parametrize("degrees", [0.2, 3.0])
 def test_no_point_leaves_a_wedge_through_its_sharp_edge(degrees: float) -> None:
     """Near the edge the other side is nearer than any share of the inset."""
     for seed in range(3):

@@ -114,6 +114,7 @@ def drop_others(store: Store, mesh_file: MeshFile) -> int:
 
 def covering(store: Store) -> Covering:
     """Ranges of keys that cover an object of a store."""
+
     def ranges(obj: Object) -> Iterable[tuple[int, int]]:
         lows, highs = object_ranges(store.grid, store.layout, obj)
         return zip(lows.tolist(), highs.tolist(), strict=True)

@@ -243,8 +243,3 @@ def test_contacts_have_places_normals_and_depths(env: Environment) -> None:
     assert (touch.contact_depths > 0).all()
     is_felt = np.isin(touch.hits, touch.contacts)
     assert touch.contact_depths.tolist() == touch.depths[is_felt].tolist()
-
-
-def test_a_law_that_reads_distances_is_refused_where_there_are_none(env: Environment) -> None:
-    with pytest.raises(hapticdb.errors.UsageError, match=r"distances to (their )?surfaces"):
-        env.touch(random_shell(5, 300), random_pose(5), law=hapticdb.DistanceField())

@@ -296,10 +296,9 @@ BLOB = blob(3, (30, 34, 31))
 
 
 @pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("quarters", [1, 2, 3])
-def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int, quarters: int) -> None:
+def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int) -> None:
     """Tool and environment are turned together, by 90 degrees about a vertex of the grid."""
-    turn = np.linalg.matrix_power(quarter_turn(axis), quarters)
+    turn = quarter_turn(axis)
     turned = np.round((BLOB + 0.5 - MIDDLE) @ turn.T - 0.5 + MIDDLE).astype(np.int64)
     before = scene_of(tmp_path / "a.db", BLOB)
     after = scene_of(tmp_path / "b.db", turned)
@@ -316,7 +315,7 @@ def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int, quarters: in
         np.testing.assert_allclose(moved.torque, turn @ plain.torque, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("shift", [(1, 0, 0), (0, -5, 0), (0, 0, 13), (-7, 3, 11), (15, 15, -15)])
+@pytest.mark.parametrize("shift", [(0, 0, 13), (-7, 3, 11)])
 @unplanned
 def test_a_scene_shifted_by_whole_voxels_keeps_the_wrench(
     tmp_path: Path, strategy: Strategy, shift: tuple[int, int, int]

@@ -3,13 +3,12 @@
 from pathlib import Path
 
 import numpy as np
-import pytest
 from numpy.typing import NDArray
 
 from hapticdb import DistanceField, Environment, PointShell
 from hapticdb.query.frame import STRATEGIES
 from servers import Place
-from smooth_scenes import TOP, VOXEL, imported
+from smooth_scenes import imported
 
 SMOOTH = [strategy for strategy in STRATEGIES if strategy != "statement"]
 
@@ -61,25 +60,3 @@ def test_both_engines_and_curves_feel_the_same(tmp_path: Path, place: Place) -> 
     for curve in ("z", "hilbert"):
         with imported(place(), curve) as env:
             assert check_strategies(env, shell) == wanted
-
-
-@pytest.mark.parametrize("thickness", [0.2, 1.0, 3.0])
-def test_a_thin_plate_on_the_slab_is_pushed_up(tmp_path: Path, thickness: float) -> None:
-    """F = K s (delta - u) a point, averaged over the 16 of the near side; the plane law: nothing.
-
-    Nothing, because no point is in a voxel of the slab's upper face.
-    """
-    across = np.linspace(-0.02, 0.02, 4) - 0.05
-    near = np.array([[x, y, 0.0] for x in across for y in across + 0.05])
-    points = np.concatenate([near, near + np.array([0.0, 0.0, thickness * VOXEL])])
-    normals = np.repeat([[0.0, 0.0, 1.0], [0.0, 0.0, -1.0]], len(near), axis=0)
-    shell = PointShell(points, normals, np.zeros(3))
-    pose = np.eye(4)
-    with imported(tmp_path / "e.db") as env:
-        for u in (0.85, 1.1, 1.4):
-            pose[2, 3] = TOP + u * VOXEL
-            felt = env.touch(shell, pose)
-            wanted = 1000.0 * VOXEL * (1.5 - u) * 10.0
-            assert felt.force[2] == pytest.approx(wanted, abs=0.02 * 1000.0 * VOXEL * 10.0)
-            assert felt.contacts.tolist() == [*range(16)]
-            assert not env.touch(shell, pose, law="plane").force.any()

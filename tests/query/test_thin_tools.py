@@ -78,27 +78,6 @@ def test_a_plate_is_pushed_by_its_near_side_alone(
     assert felt[0] == felt[1] == 0.0
 
 
-@pytest.mark.parametrize("thickness", [0.2, 1.0, 2.0, 3.0])
-def test_a_plate_drawn_inward_is_pushed_by_its_near_side_alone(thickness: float) -> None:
-    """Both sides are drawn in by half the thickness, to the same place."""
-    x, y, z = np.meshgrid([-6.0, 6.0], [-6.0, 6.0], [0.0, thickness], indexing="ij")
-    corners = SIZE * np.column_stack([x.ravel(), y.ravel(), z.ravel()])
-    quads = [[0, 2, 6, 4], [1, 5, 7, 3], [0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6]]
-    faces = np.array([[q[0], q[m], q[m + 1]] for q in quads for m in (1, 2)])
-    shell = PointShell.from_mesh(corners, faces, 200, inset=1.5 * SIZE)
-    pushes_up = shell.normals[:, 2] > 0.9
-    assert pushes_up.sum() > 20
-    assert (shell.normals[:, 2] < -0.9).sum() > 20
-    inner = np.abs(shell.points[pushes_up, 2] / SIZE - thickness / 2)
-    assert np.median(inner) < 0.1
-    pose = np.eye(4)
-    u = 0.9
-    pose[:3, 3] = np.array(ORIGIN) + SIZE * np.array([32.3, 32.4, PLANE_AT + u - thickness / 2])
-    felt = on_rows(sheet(), grid_of(), shell, pose, [])[0][0]
-    assert felt[2] == pytest.approx(10.0 * K_S * (1.5 - u), rel=0.1)
-    assert np.abs(felt[:2]).max() < 0.05 * felt[2]
-
-
 def test_a_point_that_only_faces_away_is_no_contact_but_stays_a_hit() -> None:
     """The far side: a hit has depth 0, and what is no hit is not felt."""
     points = np.array([[30.2, 30.3, PLANE_AT + 0.8], [30.2, 30.3, PLANE_AT + 1.2]])

@@ -19,7 +19,6 @@ import hapticdb
 from children import child, exit_code
 from command_line import Run, refused, run  # noqa: F401 - a fixture
 from hapticdb import Grid, backup_environment, restore_environment
-from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import blob, floor_voxels, write_voxels
 
@@ -249,12 +248,6 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         restore_environment(other, tmp_path / "q.db")
     assert files(tmp_path) == before
-
-
-def test_every_copy_has_a_mark_of_its_own(path: Path, copy: Path, tmp_path: Path) -> None:
-    restore_environment(copy, tmp_path / "other.db")
-    marks = {sqlite_log.file_mark(p) for p in (path, copy, tmp_path / "other.db")}
-    assert len(marks - {None, sqlite_log.NO_MARK}) == 3
 
 
 # --- the command line -----------------------------------------------------------------------------

@@ -35,7 +35,7 @@ CRAFTED = {
 }
 
 
-@pytest.mark.parametrize("layout", ["brick", "voxel"])
+@pytest.mark.parametrize("layout", ["brick", pytest.param("voxel", marks=pytest.mark.long)])
 def test_a_crafted_schema_is_told_and_found(
     place: Place, sphere: hapticdb.PointShell, layout: Layout
 ) -> None:

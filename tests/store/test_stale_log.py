@@ -88,13 +88,6 @@ def test_an_old_copy_under_a_newer_log_is_refused_and_left_alone(
     assert folder_bytes(stale.parent) == before
 
 
-def test_a_copy_from_before_format_2_is_refused_under_a_newer_log(stale: Path) -> None:
-    make_old(stale.with_name("backup"))
-    shutil.copy(stale.with_name("backup"), stale)
-    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
-        hapticdb.open(stale)
-
-
 def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_write(
     path: Path, tmp_path: Path
 ) -> None:
@@ -128,23 +121,6 @@ def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(
     assert sqlite_log.file_mark(path) != sqlite_log.NO_MARK
     with closing(sqlite3.connect(path)) as plain:
         assert plain.execute("PRAGMA user_version").fetchone() == (FORMAT_VERSION,)
-
-
-def test_every_commit_draws_a_new_mark(path: Path) -> None:
-    marks = set()
-    with closing(SQLiteStore.open(path)) as store:
-        works: list[Callable[[], object]] = [
-            lambda: write(store, 1),
-            lambda: store.remove(1, lambda _: [(0, 2**62)]),
-            lambda: store.save_costs("here", {}),
-            lambda: store.analyze(10),
-        ]
-        for work in works:
-            work()
-            ((lineage,),) = store._connection.fetch("SELECT lineage FROM environment")
-            marks.add(lineage[:16])
-            assert lineage[16:] in {*marks, sqlite_log.file_mark(path)}
-    assert len(marks) == 4
 
 
 # --- crashes at every moment ----------------------------------------------------------------------

@@ -128,16 +128,6 @@ class Editor:
         return tuple(self._out.values())
 
     @property
-    def can_undo(self) -> bool:
-        """Whether there is a step to undo."""
-        return bool(self._done)
-
-    @property
-    def can_redo(self) -> bool:
-        """Whether a step was undone last and can be done again."""
-        return bool(self._undone)
-
-    @property
     def history(self) -> tuple[str, ...]:
         """What was done, undone and refused: lines for people, the oldest first."""
         return tuple(self._history)

@@ -70,7 +70,8 @@ def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
     code, out, err = run("move", scene, "box[01]", 3, "--translate", "0,0,0.01", "--json")
     assert (code, err) == (0, "")
     assert [json.loads(line)["id"] for line in out.splitlines()] == [1, 2, 3]
-    refused(run("move", scene, "box*", "--pose", "0,0,0,1,0,0,0"), "3 are chosen")
+    placed = ("--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
+    refused(run("move", scene, "box*", *placed), "3 are chosen")
     refused(run("remove", scene, "box1", "cone*"), "no object 'cone*'")
     assert ids_in(scene) == [1, 2, 3]
     code, out, err = run("remove", scene, "box1", "2,3", "--json")

@@ -306,10 +306,10 @@ def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None
 
 
 def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) -> None:
-    file = boxes(tmp_path / "many.glb", count=60, side=0.15)
-    options = ("--layout", "voxel", "--voxel-size", 0.002)
+    file = boxes(tmp_path / "many.glb", count=8)
+    options = ("--layout", "voxel", "--voxel-size", 0.01)
     assert run("import", "whole.db", file, *options)[0] == 0
-    args = command_that_halts(30, "import", "cut.db", file, *options)
+    args = command_that_halts(4, "import", "cut.db", file, *options)
     with child(args, cwd=tmp_path) as process:
         cut = tmp_path / "cut.db"
         wait_for_an_object(cut, process)
@@ -322,9 +322,9 @@ def test_an_interrupted_import_goes_on_and_ends_equal(run: Run, tmp_path: Path) 
     with hapticdb.open(cut, read_only=True) as env:
         n_objects = len(env.objects())
         assert all(len(env.voxels(obj.id)) == obj.voxels for obj in env.objects())
-    assert 0 < n_objects < 60
+    assert 0 < n_objects < 8
     code, out, err_text = run("import", "cut.db", file, *options)
     assert (code, err_text) == (0, "")
-    assert f"{60 - n_objects} objects imported" in out
+    assert f"{8 - n_objects} objects imported" in out
     assert f"{n_objects} were there already" in out
     assert rows_of(cut) == rows_of(tmp_path / "whole.db")

@@ -38,10 +38,9 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
         "verdict", "line", "parts", "way", "touched", "blockers", "pulls", "motions", "poses",
         "is_planned", "seconds", "seed",
     ]  # fmt: skip
-    assert list(found["way"]) == [
-        "how", "poses", "length", "clearance", "rest_from", "proof", "rest", "depths",
-        "beside",
-    ]  # fmt: skip
+    assert set(found["way"]) == {
+        "how", "poses", "length", "clearance", "rest_from", "proof", "rest", "depths", "beside",
+    }  # fmt: skip
     assert (found["verdict"], found["way"]["how"]) == ("slides out", "pull")
     assert found["way"]["proof"]["verdict"] == "hits"
     assert found["way"]["rest"]["verdict"] == found["way"]["beside"]["verdict"] == "comes out"
@@ -65,14 +64,6 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     assert not Path("out.png").exists()
     found = json.loads(run("extract", url, "block", "--motions", 0, "--json")[1])
     assert (found["way"], found["blockers"][0]["name"]) == (None, "cage")
-
-
-@pytest.mark.long
-def test_the_picture_is_drawn(run: Run, scene: Path) -> None:
-    code, out, _ = run("extract", scene, "box0", "--motions", 0, "--picture", "out.png")
-    assert code == 0
-    assert out.splitlines()[-1].split() == ["picture", "out.png"]
-    assert Path("out.png").stat().st_size > 10_000
 
 
 def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:

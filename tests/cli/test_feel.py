@@ -183,7 +183,6 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
         ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
         ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
-        ([*PLAY, "--staleness", 0], ["staleness"]),
         ([*PLAY, "--scale", 0], ["a scale of 0.0"]),
         ([*PLAY, "--scale", 1e300], ["a scale of 1e+300", "at most"]),
         (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),

@@ -12,10 +12,9 @@ import pytest
 import hapticdb
 from bands import band_rows
 from command_line import Run, poses, run, tool  # noqa: F401 - fixtures
-from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
-from hapticdb.testing import floor_voxels, voxel_object, write_voxels
+from hapticdb.testing import voxel_object
 
 VOXEL = 0.001
 FLOOR = 0.0325
@@ -92,27 +91,6 @@ def test_a_saved_shell_that_was_drawn_in_is_told_where_clearance_counts(
         code, _, err = run(*args, *more)
         assert code == 0
         assert f"drawn in by 2 mm: contact begins up to {late} late" in err
-
-
-def test_info_tells_the_accuracy_of_fit_where_there_are_distances(run: Run, floor: Path) -> None:
-    code, out, err = run("info", floor)
-    assert (code, err) == (0, "")
-    late = "free from 0.1 mm of clearance on; edges of 90° touch up to 0.621 mm late"
-    assert re.search(rf"^fit +{late}$", out, re.MULTILINE)
-    kept = "free from 1.6 mm of clearance on; no edge touches late"
-    assert re.search(rf"^fit, conservative +{kept}$", out, re.MULTILINE)
-    fit = json.loads(run("info", floor, "--json")[1])["fit"]
-    assert fit["free_from"] == pytest.approx(0.1 * VOXEL)
-    assert fit["free_from_conservative"] == pytest.approx(1.6 * VOXEL)
-    assert fit["edge_late"] == pytest.approx(ONSET * VOXEL * (1.0 / np.sin(np.pi / 4.0) - 1.0))
-
-
-def test_info_tells_no_fit_where_an_object_has_no_distances(run: Run, floor: Path) -> None:
-    with hapticdb.open(floor) as env:
-        write_voxels(env.store, floor_voxels(env.grid, 2, 4), "without")
-    out = run("info", floor)[1]
-    assert not re.search(r"^fit\b", out, re.MULTILINE)
-    assert json.loads(run("info", floor, "--json")[1])["fit"] is None
 
 
 def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, floor: Path) -> None:

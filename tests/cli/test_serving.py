@@ -25,9 +25,6 @@ def scene(tmp_path: Path) -> Path:
     ("args", "words"),
     [
         (["--host", "192.0.2.1"], "--token"),
-        (["--role-token", "owner=0123456789abcdef"], "viewer, toucher, editor"),
-        (["--role-token", "editor=short"], "16"),
-        (["--role-token", "editor"], "ROLE="),
         (["--token-file", "none"], "--token-file none"),
         (["--tool", "none.stl"], "no such file"),
         (["--files", "none"], "no such folder"),
@@ -45,6 +42,25 @@ def test_a_mistake_is_one_line_and_starts_nothing(
     assert told.out == ""
     assert words in told.err
     assert len(told.err.splitlines()) == 1
+
+
+@pytest.mark.parametrize(
+    ("line", "words"),
+    [
+        ("owner=0123456789abcdef", "viewer, toucher, editor"),
+        ("editor=short", "16"),
+        ("editor", "ROLE="),
+    ],
+)
+def test_a_wrong_token_is_one_line(
+    scene: Path, capsys: pytest.CaptureFixture[str], line: str, words: str
+) -> None:
+    tokens = scene.with_name("tokens")
+    tokens.write_text(line)
+    assert main(["serve", str(scene), "--token-file", str(tokens)]) == 2
+    told = capsys.readouterr()
+    assert (told.out, len(told.err.splitlines())) == ("", 1)
+    assert words in told.err
 
 
 @pytest.mark.long

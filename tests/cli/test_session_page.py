@@ -12,7 +12,8 @@ AWAY = SimpleNamespace(is_lost=True, url="gone.db")
 
 
 def session(*, is_loose: bool, ids: tuple[int, ...] = ()) -> Any:  # noqa: ANN401 - of a stand-in
-    return SimpleNamespace(is_loose=is_loose, loose_objects=ids, cells=AWAY)
+    calm = {"database_lost": None, "recording_ended": None, "cells": AWAY}
+    return SimpleNamespace(is_loose=is_loose, loose_objects=ids, **calm)
 
 
 def report(**figures: Any) -> Any:  # noqa: ANN401 - of a stand-in
@@ -23,7 +24,7 @@ def report(**figures: Any) -> Any:  # noqa: ANN401 - of a stand-in
 def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    notes = session_page.LooseNotes()
+    notes = session_page.Notes()
     for _ in range(3):
         notes.look(session(is_loose=True, ids=(3,)))
     said = capsys.readouterr().err
@@ -37,7 +38,7 @@ def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
 def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
-    notes = session_page.LooseNotes()
+    notes = session_page.Notes()
     notes.look(session(is_loose=True))
     assert capsys.readouterr().err == ""
     notes.look(session(is_loose=True))
@@ -45,7 +46,7 @@ def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
 
 
 def test_a_session_without_such_a_tool_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    notes = session_page.LooseNotes()
+    notes = session_page.Notes()
     notes.look(session(is_loose=False))
     assert capsys.readouterr().err == ""
 

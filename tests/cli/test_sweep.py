@@ -119,21 +119,21 @@ def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
     code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--points", 50)
     assert (code, err) == (1, "")
     found = json.loads(out)
-    assert list(found) == [
+    assert set(found) == {
         "verdict", "comes_out", "line", "proof", "poses", "samples", "hits", "contacts",
         "first_hit", "first_contact", "deepest", "objects", "enclosed", "hit_intervals",
         "contact_intervals", "clearance", "tool", "revision", "elapsed", "cells", "proportions",
         "at_least", "looked", "left_at_start", "decision", "depths",
-    ]  # fmt: skip
-    assert list(found["first_contact"]) == ["sample", "fraction", "segment", "pose", "objects"]
-    assert list(found["deepest"]) == ["depth", "point", "moment"]
-    assert list(found["clearance"]) == [
+    }  # fmt: skip
+    assert set(found["first_contact"]) == {"sample", "fraction", "segment", "pose", "objects"}
+    assert set(found["deepest"]) == {"depth", "point", "moment"}
+    assert set(found["clearance"]) == {
         "distance", "at_least", "at_most", "is_beyond", "point", "voxel", "moment",
-    ]  # fmt: skip
-    assert list(found["objects"][0]) == [
+    }  # fmt: skip
+    assert set(found["objects"][0]) == {
         "id", "name", "first", "last", "intervals", "first_contact", "length", "samples",
         "contacts", "points", "deepest",
-    ]  # fmt: skip
+    }  # fmt: skip
     assert (found["comes_out"], found["poses"], found["tool"]["points"]) == (False, 3, 50)
     assert found["clearance"]["distance"] == 0.0
 
@@ -236,16 +236,7 @@ def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path)
     assert run("sweep", scene, "--part", 2, "--path", "aside.csv", *more)[0] == 0
 
 
-@pytest.mark.usefixtures("through")
-def test_a_picture_is_drawn(run: Run, scene: Path) -> None:
-    code, out, _ = run("sweep", scene, *TOOL, "--path", "through.csv", "--picture", "out.png")
-    assert code == 1
-    assert out.splitlines()[-1] == "picture: out.png"
-    image = matplotlib.image.imread("out.png")
-    assert image.shape[:2] == (1000, 1600)
-    assert image[..., :3].std() > 0.05
-
-
+@pytest.mark.long
 @pytest.mark.usefixtures("free")
 def test_the_picture_is_drawn_although_nobody_reads_on(scene: Path) -> None:
     args = command("sweep", scene.name, *TOOL, "--path", "free.csv", "--picture", "out.png")

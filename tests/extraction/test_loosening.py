@@ -82,6 +82,7 @@ def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) 
     assert (shifts[lifted, 0] > 0.02).all()  # the ledge covers 0.02 m
 
 
+@pytest.mark.long
 def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Path) -> None:
     url = bayonet(tmp_path)
     found = found_in(url, "bar")
@@ -94,6 +95,7 @@ def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Pa
     assert (turn_of(poses[passing]) > 1.0).all()
 
 
+@pytest.mark.long
 def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
     url = elbow(tmp_path)
     found = found_in(url, "peg")
@@ -102,15 +104,14 @@ def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
     assert places_in_boxes(found, url, "peg", 0.5 * SIZE) == 0
 
 
-@pytest.mark.parametrize(("scene", "part"), [(ledge, "plate"), (bayonet, "bar")])
-def test_no_pull_cuts_through_what_it_touches(tmp_path: Path, scene: object, part: str) -> None:
+def test_no_pull_cuts_through_what_it_touches(tmp_path: Path) -> None:
     """The part has fewer hits while it passes a thin wall than at its start."""
-    url = scene(tmp_path)  # type: ignore[operator]
-    found = found_in(url, part, motions=0)
+    found = found_in(ledge(tmp_path), "plate", motions=0)
     assert found.way is None
     assert found.blockers[0].pulls == found.pulls
 
 
+@pytest.mark.long
 def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None:
     found = found_in(grounded(tmp_path), "block", motions=200)
     assert (found.verdict, found.is_planned) == ("no way found", True)
@@ -118,6 +119,7 @@ def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None
     assert 0 < found.motions <= 2 * 200
 
 
+@pytest.mark.long
 def test_the_same_seed_leaves_contact_on_the_same_way(tmp_path: Path) -> None:
     url = ledge(tmp_path)
     found, again = found_in(url, "plate", seed=5), found_in(url, "plate", seed=5)
@@ -135,10 +137,6 @@ def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
     assert is_out(found, url, "plate")
     assert places_in_boxes(found, url, "plate", 0.0) == 0
     assert turn_of(poses_of(found)).max() > 0.5
-    again = found_in(url, "plate", seed=1)
-    assert again.way is not None
-    assert found.way is not None
-    assert np.array_equal(found.way.poses, again.way.poses)
 
 
 # --- motions -------------------------------------------------------------------------------------

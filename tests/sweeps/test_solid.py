@@ -52,7 +52,7 @@ corners = st.tuples(*[st.integers(0, 6)] * 3).map(lambda one: np.array(one, dtyp
 edges = st.tuples(*[st.integers(1, 4)] * 3).map(lambda one: np.array(one, dtype=float))
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=6, deadline=None)
 @given(
     boxes=st.lists(st.tuples(corners, edges), min_size=1, max_size=4),
     shift=st.sampled_from([0.0, 0.013]),
@@ -121,7 +121,7 @@ def test_a_void_is_outside() -> None:
     assert high == pytest.approx([1.0, -1.0], abs=1e-2)
 
 
-@settings(max_examples=25, deadline=None)
+@settings(max_examples=10, deadline=None)
 @given(seed=st.integers(0, 2**32 - 1), n=st.integers(1, 40))
 def test_the_tree_finds_the_least_distance_of_a_plain_loop(seed: int, n: int) -> None:
     rng = np.random.default_rng(seed)

@@ -14,23 +14,20 @@ from itertools import takewhile
 from hapticdb import interrupting
 from hapticdb.cli import render
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
-from hapticdb.cli.verbs.checking import check
 from hapticdb.cli.verbs.editing import move, remove
+from hapticdb.cli.verbs.extracting import HELP as EXTRACT_HELP
+from hapticdb.cli.verbs.extracting import extract
 from hapticdb.cli.verbs.feeling import feel
-from hapticdb.cli.verbs.granting import grant
 from hapticdb.cli.verbs.importing import import_
-from hapticdb.cli.verbs.keeping import backup, restore
+from hapticdb.cli.verbs.keeping import backup, check, grant, restore, upgrade
 from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.moving import copy, diff
-from hapticdb.cli.verbs.paths.extracting import HELP as EXTRACT_HELP
-from hapticdb.cli.verbs.paths.extracting import extract
-from hapticdb.cli.verbs.paths.sweeping import HELP as SWEEP_HELP
-from hapticdb.cli.verbs.paths.sweeping import sweep
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample, warm
 from hapticdb.cli.verbs.serving import serve, view
+from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
+from hapticdb.cli.verbs.sweeping import sweep
 from hapticdb.cli.verbs.touching import touch
-from hapticdb.cli.verbs.upgrading import upgrade
 from hapticdb.errors import HapticDBError
 
 __all__ = ["app", "main"]

@@ -67,15 +67,7 @@ FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
 
 
 class CsvWriter:
-    """Rows that are written as CSV.
-
-    Parameters
-    ----------
-    stream : TextIO
-        Opened without translating ends of lines.
-    columns : sequence of str
-        The header.
-    """
+    """Rows that are written as CSV below a header, to a stream that translates no ends of lines."""
 
     def __init__(self, stream: TextIO, columns: Sequence[str]) -> None:
         self._writer = csv.writer(stream, lineterminator="\n")
@@ -95,15 +87,7 @@ class CsvWriter:
 
 @contextmanager
 def open_csv(target: str | None, option: str, columns: Sequence[str]) -> Iterator[CsvWriter | None]:
-    """Open a CSV file for writing; None where no target is given. After an error no file is left.
-
-    Raises
-    ------
-    UsageError
-        When a file is there already.
-    FileError
-        When it cannot be written.
-    """
+    """Open a new CSV file for writing; None where none is given. After an error no file is left."""
     if target is None:
         yield None
     elif target == STDOUT:
@@ -181,19 +165,8 @@ def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
             yield [obj.id, text_cell(obj.name), 0.0, 1.0, 1, 0, 0, 0, 0.0, found.verdict, *none]
     for left in found.depths:
         who = [left.object.id, text_cell(left.object.name)]
-        depths = [left.at_start_most, left.deepest, left.deepest_most]
-        yield [
-            *who,
-            0.0,
-            "",
-            0,
-            "",
-            "",
-            "",
-            "",
-            found.verdict,
-            *("" if left.why else d for d in depths),
-        ]
+        depths = none if left.why else [left.at_start_most, left.deepest, left.deepest_most]
+        yield [*who, 0.0, "", 0, "", "", "", "", found.verdict, *depths]
 
 
 def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:

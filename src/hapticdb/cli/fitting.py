@@ -1,8 +1,8 @@
-"""How well a tool fits a scene: sizes compared before a verb begins, and clearance that is felt."""
+"""Whether the sizes of tool, path and scene fit together, told before a verb begins."""
 
 from collections.abc import Iterable
 from pathlib import Path
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
 from hapticdb.units import length_text
@@ -17,40 +17,6 @@ if TYPE_CHECKING:
 
 UNITLESS = {".stl", ".obj", ".ply", ".off"}
 """Suffixes of tools whose unit --tool-unit says."""
-FREE_FROM = 0.1
-"""Radial clearance, voxels, from which on a peg drawn inward moves freely in a hole; measured: 0.05
-to 0.08. A larger value promises less."""
-FREE_FROM_CONSERVATIVE = 1.6
-"""The same for a peg with its points on its surface: the onset, 1.5 voxels, and that error."""
-EDGE_LATE = 1.5 * (2.0**0.5 - 1.0)
-"""How late an edge of 90 degrees of a tool drawn inward touches, voxels: for an edge of angle a,
-1.5 (1 / sin(a / 2) - 1)."""
-
-
-class Accuracy(NamedTuple):
-    """Accuracy with which the smooth law tells whether a tool fits, metres; fields as above."""
-
-    free_from: float
-    free_from_conservative: float
-    edge_late: float
-
-    @property
-    def facts(self) -> list[tuple[str, str]]:
-        """The same in words."""
-        free, conservative, late = (f"{1e3 * length:.3g} mm" for length in self)
-        return [
-            ("fit", f"free from {free} of clearance on; edges of 90° touch up to {late} late"),
-            (
-                "fit, conservative",
-                f"free from {conservative} of clearance on; no edge touches late",
-            ),
-        ]
-
-
-def accuracy_at(voxel_size: float) -> Accuracy:
-    """Accuracy of fit at that voxel size, metres."""
-    in_voxels = (FREE_FROM, FREE_FROM_CONSERVATIVE, EDGE_LATE)
-    return Accuracy(*(voxel_size * length for length in in_voxels))
 
 
 def compare(

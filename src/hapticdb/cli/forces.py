@@ -21,27 +21,10 @@ PLANE_STIFFNESS = 1000.0
 
 @dataclass(frozen=True)
 class ForceOptions:
-    """What the options of `feel` say of the force.
+    """What the options of `feel` say of the force; a UsageError where they contradict.
 
-    Attributes
-    ----------
-    law_name : {"plane", "smooth"} or None
-        --law. None: smooth.
-    stiffness : float or None
-        --stiffness, N/m: at the device under the smooth law, of a contact under the plane law.
-    profile_name : str or None
-        --device-profile.
-    cap : float or None
-        --cap, N.
-    delay_ms : float or None
-        --delay, milliseconds.
-    is_conservative : bool
-        --conservative: the tool's points stay on its surface.
-
-    Raises
-    ------
-    UsageError
-        If a number is out of its range, or options contradict one another.
+    stiffness : N/m, at the device under the smooth law, of a contact under the plane law; cap : N;
+    delay_ms : milliseconds; is_conservative : the tool's points stay on its surface.
     """
 
     law_name: "LawName | None"
@@ -72,13 +55,7 @@ class ForceOptions:
         )  # fmt: skip
 
     def law_and_coupling(self, cells: "ResidentCells") -> "tuple[ForceLaw | None, Coupling]":
-        """Law and coupling of a session on those cells.
-
-        Raises
-        ------
-        UsageError
-            If no law was asked for and the cells have no distances.
-        """
+        """Law and coupling; a UsageError if no law was asked for and cells have no distances."""
         from hapticdb.realtime.resident_cells import without_distances
 
         if self.law_name is None and not cells.has_distances:
@@ -104,9 +81,6 @@ class ForceOptions:
             delay = None if self.delay_ms is None else 1e-3 * self.delay_ms
             return None, Coupling(self.stiffness, self.cap, delay=delay, profile=self.profile())
         if self.delay_ms is not None:
-            raise UsageError(
-                "--delay belongs to the smooth law: under the plane law there is no coupling that "
-                "it could change; leave it out"
-            )
+            raise UsageError("--delay belongs to the smooth law: under the plane law leave it out")
         stiffness = PLANE_STIFFNESS if self.stiffness is None else self.stiffness
         return TangentPlane(stiffness), Coupling(cap=self.cap, profile=self.profile())

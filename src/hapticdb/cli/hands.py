@@ -26,22 +26,8 @@ PATH_SPEED = 0.1
 class HandOptions:
     """What the options of `feel` say of the hand.
 
-    Attributes
-    ----------
-    word : str
-        --device: a file, the name of a computed motion, or the name of a vendor's device.
-    speed : float or None
-        --speed, m/s.
-    place : str or None
-        --at, three numbers, metres.
-    seed : int
-        --seed, of a random hand.
-    loops : bool
-        --loop: a path begins again at its end.
-    is_simulated : bool
-        --simulate: the force moves the hand.
-    profile : DeviceProfile or None
-        --device-profile: what the device renders.
+    word : --device; speed : m/s; place : --at; loops : a path begins again at its end;
+    is_simulated : the force moves the hand; profile : what the device renders.
     """
 
     word: str
@@ -61,15 +47,7 @@ class HandOptions:
         return PATH_SPEED if read_timed_poses(self.word)[0] is None else None
 
     def open(self, path_speed: float | None) -> "Device":
-        """Open the device, or read the file of the motion.
-
-        Raises
-        ------
-        UsageError
-            When options contradict one another, or `word` names no hand.
-        DeviceError, FileError, MissingExtraError
-            When the device or the file cannot be used.
-        """
+        """Open the device, or read the file of the motion."""
         self._check()
         if self.word in VENDORS:
             return self._vendor_device()
@@ -84,8 +62,6 @@ class HandOptions:
         word = self.word
         if self.seed < 0:
             raise UsageError(f"--seed {self.seed}: give 0 or more")
-        if self.place is not None:
-            self._position()
         if word == "random" and self.place is None:
             raise UsageError("--device random: give --at, where the hand is")
         if word != "random" and self.place is not None:

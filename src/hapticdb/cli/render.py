@@ -3,25 +3,19 @@
 import json
 import os
 import re
-import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from typing import TYPE_CHECKING, Any, ParamSpec
 
-from hapticdb.cli.columns import Columns
-from hapticdb.units import length_text
+from hapticdb.cli import columns
 
 if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.check import CheckCallback
-    from hapticdb.extraction.pulls import SearchCallback
     from hapticdb.ingest.files import ImportCallback
-    from hapticdb.store.engines import BackupCallback
-    from hapticdb.transfer import CopyCallback
 
 _UNPRINTABLE = re.compile(
     "[\x00-\x09\x0b-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]"
@@ -69,25 +63,15 @@ def say_json(record: Mapping[str, Any]) -> None:
     print(json.dumps(record, allow_nan=False))
 
 
-def show(columns: Columns) -> None:
-    """Print a table or facts to standard output: as wide as the terminal, or whole into a pipe."""
-    is_terminal = sys.stdout.isatty()
-    width = shutil.get_terminal_size().columns if is_terminal else None
-    is_styled = is_terminal and os.environ.get("TERM", "") not in {"", "dumb", "unknown"}
-    lines = columns.lines(width, is_styled=is_styled)
-    sys.stdout.write("\n".join([*lines, ""]))
+def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
+    """Print rows under headings; a heading that ends in ``>`` is of a column of numbers."""
+    laid = columns.table(headings, [[_cell(text) for text in row] for row in rows])
+    print("\n".join(laid))
 
 
-def table(columns: Sequence[str], rows: Iterable[Sequence[str]]) -> Columns:
-    """Lay out rows under headings; a heading that ends in ``>`` is of a column of numbers."""
-    numbers = frozenset(i for i, column in enumerate(columns) if column.endswith(">"))
-    laid = [[_cell(text) for text in row] for row in rows]
-    return Columns(laid, [column.rstrip(">") for column in columns], numbers)
-
-
-def facts(rows: Iterable[tuple[str, str]]) -> Columns:
-    """Lay out names and values, a pair a line."""
-    return Columns([(_cell(name), _cell(value)) for name, value in rows])
+def facts(rows: Iterable[tuple[str, str]]) -> None:
+    """Print names and values, a pair a line."""
+    print("\n".join(columns.facts((_cell(name), _cell(value)) for name, value in rows)))
 
 
 def counted(n: float, noun: str = "") -> str:
@@ -108,11 +92,6 @@ def bytes_text(n: float) -> str:
         if n >= size:
             return f"{n / size:.3g} {word}"
     return f"{n:.0f} bytes"
-
-
-def metres(length: float) -> str:
-    """Put a length in the unit that reads best: ``3.3 mm``, ``4.21 m``."""
-    return length_text(length)
 
 
 def box(bounds: "NDArray[np.float64]") -> str:
@@ -159,108 +138,53 @@ def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
     names = missing(entries_for(*purposes))
     if not names:
         return 0
-    doing = "compiling, once"
     if not sys.stderr.isatty():
-        note(f"{doing}: {counted(len(names), 'kernel')}, some seconds ...")
-        return compile_missing(names)
-    with _bar(doing, "kernels") as advance:
-        return compile_missing(names, lambda now: advance(doing, now.done, now.total, 0))
+        note(f"compiling, once: {counted(len(names), 'kernel')}, some seconds ...")
+    with bar("compiling, once", "kernels", lambda now: (now.done, now.total)) as progress:
+        return compile_missing(names, progress)
 
 
 def import_bar() -> "AbstractContextManager[ImportCallback | None]":
-    """Show how many parts are imported; see `_progress_bar`."""
-    return _progress_bar(
-        "reading",
-        "parts",
-        lambda now: (now.link, now.parts_done + now.share, now.parts_total, now.voxels),
-    )
-
-
-def copy_bar(doing: str) -> "AbstractContextManager[CopyCallback | None]":
-    """Show how many objects are copied or compared; see `_progress_bar`."""
-    return _progress_bar(
-        doing, "objects", lambda now: (doing, now.objects_done, now.objects_total, now.voxels)
-    )
-
-
-def file_bar(doing: str) -> "AbstractContextManager[BackupCallback | None]":
-    """Show how many megabytes are copied; see `_progress_bar`."""
-    return _progress_bar(
-        doing, "MB", lambda now: (doing, now.bytes_done // 10**6, now.bytes_total // 10**6, 0)
-    )
-
-
-def check_bar(doing: str) -> "AbstractContextManager[CheckCallback | None]":
-    """Show how many rows are read; see `_progress_bar`."""
-    return _progress_bar(doing, "rows", lambda now: (doing, now.done, now.total, 0))
-
-
-def pull_bar() -> "AbstractContextManager[SearchCallback | None]":
-    """Show how many straight pulls are tried; see `_progress_bar`."""
-    return _progress_bar("pulling", "pulls", lambda now: ("pulling", now.done, now.total, 0))
-
-
-def count_bar(doing: str, noun: str) -> "AbstractContextManager[Callable[[int, int], None] | None]":
-    """Show how many of something are done, of how many; see `_progress_bar`."""
-    return _progress_bar(doing, noun, lambda done, total: (doing, done, total, 0))
+    """Show how many parts of a file are imported; see `bar`."""
+    return bar("importing", "parts", lambda now: (now.parts_done + now.share, now.parts_total))
 
 
 @contextmanager
-def _progress_bar(
-    doing: str, noun: str, figures: "Callable[Progressed, tuple[str, float, int, int]]"
+def bar(
+    doing: str, noun: str, measure: "Callable[Progressed, tuple[float, int]]"
 ) -> "Iterator[Callable[Progressed, None] | None]":
-    """Show a bar with counts, voxels a second and time left while standard error is a terminal.
+    """Show a bar with counts and the time left while standard error is a terminal.
 
-    figures : of a progress: what is being done, how much of it, of how much, voxels so far.
-    Yields the library's callback; None where standard error is no terminal.
+    measure : of what the library's callback gets: how much is done, of how much. Yields the
+    callback; None where standard error is no terminal.
     """
     if not sys.stderr.isatty():
         yield None
         return
-    with _bar(doing, noun) as advance:
-        yield lambda *now, **more: advance(*figures(*now, **more))
-
-
-@contextmanager
-def _bar(first: str, noun: str) -> Iterator[Callable[[str, float, int, int], None]]:
-    """Show a bar; yields what advances it: what is being done, how much of it, voxels so far."""
-    from time import monotonic
-
     from rich.console import Console
     from rich.progress import BarColumn, Progress, SpinnerColumn, TextColumn, TimeRemainingColumn
 
-    bar = Progress(
+    shown = Progress(
         SpinnerColumn(),
-        TextColumn("{task.fields[doing]}", markup=False),
+        TextColumn("{task.description}", markup=False),
         BarColumn(bar_width=14),
         TextColumn("{task.fields[count]}", markup=False),
-        TextColumn("{task.fields[rate]}", markup=False),
         TimeRemainingColumn(compact=True),
         console=Console(file=sys.stderr),
         transient=True,
     )
-    started: dict[str, tuple[float, int]] = {}
-    with bar:
-        task = bar.add_task("", total=None, doing=first, count="", rate="")
+    with shown:
+        task = shown.add_task(doing, total=None, count="")
 
-        def advance(doing: str, done: float, total: int, voxels: int) -> None:
-            since, before = started.setdefault(doing, (monotonic(), voxels))
-            elapsed = monotonic() - since
-            rate = (voxels - before) / elapsed if elapsed > 0.05 else 0.0
+        def advance(*now: Progressed.args, **more: Progressed.kwargs) -> None:
+            done, total = measure(*now, **more)
             is_last = done == total
-            bar.update(
+            shown.update(
                 task,
+                description="finishing" if is_last else doing,
                 total=None if is_last else total,
                 completed=done,
-                doing="finishing" if is_last else _short(doing),
-                count=f"{int(done)}/{total} {noun}"
-                + (f", {done % 1:.0%} of one" if done % 1 else ""),
-                rate=f"{counted(rate, 'voxel')}/s" if rate else "",
+                count=f"{int(done):,}/{total:,} {noun}",
             )
 
         yield advance
-
-
-def _short(link: str, most: int = 24) -> str:
-    name = link.rsplit("/", 1)[-1]
-    return printable(name if len(name) <= most else f"{name[: most - 1]}…")

@@ -6,18 +6,17 @@ from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
 from hapticdb.cli.tools import shell_text
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
-    from hapticdb.cli.columns import Columns
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.realtime.coupling import SettledCoupling
-    from hapticdb.realtime.report import Report, Spread
+    from hapticdb.realtime.report import Report
     from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
 MOST_NAMED = 8
 """Objects that were touched whose names are printed; more are counted."""
-PERCENTILES = (("p50", "p50"), ("p99", "p99"), ("p99.9", "p999"), ("worst", "worst"))
+PERCENTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "worst": "worst"}
 """Heading of each, and the field of a `Spread`."""
 
 Facts = list[tuple[str, str]]
@@ -39,10 +38,11 @@ def show(
     path_speed : float or None
         Speed assumed for a path without times, m/s.
     """
-    render.show(_loop_table(report))
-    facts = [("shell", shell_text(shell)), *_frame_facts(report)]
-    facts += [*_force_facts(report), *_cell_facts(report)]
-    facts.append(("warm start", f"{1e3 * report.warm_up:.3g} ms" + _cold_clause(report)))
+    _show_loops(report)
+    facts = [("shell", shell_text(shell)), *_frame_facts(report), *_force_facts(report)]
+    cache = report.cache
+    resident = f"{render.counted(cache.resident, 'cell')} in {cache.budget_bytes / 2**20:.4g} MiB"
+    facts.append(("resident", f"{resident}; {1e3 * cache.worst:.3g} ms to fetch more at worst"))
     if report.loose_frames:
         facts.append(("in something", loose_text(report, cells)))
     facts.append(("objects", f"{len(report.objects)} touched{_names_after(cells, report.objects)}"))
@@ -51,47 +51,36 @@ def show(
         facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
     if recording is not None:
         facts.append(("recorded", _recording_text(report, recording)))
-    facts += sorted(report.conditions.items())
-    render.show(render.facts(facts))
+    render.facts([*facts, *sorted(report.conditions.items())])
 
 
-def _loop_table(report: "Report") -> "Columns":
-    """Frames, deadlines and times of the session, and of the empty loop where it ran."""
+def _show_loops(report: "Report") -> None:
+    """Print frames, deadlines and times of the session, and of the empty loop where it ran."""
     loops = [loop for loop in (report.loop, report.empty) if loop is not None]
-    headings = ("", "session>", "empty loop>")[: 1 + len(loops)]
     rows = [
         ("frames", *(f"{loop.frames:,}" for loop in loops)),
         ("rate, Hz", *(f"{loop.rate:,.1f}" for loop in loops)),
         ("missed deadlines", *(f"{loop.missed:,}" for loop in loops)),
-        *_percentile_rows("late", [loop.lateness for loop in loops]),
-        *_percentile_rows("computing", [loop.elapsed for loop in loops]),
     ]
-    return render.table(headings, rows)
-
-
-def _percentile_rows(what: str, spreads: "Sequence[Spread]") -> list[tuple[str, ...]]:
-    """A row for each percentile, microseconds."""
-    return [
-        (f"{what} {name}, µs", *(f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads))
-        for name, field in PERCENTILES
-    ]
+    for what, spreads in (
+        ("late", [loop.lateness for loop in loops]),
+        ("computing", [loop.elapsed for loop in loops]),
+    ):
+        for name, field in PERCENTILES.items():
+            figures = (f"{1e6 * getattr(spread, field):,.1f}" for spread in spreads)
+            rows.append((f"{what} {name}, µs", *figures))
+    render.table(("", "session>", "empty loop>")[: 1 + len(loops)], rows)
 
 
 def _frame_facts(report: "Report") -> Facts:
     """Frames that touched, that knew too little, and whose force was held."""
-    touching = (
-        f"{render.counted(report.hit_frames, 'frame')} with a hit, "
-        f"{report.contact_frames:,} in contact, {report.cut_frames:,} held back at surfaces"
-    )
-    unknown = (
-        f"{render.counted(report.unknown_frames, 'frame')}, "
-        f"of {report.points:,} points {100 * (1 - report.hit_rate):.3g} %"
-    )
-    held = (
-        f"{render.counted(report.held_frames, 'frame')}, "
-        f"{report.stale_frames:,} while the database was silent"
-    )
-    facts = [("touching", touching), ("not known", unknown), ("force held", held)]
+    frames = report.unknown_frames, report.held_frames
+    unknown, held = (render.counted(n, "frame") for n in frames)
+    facts = [
+        ("touching", f"{report.hit_frames:,} frames hit, {report.contact_frames:,} in contact"),
+        ("not known", f"{unknown} with cells that were not in memory yet"),
+        ("force held", f"{held}, {report.stale_frames:,} while the database was silent"),
+    ]
     if report.budget_points is not None:
         facts.append(("budget", budget_text(report)))
     return facts
@@ -110,37 +99,24 @@ def _force_facts(report: "Report") -> Facts:
     """Law and coupling, the greatest force, and what was done to keep it stable."""
     from hapticdb.realtime.coupling import SettledCoupling
 
-    facts: Facts
     spring = report.coupling
-    if not isinstance(spring, SettledCoupling):
-        facts = [
-            ("force law", "plane: tangent planes of voxels"),
-            ("rendering", "direct, without coupling: each frame's wrench goes to the device"),
-        ]
-        caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
-        facts.append(("at most", caps))
-        return [*facts, ("peak", _peak_text(report))]
-    facts = [
-        ("force law", "smooth: distances to surfaces"),
-        ("stiffness", f"{spring.stiffness:.4g} N/m at the device{_lowered_clause(spring)}"),
-        (
-            "at most",
-            (
-                f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m; damping {spring.damping:.3g} "
-                f"N s/m (profile {spring.profile}, {1e3 * spring.delay:.3g} ms of delay)"
-            ),
-        ),
-        ("peak", _peak_text(report)),
-    ]
+    facts = [("force law", "smooth: distances to surfaces")]
+    if isinstance(spring, SettledCoupling):
+        lowered = "" if spring.lowered is None else f"; {spring.lowered}"
+        facts.append(("stiffness", f"{spring.stiffness:.4g} N/m at the device{lowered}"))
+    else:
+        facts = [("force law", "plane: each frame's wrench goes to the device, without coupling")]
+    caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
+    facts.append(("at most", caps))
+    peak = (
+        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m at the device; "
+        f"deepest contact {length_text(report.deepest)}"
+    )
+    facts.append(("peak", peak))
     if report.guard_actions:
         times = render.counted(report.guard_actions, "time")
         left = f"to {100.0 * report.least_share:.0f} %"
         facts.append(("guard", f"the force went back and forth: stiffness lowered {times}, {left}"))
-    if report.snapping_frames:
-        slowed = render.counted(report.snapping_frames, "frame")
-        facts.append(
-            ("snap-off", f"{slowed} in which the tool snapped over: the force changed by 1 N a ms")
-        )
     return facts
 
 
@@ -158,67 +134,48 @@ def loose_text(report: "Report", cells: "ResidentCells") -> str:
     return f"{start} {inside}: no force for {counted} ({frames / report.rate:.3g} s), {end}"
 
 
-class LooseNotes:
-    """Tells on the command line when the tool lies in an object, and when it is free again."""
+class Notes:
+    """Tells on the command line, as it happens, what a person who feels nothing should know."""
 
     def __init__(self) -> None:
-        self._looks = 0
-
-    def look(self, session: "Session") -> None:
-        """Tell what has changed since the last look; names may come a look later than the fact."""
-        if session.is_loose:
-            self._looks += 1
-            if self._looks <= 2 and (self._looks == 2 or session.loose_objects):
-                inside = _in_objects(session.cells, session.loose_objects)
-                render.note(
-                    f"the tool is inside {inside}: nothing is felt until it is free; draw it out"
-                )
-                self._looks = 2
-        elif self._looks:
-            if self._looks > 1:
-                render.note("the tool is free: from now on surfaces are felt")
-            self._looks = 0
-
-
-class DatabaseNotes:
-    """Tells on the command line when the database cannot be read, and when it can be again."""
-
-    def __init__(self) -> None:
-        self._is_lost = False
+        self._loose_looks = 0
+        self._is_lost = self._is_cut = False
 
     def look(self, session: "Session") -> None:
         """Tell what has changed since the last look."""
         lost = session.database_lost
+        if lost is None:  # without it the tool lies in nothing that is known
+            self._look_for_objects(session)
         if lost is not None and not self._is_lost:
             render.note(f"{lost}; until then no force is felt")
         elif lost is None and self._is_lost:
             render.note("the database is back: surfaces are felt again")
         self._is_lost = lost is not None
+        if session.recording_ended is not None and not self._is_cut:
+            render.note(f"{session.recording_ended}; the session goes on without it")
+            self._is_cut = True
 
-
-def _lowered_clause(spring: "SettledCoupling") -> str:
-    return "" if spring.lowered is None else f"; {spring.lowered}"
-
-
-def _cell_facts(report: "Report") -> Facts:
-    """Cells in memory, and what it cost to fetch them."""
-    cache = report.cache
-    resident = (
-        f"{render.counted(cache.resident, 'cell')}, and {cache.empty:,} known to be empty, "
-        f"in {cache.budget_bytes / 2**20:.4g} MiB"
-    )
-    fetched = (
-        f"{render.counted(cache.loaded, 'cell')} in "
-        f"{render.counted(cache.statements, 'statement')}, "
-        f"{1e3 * cache.latency:.3g} ms each, {1e3 * cache.worst:.3g} ms at worst; "
-        f"{cache.evicted:,} evicted"
-    )
-    return [("resident", resident), ("fetched", fetched)]
+    def _look_for_objects(self, session: "Session") -> None:
+        """Tell whether the tool lies in an object; names may come a look later than the fact."""
+        if session.is_loose:
+            self._loose_looks += 1
+            if self._loose_looks <= 2 and (self._loose_looks == 2 or session.loose_objects):
+                inside = _in_objects(session.cells, session.loose_objects)
+                render.note(
+                    f"the tool is inside {inside}: nothing is felt until it is free; draw it out"
+                )
+                self._loose_looks = 2
+        elif self._loose_looks:
+            if self._loose_looks > 1:
+                render.note("the tool is free: from now on surfaces are felt")
+            self._loose_looks = 0
 
 
 def _exceptional_facts(report: "Report") -> Facts:
-    """What most sessions have not: no baseline, bad readings, outages, a standby."""
+    """What most sessions have not: missing cells at the start, bad readings, outages, a standby."""
     facts: Facts = []
+    if not report.is_warm:
+        facts.append(("warm start", "it began although cells were missing"))
     if report.empty is None:
         facts.append(("empty loop", "not measured (--no-baseline)"))
     if report.bad_reading is not None:
@@ -233,17 +190,6 @@ def _exceptional_facts(report: "Report") -> Facts:
             ("standby", f"the last commit that it has replayed: {report.cache.lag:.3g} s old")
         )
     return facts
-
-
-def _cold_clause(report: "Report") -> str:
-    return "" if report.is_warm else ", and begun although cells were missing"
-
-
-def _peak_text(report: "Report") -> str:
-    return (
-        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m at the device; "
-        f"deepest contact {render.metres(report.deepest)}"
-    )
 
 
 def _recording_text(report: "Report", recording: str) -> str:

@@ -5,6 +5,7 @@ from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
 from hapticdb.errors import FileError, UsageError
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
@@ -54,8 +55,8 @@ def shell_of(
     deepest = float(shell.inset.max())
     if deepest > 1.001 * inset:
         render.note(
-            f"{tool}: a saved shell, drawn in by {render.metres(deepest)}: contact begins up to "
-            f"{render.metres(deepest - inset)} late; give the mesh it was made of, if that matters"
+            f"{tool}: a saved shell, drawn in by {length_text(deepest)}: contact begins up to "
+            f"{length_text(deepest - inset)} late; give the mesh it was made of, if that matters"
         )
     return shell
 
@@ -77,7 +78,7 @@ def shell_text(shell: "PointShell") -> str:
         return f"{points}, on the surface"
     n_less = int((shell.inset < 0.98 * deepest).sum())
     less = f"; {n_less:,} of them less, in thin or sharp parts" if n_less else ""
-    return f"{points}, drawn in by {render.metres(deepest)}{less}"
+    return f"{points}, drawn in by {length_text(deepest)}{less}"
 
 
 def shell_record(shell: "PointShell") -> dict[str, object]:

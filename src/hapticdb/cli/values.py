@@ -13,14 +13,7 @@ SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 
 
 def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
-    """Finite numbers of an option, separated by commas or blanks.
-
-    Raises
-    ------
-    UsageError
-        When the text holds anything else, or not `count` numbers; it names `option`, and `example`
-        as what to give.
-    """
+    """Finite numbers of an option, separated by commas or blanks; `example` is what to give."""
     try:
         numbers = [float(word) for word in text.replace(",", " ").split()]
     except ValueError:
@@ -31,26 +24,14 @@ def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
 
 
 def budget_bytes(mib: float) -> int:
-    """Bytes of ``--budget``, which is given in MiB.
-
-    Raises
-    ------
-    UsageError
-        When it is below 1 MiB or above `LARGEST_MIB`.
-    """
+    """Bytes of ``--budget``, which is given in MiB."""
     if not 1.0 <= mib <= LARGEST_MIB:
         raise UsageError(f"--budget {mib}: give MiB, 1 to a million")
     return int(mib * MIB)
 
 
 def size_bytes(text: str, option: str) -> int:
-    """Bytes of a size that is given in MiB, or with its unit, such as ``4GiB``.
-
-    Raises
-    ------
-    UsageError
-        When the text is no size, or one below 1 MiB or above `LARGEST_MIB`; it names `option`.
-    """
+    """Bytes of a size that is given in MiB, or with its unit, such as ``4GiB``."""
     match = SIZE.fullmatch(text.strip())
     unit = (match[2] or "M")[0].upper() if match else "M"
     mib = float(match[1]) * (1024.0 if unit == "G" else 1.0) if match else 0.0

@@ -1,7 +1,7 @@
 """Straight pulls: how far a part goes in each direction before something is in the way."""
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -18,6 +18,7 @@ from hapticdb.extraction.directions import (
 from hapticdb.extraction.free_space import GROWTH, ContactSpace, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
+from hapticdb.sweeps.run import SampleCallback
 
 Floats = NDArray[np.float64]
 
@@ -28,17 +29,6 @@ proved."""
 BLOCKS = (8, 64)
 """Samples, half a voxel apart, that are looked at together: at first, since most pulls are blocked
 soon, and at most; each block is twice as long as the one before."""
-
-
-class _SearchProgress(NamedTuple):
-    """Straight pulls tried, of so many."""
-
-    done: int
-    total: int
-
-
-SearchCallback = Callable[[_SearchProgress], None]
-"""Called after each straight pull."""
 
 
 class Pull(NamedTuple):
@@ -97,7 +87,7 @@ class Pulls:
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
         self._opposed = opposed_shares(self._directions, self._normals)
 
-    def run(self, until: float, progress: SearchCallback | None) -> None:
+    def run(self, until: float, progress: SampleCallback | None) -> None:
         """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
         total = len(self._directions)
         for n in range(total):
@@ -106,7 +96,7 @@ class Pulls:
             is_opposed = self._opposed[n] > MOST_OPPOSED
             self.done.append(self._blocked(n) if is_opposed else self._pull(n))
             if progress is not None:
-                progress(_SearchProgress(n + 1, total))
+                progress(n + 1, total)
 
     def opposed_out(self, until: float) -> list[Pull]:
         """Pulls that lead out though they press against more than `MOST_OPPOSED` of the contacts.

@@ -1,11 +1,12 @@
-"""A search's result for JSON: metres, displacements, world frame."""
+"""Results of searches for JSON: metres, displacements, world frame."""
 
 from typing import Any
 
+from hapticdb.extraction.disassembly.result import Disassembly
 from hapticdb.extraction.result import Extraction, WayOut
-from hapticdb.extraction.verdict import extraction_line
+from hapticdb.extraction.verdict import disassembly_line, extraction_line
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.sweeps.record import depth_record, named, sweep_record
+from hapticdb.sweeps.record import plain, sweep_record
 from hapticdb.sweeps.result import Swept
 
 
@@ -15,34 +16,54 @@ def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
     excluded : ids of the objects that were left out, those of the parts among them.
     """
     parts = [obj.id for obj in found.parts]
+    told = ("touched", "blockers", "pulls", "motions", "poses", "is_planned", "seconds", "seed")
     return {
         "verdict": found.verdict,
         "line": extraction_line(found),
-        "parts": [named(obj) for obj in found.parts],
+        "parts": plain(found.parts),
         "way": found.way and _way(found.way, found.shell, parts, excluded),
-        "touched": [named(obj) for obj in found.touched],
-        "blockers": [{**named(one.object), "pulls": one.pulls} for one in found.blockers],
-        "pulls": found.pulls,
-        "motions": found.motions,
-        "poses": found.poses,
-        "is_planned": found.is_planned,
-        "seconds": found.seconds,
-        "seed": found.seed,
+        **{name: plain(getattr(found, name)) for name in told},
     }
 
 
 def _way(way: WayOut, shell: PointShell, parts: list[int], excluded: list[int]) -> dict[str, Any]:
-    def proof(swept: Swept) -> dict[str, Any]:
-        return sweep_record(swept, shell, parts, excluded)
+    def proof(swept: Swept | None) -> dict[str, Any] | None:
+        return None if swept is None else sweep_record(swept, shell, parts, excluded)
 
+    told = ("how", "poses", "length", "clearance", "rest_from", "depths")
     return {
-        "how": way.how,
-        "poses": way.poses.tolist(),
-        "length": way.length,
-        "clearance": way.clearance,
-        "rest_from": way.rest_from,
+        **{name: plain(getattr(way, name)) for name in told},
         "proof": proof(way.swept),
-        "rest": way.rest and proof(way.rest),
-        "depths": [depth_record(one) for one in way.depths],
-        "beside": way.beside and proof(way.beside),
+        "rest": proof(way.rest),
+        "beside": proof(way.beside),
+    }
+
+
+def disassembly_record(found: Disassembly) -> dict[str, Any]:
+    """Convert a result to numbers and strings, as `extract --disassemble --json` prints it.
+
+    Each step is a record as `extract --json` prints it, with its proof, and the ids of what is not
+    felt in it.
+    """
+    return {
+        "verdict": found.verdict,
+        "line": disassembly_line(found),
+        "parts": plain(found.parts),
+        "steps": [
+            {"excluded": plain(step.excluded)} | extraction_record(step.found, list(step.excluded))
+            for step in found.steps
+        ],
+        "failed": [
+            {
+                "parts": plain(one.parts),
+                "after_steps": one.n_gone,
+                "verdict": one.verdict,
+                "reason": one.reason or None,
+                "blockers": plain(one.blockers),
+            }
+            for one in found.failed
+        ],
+        "is_out_of_time": found.is_out_of_time,
+        "seconds": found.seconds,
+        "seed": found.seed,
     }

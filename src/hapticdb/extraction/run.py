@@ -20,10 +20,11 @@ from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Problem, problem_of
-from hapticdb.extraction.pulls import Pull, Pulls, SearchCallback
+from hapticdb.extraction.pulls import Pull, Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut, WayOutVerdict
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.finding import Words
+from hapticdb.sweeps.run import SampleCallback
 
 Floats = NDArray[np.float64]
 
@@ -53,7 +54,7 @@ def extract(
     motions: int = DEFAULT_MOTIONS,
     out: float | None = None,
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SearchCallback | None = None,
+    progress: SampleCallback | None = None,
 ) -> Extraction:
     """Search a path on which parts come out of what stands around them.
 
@@ -77,7 +78,7 @@ def extract(
     budget_bytes : int
         Memory for resident cells.
     progress : callable or None
-        Called after each straight pull.
+        Called after each straight pull with the pulls tried and their total.
 
     Raises
     ------
@@ -119,7 +120,7 @@ class _Asked(NamedTuple):
             raise UsageError(f"out at {self.out} m: give a length above 0")
 
 
-def _searched(problem: Problem, asked: _Asked, progress: SearchCallback | None) -> Extraction:
+def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
     leaving = Exit(
         problem.box[0],

@@ -7,8 +7,22 @@ import numpy as np
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import ContactDepth, Decision, MetObject, Moment, Swept
+from hapticdb.sweeps.result import ContactDepth, Decision, MetObject, Proof, Swept
 from hapticdb.sweeps.verdict import verdict_line
+
+MORE: dict[type, tuple[str, ...]] = {
+    Proof: ("is_clear", "cover_needed"),
+    Decision: ("is_near",),
+    ContactDepth: ("is_bounded", "is_cut"),
+    MetObject: ("first", "last"),
+}
+"""What is told of a part of a result beside its fields."""
+FOUND = (
+    "samples", "hits", "contacts", "first_hit", "first_contact", "deepest", "enclosed",
+    "hit_intervals", "contact_intervals", "clearance", "revision", "elapsed", "cells", "at_least",
+    "looked", "left_at_start", "decision", "depths",
+)  # fmt: skip
+"""What is told of a `Swept` as it is."""
 
 
 def sweep_record(
@@ -19,119 +33,45 @@ def sweep_record(
     shell : the tool; parts : ids of the objects that it was made of, empty for a tool from a file;
     excluded : ids of the objects that the sweep left out.
     """
-    deepest, clearance, proof = found.deepest, found.clearance, found.proof
     return {
         "verdict": found.verdict,
         "comes_out": found.comes_out,
         "line": verdict_line(found, shell),
-        "proof": {
-            **proof._asdict(),
-            "is_clear": proof.is_clear,
-            "cover_needed": proof.cover_needed,
-        },
+        "proof": plain(found.proof),
         "poses": len(found.path.poses),
-        "samples": found.samples,
-        "hits": found.hits,
-        "contacts": found.contacts,
-        "first_hit": _moment(found.first_hit),
-        "first_contact": _moment(found.first_contact),
-        "deepest": deepest
-        and {
-            "depth": deepest.depth,
-            "point": deepest.point.tolist(),
-            "moment": _moment(deepest.moment),
-        },
-        "objects": [_met_object(one) for one in found.objects],
-        "enclosed": [named(obj) for obj in found.enclosed],
-        "hit_intervals": found.hit_intervals.tolist(),
-        "contact_intervals": found.contact_intervals.tolist(),
-        "clearance": clearance
-        and {
-            "distance": clearance.distance,
-            "at_least": clearance.at_least,
-            "at_most": None if clearance.is_beyond else clearance.at_most,
-            "is_beyond": clearance.is_beyond,
-            "point": None if clearance.point is None else clearance.point.tolist(),
-            "voxel": None if clearance.voxel is None else clearance.voxel.tolist(),
-            "moment": _moment(clearance.moment),
-        },
+        **{name: plain(getattr(found, name)) for name in FOUND},
+        "objects": [
+            plain(one) | {"first_contact": one.first_contact and one.first_contact.fraction}
+            for one in found.objects
+        ],
         "tool": {
             "points": len(shell),
             "spacing": median_spacing(shell),
             "parts": parts,
             "excluded": excluded,
         },
-        "revision": found.revision,
-        "elapsed": found.elapsed,
-        "cells": found.cells,
         "proportions": found.proportions.record(),
-        "at_least": found.at_least,
-        "looked": found.looked,
-        "left_at_start": [named(obj) for obj in found.left_at_start],
-        "decision": found.decision and _decision(found.decision),
-        "depths": [depth_record(one) for one in found.depths],
     }
 
 
-def depth_record(one: ContactDepth) -> dict[str, object]:
-    """Convert bounds of a depth; one that is not known is None, since JSON has no infinity."""
+def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
+    """Convert a part of a result; a number that is not known is None, since JSON has no infinity.
 
-    def known(depth: float) -> float | None:
-        return depth if math.isfinite(depth) else None
-
-    return {
-        **named(one.object),
-        "at_start": one.at_start,
-        "at_start_most": known(one.at_start_most),
-        "deepest": one.deepest,
-        "deepest_most": known(one.deepest_most),
-        "fraction": one.fraction,
-        "allowed": one.allowed,
-        "is_bounded": one.is_bounded,
-        "is_cut": one.is_cut,
-        "why": one.why,
-    }
-
-
-def _decision(decision: Decision) -> dict[str, object]:
-    """Convert a decision; a distance that is not known is None, since JSON has no infinity."""
-    within = decision.within if math.isfinite(decision.within) else None
-    return {
-        **decision._asdict(),
-        "within": within,
-        "near": _moment(decision.near),
-        "is_near": decision.is_near,
-    }
-
-
-def _met_object(one: MetObject) -> dict[str, object]:
-    return {
-        **named(one.object),
-        "first": one.first,
-        "last": one.last,
-        "intervals": one.intervals.tolist(),
-        "first_contact": one.first_contact and one.first_contact.fraction,
-        "length": one.length,
-        "samples": one.samples,
-        "contacts": one.contacts,
-        "points": one.points,
-        "deepest": one.deepest,
-    }
-
-
-def named(obj: Object) -> dict[str, object]:
-    """Convert an object to its id and name."""
-    return {"id": obj.id, "name": obj.name}
-
-
-def _moment(moment: Moment | None) -> dict[str, object] | None:
-    return moment and {
-        "sample": moment.sample,
-        "fraction": moment.fraction,
-        "segment": moment.segment,
-        "pose": moment.pose.tolist(),
-        "objects": [named(obj) for obj in moment.objects],
-    }
+    An object is told by its id and name; the object of a part beside the part's own fields.
+    """
+    if isinstance(value, Object):
+        return {"id": value.id, "name": value.name}
+    if isinstance(value, np.ndarray):
+        return value.tolist()
+    if isinstance(value, float):
+        return value if math.isfinite(value) else None
+    if hasattr(value, "_asdict"):
+        told = value._asdict() | {name: getattr(value, name) for name in MORE.get(type(value), ())}
+        about = plain(told.pop("object")) if "object" in told else {}
+        return about | {name: plain(one) for name, one in told.items()}
+    if isinstance(value, tuple | list):
+        return [plain(one) for one in value]
+    return value
 
 
 def median_spacing(shell: PointShell) -> float:

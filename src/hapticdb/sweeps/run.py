@@ -61,7 +61,7 @@ BLOCK_POINTS = 1 << 21
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 SampleCallback = Callable[[int, int], None]
-"""Called after each block with the samples done and their total."""
+"""Called with how much is done and the total: of samples, or of straight pulls."""
 
 
 def sweep(

@@ -31,7 +31,6 @@ from hapticdb.errors import UsageError
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.report import Report
-    from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
 PolicyName = Literal["hold", "wait"]
@@ -107,12 +106,6 @@ PolicyOption = Annotated[
         "and lets it fall, or it waits."
     ),
 ]
-StalenessOption = Annotated[
-    float,
-    typer.Option(
-        metavar="S", help="Seconds without an answer of the database, after which the force falls."
-    ),
-]
 DeviceStiffnessOption = Annotated[
     float | None,
     typer.Option(
@@ -149,7 +142,6 @@ HandSeedOption = Annotated[
         metavar="N", help="Seed of the points' places, and of a random hand.", show_default="0"
     ),
 ]
-FifoOption = Annotated[bool, typer.Option("--fifo", help="Ask the system for SCHED_FIFO.")]
 ProcessorOption = Annotated[
     int | None, typer.Option(metavar="N", help="Bind the loop to that processor.")
 ]
@@ -183,7 +175,6 @@ def feel(
     budget: BudgetOption = 256.0,
     budget_points: BudgetPointsOption = None,
     policy: PolicyOption = "hold",
-    staleness: StalenessOption = 1.0,
     law: LawOption = None,
     conservative: ConservativeOption = False,
     stiffness: DeviceStiffnessOption = None,
@@ -193,7 +184,6 @@ def feel(
     tool_unit: ToolUnitOption = None,
     points: PointsOption = None,
     seed: HandSeedOption = None,
-    fifo: FifoOption = False,
     processor: ProcessorOption = None,
     no_baseline: NoBaselineOption = False,
     json: JsonOption = False,
@@ -214,12 +204,19 @@ def feel(
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
-            law=chosen, coupling=coupling, staleness=staleness, budget_points=budget_points,
-            record=record, append_recording=append, replace_recording=replace, is_fifo=fifo,
+            law=chosen, coupling=coupling, budget_points=budget_points,
+            record=record, append_recording=append, replace_recording=replace,
             record_limit_bytes=limit_bytes, processor=processor, has_baseline=not no_baseline,
         )  # fmt: skip
-        report, signals = _run(session, tool, force)
-        _show(report, cells, shell, record, speed, json=json)
+        force.tell_lowered(session)
+        with session, ended_by_signals(session.ask_to_end) as signals:
+            fitting.tell(session.proportions, tool, "--scale")
+            report = _waited_for(session)
+        if json:
+            more = {"path_speed": speed, "shell": shell_record(shell)}
+            render.say_json(report.figures() | more)
+        else:
+            session_page.show(report, cells, shell, record, speed)
     _exit_after(signals, report)
 
 
@@ -236,33 +233,13 @@ def _shell(
     return shell
 
 
-def _show(
-    report: "Report",
-    cells: "ResidentCells",
-    shell: "PointShell",
-    record: str | None,
-    path_speed: float | None,
-    *,
-    json: bool,
-) -> None:
-    if json:
-        more = {"path_speed": path_speed, "shell": shell_record(shell)}
-        render.say_json(report.figures() | more)
-    else:
-        session_page.show(report, cells, shell, record, path_speed)
-
-
 def _recording_limit(record: str | None, limit: str | None, *, is_continued: bool) -> int:
     """Bytes at which a recording ends; refuses options of a recording where there is none."""
     from hapticdb.recording.file import DEFAULT_LIMIT
 
     limit_bytes = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
-    if is_continued and record is None:
-        raise UsageError(
-            "--append and --replace belong to --record: give it, too, or leave both out"
-        )
-    if limit is not None and record is None:
-        raise UsageError("--record-limit belongs to --record: give it, too, or leave both out")
+    if record is None and (is_continued or limit is not None):
+        raise UsageError("--append, --replace and --record-limit belong to --record: give it, too")
     return limit_bytes
 
 
@@ -283,21 +260,10 @@ def _begin_loop(
 
 def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:
     """Words of the options, checked before a process is started."""
-    import hapticdb
-
     if not where and not exclude:
         return Felt([], [], [])
     with hapticdb.open(url, read_only=True) as env:
         return felt_objects(env, where, exclude)
-
-
-def _run(session: "Session", tool: str, force: ForceOptions) -> "tuple[Report, list[int]]":
-    """Wait for a session's end: its report, and the signals that asked for the end."""
-    force.tell_lowered(session)
-    with session, ended_by_signals(session.ask_to_end) as signals:
-        fitting.tell(session.proportions, tool, "--scale")
-        report = _waited_for(session)
-    return report, signals
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
@@ -313,14 +279,8 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
 
 def _waited_for(session: "Session") -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
-    report, is_told = None, False
-    notes, database_notes = session_page.LooseNotes(), session_page.DatabaseNotes()
+    report, notes = None, session_page.Notes()
     while report is None:
         report = session.wait(LOOK_EVERY)
-        if session.database_lost is None:  # without it the tool lies in nothing that is known
-            notes.look(session)
-        database_notes.look(session)
-        if session.recording_ended is not None and not is_told:
-            render.note(f"{session.recording_ended}; the session goes on without it")
-            is_told = True
+        notes.look(session)
     return report

@@ -1,17 +1,69 @@
-"""The verbs that keep environments as whole copies: backup and restore."""
+"""The verbs that keep an environment: check, backup, restore, upgrade, grant."""
 
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.cli.root import Interrupted
+from hapticdb.cli.verbs.importing import JobsOption
 
 if TYPE_CHECKING:
+    from hapticdb.check import CheckReport
+    from hapticdb.ingest.upgrading import UpgradeReport
     from hapticdb.store.engines import BackupReport
 
 CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
+RightName = Literal["viewer", "toucher", "editor", "nobody"]
+MEANINGS: dict[RightName, str] = {
+    "viewer": "may read and touch",
+    "toucher": "may read and touch, and keep what 'hapticdb info --calibrate' measures",
+    "editor": "may import, move and remove objects",
+    "nobody": "has no right here any more",
+}
+
+
+def check(url: UrlArgument, *, json: JsonOption = False) -> None:
+    """Read all of an environment and say what is wrong with it, a line each.
+
+    The structure, rows, objects and the log of changes are compared. The exit code
+    is 0 when it is sound, 1 when it is damaged, 2 when it cannot be read.
+
+    Example: hapticdb check car.db
+    """
+    from hapticdb.check import check_environment
+
+    render.compile_kernels("copy")
+    with render.bar("checking", "rows", lambda now: (now.done, now.total)) as progress:
+        report = check_environment(url, progress=progress)
+    if json:
+        render.say_json({"sound": report.is_sound} | vars(report))
+    else:
+        for finding in report.findings:
+            render.say(finding)
+        if report.n_findings > len(report.findings):
+            more = report.n_findings - len(report.findings)
+            render.say(f"and {render.counted(more, 'finding')} more")
+        render.say(_checked(report))
+    if not report.is_sound:
+        raise typer.Exit(1)
+
+
+def _checked(report: "CheckReport") -> str:
+    if not report.is_sound:
+        count = render.counted(report.n_findings, "finding")
+        return f"{report.url} is damaged: {count}; restore a copy or import the files again"
+    line = (
+        f"{report.url} is sound: {render.counted(report.objects, 'object')}, "
+        f"{render.counted(report.voxels, 'voxel')}, {render.counted(report.rows, 'row')}"
+    )
+    if report.without_row_checksums:
+        line += (
+            f"; {render.counted(report.without_row_checksums, 'object')} without checksums: "
+            "'hapticdb copy' makes an environment that has them"
+        )
+    return line
 
 
 def backup(
@@ -32,11 +84,13 @@ def backup(
     from hapticdb.store.connect import backup_environment
 
     try:
-        with render.file_bar("copying") as progress:
+        with render.bar(
+            "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
+        ) as progress:
             report = backup_environment(url, file, replace=replace, progress=progress)
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; there is no new {file}") from None
-    _say(report, json=json)
+    _say_copied(report, json=json)
 
 
 def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -> None:
@@ -51,14 +105,16 @@ def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -
     from hapticdb.store.connect import restore_environment
 
     try:
-        with render.file_bar("copying") as progress:
+        with render.bar(
+            "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
+        ) as progress:
             report = restore_environment(file, url, progress=progress)
     except KeyboardInterrupt:
         raise Interrupted(f"interrupted; {url} is as it was") from None
-    _say(report, json=json)
+    _say_copied(report, json=json)
 
 
-def _say(report: "BackupReport", *, json: bool) -> None:
+def _say_copied(report: "BackupReport", *, json: bool) -> None:
     if json:
         render.say_json(report._asdict())
         return
@@ -66,3 +122,89 @@ def _say(report: "BackupReport", *, json: bool) -> None:
         f"{report.target}: {report.source} at revision {report.revision}, "
         f"{render.counted(report.objects, 'object')}, {report.bytes / 1e6:,.1f} MB"
     )
+
+
+def upgrade(url: UrlArgument, *, jobs: JobsOption = None, json: JsonOption = False) -> None:
+    """Give distances to the objects of an environment, from which smooth forces are computed.
+
+    The file of each object is read again; its voxels stay as they are. Every
+    object is written in a transaction of its own: run the same command again
+    to go on with what was interrupted. An object whose file is gone or has
+    changed is named and stays without, and the exit code is 1. Parts that are
+    imported later get distances, too. The layout voxel has none.
+
+    Example: hapticdb upgrade car.db
+    """
+    from hapticdb.ingest.upgrading import upgrade_environment
+
+    try:
+        render.compile_kernels("move")
+        with render.import_bar() as progress:
+            report = upgrade_environment(url, jobs=jobs, progress=progress)
+    except KeyboardInterrupt:
+        raise Interrupted(
+            "interrupted; what is upgraded is whole, and the same command goes on from there"
+        ) from None
+    for left in report.left_out:
+        render.note(str(left.error))
+    if json:
+        render.say_json(_upgrade_record(report))
+    else:
+        render.say(_upgraded(report))
+    if not report.is_complete:
+        raise typer.Exit(1)
+
+
+def _upgrade_record(report: "UpgradeReport") -> dict[str, object]:
+    return {
+        "url": report.url,
+        "upgraded": report.upgraded,
+        "present": report.present,
+        "voxels": report.voxels,
+        "left_out": [
+            {"id": obj.id, "name": obj.name, "link": obj.link, "error": str(left.error)}
+            for left in report.left_out
+            for obj in left.objects
+        ],
+    }
+
+
+def _upgraded(report: "UpgradeReport") -> str:
+    there = render.counted(report.present, "object")
+    if not report.upgraded and report.is_complete:
+        return f"{report.url}: complete already ({there}), nothing to do"
+    line = f"{report.url}: distances for {render.counted(report.upgraded, 'object')}"
+    if report.present:
+        line += f"; {report.present} had them already"
+    if not report.is_complete:
+        n_left = sum(len(left.objects) for left in report.left_out)
+        line += f"; {render.counted(n_left, 'object')} without; the same command tries again"
+    return line
+
+
+def grant(
+    url: UrlArgument,
+    role: Annotated[str, typer.Argument(metavar="ROLE", help="A role of the server.")],
+    *,
+    right: Annotated[
+        RightName,
+        typer.Option("--as", help="What ROLE may do from now on, instead of what it may do now."),
+    ],
+    json: JsonOption = False,
+) -> None:
+    """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
+
+    A viewer reads and touches; a toucher also keeps cost figures; an editor
+    also imports, moves and removes objects; nobody has no right. The grid
+    and the rights belong to the owner, who made the environment.
+
+    Example: hapticdb grant postgresql://me@host/plant anna --as editor
+    """
+    from hapticdb.store.connect import grant as grant_right
+    from hapticdb.store.connect import redact
+
+    grant_right(url, role, right)
+    if json:
+        render.say_json({"environment": redact(url), "role": role, "right": right})
+    else:
+        render.say(f"{redact(url)}: {role} {MEANINGS[right]}")

@@ -1,24 +1,22 @@
 """The verbs that look at an environment: info, objects."""
 
+import sys
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple, Self
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hapticdb.cli import fitting, render
-from hapticdb.cli.columns import Columns
+from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, UrlArgument
-from hapticdb.cli.pages import PAGE, Corners, ListingPage, Order, page_of, selected
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
-    import numpy as np
-    from numpy.typing import NDArray
-
-    from hapticdb.grid import Grid
     from hapticdb.query.cost_model import CostModel
-    from hapticdb.store.base import Freshness, Layout, Object, Size, Store
+    from hapticdb.store.base import Freshness, Object, Store
     from hapticdb.store.engines import Lag
 
+PAGE = 40
+"""Objects that a terminal shows, unless asked otherwise."""
 MEANINGS = {
     "statement": "a statement of ranges, without what it reads",
     "descent": "each range of a statement: a descent of the index",
@@ -42,25 +40,15 @@ NameOption = Annotated[
         help="Only these objects: 7 or 3,4, 'wheel*', attribute=value. Give it again for more.",
     ),
 ]
-BoxOption = Annotated[
-    Corners | None,
-    typer.Option(
-        metavar="X0 Y0 Z0 X1 Y1 Z1", help="Only objects whose bounding boxes meet this box, metres."
-    ),
-]
-SortOption = Annotated[
-    Order, typer.Option(help="By id or name; or by voxels or longest side, the largest first.")
-]
-ReverseOption = Annotated[bool, typer.Option("--reverse", help="Reverse the order.")]
 LimitOption = Annotated[
     int | None,
     typer.Option(
         metavar="N",
-        help="Objects on a page; 0: all.",
+        min=0,
+        help="Objects to list; 0: all.",
         show_default=f"{PAGE} on a terminal, all in a pipe",
     ),
 ]
-PageOption = Annotated[int | None, typer.Option(metavar="N", help="Which page, from 1.")]
 
 CalibrateOption = Annotated[
     bool,
@@ -97,128 +85,67 @@ def info(
     measured = _measured(url, cold=cold) if calibrate else None
     # the store: an Environment brings what touches and imports, a tenth of a second
     with closing(open_store(url, read_only=True)) as store:
-        looked_at = _Overview.of(store)
+        record, words = _overview(store)
     if json:
         costs = {} if measured is None else {"costs": _costs_record(*measured)}
-        render.say_json(looked_at.record() | costs)
+        render.say_json(record | costs)
         return
-    render.show(render.facts(looked_at.facts()))
+    render.facts(words)
     if measured is not None:
         _show_costs(measured[0])
 
 
-class _Overview(NamedTuple):
-    """What `info` tells of an environment."""
+def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]:
+    """What `info` tells of an environment, as JSON and in words."""
+    from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+    from hapticdb.store.base import scene_bounds
+    from hapticdb.store.engines import MayLag
 
-    url: str
-    name: str
-    engine: str
-    grid: "Grid"
-    layout: "Layout"
-    size: "Size"
-    n_objects: int
-    n_with_distances: int
-    voxels: int
-    scene: "NDArray[np.float64] | None"
-    freshness: "Freshness"
-    source: str
-    lag: "Lag | None"
-
-    @classmethod
-    def of(cls, store: "Store") -> Self:
-        """Ask a store."""
-        from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-        from hapticdb.store.base import scene_bounds
-        from hapticdb.store.engines import MayLag
-
-        objects = store.objects()
-        return cls(
-            url=store.url,
-            name=store.name,
-            engine=store.engine,
-            grid=store.grid,
-            layout=store.layout,
-            size=store.size(),
-            n_objects=len(objects),
-            n_with_distances=sum(obj.has_distances for obj in objects),
-            voxels=sum(obj.voxels for obj in objects),
-            scene=scene_bounds(objects),
-            freshness=store.freshness(DEFAULT_RESOLUTION),
-            source=QuantileVector.of(store, DEFAULT_RESOLUTION).source,
-            lag=store.lag() if isinstance(store, MayLag) else None,
-        )
-
-    @property
-    def has_distances(self) -> bool:
-        """Whether every object has distances, and there is one."""
-        return 0 < self.n_with_distances == self.n_objects
-
-    @property
-    def _distances(self) -> str:
-        """Put in words which objects have distances, and what these take."""
-        if not self.n_with_distances:
-            return "none"
-        whose = "all objects"
-        if not self.has_distances:
-            whose = f"{self.n_with_distances:,} of {render.counted(self.n_objects, 'object')}"
-        band = self.size.band_bytes
-        return f"of {whose}: {self.size.band_rows:,} rows, {render.bytes_text(band)}"
-
-    @property
-    def fit(self) -> fitting.Accuracy | None:
-        """Accuracy of fit under the smooth law; None where that law cannot be felt."""
-        return fitting.accuracy_at(self.grid.voxel_size) if self.has_distances else None
-
-    def record(self) -> dict[str, object]:
-        """Put it in JSON."""
-        return {
-            "name": self.name,
-            "engine": self.engine,
-            "voxel_size": self.grid.voxel_size,
-            "bits": self.grid.bits,
-            "origin": list(self.grid.origin),
-            "curve": self.grid.curve,
-            "layout": self.layout,
-            "objects": self.n_objects,
-            "scene": render.box_record(self.scene),
-            "voxels": self.voxels,
-            "rows": self.size.rows,
-            "bytes": self.size.bytes,
-            "distances": {
-                "objects": self.n_with_distances,
-                "rows": self.size.band_rows,
-                "bytes": self.size.band_bytes,
-            },
-            "standby": None if self.lag is None else self.lag._asdict(),
-            "fit": None if self.fit is None else self.fit._asdict(),
-            "statistics": {"source": self.source, **self.freshness._asdict()},
-        }
-
-    def facts(self) -> list[tuple[str, str]]:
-        """Put it in words."""
-        grid, size = self.grid, self.size
-        origin = ", ".join(f"{x:.6g}" for x in grid.origin)
-        a_voxel = f" ({size.bytes / self.voxels:.3g} a voxel)" if self.voxels else ""
-        return [
-            ("environment", self.url),
-            ("name", self.name),
-            ("engine", self.engine),
-            *([] if self.lag is None else [("standby", _lag_text(self.lag))]),
-            ("voxel size", render.metres(grid.voxel_size)),
-            ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
-            ("edge", render.metres(grid.edge)),
-            ("origin", f"({origin}) m"),
-            ("curve", grid.curve),
-            ("layout", self.layout),
-            ("objects", f"{self.n_objects:,}"),
-            ("scene", "nothing in it" if self.scene is None else render.box(self.scene)),
-            ("voxels", f"{self.voxels:,}"),
-            ("rows", f"{size.rows:,}"),
-            ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
-            ("distances", self._distances),
-            *(self.fit.facts if self.fit is not None else ()),
-            ("statistics", f"{SOURCES[self.source]}; {_age(self.freshness)}"),
-        ]
+    objects, grid, size = store.objects(), store.grid, store.size()
+    n_banded = sum(obj.has_distances for obj in objects)
+    voxels, scene = sum(obj.voxels for obj in objects), scene_bounds(objects)
+    freshness = store.freshness(DEFAULT_RESOLUTION)
+    source = QuantileVector.of(store, DEFAULT_RESOLUTION).source
+    lag = store.lag() if isinstance(store, MayLag) else None
+    record = {
+        "name": store.name,
+        "engine": store.engine,
+        "voxel_size": grid.voxel_size,
+        "bits": grid.bits,
+        "origin": list(grid.origin),
+        "curve": grid.curve,
+        "layout": store.layout,
+        "objects": len(objects),
+        "scene": render.box_record(scene),
+        "voxels": voxels,
+        "rows": size.rows,
+        "bytes": size.bytes,
+        "distances": {"objects": n_banded, "rows": size.band_rows, "bytes": size.band_bytes},
+        "standby": None if lag is None else lag._asdict(),
+        "statistics": {"source": source, **freshness._asdict()},
+    }
+    origin = ", ".join(f"{x:.6g}" for x in grid.origin)
+    a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
+    distances = f"of {n_banded:,} objects, {render.bytes_text(size.band_bytes)}"
+    words = [
+        ("environment", store.url),
+        ("name", store.name),
+        ("engine", store.engine),
+        *([] if lag is None else [("standby", _lag_text(lag))]),
+        ("voxel size", length_text(grid.voxel_size)),
+        ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
+        ("origin", f"({origin}) m"),
+        ("curve", grid.curve),
+        ("layout", store.layout),
+        ("objects", f"{len(objects):,}"),
+        ("scene", "nothing in it" if scene is None else render.box(scene)),
+        ("voxels", f"{voxels:,}"),
+        ("rows", f"{size.rows:,}"),
+        ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
+        ("distances", distances if n_banded else "none"),
+        ("statistics", f"{SOURCES[source]}; {_age(freshness)}"),
+    ]
+    return record, words
 
 
 def _lag_text(lag: "Lag") -> str:
@@ -231,11 +158,7 @@ def objects(
     url: UrlArgument,
     *,
     name: NameOption = None,
-    box: BoxOption = None,
-    sort: SortOption = "id",
-    reverse: ReverseOption = False,
     limit: LimitOption = None,
-    page: PageOption = None,
     json: JsonOption = False,
 ) -> None:
     """List the objects of an environment.
@@ -250,7 +173,7 @@ def objects(
 
     Example: hapticdb objects car.db
 
-    Example: hapticdb objects car.db --name 'wheel*' --sort voxels --limit 10
+    Example: hapticdb objects car.db --name 'wheel*' --limit 10
 
     Example: hapticdb objects car.db --name up=z
     """
@@ -258,38 +181,29 @@ def objects(
 
     from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.connect import open_store
+    from hapticdb.store.finding import find_objects
 
     with closing(open_store(url, read_only=True)) as store:
         shown_url = store.url
         try:
-            found = selected(store, name, box, sort, reverse=reverse)
+            found = find_objects(store, name) if name else store.objects()
         except ObjectNotFoundError as error:
             raise ObjectNotFoundError(f"--name: {error}") from None
-    is_whole = json and limit is None and page is None
-    part = page_of(found, 0 if is_whole else limit, page)
+    if limit is None:
+        limit = PAGE if sys.stdout.isatty() and not json else 0
+    shown = found[: limit or None]
     if json:
-        for obj in part.objects:
+        for obj in shown:
             render.say_json(record_of(obj))
     elif found:
-        _show_page(part)
-    elif box is None:
-        render.note(f"{shown_url} is empty; 'hapticdb import URL FILE' fills it")
+        rows = [
+            (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown
+        ]
+        render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows)
+        if len(shown) < len(found):
+            render.note(f"{len(shown):,} of {len(found):,} objects; --limit 0 shows all")
     else:
-        render.note(f"{shown_url}: no object meets the box")
-
-
-def _show_page(page: ListingPage) -> None:
-    """Print a page as a table, and where the next one begins."""
-    rows = [
-        (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in page.objects
-    ]
-    render.show(render.table(("id>", "name", "voxels>", "size, mm>", "file"), rows))
-    last = page.first + len(rows) - 1
-    if len(rows) < page.total:
-        more = "" if last == page.total else f"; --page {last // len(rows) + 1} goes on"
-        render.note(
-            f"objects {page.first:,} to {last:,} of {page.total:,}{more}, --limit 0 shows all"
-        )
+        render.note(f"{shown_url} is empty; 'hapticdb import URL FILE' fills it")
 
 
 def record_of(obj: "Object") -> dict[str, object]:
@@ -346,7 +260,13 @@ def _costs_record(costs: "CostModel", is_kept: bool) -> dict[str, object]:  # no
 
 
 def _show_costs(costs: "CostModel") -> None:
-    render.show(_costs_table(costs))
+    rows = []
+    figures = costs.figures()
+    for name, meaning in MEANINGS.items():
+        spread = costs.spread.get(name)
+        known = "" if spread is None else f"± {100 * spread:.0f} %"
+        rows.append((name, f"{figures[name]:.3f}", known, meaning))
+    render.table(("figure", "µs>", "spread>", "what it is"), rows)
     worth = costs.descent / costs.row_in_gap if costs.row_in_gap else None
     when = "always" if worth is None else f"when it should hold fewer than {worth:.1f} rows"
     render.say(f"{costs.rows_per_block:.0f} rows in a leaf block; a gap is scanned {when}")
@@ -359,13 +279,3 @@ def _age(freshness: "Freshness") -> str:
     if not freshness.changes:
         return "fresh"
     return f"{render.counted(freshness.changes, 'write')} behind"
-
-
-def _costs_table(costs: "CostModel") -> Columns:
-    rows = []
-    figures = costs.figures()
-    for name, meaning in MEANINGS.items():
-        spread = costs.spread.get(name)
-        known = "" if spread is None else f"± {100 * spread:.0f} %"
-        rows.append((name, f"{figures[name]:.3f}", known, meaning))
-    return render.table(("figure", "µs>", "spread>", "what it is"), rows)

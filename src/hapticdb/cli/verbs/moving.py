@@ -1,6 +1,7 @@
 """The verbs that copy and compare environments: copy, diff."""
 
 from collections.abc import Iterator
+from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -8,11 +9,12 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, SameCurveOption, SameLayoutOption
 from hapticdb.cli.root import Interrupted
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.difference import Difference
     from hapticdb.store.base import Object
-    from hapticdb.transfer import CopyReport
+    from hapticdb.transfer import CopyCallback, CopyReport
 
 MOST_LINES = 20
 """Differences that are listed; more are counted."""
@@ -40,7 +42,7 @@ def copy(
 
     try:
         render.compile_kernels("copy")
-        with render.copy_bar("copying") as progress:
+        with _bar("copying") as progress:
             report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
     except KeyboardInterrupt:
         raise Interrupted(
@@ -50,6 +52,10 @@ def copy(
         render.say_json(vars(report))
     else:
         render.say(_copied(report))
+
+
+def _bar(doing: str) -> "AbstractContextManager[CopyCallback | None]":
+    return render.bar(doing, "objects", lambda now: (now.objects_done, now.objects_total))
 
 
 def _copied(report: "CopyReport") -> str:
@@ -86,7 +92,7 @@ def diff(
     from hapticdb.difference import diff_environments
 
     render.compile_kernels("copy")
-    with render.copy_bar("comparing") as progress:
+    with _bar("comparing") as progress:
         difference = diff_environments(a, b, progress=progress)
     if json:
         render.say_json(_record(difference))
@@ -141,7 +147,7 @@ def _equal(difference: "Difference") -> str:
         f"{difference.a} and {difference.b} hold the same: "
         f"{render.counted(difference.compared, 'object')}, "
         f"{render.counted(difference.n_voxels, 'voxel')}, {difference.grids[0].side}^3 cells of "
-        f"{render.metres(difference.grids[0].voxel_size)}"
+        f"{length_text(difference.grids[0].voxel_size)}"
     )
     in_a, in_b = difference.with_distances
     if in_a == in_b:
@@ -165,17 +171,9 @@ def _show(difference: "Difference") -> None:
         )
     rows = list(_rows(difference))
     if rows:
-        columns = (
-            "id>",
-            "name",
-            "what",
-            "only in A>",
-            "only in B>",
-            "shared>",
-            "moved by>",
-            "file",
-        )
-        render.show(render.table(columns, rows[:MOST_LINES]))
+        headings = "id> name what only_in_A> only_in_B> shared> moved_by> file"
+        columns = [word.replace("_", " ") for word in headings.split()]
+        render.table(columns, rows[:MOST_LINES])
         render.say(f"A: {a}; B: {b}")
     count = render.counted(len(rows) + (not difference.is_same_grid), "difference")
     cut = "" if len(rows) <= MOST_LINES else f", {MOST_LINES} of them shown"
@@ -222,4 +220,4 @@ def _moved_text(a: "Object", b: "Object", voxel_size: float) -> str:
     from hapticdb.difference import farthest_corner
 
     way = farthest_corner(a, b)
-    return f"{render.metres(way)} ({way / voxel_size:.3g} voxels)" if way > 0.0 else ""
+    return f"{length_text(way)} ({way / voxel_size:.3g} voxels)" if way > 0.0 else ""

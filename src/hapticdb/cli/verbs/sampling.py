@@ -6,10 +6,9 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import JsonOption
 
 if TYPE_CHECKING:
-    from hapticdb.demo import Comparison, DemoScene, Imported, LayoutFigures
+    from hapticdb.demo import DemoScene, Imported, LayoutFigures
 
 FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
 FramesOption = Annotated[
@@ -18,7 +17,7 @@ FramesOption = Annotated[
 
 
 def sample(
-    folder: FolderArgument, *, frames: FramesOption = 1000, json: JsonOption = False
+    folder: FolderArgument, *, frames: FramesOption = 1000
 ) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
@@ -27,14 +26,11 @@ def sample(
     from hapticdb.sample import write_sample
 
     written = write_sample(folder, frames)
-    if json:
-        render.say_json({"files": [str(path) for path in written], "poses": frames})
-        return
     for path in written:
         render.say(str(path))
 
 
-def warm(*, json: JsonOption = False) -> None:
+def warm() -> None:
     """Compile every kernel that this machine has not compiled yet, so that no verb has to.
 
     Half a minute on two processors; kept in the user's cache folder until
@@ -50,9 +46,6 @@ def warm(*, json: JsonOption = False) -> None:
     n_compiled = render.compile_kernels("everything")
     total = len(entries_for("everything"))
     elapsed = perf_counter() - started
-    if json:
-        render.say_json({"kernels": total, "compiled": n_compiled, "elapsed": elapsed})
-        return
     render.say(
         f"{render.counted(total, 'kernel')} ready: {n_compiled} compiled now, in {elapsed:.1f} s"
     )
@@ -71,7 +64,6 @@ def demo(
     bits: Annotated[int, typer.Option(metavar="1..21", help="Bits of each axis of the grid.")] = 10,
     frames: FramesOption = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
-    json: JsonOption = False,
 ) -> None:
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 
@@ -79,73 +71,31 @@ def demo(
 
     Example: hapticdb demo --url 'postgresql:///local?data=DIR'
     """
+    from shlex import quote
+
     import numpy as np
 
     from hapticdb.demo import compare, prepare
     from hapticdb.pictures.demo import draw
+    from hapticdb.store.connect import redact
 
     render.compile_kernels("import", "touch")
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
         scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
-    if not json:
-        _show_scene(scene)
+    _show_scene(scene)
     comparison = compare(scene)
+    for measured in comparison.layouts:
+        _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
+    render.say(f"\n{comparison.against_paper()}")
+    render.say(comparison.verdict)
     picture = folder / "demo.png"
-    if not json:
-        for measured in comparison.layouts:
-            _show_layout(measured, scene, float(np.median(comparison.trace.hits)))
-        render.say(f"\n{comparison.against_paper()}")
-        render.say(comparison.verdict)
     draw(picture, scene, comparison)
-    if json:
-        render.say_json(_record(scene, comparison, picture))
-    else:
-        render.say(f"picture: {picture}")
-        brick = next((one for one in scene.imported if one.layout == "brick"), scene.imported[0])
-        render.say(f"see it and feel it in a browser: hapticdb view {_quoted(brick.url)}")
+    render.say(f"picture: {picture}")
+    url = quote(redact(scene.imported[0].url))
+    render.say(f"see it and feel it in a browser: hapticdb view {url}")
     if comparison.disagreed:
         raise typer.Exit(1)
-
-
-def _quoted(url: str) -> str:
-    """URL as an argument of a shell, without its password."""
-    import shlex
-
-    from hapticdb.store.connect import redact
-
-    return shlex.quote(redact(url))
-
-
-def _record(scene: "DemoScene", comparison: "Comparison", picture: Path) -> dict[str, object]:
-    from hapticdb.store.connect import redact
-
-    return {
-        "files": [str(path) for path in scene.files],
-        "points": len(scene.shell),
-        "poses": len(scene.poses),
-        "layouts": [
-            {
-                **measured.imported._asdict(),
-                "url": redact(measured.imported.url),
-                "strategies": {
-                    name: {
-                        "median_us": felt.median_us,
-                        "p99_us": felt.p99_us,
-                        "statements": sum(felt.statements),
-                        "ranges": sum(felt.ranges),
-                        "rows": sum(felt.rows),
-                        "used": dict(felt.used),
-                    }
-                    for name, felt in measured.felt.items()
-                },
-            }
-            for measured in comparison.layouts
-        ],
-        "frames_compared": comparison.compared,
-        "frames_disagreed": len(comparison.disagreed),
-        "picture": str(picture),
-    }
 
 
 def _show_scene(scene: "DemoScene") -> None:
@@ -155,7 +105,7 @@ def _show_scene(scene: "DemoScene") -> None:
     ]
     rows += [(f"import, {one.layout}", _import_text(one)) for one in scene.imported]
     rows.append(("tool", f"{len(scene.shell)} points, {len(scene.poses):,} poses"))
-    render.show(render.facts(rows))
+    render.facts(rows)
 
 
 def _import_text(one: "Imported") -> str:
@@ -198,5 +148,5 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
         f"a frame: {len(scene.shell)} points, {keys:.0f} distinct keys, {hits:.0f} hits (medians)\n"
     )
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
-    render.show(render.table(columns, rows))
+    render.table(columns, rows)
     render.say(f"auto chose {render.shares(measured.felt['auto'].used)}")

@@ -51,17 +51,12 @@ TokenOption = Annotated[
         "--token", help="Ask for a token. One is made for each role, and printed at the start."
     ),
 ]
-RoleTokenOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="ROLE=TOKEN",
-        help="A token of yours, 16 characters or more. Roles: viewer, toucher, editor.",
-    ),
-]
 TokenFileOption = Annotated[
     str | None,
     typer.Option(
-        metavar="FILE", help="Tokens in a file, ROLE=TOKEN on each line: other users cannot see it."
+        metavar="FILE",
+        help="Tokens of yours, 16 characters or more: a file with ROLE=TOKEN on each line. Roles: "
+        "viewer, toucher, editor.",
     ),
 ]
 RoleUrlOption = Annotated[
@@ -126,7 +121,6 @@ def serve(
     *,
     tool: ToolsOption = None,
     token: TokenOption = False,
-    role_token: RoleTokenOption = None,
     token_file: TokenFileOption = None,
     role_url: RoleUrlOption = None,
     host: HostOption = "127.0.0.1",
@@ -147,7 +141,7 @@ def serve(
     _check_extra()
     from dataclasses import replace
 
-    tokens = _tokens(role_token, token_file, are_made=token)
+    tokens = _tokens(token_file, are_made=token)
     serving = replace(
         _serving(url, tool, files, tokens, role_url, recordings),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
@@ -218,23 +212,21 @@ def _title(url: str) -> str:
     return f"{Path(redact(url).partition('?')[0]).stem} - hapticdb"
 
 
-def _tokens(given: Sequence[str] | None, file: str | None, *, are_made: bool) -> "dict[str, Role]":
-    """Collect the tokens of all options, with the role of each."""
+def _tokens(file: str | None, *, are_made: bool) -> "dict[str, Role]":
+    """Collect the tokens of a file, and those that are made, with the role of each."""
     from hapticdb.server.access import Role, check_token, make_token
 
-    lines = [(text, "--role-token") for text in given or ()]
+    tokens = {make_token(): role for role in Role} if are_made else {}
     if file is not None:
         try:
-            text = Path(file).read_text("utf-8")
+            lines = Path(file).read_text("utf-8").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"--token-file {file}: cannot be read: {error}") from None
-        lines += [(line.strip(), "--token-file") for line in text.splitlines() if line.strip()]
-    tokens: dict[str, Role] = {}
-    for text, option in lines:
-        role, token = _pair(text, option)
-        check_token(token)
-        tokens[token] = role
-    return tokens | ({make_token(): role for role in Role} if are_made else {})
+        for line in filter(None, map(str.strip, lines)):
+            role, token = _pair(line, "--token-file")
+            check_token(token)
+            tokens[token] = role
+    return tokens
 
 
 def _pair(text: str, option: str) -> "tuple[Role, str]":

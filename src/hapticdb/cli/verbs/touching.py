@@ -236,35 +236,27 @@ class _Summary:
         forces, torques, hits, contacts, statements, ranges, rows, elapsed = np.array(self.frames).T
         peak, twist = int(np.argmax(forces)), int(np.argmax(torques))
         median, p99 = np.percentile(elapsed, [50, 99])
-        asked = (
-            f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
-            f"reads {rows.mean():.3g} rows"
-        )
         n_hit, n_contact = np.count_nonzero(hits), np.count_nonzero(contacts)
-        render.show(
-            render.facts(
-                [
-                    ("shell", shell_text(shell)),
-                    ("frames", f"{len(hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
-                    (
-                        "hits a frame",
-                        f"median {np.median(hits):.0f}, {hits.max():.0f} at most",
-                    ),
-                    ("peak force", f"{forces[peak]:.4g} N at pose {peak}"),
-                    ("peak torque", f"{torques[twist]:.4g} N m at pose {twist}"),
-                    ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
-                    ("a frame asks", asked),
-                    ("law", render.shares(self.laws)),
-                    ("strategy", render.shares(self.strategies)),
-                    ("objects", f"{len(self.objects)} touched"),
-                ]
-            )
-        )
+        render.facts([
+            ("shell", shell_text(shell)),
+            ("frames", f"{len(hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
+            ("peak force", f"{forces[peak]:.4g} N at pose {peak}"),
+            ("peak torque", f"{torques[twist]:.4g} N m at pose {twist}"),
+            ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
+            (
+                "a frame asks",
+                (
+                    f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
+                    f"reads {rows.mean():.3g} rows"
+                ),
+            ),
+            ("law", render.shares(self.laws)),
+            ("strategy", render.shares(self.strategies)),
+            ("objects", f"{len(self.objects)} touched"),
+        ])  # fmt: skip
         if self.objects:
             ranked = sorted(self.frames_of.items(), key=lambda item: (-item[1], item[0]))
-            render.show(
-                render.table(
-                    ("id>", "touched most", "frames>"),
-                    [(str(i), self.objects[i].name, str(n)) for i, n in ranked[:MOST_TOUCHED]],
-                )
+            render.table(
+                ("id>", "touched most", "frames>"),
+                [(str(i), self.objects[i].name, str(n)) for i, n in ranked[:MOST_TOUCHED]],
             )

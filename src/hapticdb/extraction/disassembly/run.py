@@ -23,13 +23,12 @@ from hapticdb.extraction.disassembly.result import (
 )
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.problem import problem_of
-from hapticdb.extraction.pulls import SearchCallback
 from hapticdb.extraction.result import Blocker, Extraction
 from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import sweep
+from hapticdb.sweeps.run import SampleCallback, sweep
 from hapticdb.sweeps.verdict import names_of
 
 DEFAULT_ORDER_SECONDS = 600.0
@@ -57,7 +56,7 @@ def disassemble(
     depth: int = DEFAULT_DEPTH,
     keep: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SearchCallback | None = None,
+    progress: SampleCallback | None = None,
 ) -> Disassembly:
     """Search an order in which objects are taken off so that parts come out.
 
@@ -133,7 +132,7 @@ class _Asked(NamedTuple):
     motions: int
     out: float | None
     budget_bytes: int
-    progress: SearchCallback | None
+    progress: SampleCallback | None
 
 
 class _Known(NamedTuple):

@@ -1,6 +1,8 @@
 """The verb extract."""
 
-from typing import TYPE_CHECKING, Annotated, TypedDict
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
 
 import typer
 
@@ -15,21 +17,20 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.values import budget_bytes
-from hapticdb.cli.verbs.paths.disassembling import EXIT_CODES as ORDER_EXIT_CODES
-from hapticdb.cli.verbs.paths.disassembling import Outputs, report, write
-from hapticdb.cli.verbs.paths.sweeping import PictureOption, UpOption, check_picture
+from hapticdb.cli.verbs.sweeping import PictureOption, UpName, UpOption, check_picture
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
-    from hapticdb.extraction.pulls import SearchCallback
+    from hapticdb.extraction.disassembly.result import Disassembly
     from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {
     "comes out": 0, "slides out": 0, "comes out of contact": 3, "not decided": 3, "no way found": 1,
 }  # fmt: skip
+ORDER_EXIT_CODES = {"comes out": 0, "comes out of contact": 3, "no order found": 1}
 MOST_BLOCKERS = 10
-"""Rows of the table of what is in the way."""
+"""Rows of the table of what is in the way, and of the table of searches that failed."""
 
 SecondsOption = Annotated[
     float | None,
@@ -137,29 +138,28 @@ def extract(
     _check_animation(animation)
     if not disassemble and (depth is not None or keep):
         raise UsageError("--depth and --keep go with --disassemble")
-    asked = Outputs(path, picture, animation, up, json)
-    n_bytes = budget_bytes(budget)
+    asked = _Outputs(path, picture, animation, up, json)
+    options: dict[str, Any] = {
+        "seed": seed, "motions": motions, "out": out, "budget_bytes": budget_bytes(budget),
+    }  # fmt: skip
+    if seconds is not None:
+        options["seconds"] = seconds
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")
         felt = felt_objects(env, where, exclude, ids)
         kept = ids_of(env, keep, "--keep") if keep else []
         render.compile_kernels("extract")
-        with render.pull_bar() as progress:
-            options: _Options = {
-                "where": felt.where, "seed": seed, "motions": motions, "out": out,
-                "budget_bytes": n_bytes, "progress": progress,
-            }  # fmt: skip
+        with render.bar("pulling", "pulls", lambda *now: now) as progress:
+            options |= {"where": felt.where, "progress": progress}
             if disassemble:
+                chain = orders.DEFAULT_DEPTH if depth is None else depth
                 order = orders.disassemble(
-                    env, *ids, exclude=exclude or (), keep=kept,
-                    depth=orders.DEFAULT_DEPTH if depth is None else depth,
-                    seconds=orders.DEFAULT_ORDER_SECONDS if seconds is None else seconds, **options,
-                )  # fmt: skip
+                    env, *ids, exclude=exclude or (), keep=kept, depth=chain, **options
+                )
             else:
-                seconds = run.DEFAULT_SECONDS if seconds is None else seconds
-                found = run.extract(env, *ids, exclude=felt.exclude, seconds=seconds, **options)
+                found = run.extract(env, *ids, exclude=felt.exclude, **options)
         if disassemble:
-            report(env, order, asked)
+            _report_order(env, order, asked)
             code = ORDER_EXIT_CODES[order.verdict]
         else:
             _report(env, found, felt.left_out, asked)
@@ -168,15 +168,31 @@ def extract(
         raise typer.Exit(code)
 
 
-class _Options(TypedDict):
-    """Options of both searches."""
+class _Outputs(NamedTuple):
+    """What is written beside the printed lines: names of files, or None."""
 
-    where: "list[str]"
-    seed: int
-    motions: int
-    out: float | None
-    budget_bytes: int
-    progress: "SearchCallback | None"
+    path: str | None
+    picture: str | None
+    animation: str | None
+    up: UpName | None
+    json: bool
+
+    def of_step(self, step: int) -> "_Outputs":
+        """Files of a step of an order: ``out.csv`` is ``out-1.csv`` for the first step, 0."""
+
+        def numbered(file: str | None) -> str | None:
+            path = Path(file or "")
+            return file and str(path.with_name(f"{path.stem}-{step + 1}{path.suffix}"))
+
+        return self._replace(path=numbered(self.path), picture=numbered(self.picture))
+
+
+class _Way(NamedTuple):
+    """A way that was found, the ids of what is not felt on it, and its files."""
+
+    found: "Extraction"
+    excluded: Sequence[int]
+    files: _Outputs
 
 
 def _check_animation(animation: str | None) -> None:
@@ -190,20 +206,63 @@ def _check_animation(animation: str | None) -> None:
     check_view()
 
 
-def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: Outputs) -> None:
+def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: _Outputs) -> None:
     """Print the verdict; write path, picture and animation of a path that was found."""
     from hapticdb.extraction.record import extraction_record
 
-    def tell() -> None:
-        if asked.json:
-            render.say_json(extraction_record(found, left_out))
-        else:
-            _show(found, asked)
+    ways = [] if found.way is None else [_Way(found, left_out, asked)]
+    _write_paths(ways)
+    if asked.json:
+        render.say_json(extraction_record(found, left_out))
+    else:
+        _show(found, asked)
+    _draw(env, ways, asked)
 
-    write(env, [] if found.way is None else [(found, left_out)], asked, tell)
+
+def _report_order(env: "Environment", found: "Disassembly", asked: _Outputs) -> None:
+    """Print an order or why there is none; write a path and a picture a step, and an animation."""
+    from hapticdb.extraction.record import disassembly_record
+
+    steps = found.steps if found.is_found else ()
+    ways = [_Way(step.found, step.excluded, asked.of_step(n)) for n, step in enumerate(steps)]
+    _write_paths(ways)
+    if asked.json:
+        render.say_json(disassembly_record(found))
+    else:
+        _show_order(found, ways)
+    _draw(env, ways, asked)
 
 
-def _show(found: "Extraction", asked: Outputs) -> None:
+def _write_paths(ways: Sequence[_Way]) -> None:
+    from hapticdb.poses import write_poses
+
+    for found, _, files in ways:
+        if files.path is not None and found.way is not None:
+            write_poses(files.path, found.way.poses)
+
+
+def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
+    """Draw the pictures and the animation that were asked for."""
+    from hapticdb.extraction.verdict import extraction_line
+
+    for found, excluded, files in ways:
+        if files.picture is not None and found.way is not None:
+            from hapticdb.pictures.demo import save
+            from hapticdb.pictures.sweep import compose_sweep
+
+            figure = compose_sweep(
+                env, found.shell, found.way.swept, exclude=excluded,
+                verdict=extraction_line(found), up=asked.up,
+            )  # fmt: skip
+            save(figure, files.picture)
+    if asked.animation is not None and ways:
+        from hapticdb.page.animation import animate
+
+        steps = [way.found for way in ways]
+        animate(asked.animation, env, steps, exclude=ways[-1].excluded, up=asked.up)
+
+
+def _show(found: "Extraction", asked: _Outputs) -> None:
     """Print the verdict, what is in the way, and the figures of the search."""
     from hapticdb.extraction.verdict import extraction_line
     from hapticdb.sweeps.verdict import depth_text, names_of
@@ -214,17 +273,38 @@ def _show(found: "Extraction", asked: Outputs) -> None:
             (str(one.object.id), one.object.name, f"{one.pulls} of {found.pulls}")
             for one in found.blockers[:MOST_BLOCKERS]
         ]
-        render.show(render.table(("id>", "in the way", "of pulls>"), rows))
-    touched = names_of(found.touched) if found.touched else "nothing"
+        render.table(("id>", "in the way", "of pulls>"), rows)
     facts = [
-        ("touches at its start", touched),
+        ("touches at its start", names_of(found.touched) or "nothing"),
         ("searched", f"{found.pulls} pulls, {found.motions:,} motions, {found.poses:,} poses"),
         ("took", f"{found.seconds:.1f} s"),
     ]
     if found.way is not None:
         facts += [(f"depth in {one.object.name}", depth_text(one)) for one in found.way.depths]
-        files = (("path", asked.path), ("picture", asked.picture), ("animation", asked.animation))
-        for name, file in files:
-            if file is not None:
-                facts.append((name, file))
-    render.show(render.facts(facts))
+        files = asked._asdict()
+        facts += [(name, files[name]) for name in ("path", "picture", "animation") if files[name]]
+    render.facts(facts)
+
+
+def _show_order(found: "Disassembly", ways: Sequence[_Way]) -> None:
+    from hapticdb.extraction.verdict import disassembly_line, extraction_line, failed_line
+    from hapticdb.sweeps.verdict import names_of
+
+    render.say(disassembly_line(found))
+    for n, step in enumerate(found.steps):
+        render.say(f"{n + 1}. {names_of(step.found.parts)}: {extraction_line(step.found)}")
+    if not found.is_found and found.failed:
+        rows = [
+            (names_of(one.parts), str(one.n_gone), failed_line(one))
+            for one in found.failed[-MOST_BLOCKERS:]
+        ]
+        render.table(("tried", "after steps>", "result"), rows)
+    facts = [("took", f"{found.seconds:.1f} s")]
+    if ways:
+        ends = [way.files._asdict() for way in (ways[0], ways[-1])]
+        facts += [
+            (name, " ... ".join(dict.fromkeys(end[name] for end in ends)))
+            for name in ("path", "picture", "animation")
+            if ends[0][name]
+        ]
+    render.facts(facts)

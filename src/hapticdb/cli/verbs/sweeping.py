@@ -23,19 +23,22 @@ from hapticdb.cli.options import (
 )
 from hapticdb.cli.tools import shell_of
 from hapticdb.cli.values import budget_bytes
-from hapticdb.cli.verdict import show
 from hapticdb.errors import UsageError
+from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.sweeps.result import Swept
+    from hapticdb.sweeps.result import Clearance, Swept
 
 EXIT_CODES = {"comes out": 0, "hits": 1, "not decided": 3}
 DOUBTFUL = 3
 """Exit code of "comes out", too, where tool, path and scene do not fit."""
 DENSE = 0.5
 """Voxels from point to point of the tool, unless --points are given."""
+
+MOST_OBJECTS = 20
+"""Rows of the table of what is hit; the other objects are counted below it."""
 
 UpName = Literal["x", "y", "z"]
 PartsOption = Annotated[
@@ -161,7 +164,7 @@ def sweep(
             env, shell, poses, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
             path_unit=path_unit, is_moving=True,
         )  # fmt: skip
-        with render.count_bar("sweeping", "samples") as progress:
+        with render.bar("sweeping", "samples", lambda *now: now) as progress:
             found = sweep_path(
                 env, shell, poses, where=felt.where, exclude=felt.exclude, proportions=fit,
                 budget_bytes=budget_bytes(budget), clearance_limit=clearance, refine=refine,
@@ -175,7 +178,7 @@ def sweep(
             if json:
                 render.say_json(sweep_record(found, shell, parts, felt.left_out))
             elif csv != STDOUT:
-                show(env, found, shell)
+                _show(env, found, shell)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
                 _draw(picture, env, shell, found, felt.left_out, up)
@@ -233,12 +236,9 @@ def _shell(
 ) -> "PointShell":
     """Shell of the tool's file, or of the parts, with its covering radius."""
     spacing = DENSE * env.grid.voxel_size if points is None else None
-    with render.count_bar("spreading points", "points"):
-        if tool is not None:
-            shell = shell_of(tool, tool_unit, points, seed, spacing)
-        else:
-            shell = env.shell(*parts, points=points, spacing=spacing, seed=seed or 0)
-        return shell.with_cover()
+    if tool is not None:
+        return shell_of(tool, tool_unit, points, seed, spacing).with_cover()
+    return env.shell(*parts, points=points, spacing=spacing, seed=seed or 0).with_cover()
 
 
 def _draw(
@@ -256,3 +256,63 @@ def _draw(
     verdict = verdict_line(found, shell)
     figure = compose_sweep(env, shell, found, exclude=excluded, verdict=verdict, up=up)
     save(figure, picture)
+
+
+def _show(env: "Environment", found: "Swept", shell: "PointShell") -> None:
+    """Print the verdict, a table of what is hit, and the figures that it stands on."""
+    from hapticdb.sweeps.verdict import percent, verdict_line
+
+    render.say(verdict_line(found, shell))
+    if found.objects:
+        rows = [
+            (
+                str(one.object.id),
+                one.object.name,
+                f"{percent(one.first)} to {percent(one.last)}",
+                length_text(one.length),
+                f"{one.samples:,}",
+                f"{one.contacts:,}",
+                f"{one.points:,}",
+            )
+            for one in found.objects[:MOST_OBJECTS]
+        ]
+        columns = ("id>", "hit", "of the path>", "length>", "samples>", "in contact>", "points>")
+        render.table(columns, rows)
+        if len(found.objects) > MOST_OBJECTS:
+            render.say(f"{len(found.objects)} objects, {MOST_OBJECTS} of them shown")
+    render.facts(_facts(env, found, shell))
+
+
+def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tuple[str, str]]:
+    from hapticdb.sweeps.record import median_spacing
+    from hapticdb.sweeps.verdict import depth_text
+
+    size = env.grid.voxel_size
+    way = f"{len(found.path.poses):,} poses given, {found.samples:,} samples"
+    tool = f"{len(shell):,} points, {length_text(median_spacing(shell))} apart (median)"
+    if found.proof.cover is not None:
+        tool += f", none of its surface more than {length_text(found.proof.cover)} from one"
+    rows = [
+        ("path", f"{way}, no point moves more than {length_text(0.5 * size)} between two"),
+        ("tool", tool),
+        ("hits", f"{found.hits:,} samples hit, {found.contacts:,} in contact"),
+    ]
+    if found.clearance is not None and not found.hits:
+        rows.append(("clearance", _clearance_text(found.clearance)))
+    rows += [(f"in {one.object.name}", depth_text(one)) for one in found.depths[:MOST_OBJECTS]]
+    rate = f"{found.samples / max(found.elapsed, 1e-9):,.0f} poses a second"
+    rows.append(("took", f"{found.elapsed:.2f} s, {rate}, {found.cells:,} cells fetched"))
+    return rows
+
+
+def _clearance_text(clearance: "Clearance") -> str:
+    """What the number means: a surface lies somewhere in its voxel, and beside the points."""
+    from hapticdb.sweeps.verdict import names_of, percent
+
+    if clearance.moment is None:
+        return f"no voxel nearer than {length_text(clearance.distance)}; farther is not looked"
+    return (
+        f"{length_text(clearance.distance)} from a voxel of {names_of(clearance.moment.objects)} "
+        f"at {percent(clearance.moment.fraction)}: the surfaces are "
+        f"{length_text(clearance.at_least)} to {length_text(clearance.at_most)} apart"
+    )

@@ -81,18 +81,6 @@ def test_a_touch_prints_what_it_prints_on_a_file(run: Run, scene: str, made: Pat
     assert len(felt[0]) == len(PLACES)
 
 
-def test_nothing_usable_leaves_no_environment(run: Run, place: Place, tmp_path: Path) -> None:
-    url = place()
-    (tmp_path / "empty.obj").write_bytes(b"")
-    refused(run("import", url, "empty.obj"), "empty.obj")
-    refused(run("info", url), "no environment", "hapticdb import URL FILE")
-
-
-def test_another_grid_than_the_environments_is_refused(run: Run, scene: str, made: Path) -> None:
-    refused(run("import", scene, made / "boxes.glb", "--bits", 7), "bits 7 instead of 6")
-    refused(run("import", scene, made / "boxes.glb", "--layout", "voxel"), "layout")
-
-
 def test_info_names_the_environment_and_the_server(
     run: Run, scene: str, admin: psycopg.Connection
 ) -> None:

@@ -65,18 +65,3 @@ def test_the_report_says_in_what_for_how_long_and_whether_it_came_free(
     figures: dict[str, Any], said: str
 ) -> None:
     assert said in session_page.loose_text(report(**figures), AWAY)  # type: ignore[arg-type]
-
-
-@pytest.mark.parametrize(
-    ("frames", "points", "said"),
-    [
-        (0, 0, "2,000 points a frame; none was left out"),
-        (1, 12, "2,000 points a frame; 1 frame left out 12 points at most"),
-        (1500, 30_000, "2,000 points a frame; 1,500 frames left out 30,000 points at most"),
-    ],
-)
-def test_the_report_says_how_many_points_the_budget_left_out(
-    frames: int, points: int, said: str
-) -> None:
-    told = report(budget_points=2000, left_out_frames=frames, most_left_out=points)
-    assert session_page.budget_text(told) == said

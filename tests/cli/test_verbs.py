@@ -180,37 +180,6 @@ def test_touch_json_has_a_line_a_pose(run: Run, scene: Scene) -> None:
     assert found[0]["hits"] >= found[0]["contacts"] > 0
 
 
-def test_touch_json_is_the_librarys_answer_to_the_bit(run: Run, scene: Scene) -> None:
-    args = ("--json", "--tool", "tool.stl", "--points", 90, "--conservative")
-    lines = touch(run, scene, *args)[1].splitlines()
-    shell = hapticdb.PointShell.from_file("tool.stl", 90)
-    with hapticdb.open(scene, read_only=True) as env:
-        for line, place in zip(lines, PLACES, strict=True):
-            pose = np.eye(4)
-            pose[:3, 3] = place
-            touched = env.touch(shell, pose)
-            frame = json.loads(line)
-            assert frame["force"] == touched.force.tolist()
-            assert frame["torque"] == touched.torque.tolist()
-            assert frame["hits"] == len(touched.hits)
-
-
-def test_every_strategy_prints_the_same_wrench(run: Run, scene: Scene) -> None:
-    wrenches = set()
-    for strategy in STRATEGIES:
-        lines = touch(run, scene, "--json", "--law", "plane", "--strategy", strategy)[
-            1
-        ].splitlines()
-        frames = [json.loads(line) for line in lines]
-        wrenches.add(str([(f["force"], f["torque"], f["hits"], f["objects"]) for f in frames]))
-    assert len(wrenches) == 1
-
-
-def test_an_excluded_object_is_not_felt(run: Run, scene: Scene) -> None:
-    out = touch(run, scene, "--json", "--exclude", "1,3", "--exclude", 2)[1]
-    assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
-
-
 def test_stiffness_scales_the_force(run: Run, scene: Scene) -> None:
     one, two = (
         json.loads(touch(run, scene, "--json", "--stiffness", k)[1].splitlines()[0])["force"]

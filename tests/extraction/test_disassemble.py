@@ -23,7 +23,7 @@ from extraction_scenes import corner, lid
 from hapticdb import Disassembly, disassemble
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
 from hapticdb.extraction.directions import AGAINST
-from hapticdb.extraction.disassembly.pressing import opposed
+from hapticdb.extraction.disassembly.run import opposed
 from hapticdb.extraction.verdict import disassembly_line, failed_line
 
 numbers = st.floats(-1.0, 1.0)

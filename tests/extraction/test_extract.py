@@ -78,17 +78,13 @@ def test_a_lid_on_its_pot_slides_off_no_deeper_than_it_is(tmp_path: Path) -> Non
 @pytest.mark.long
 def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
     """Pulled across, the walls of the upper one pass through the stud of the lower one."""
-    url = studded(tmp_path)
-    found = found_in(url, "upper", motions=0)
-    assert found.way is not None
-    assert found.verdict == "slides out"
-    way = found.way.poses[-1][:3, 3]
-    assert way[2] > 0.9 * np.linalg.norm(way)
-    with hapticdb.open(url, read_only=True) as env:
+    with hapticdb.open(studded(tmp_path), read_only=True) as env:
         problem = problem_of(env, ("upper",), (), (), seed=0)
-        across = judge(
-            problem, np.stack([np.eye(4), shifted(np.array([0.3, 0.0, 0.0]))]), "pull", 2**28
+        along, across = (
+            judge(problem, np.stack([np.eye(4), shifted(0.2 * axis)]), "pull", 2**28)
+            for axis in np.eye(3)[[2, 0]]
         )
+    assert along.verdict == "slides out"
     assert (across.verdict, [obj.name for obj in across.in_way]) == ("not decided", ["lower"])
     (depth,) = across.depths
     assert depth.is_cut
@@ -117,12 +113,6 @@ def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
     assert way[1] > 0.9 * np.linalg.norm(way)
     assert is_out(found, url)
     assert [(one.object.name, one.pulls > 0) for one in found.blockers] == [("shaft", True)]
-
-
-def test_what_counts_as_out_may_be_near(tmp_path: Path) -> None:
-    found = found_in(drawer(tmp_path), "drawer", motions=0, out=0.1)
-    assert found.way is not None
-    assert np.linalg.norm(found.way.poses[-1][:3, 3]) == pytest.approx(0.1)
 
 
 # --- the planner ---------------------------------------------------------------------------------

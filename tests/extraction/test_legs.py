@@ -8,7 +8,6 @@ import pytest
 import hapticdb
 from extraction_scenes import room_with_a_door
 from hapticdb import extract
-from hapticdb.extraction import legs
 from hapticdb.extraction.planner import Planner
 
 
@@ -31,15 +30,3 @@ def test_a_block_leaves_a_room_by_its_door(tmp_path: Path) -> None:
     assert (along != 0.0).tolist() == [True, False, False]
     assert 0.27 < up[0] + along[0] < 0.37  # the block is 0.06 m wide, the door 0.14 m
     assert out[1] > 0.1
-
-
-@pytest.mark.usefixtures("no_planner")
-def test_the_legs_end_after_so_many_motions(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(legs, "MOST_MOTIONS", 5)
-    with (
-        hapticdb.open(room_with_a_door(tmp_path), read_only=True) as env,
-        pytest.raises(AssertionError, match="process was asked"),
-    ):
-        extract(env, "block", seconds=500.0)

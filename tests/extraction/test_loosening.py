@@ -120,16 +120,6 @@ def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None
 
 
 @pytest.mark.long
-def test_the_same_seed_leaves_contact_on_the_same_way(tmp_path: Path) -> None:
-    url = ledge(tmp_path)
-    found, again = found_in(url, "plate", seed=5), found_in(url, "plate", seed=5)
-    assert found.way is not None
-    assert again.way is not None
-    assert np.array_equal(found.way.poses, again.way.poses)
-    assert (found.motions, found.poses) == (again.motions, again.poses)
-
-
-@pytest.mark.long
 def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
     url = slot(tmp_path)
     found = found_in(url, "plate", seed=1)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from extraction_scenes import SIZE, bayonet, box, grounded, imported, joined, ledge
+from extraction_scenes import SIZE, box, grounded, imported, joined, ledge
 from hapticdb import GridOptions, ImportOptions, extract
 from hapticdb.extraction.free_space import ContactSpace, FreeSpace
 from hapticdb.extraction.leaving import Exit
@@ -64,9 +64,7 @@ def test_a_part_stays_where_it_slides_along_its_bore_and_not_across(tmp_path: Pa
             assert contact.stays(poses) is stays
 
 
-@pytest.mark.parametrize(
-    ("scene", "part"), [(ledge, "plate"), (bayonet, "bar"), (grounded, "block")]
-)
+@pytest.mark.parametrize(("scene", "part"), [(ledge, "plate"), (grounded, "block")])
 def test_no_pull_against_contacts_passes_through_a_wall(
     tmp_path: Path, scene: object, part: str
 ) -> None:
@@ -75,13 +73,10 @@ def test_no_pull_against_contacts_passes_through_a_wall(
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("bits", [9, 10, 11])
-def test_a_wheel_bolt_comes_out_along_its_bore_in_voxels_of_any_size(
-    tmp_path: Path, bits: int
-) -> None:
+def test_a_wheel_bolt_comes_out_along_its_bore(tmp_path: Path) -> None:
     """At 10 bits its head presses against a third of the contacts, which are in its recess."""
     url = tmp_path / "car.db"
-    options = ImportOptions(grid=GridOptions(bits=bits))
+    options = ImportOptions(grid=GridOptions(bits=10))
     hapticdb.import_files(url, [write_sample(tmp_path / "sample").car], options)
     with hapticdb.open(url, read_only=True) as env:
         found = extract(env, "wheels/wheel_bolt_front_left_1", motions=0, seconds=500.0)

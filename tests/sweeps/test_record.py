@@ -9,10 +9,9 @@ import pytest
 from scipy.spatial.distance import cdist
 
 import hapticdb
-from hapticdb import Environment, Grid, PointShell, compare_proportions
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.pointshell.shell import fibonacci_sphere
-from hapticdb.sweeps import run as sweeping
 from hapticdb.sweeps.record import median_spacing, sweep_record
 from hapticdb.sweeps.run import sweep
 from hapticdb.sweeps.verdict import MOST_NAMED, names_of, verdict_line
@@ -56,24 +55,6 @@ def test_the_record_holds_what_the_sweep_found_and_is_json(env: Environment) -> 
     assert [one["name"] for one in record["objects"]] == ["plate"]
     assert (record["tool"]["parts"], record["tool"]["excluded"]) == ([3], [3, 4])
     assert record["proportions"] == json.loads(json.dumps(found.proportions.record()))
-
-
-def test_proportions_that_are_given_are_not_computed_again(
-    env: Environment, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    shell = ball()
-    given = compare_proportions(
-        env.objects(), GRID.voxel_size, shell, 1000.0 * THROUGH, tool_unit=None, path_unit="mm"
-    )
-    assert [misfit.unit for misfit in given.misfits] == ["um"]
-    monkeypatch.delattr(sweeping, "compare_proportions")
-    assert sweep(env, shell, THROUGH, proportions=given).proportions is given
-
-
-def test_proportions_are_compared_as_metres_unless_given(env: Environment) -> None:
-    shell = ball()
-    alone = compare_proportions(env.objects(), GRID.voxel_size, shell, THROUGH)
-    assert sweep(env, shell, THROUGH).proportions.record() == alone.record()
 
 
 def test_the_median_spacing_is_that_of_all_pairs_of_points() -> None:

@@ -38,7 +38,7 @@ class HandOptions:
     is_simulated: bool
     profile: "DeviceProfile | None" = None
 
-    def path_speed(self) -> float | None:
+    def _path_speed(self) -> float | None:
         """Speed, m/s, that is assumed for a path without times; None where none is assumed."""
         from hapticdb.poses import read_timed_poses
 
@@ -46,13 +46,14 @@ class HandOptions:
             return None
         return PATH_SPEED if read_timed_poses(self.word)[0] is None else None
 
-    def open(self, path_speed: float | None) -> "Device":
-        """Open the device, or read the file of the motion."""
+    def open(self) -> "tuple[Device, float | None]":
+        """Open the device, or read the motion; also the speed assumed for a path without times."""
         self._check()
         if self.word in VENDORS:
-            return self._vendor_device()
+            return self._vendor_device(), None
+        path_speed = self._path_speed()
         hand = self._scripted(path_speed)
-        return self._simulated(hand) if self.is_simulated else hand
+        return self._simulated(hand) if self.is_simulated else hand, path_speed
 
     def _ends_with(self, suffix: str) -> bool:
         return self.word.lower().endswith(suffix)

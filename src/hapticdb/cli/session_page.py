@@ -5,7 +5,7 @@ from contextlib import suppress
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.cli.tools import shell_text
+from hapticdb.cli.tools import shell_record, shell_text
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
@@ -28,6 +28,8 @@ def show(
     shell: "PointShell",
     recording: str | None,
     path_speed: float | None,
+    *,
+    json: bool,
 ) -> None:
     """Print how the loop kept its time, beside the empty loop, and what happened in it.
 
@@ -38,11 +40,16 @@ def show(
     path_speed : float or None
         Speed assumed for a path without times, m/s.
     """
+    if json:
+        more = {"path_speed": path_speed, "shell": shell_record(shell)}
+        render.say_json(report.figures() | more)
+        return
     _show_loops(report)
     facts = [("shell", shell_text(shell)), *_frame_facts(report), *_force_facts(report)]
     cache = report.cache
     resident = f"{render.counted(cache.resident, 'cell')} in {cache.budget_bytes / 2**20:.4g} MiB"
-    facts.append(("resident", f"{resident}; {1e3 * cache.worst:.3g} ms to fetch more at worst"))
+    facts.append(("resident", resident))
+    facts.append(("fetched", f"{cache.loaded:,} cells, {1e3 * cache.worst:.3g} ms at worst"))
     if report.loose_frames:
         facts.append(("in something", loose_text(report, cells)))
     facts.append(("objects", f"{len(report.objects)} touched{_names_after(cells, report.objects)}"))

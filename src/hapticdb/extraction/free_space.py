@@ -8,6 +8,7 @@ share voxels. In contact a pose is allowed if the part is clear of all that it d
 start, and if its core, its surface drawn inward, is free, or hit little more than at the start.
 """
 
+from contextlib import ExitStack, closing
 from typing import Self
 
 import numpy as np
@@ -64,26 +65,23 @@ class FreeSpace:
         self.shell = searched_shell(problem.shell)
         self.extent = Extent.of(self.shell)
         self.n_poses = 0
-        self._table = CellTable.create(budget_bytes)
-        try:
+        shells = (self.shell, guarded_shell(self.shell, self.voxel_size))
+        with ExitStack() as stack:
+            table = stack.enter_context(CellTable.create(budget_bytes))
             self.residency = Residency(
-                problem.env.store, self._table, problem.exclude, where=problem.where
+                problem.env.store, table, problem.exclude, where=problem.where
             )
             self._frames = [
-                ResidentFrames(self.residency, shell)
-                for shell in (self.shell, guarded_shell(self.shell, self.voxel_size))
+                stack.enter_context(closing(ResidentFrames(self.residency, shell)))
+                for shell in shells
             ]
-        except BaseException:
-            self._table.close()
-            raise
+            self._close = stack.pop_all().close
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for frames in self._frames:
-            frames.close()
-        self._table.close()
+        self._close()
 
     def hits(self, poses: Floats, *, is_guarded: bool = False) -> Ints:
         """Numbers of points (n,) in occupied voxels at poses (n, 4, 4)."""
@@ -143,38 +141,33 @@ class ContactSpace:
         self._frames: list[ResidentFrames] = []
         self._most: list[float] = []
         self._most_pulled: list[float] = []
-        self._table: CellTable | None = None
-        if not self.touched:
-            return
-        self._table = CellTable.create(budget_bytes)
-        try:
-            others = Residency(
-                problem.env.store,
-                self._table,
-                (*problem.exclude, *self.touched),
-                where=problem.where,
-            )
-            self._frames.append(ResidentFrames(others, space.shell))
-            core = core_shell(space.shell, problem.voxel_size)
-            if core is not None:
-                self._frames.append(ResidentFrames(space.residency, core))
-            for frames in self._frames:
-                start = int(frames.feel(np.eye(4)).hits[0])
-                self._most.append(CORE_GROWTH * start)
-                more = start + CORE_SHARE * len(frames.shell) if start else 0.0
-                self._most_pulled.append(max(CORE_GROWTH * start, more))
-        except BaseException:
-            self.__exit__()
-            raise
+        with ExitStack() as stack:
+            if self.touched:
+                self._feel_beside(stack, budget_bytes)
+            self._close = stack.pop_all().close
+
+    def _feel_beside(self, stack: ExitStack, budget_bytes: int) -> None:
+        """Set up frames of the part without what it touches, and of its core."""
+        problem, shell = self._problem, self._space.shell
+        table = stack.enter_context(CellTable.create(budget_bytes))
+        others = Residency(
+            problem.env.store, table, (*problem.exclude, *self.touched), where=problem.where
+        )
+        core = core_shell(shell, problem.voxel_size)
+        asked = [(others, shell), *([] if core is None else [(self._space.residency, core)])]
+        for residency, points in asked:
+            frames = stack.enter_context(closing(ResidentFrames(residency, points)))
+            start = int(frames.feel(np.eye(4)).hits[0])
+            more = start + CORE_SHARE * len(points) if start else 0.0
+            self._frames.append(frames)
+            self._most.append(CORE_GROWTH * start)
+            self._most_pulled.append(max(CORE_GROWTH * start, more))
 
     def __enter__(self) -> Self:
         return self
 
     def __exit__(self, *_: object) -> None:
-        for frames in self._frames:
-            frames.close()
-        if self._table is not None:
-            self._table.close()
+        self._close()
 
     def touch(self, pose: Floats) -> Touch:
         """Contacts of the searched shell at a pose (4, 4)."""

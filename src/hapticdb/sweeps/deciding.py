@@ -105,7 +105,6 @@ class Decider:
             np.arange(count, dtype=float), np.full(count, 0.5 if count > 1 else 0.0),
         )  # fmt: skip
         self.clear_sample: int | None = None
-        self.finest, self.n_pieces = self.cover, len(shell)
 
     def look_by_voxels(self, residency: Residency, *, has_distances: bool) -> None:
         """Look at the whole path; what is tight remains. It is more if distances can be asked."""
@@ -145,9 +144,6 @@ class Decider:
             within=float(self.within * self.size),
             near=near,
             tolerance=self.tolerance,
-            looked=self.looked,
-            pieces=self.n_pieces,
-            finest=float(self.finest),
             by=self.by,
         )
 
@@ -167,7 +163,6 @@ class Decider:
             self._look_at(residency, pieces, work, slice(first, first + BLOCK), wanted, is_tight)
         self.least = float(pieces.state[proving.LEAST])
         self.looked += int(pieces.where[proving.LOOKED])
-        self.n_pieces, self.finest = len(work.points), work.radii.max(initial=0.0)
         return work.kept(pieces.is_tight > 0, is_tight > 0)
 
     def _look_at(

@@ -106,9 +106,8 @@ class Decision(NamedTuple):
     is_clear : whether no surface meets the tool's, on the whole path; at_least : the proved
     distance of the surfaces, 0 unless `is_clear`; within : a surface comes at least so near to the
     tool's, or infinity; near : where that is so, with the objects in the nearest voxel, or None;
-    tolerance : as requested, but a voxel's diagonal at most, or None; looked : number of poses at
-    which points were looked at; pieces : number of pieces of the last round; finest : greatest
-    radius of a piece of the last round; by : what bounded the distances, "voxels" or "distances".
+    tolerance : as requested, but a voxel's diagonal at most, or None; by : what bounded the
+    distances, "voxels" or "distances".
     """
 
     is_clear: bool
@@ -116,9 +115,6 @@ class Decision(NamedTuple):
     within: float
     near: Moment | None
     tolerance: float | None
-    looked: int
-    pieces: int
-    finest: float
     by: str
 
     @property

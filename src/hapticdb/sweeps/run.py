@@ -6,8 +6,8 @@ need. A bound covers the space between samples and between points (`result.Proof
 """
 
 import time
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import closing, contextmanager, suppress
 from dataclasses import replace
 from typing import NamedTuple
 
@@ -15,10 +15,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import (
-    ConnectionLostError,
-    UsageError,
-)
+from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.resident import sweep as kernels
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.shell import PointShell
@@ -103,7 +100,7 @@ def sweep(
     proportions : Proportions or None
         Of the same tool, path and scene, with their units; compared here in metres unless given.
     progress : callable or None
-        Called after each block with the samples done and their total.
+        As `SampleCallback`.
     leave_start, refine : bool
         Leave out the objects that the tool hits at the first pose, and bound how deep it goes into
         them; draw a finer shell where the verdict is open.
@@ -121,14 +118,18 @@ def sweep(
     shell = shell.with_cover()
     path = SweepPath.of(poses, shell, env.grid.voxel_size)
     limit = DEFAULT_LIMIT * env.grid.voxel_size if clearance_limit is None else clearance_limit
-    asked = _Asked(leave_start, tolerance, refine)
-    run = _Run(env, shell, path, limit, profile, proportions, progress, asked)
+    asked = _Asked(limit, profile, proportions, progress, leave_start, tolerance, refine)
+    run = _Run(env, shell, path, asked)
     return with_depths(run.swept_once(Filter(where, exclude), budget_bytes), shell, tolerance)
 
 
 class _Asked(NamedTuple):
-    """What is asked beyond the samples, as for `sweep`."""
+    """What is asked, as for `sweep`; limit : metres."""
 
+    limit: float
+    profile: bool
+    proportions: Proportions | None
+    progress: SampleCallback | None
     leave_start: bool
     tolerance: float | None
     refine: bool
@@ -137,17 +138,8 @@ class _Asked(NamedTuple):
 class _Run:
     """State of one sweep."""
 
-    def __init__(
-        self,
-        env: Environment,
-        shell: PointShell,
-        path: SweepPath,
-        limit: float,
-        profile: bool,  # noqa: FBT001 - private
-        proportions: Proportions | None,
-        progress: SampleCallback | None,
-        asked: _Asked,
-    ) -> None:
+    def __init__(self, env: Environment, shell: PointShell, path: SweepPath, asked: _Asked) -> None:
+        limit = asked.limit
         if not (np.isfinite(limit) and limit >= 0.0):
             raise UsageError(f"clearance up to {limit} m: give a finite length, 0 or more")
         if asked.tolerance is not None and not 0.0 < asked.tolerance < np.inf:
@@ -161,18 +153,15 @@ class _Run:
         if shell.cover is not None:
             limit = max(limit, LOOKED * (shell.cover + path.off))
         self.limit = limit
-        self.is_profiled = profile and self.is_asked
-        self.proportions = proportions
-        self.progress = progress
+        self.is_profiled = asked.profile and self.is_asked
         self.n_windows = min(len(path), WINDOWS)
         self.begins = -(-np.arange(self.n_windows) * len(path) // self.n_windows)
 
     def swept_once(self, felt: Filter, budget_bytes: int) -> Swept:
         """Sweep; all of it is repeated once if a snapshot is lost."""
-        try:
+        with suppress(ConnectionLostError):
             return self.swept(felt, budget_bytes)
-        except ConnectionLostError:
-            return self.swept(felt, budget_bytes)
+        return self.swept(felt, budget_bytes)
 
     def swept(self, felt: Filter, budget_bytes: int) -> Swept:
         """Sweep from the start, in one snapshot."""
@@ -199,42 +188,42 @@ class _Run:
 
     def _hit_at_start(self, felt: Filter, budget_bytes: int) -> Ints:
         """Ids of the objects in whose voxels the tool has a point at the first pose, ascending."""
-        with CellTable.create(budget_bytes) as table:
-            residency = Residency(
-                self.store, table, felt.exclude, where=felt.where, may_measure=False
-            )
-            frames = ResidentFrames(residency, self.shell)
-            try:
-                first = self.path.poses[:1]
-                found = find_hits(frames, first, frames.feel(first).hits)
-                exclude = residency.exclude
-                return np.unique(pairs_of_hits(found.places, found.voxels, self.store, exclude).ids)
-            finally:
-                frames.close()
+        with self._frames(felt, budget_bytes, may_measure=False) as frames:
+            first = self.path.poses[:1]
+            found = find_hits(frames, first, frames.feel(first).hits)
+            exclude = frames.residency.exclude
+            return np.unique(pairs_of_hits(found.places, found.voxels, self.store, exclude).ids)
 
     def _by_voxels(self, felt: Filter, budget_bytes: int) -> tuple[Swept, Decider | None]:
         """Sweep by voxels; the decider has what they leave open, if it is to be looked at."""
+        with self._frames(felt, budget_bytes, may_measure=True) as frames:
+            residency = frames.residency
+            started = time.perf_counter()
+            residency.refresh()
+            self._begin(frames, felt)
+            self.exclude = residency.exclude
+            self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
+            self._sweep(frames)
+            found = self._result(frames, time.perf_counter() - started)
+            if not self._is_open(found):
+                return found, None
+            decider = Decider(
+                self.shell, self.path, self.grid.voxel_size, self._tolerance,
+                refines=self.asked.refine,
+            )  # fmt: skip
+            decider.look_by_voxels(residency, has_distances=self._have_distances)
+            return self._enclosed_later(found, decider, residency), decider
+
+    @contextmanager
+    def _frames(
+        self, felt: Filter, budget_bytes: int, *, may_measure: bool
+    ) -> Iterator[ResidentFrames]:
         with CellTable.create(budget_bytes) as table:
-            residency = Residency(self.store, table, felt.exclude, where=felt.where)
-            frames = ResidentFrames(residency, self.shell)
-            try:
-                started = time.perf_counter()
-                residency.refresh()
-                self._begin(frames, felt)
-                self.exclude = residency.exclude
-                self.enclosed = enclosed_ids(residency, self.shell, self.path.poses[0])
-                self._sweep(frames)
-                found = self._result(frames, time.perf_counter() - started)
-                if not self._is_open(found):
-                    return found, None
-                decider = Decider(
-                    self.shell, self.path, self.grid.voxel_size, self._tolerance,
-                    refines=self.asked.refine,
-                )  # fmt: skip
-                decider.look_by_voxels(residency, has_distances=self._have_distances)
-                return self._enclosed_later(found, decider, residency), decider
-            finally:
-                frames.close()
+            residency = Residency(
+                self.store, table, felt.exclude, where=felt.where, may_measure=may_measure
+            )
+            with closing(ResidentFrames(residency, self.shell)) as frames:
+                yield frames
 
     def _is_open(self, found: Swept) -> bool:
         """Whether a closer look is to decide; a hit is looked at on request only."""
@@ -333,8 +322,8 @@ class _Run:
                 if is_hit.any():
                     self._note_hits(frames, begin, poses[begin - first :], felt)
             self._note_profile(first, poses, is_hit)
-            if self.progress is not None:
-                self.progress(last, total)
+            if self.asked.progress is not None:
+                self.asked.progress(last, total)
 
     def _first_to_feel(self, first: int, poses: Floats) -> int:
         """Search the clearance in a block; returns the first sample that may hit anything.
@@ -474,8 +463,8 @@ class _Run:
 
     def _compared(self, exclude: Keys) -> Proportions:
         """Compare tool, path and scene in metres, unless the caller has compared them."""
-        if self.proportions is not None:
-            return self.proportions
+        if self.asked.proportions is not None:
+            return self.asked.proportions
         return compare_proportions(
             self.known.values(), self.grid.voxel_size, self.shell, self.path.poses,
             exclude=exclude.tolist(),

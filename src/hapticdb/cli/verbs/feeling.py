@@ -24,7 +24,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import compile_for, compile_for_large, shell_of, shell_record
+from hapticdb.cli.tools import compile_for, compile_for_large, shell_of
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 
@@ -195,28 +195,23 @@ def feel(
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     _begin_loop(processor, policy, device, budget_points)
-    given = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
-    hand = given.open(speed := given.path_speed())
-    handle = hapticdb.Handle(scale=scale, clutch=clutch)
+    hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
+    (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         chosen, coupling = force.law_and_coupling(cells)
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
-            law=chosen, coupling=coupling, budget_points=budget_points,
+            law=chosen, coupling=coupling, budget_points=budget_points, processor=processor,
             record=record, append_recording=append, replace_recording=replace,
-            record_limit_bytes=limit_bytes, processor=processor, has_baseline=not no_baseline,
+            record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
         )  # fmt: skip
         force.tell_lowered(session)
         with session, ended_by_signals(session.ask_to_end) as signals:
             fitting.tell(session.proportions, tool, "--scale")
             report = _waited_for(session)
-        if json:
-            more = {"path_speed": speed, "shell": shell_record(shell)}
-            render.say_json(report.figures() | more)
-        else:
-            session_page.show(report, cells, shell, record, speed)
+        session_page.show(report, cells, shell, record, speed, json=json)
     _exit_after(signals, report)
 
 

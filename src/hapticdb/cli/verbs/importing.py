@@ -2,7 +2,7 @@
 
 import time
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -129,12 +129,28 @@ def import_(
         replace=replace, distances=distances,
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)
-    if json:
-        _say_records(url, reports)
-    else:
-        _say_lines(url, files, reports, elapsed)
+    _tell(url, files, reports, elapsed, json=json)
     if any(report.error for report in reports):
         raise typer.Exit(2)
+
+
+def _tell(
+    url: str, files: Sequence[str], reports: "Sequence[FileReport]", elapsed: float, *, json: bool
+) -> None:
+    """Print what became of each file, and what the environment holds now."""
+    held = None if all(report.error for report in reports) else _Held.by(url)
+    for file, report in zip(files, reports, strict=True):
+        if json:
+            scene = render.box_record(None if held is None else held.scene)
+            render.say_json(_record(report) | {"scene": scene})
+        elif report.error is None:
+            _say(file, report)
+        if report.error is not None:
+            render.note(str(report.error))
+    if not json and held is not None and any(report.status == "imported" for report in reports):
+        render.say(f"{held.line}; {elapsed:.1f} s")
+        if held.scene is not None:
+            render.say(f"the scene: {render.box(held.scene)}")
 
 
 def _imported(
@@ -155,27 +171,27 @@ def _imported(
     return reports, time.perf_counter() - started
 
 
-def _say_records(url: str, reports: "Sequence[FileReport]") -> None:
-    """Print what became of each file, as JSON."""
-    is_any_in = any(report.error is None for report in reports)
-    scene = render.box_record(_scene(url) if is_any_in else None)
-    for report in reports:
-        render.say_json(_record(report) | {"scene": scene})
-        if report.error is not None:
-            render.note(str(report.error))
+class _Held(NamedTuple):
+    """What an environment holds now, in a line, and the bounds of all of it."""
 
+    line: str
+    scene: "NDArray[np.float64] | None"
 
-def _say_lines(
-    url: str, files: Sequence[str], reports: "Sequence[FileReport]", elapsed: float
-) -> None:
-    """Print what became of each file, in words, and what the environment holds now."""
-    for file, report in zip(files, reports, strict=True):
-        if report.error is None:
-            _say(file, report)
-        else:
-            render.note(str(report.error))
-    if any(report.status == "imported" for report in reports):
-        _say_total(url, elapsed)
+    @classmethod
+    def by(cls, url: str) -> "_Held":
+        from contextlib import closing
+
+        from hapticdb.store.base import scene_bounds
+        from hapticdb.store.connect import open_store
+
+        with closing(open_store(url, read_only=True)) as store:
+            size, objects = store.size(), store.objects()
+            line = (
+                f"{store.url}: {render.counted(len(objects), 'object')}, "
+                f"{render.counted(size.rows, 'row')}, {render.bytes_text(size.bytes)}; "
+                f"{store.grid.describe()}"
+            )
+            return cls(line, scene_bounds(objects))
 
 
 def _record(report: "FileReport") -> dict[str, object]:
@@ -223,31 +239,3 @@ def _say(file: str, report: "FileReport") -> None:
         render.say("  it names no unit, so its numbers are taken as metres; --unit gives another")
     if report.defects:
         render.say(f"  found in the file: {report.defects.describe()}")
-
-
-def _say_total(url: str, elapsed: float) -> None:
-    import hapticdb
-    from hapticdb.store.base import scene_bounds
-
-    with hapticdb.open(url, read_only=True) as env:
-        size = env.size()
-        objects = env.objects()
-        render.say(
-            f"{env.url}: {render.counted(len(objects), 'object')}, "
-            f"{render.counted(size.rows, 'row')}, "
-            f"{render.bytes_text(size.bytes)}; {env.grid.describe()}; {elapsed:.1f} s"
-        )
-        scene = scene_bounds(objects)
-    if scene is not None:
-        render.say(f"the scene: {render.box(scene)}")
-
-
-def _scene(url: str) -> "NDArray[np.float64] | None":
-    """Bounds of all that an environment holds now."""
-    from contextlib import closing
-
-    from hapticdb.store.base import scene_bounds
-    from hapticdb.store.connect import open_store
-
-    with closing(open_store(url, read_only=True)) as store:
-        return scene_bounds(store.objects())

@@ -1,8 +1,7 @@
 """The verbs that copy and compare environments: copy, diff."""
 
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
@@ -16,6 +15,12 @@ if TYPE_CHECKING:
     from hapticdb.store.base import Object
     from hapticdb.transfer import CopyCallback, CopyReport
 
+SIDES = ("only_in_a", "only_in_b")
+KINDS = {
+    "only_in_a": "only in A", "only_in_b": "only in B", "changed": "other geometry",
+    "moved": "another place", "voxels": "other voxels", "distances": "other distances",
+}  # fmt: skip
+"""Kinds of differences, the most important first, by their names in JSON."""
 MOST_LINES = 20
 """Differences that are listed; more are counted."""
 
@@ -94,17 +99,18 @@ def diff(
     render.compile_kernels("copy")
     with _bar("comparing") as progress:
         difference = diff_environments(a, b, progress=progress)
+    record = _record(difference)
     if json:
-        render.say_json(_record(difference))
+        render.say_json(record)
     elif difference.is_equal:
         render.say(_equal(difference))
     else:
-        _show(difference)
+        _show(difference, record)
     if not difference.is_equal:
         raise typer.Exit(1)
 
 
-def _record(difference: "Difference") -> dict[str, object]:
+def _record(difference: "Difference") -> dict[str, Any]:
     from hapticdb.difference import farthest_corner, moved_by
 
     size = difference.grids[0].voxel_size
@@ -161,7 +167,7 @@ def _equal(difference: "Difference") -> str:
     return line
 
 
-def _show(difference: "Difference") -> None:
+def _show(difference: "Difference", record: dict[str, Any]) -> None:
     """Print differences, a row each, the most important first, and their totals."""
     a, b = difference.a, difference.b
     if not difference.is_same_grid:
@@ -169,11 +175,10 @@ def _show(difference: "Difference") -> None:
         render.say(
             f"other grids, so that voxels cannot be compared: {grid_a} in {a}; {grid_b} in {b}"
         )
-    rows = list(_rows(difference))
+    rows = [_row(kind, one) for kind in KINDS for one in record[kind]]
     if rows:
         headings = "id> name what only_in_A> only_in_B> shared> moved_by> file"
-        columns = [word.replace("_", " ") for word in headings.split()]
-        render.table(columns, rows[:MOST_LINES])
+        render.table([word.replace("_", " ") for word in headings.split()], rows[:MOST_LINES])
         render.say(f"A: {a}; B: {b}")
     count = render.counted(len(rows) + (not difference.is_same_grid), "difference")
     cut = "" if len(rows) <= MOST_LINES else f", {MOST_LINES} of them shown"
@@ -189,35 +194,11 @@ def _show(difference: "Difference") -> None:
     )
 
 
-def _rows(difference: "Difference") -> Iterator[tuple[str, ...]]:
-    """Rows of the table of differences."""
-    for n, objects in enumerate((difference.only_in_a, difference.only_in_b)):
-        for obj in objects:
-            lone = ["", ""]
-            lone[n] = f"{obj.voxels:,}"
-            yield str(obj.id), obj.name, f"only in {'AB'[n]}", *lone, "", "", obj.link
-    apart = {one.a.id: one for one in (*difference.voxels, *difference.elsewhere)}
-    size = difference.grids[0].voxel_size
-    for what, pairs in (
-        ("other geometry", difference.changed),
-        ("another place", difference.moved),
-        ("other voxels", [(one.a, one.b) for one in difference.voxels]),
-    ):
-        for obj, other in pairs:
-            counts = ("", "", "")
-            if (one := apart.get(obj.id)) is not None:
-                counts = (
-                    f"{one.only_in_a:,}", f"{one.only_in_b:,}", render.percent(one.share)
-                )  # fmt: skip
-            yield str(obj.id), obj.name, what, *counts, _moved_text(obj, other, size), obj.link
-    for found in difference.distances:
-        what = f"other distances in {render.counted(found.n_rows, 'row')}"
-        yield str(found.a.id), found.a.name, what, "", "", "", "", found.a.link
-
-
-def _moved_text(a: "Object", b: "Object", voxel_size: float) -> str:
-    """How far an object is from where it was: ``12.5 mm (3.2 voxels)``."""
-    from hapticdb.difference import farthest_corner
-
-    way = farthest_corner(a, b)
-    return f"{length_text(way)} ({way / voxel_size:.3g} voxels)" if way > 0.0 else ""
+def _row(kind: str, one: dict[str, Any]) -> tuple[str, ...]:
+    """Row of the table for an entry of the record."""
+    only = [one.get(side, one.get("voxels") if side == kind else None) for side in SIDES]
+    counts = ["" if n is None else f"{n:,}" for n in only]
+    share, way = one.get("share"), one.get("farthest_corner", 0.0)
+    moved = f"{length_text(way)} ({one['farthest_corner_voxels']:.3g} voxels)" if way else ""
+    shared = "" if share is None else render.percent(share)
+    return str(one["id"]), one["name"], KINDS[kind], *counts, shared, moved, one["link"]

@@ -31,30 +31,6 @@ STACK: Scene = {
 """Content, lid and weight in a pot, one above the other."""
 
 
-def perforated(low: float, high: float) -> Boxes:
-    """A plate between two heights with square holes, 0.08 m wide, at x = -0.1 and 0.1."""
-    sides: Boxes = [((-0.2, y, low), (0.2, y + 0.06, high)) for y in (-0.1, 0.04)]
-    columns = ((-0.2, -0.14), (-0.06, 0.06), (0.14, 0.2))
-    return [*sides, *(((a, -0.04, low), (b, 0.04, high)) for a, b in columns)]
-
-
-def bolt(x: float) -> Boxes:
-    """A shaft with a head that is wider than the holes."""
-    return [
-        ((x - 0.01, -0.01, 0.04), (x + 0.01, 0.01, 0.18)),
-        ((x - 0.06, -0.06, 0.18), (x + 0.06, 0.06, 0.2)),
-    ]
-
-
-BOLTED: Scene = {
-    "base": perforated(0.0, 0.1),
-    "cover": perforated(0.13, 0.15),
-    "bolt_1": bolt(-0.1),
-    "bolt_2": bolt(0.1),
-}
-"""A cover above a base; two bolts go through both."""
-
-
 def link(x: float, axis: int) -> Boxes:
     """A square link of a chain in the plane of x and another axis, 0.16 m wide, 0.02 m thick."""
 

@@ -200,20 +200,6 @@ def room_with_a_door(folder: Path) -> Path:
     return imported(folder, room=joined(room, *side, floor), block=block)
 
 
-def elbow(folder: Path) -> Path:
-    """A peg on the floor of a bent channel: up, and then along +x."""
-    channel = [
-        box((-0.06, -0.06, -0.02), (-0.04, 0.06, 0.34)),
-        box((0.04, -0.06, -0.02), (0.06, 0.06, 0.22)),
-        box((-0.06, -0.06, -0.02), (0.06, 0.06, 0.0)),
-        box((-0.06, -0.06, 0.32), (0.24, 0.06, 0.34)),
-        box((0.04, -0.06, 0.2), (0.24, 0.06, 0.22)),
-        *(box((-0.06, y - 0.01, -0.02), (0.24, y + 0.01, 0.34)) for y in (-0.05, 0.05)),
-    ]
-    peg = box((-0.01, -0.01, 0.0), (0.01, 0.01, 0.06))
-    return imported(folder, channel=joined(*channel), peg=peg)
-
-
 def solids(url: Path, part: str) -> Floats:
     """Corners (B, 2, 3) of the boxes that all but a part are made of, metres."""
     scene = trimesh.load(url.with_suffix(".glb"))

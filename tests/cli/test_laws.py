@@ -54,15 +54,6 @@ def test_the_law_is_smooth_where_distances_are_unless_it_is_named(run: Run, scen
     assert smooth[2]["force"] == [0.0, 0.0, 0.0]
 
 
-def test_the_summary_names_the_law(run: Run, scene: str) -> None:
-    for law in ("plane", "smooth"):
-        code, out, _ = run(
-            "touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--law", law
-        )
-        assert code == 0
-        assert [line.split()[1] for line in out.splitlines() if line.startswith("law")] == [law]
-
-
 @pytest.mark.usefixtures("scene")
 def test_without_distances_the_law_is_the_plane_and_smooth_is_refused(
     run: Run, tmp_path: Path

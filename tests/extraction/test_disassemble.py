@@ -10,7 +10,6 @@ from hypothesis import strategies as st
 
 import hapticdb
 from disassembly_scenes import (
-    BOLTED,
     CHAIN,
     STACK,
     WINDOW,
@@ -67,10 +66,9 @@ def test_what_lies_above_goes_first_in_a_stack(tmp_path: Path) -> None:
 
 @pytest.mark.long
 def test_what_was_left_out_is_not_taken_off(tmp_path: Path) -> None:
-    url = made(tmp_path, BOLTED)
-    found = found_in(url, "cover", exclude=["bolt_1"], keep=["base"])
-    assert order(found) == ["bolt_2", "cover"]
-    assert_free(BOLTED, found, gone=("bolt_1",))
+    found = found_in(made(tmp_path, STACK), "content", exclude=["weight"], keep=["pot"])
+    assert order(found) == ["lid", "content"]
+    assert_free(STACK, found, gone=("weight",))
 
 
 def test_links_of_a_chain_have_no_order(tmp_path: Path) -> None:

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from extraction_scenes import SIZE, bayonet, elbow, grounded, ledge, pocket, slot, solids
+from extraction_scenes import SIZE, bayonet, grounded, ledge, pocket, slot, solids
 from hapticdb import Extraction, extract
 from hapticdb.extraction.loosening import Twist, leaving_twist
 
@@ -93,15 +93,6 @@ def test_a_bar_is_turned_in_contact_and_then_lifts_through_the_slot(tmp_path: Pa
     passing = (poses[:, 2, 3] > 0.01) & (poses[:, 2, 3] < 0.03)
     assert passing.any()
     assert (turn_of(poses[passing]) > 1.0).all()
-
-
-@pytest.mark.long
-def test_a_peg_leaves_a_bent_channel(tmp_path: Path) -> None:
-    url = elbow(tmp_path)
-    found = found_in(url, "peg")
-    assert found.verdict == "slides out"  # it stands on the channel's floor
-    assert is_out(found, url, "peg")
-    assert places_in_boxes(found, url, "peg", 0.5 * SIZE) == 0
 
 
 def test_no_pull_cuts_through_what_it_touches(tmp_path: Path) -> None:

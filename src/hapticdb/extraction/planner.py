@@ -5,7 +5,6 @@ deadline.
 """
 
 import time
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -53,17 +52,6 @@ ENDING = 1.0
 WORK = "hapticdb.extraction.planner_child:plan"
 
 
-class Planned(NamedTuple):
-    """What the planner has done.
-
-    poses (M, 4, 4) : displacements from the start to where the part is out, or None; motions :
-    questions answered.
-    """
-
-    poses: Floats | None
-    motions: int
-
-
 class Planner:
     """Plans for one problem.
 
@@ -107,8 +95,10 @@ class Planner:
         """Do not start again where the last path did, because its way there is refuted."""
         self._starts = [one for one in self._starts or [] if one is not self._used]
 
-    def search(self) -> Planned:
-        """Search with the guard, first by shifts alone; without the guard if nothing is guarded.
+    def search(self) -> Floats | None:
+        """Path (M, 4, 4) of displacements from the start to where the part is out, or None.
+
+        Searched with the guard, first by shifts alone; without the guard if nothing is guarded.
 
         Raises
         ------
@@ -120,10 +110,10 @@ class Planner:
         is_guarded = any(one.is_guarded for one in self._starts)
         starts = [one for one in self._starts if one.is_guarded == is_guarded]
         if not starts:
-            return Planned(None, self.n_motions)
+            return None
         path = self._by_legs(starts, is_guarded=is_guarded)
         if path is not None:
-            return Planned(path, self.n_motions)
+            return path
         del starts[MOST_STARTS:]
         began, left = time.monotonic(), max(self._most - self.n_motions, 0)
         soon = began + SHARE_OF_SHIFTS * (self._until - began)
@@ -135,8 +125,8 @@ class Planner:
             most = max(int(share * (left - (self.n_motions - asked))), 1)
             path = self._ask(starts, turning, most, until, is_guarded=is_guarded)
             if path is not None:
-                return Planned(path, self.n_motions)
-        return Planned(None, self.n_motions)
+                return path
+        return None
 
     def _found_starts(self) -> list[Loosened]:
         """Ways to where the planner starts: pulls; where none is free with the guard, others, too.

@@ -219,7 +219,7 @@ def _poses_of(
 ) -> Floats | None:
     """Poses of a planned path; a missing planner is an error unless there is a way already."""
     try:
-        return planner.search().poses
+        return planner.search()
     except MissingExtraError as error:
         if way is not None:
             return None

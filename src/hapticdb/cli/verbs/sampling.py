@@ -16,9 +16,7 @@ FramesOption = Annotated[
 ]
 
 
-def sample(
-    folder: FolderArgument, *, frames: FramesOption = 1000
-) -> None:
+def sample(folder: FolderArgument, *, frames: FramesOption = 1000) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
     Example: hapticdb sample sample

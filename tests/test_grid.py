@@ -247,10 +247,3 @@ def test_an_extent_is_compared_by_the_edge_that_it_gives() -> None:
     with pytest.raises(GridError, match=r"extent 1\.7 .an edge of 6\.8 m. instead .* 6\.4 m"):
         GridOptions(bits=11, extent=1.7).check_matches(grid, BOUNDS)
     GridOptions(extent=1.7).check_matches(grid)  # no bounds: not comparable
-
-
-@pytest.mark.parametrize("extent", [1.6, 3.0])
-def test_the_options_of_a_grid_match_it_again(extent: float) -> None:
-    """An import can be finished by the same command, also with both extent and voxel size."""
-    options = GridOptions(voxel_size=0.01, extent=extent)
-    options.check_matches(options.fit(BOUNDS), BOUNDS)

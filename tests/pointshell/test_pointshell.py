@@ -206,16 +206,6 @@ def test_a_rounding_of_the_frame_leaves_the_order() -> None:
     assert np.allclose(there.points, here.points + np.array([0.1, 0.0, 0.0]), atol=1e-12)
 
 
-def test_points_given_as_arrays_keep_their_order(tmp_path: Path) -> None:
-    sampled = PointShell.from_mesh(*torus(), 200)
-    order = np.random.default_rng(1).permutation(200)
-    shell = PointShell(sampled.points[order], sampled.normals[order], sampled.center)
-    shell.save(tmp_path / "tool.npz")
-    for kept in (shell, PointShell.from_file(tmp_path / "tool.npz")):
-        assert np.array_equal(kept.points, sampled.points[order])
-        assert np.array_equal(kept.normals, sampled.normals[order])
-
-
 @pytest.mark.parametrize("state", ["outward", "inside out", "tumbled", "mirrored", "doubled"])
 def test_normals_point_inward_whatever_the_winding(state: str) -> None:
     corners, faces = torus()

@@ -20,7 +20,7 @@ from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
-from hapticdb.kernels._linking import LeafCompiler
+from hapticdb.kernels._linking import EntryCompiler, LeafCompiler, remember_calls
 
 INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -43,6 +43,17 @@ SIGNATURES: dict[str, tuple[tuple[Any, ...], ...]] = {}
 
 An entry has one such tuple, or several when it is compiled for several laws.
 """
+
+
+_ENTRY_OPTIONS: dict[str, Any] = {
+    "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": True,
+}  # fmt: skip
+"""Options of entries. `_nrt` is numba's counting of references to arrays."""
+_LEAF_OPTIONS: dict[str, Any] = _ENTRY_OPTIONS | {"_nrt": False}
+if IN_WORKER in os.environ:
+    _ENTRY_OPTIONS |= {"pipeline_class": EntryCompiler}
+    _LEAF_OPTIONS |= {"no_cpython_wrapper": True, "pipeline_class": LeafCompiler}
+    remember_calls()
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
@@ -88,7 +99,7 @@ def entry(
         before = config.CACHE_DIR
         config.CACHE_DIR = CACHE_FOLDER
         try:
-            compiled = numba.njit(nogil=True, error_model="numpy", no_cfunc_wrapper=True)(function)
+            compiled = numba.njit(**_ENTRY_OPTIONS)(function)
             if not config.DISABLE_JIT:
                 compiled._cache = _Cache(function)  # noqa: SLF001 - as cache=True sets numba's own
         finally:
@@ -101,22 +112,24 @@ def entry(
     return decorate
 
 
-def leaf(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a scalar function that only kernels call; LLVM inlines it.
+def leaf(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:  # noqa: ANN401
+    """Compile a function that only kernels call; LLVM inlines it if it is small.
 
-    A process that only compiles makes no machine code of a leaf alone (`_linking`). Elsewhere a
-    leaf can be called from Python, as tests do.
+    It counts no references, so arrays cost nothing, but it can make none (`maker`). A process that
+    only compiles makes no machine code of a leaf alone (`_linking`). Elsewhere a leaf can be called
+    from Python, as tests do.
     """
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True}
-    if IN_WORKER in os.environ:
-        options |= {"no_cpython_wrapper": True, "pipeline_class": LeafCompiler}
-    return numba.njit(**options)(function)  # type: ignore[no-any-return]
+    return numba.njit(**_LEAF_OPTIONS | more)(function)  # type: ignore[no-any-return]
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Compile a leaf that takes arrays: numba inlines it, so arrays cost no counted reference."""
-    decorate = numba.njit(nogil=True, error_model="numpy", inline="always")
-    return decorate(function)  # type: ignore[no-any-return]
+    """Compile a leaf that LLVM always inlines."""
+    return leaf(function, forceinline=True)
+
+
+def maker(function: Callable[..., Any]) -> Callable[..., Any]:
+    """Compile a leaf that makes arrays."""
+    return leaf(function, _nrt=True)
 
 
 def chosen_by_type(choose: Callable[[type], Callable[..., Any]]) -> Callable[..., Any]:
@@ -129,11 +142,7 @@ def chosen_by_type(choose: Callable[[type], Callable[..., Any]]) -> Callable[...
     def call(first: Any, *others: Any) -> Any:  # noqa: ANN401
         return choose(type(first))(first, *others)
 
-    options: dict[str, Any] = {"nogil": True, "error_model": "numpy"}
-    if IN_WORKER in os.environ:
-        options["pipeline_class"] = LeafCompiler
-
-    @overload(call, strict=False, jit_options=options)
+    @overload(call, strict=False, jit_options=_LEAF_OPTIONS)
     def body(first: Any, *others: Any) -> Any:  # noqa: ANN401, ARG001
         return choose(first.instance_class)
 

@@ -1,8 +1,8 @@
-"""Leaves that are optimized in entries alone.
+"""How a process that only compiles does so: each thing once.
 
-numba optimizes each function together with all that it calls, and emits machine code for it. A leaf
-five calls below an entry is then optimized six times. In a process that only compiles, nothing but
-entries is called from Python. There a leaf is only linked, and the entry's own passes inline it.
+There nothing but entries is called from Python. numba would optimize each function together with
+all that it calls, and emit machine code for it: a leaf five calls below an entry six times. Instead
+an entry links each leaf below it, once, and its own passes inline and optimize them.
 """
 
 from typing import Any
@@ -10,34 +10,75 @@ from typing import Any
 from llvmlite import binding
 from numba.core.codegen import JITCodeLibrary
 from numba.core.compiler import Compiler
+from numba.core.types.functions import BaseFunction
 
 ENVIRONMENT = "_ZN08NumbaEnv"
 """Prefix of the variables through which numba gives functions their constants."""
 
 
-class _LinkedLibrary(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
-    """Code of a leaf, for its callers alone."""
+class _LeafLibrary(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
+    """Code of a leaf, for entries alone."""
 
     _final_module: Any
 
-    def _optimize_final_module(self) -> None:
-        """Leave that to the entry."""
-
-    def _finalize_final_module(self) -> None:
-        """Keep the code for callers; emit nothing but the variables that numba writes to."""
+    def finalize(self) -> None:
+        """Keep the code for entries; emit nothing but the variables that numba writes to."""
         self._finalized = True
         self._get_module_for_linking()
         names = [known.name for known in self._final_module.global_variables]
         words = [f'@"{name}" = common global ptr null' for name in names if ENVIRONMENT in name]
         self._final_module = binding.parse_assembly("\n".join(words))
-        super()._finalize_final_module()
+        self._finalize_final_module()
+
+
+class _EntryLibrary(JITCodeLibrary):  # type: ignore[misc]  # likewise
+    """Code of an entry, with all leaves below it."""
+
+    _linking_libraries: list[Any]
+
+    def finalize(self) -> None:
+        """Link callers before what they call: LLVM leaves out what nothing has called yet."""
+        found: dict[Any, None] = {}
+        _add_callees(self._linking_libraries, found)
+        self._linking_libraries = list(found)[::-1]
+        super().finalize()
+
+
+def _add_callees(libraries: list[Any], found: dict[Any, None]) -> None:
+    """Add libraries and those of the leaves below them, each behind all that it calls."""
+    for library in libraries:
+        if library not in found:
+            if isinstance(library, _LeafLibrary):
+                _add_callees(library._linking_libraries, found)  # noqa: SLF001
+            found[library] = None
 
 
 class LeafCompiler(Compiler):  # type: ignore[misc]  # likewise
     """numba's compiler, for leaves."""
 
+    library: Any = _LeafLibrary
+
     def __init__(self, typing_context: Any, target: Any, library: Any, *others: Any) -> None:  # noqa: ANN401 - likewise
         if library is None:
-            library = _LinkedLibrary(target.codegen(), "leaf")
+            library = self.library(target.codegen(), "kernel")
             library.enable_object_caching()
         super().__init__(typing_context, target, library, *others)
+
+
+class EntryCompiler(LeafCompiler):
+    """numba's compiler, for entries."""
+
+    library = _EntryLibrary
+
+
+def remember_calls() -> None:
+    """Let numba search for the implementation of an operator once for types of arguments."""
+    search, known = BaseFunction.get_call_type, {}
+
+    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:  # noqa: ANN401
+        asked = self, tuple(args), tuple(kws.items())
+        if asked not in known:
+            known[asked] = search(self, context, args, kws)
+        return known[asked]
+
+    BaseFunction.get_call_type = get_call_type  # type: ignore[method-assign]

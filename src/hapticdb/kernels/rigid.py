@@ -47,10 +47,7 @@ def first_not_rigid(poses):
 
 @inlined
 def transform_of(pose):
-    """Upper three rows of a pose as twelve numbers, row by row.
-
-    Loops over points use these numbers: an array passed to a leaf costs a counted reference.
-    """
+    """Upper three rows of a pose as twelve numbers, row by row: they stay in registers."""
     return (
         pose[0, 0], pose[0, 1], pose[0, 2], pose[0, 3],
         pose[1, 0], pose[1, 1], pose[1, 2], pose[1, 3],

@@ -30,7 +30,7 @@ array. A row with more or fewer bytes than its bits need is damaged.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf
+from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf, maker
 from hapticdb.kernels.field.lattice import BEYOND, ROW_SIDE, ROW_VALUES
 
 LINES = ROW_SIDE * ROW_SIDE
@@ -285,7 +285,7 @@ def _unpack_row(row, masks, lines, out, n):
     return np.int64(at)
 
 
-@leaf
+@maker
 def unpack_rows(data, ends, wanted, out):
     """Unpack the wanted rows; return the first row that is damaged, or -1."""
     row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)

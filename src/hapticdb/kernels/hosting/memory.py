@@ -11,7 +11,7 @@ from numba import carray, config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
 
-from hapticdb.kernels._jit import leaf
+from hapticdb.kernels._jit import leaf, maker
 from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.large.budget import Asleep
 from hapticdb.kernels.large.sleeping import COUNTS, RADIUS, REST, Sleepers
@@ -46,13 +46,13 @@ else:
 
         return types.voidptr(types.int64), generate
 
-    @leaf
+    @maker
     def array_at(address, shape, dtype):
         """Array of that shape and type at an address."""
         return carray(_pointer(address), shape, dtype)
 
 
-@leaf
+@maker
 def cells_of(station):
     """Cells of a session."""
     n_slots, capacity = station.n_slots, station.capacity
@@ -69,7 +69,7 @@ def cells_of(station):
     )
 
 
-@leaf
+@maker
 def tool_of(station):
     """Tool of a session."""
     n_points = station.n_points
@@ -84,7 +84,7 @@ def tool_of(station):
     )
 
 
-@leaf
+@maker
 def asleep_of(station):
     """Sleeping clusters of a session with a large tool, with its budget and counts."""
     at, n_runs = station.sleeping, station.n_spheres

@@ -17,6 +17,7 @@ from hapticdb.kernels._jit import (
     entry,
     inlined,
     leaf,
+    maker,
 )
 from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
 from hapticdb.kernels.query.sorting import sorting_order
@@ -80,7 +81,7 @@ def _number_of_key(table, found, count, key):
     return table[at]
 
 
-@inlined
+@maker
 def sort_keys(found, count, asked, keys):
     """Write the first `count` of the keys found in ascending order; renumber the points' slots."""
     order = sorting_order(found[:count])

@@ -2,7 +2,7 @@
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, INT, INTS, entry, leaf
+from hapticdb.kernels._jit import FLOAT, INT, INTS, entry, leaf, maker
 from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
 
 
@@ -158,7 +158,7 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
     return count
 
 
-@leaf
+@maker
 def _add_range(ranges, count, low, high):
     """Append a closed range; returns the array, larger when it was full, and the new count."""
     if count == ranges.shape[0]:

@@ -22,7 +22,7 @@ from hapticdb.kernels._jit import (
     READ_BYTES,
     entry,
     inlined,
-    leaf,
+    maker,
 )
 from hapticdb.kernels.field.lattice import ROW_VALUES
 from hapticdb.kernels.field.law import DISTANCE_FIELD
@@ -57,7 +57,7 @@ NO_POINTS = np.empty(0, dtype=np.int64)
 NO_DEPTHS = np.empty(0)
 
 
-@leaf
+@maker
 def _rows_of_keys(keys, row_keys):
     """Where the rows of each asked key begin and end, (U,) int64 each.
 
@@ -79,7 +79,7 @@ def _rows_of_keys(keys, row_keys):
     return starts, ends
 
 
-@leaf
+@maker
 def _counting_rows(row_ids, exclude):
     """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct.
 
@@ -341,7 +341,7 @@ def pairs_of_contacts(
     return pairs[:count]
 
 
-@leaf
+@maker
 def is_asked(keys, row_keys):
     """Mask (R,) bool of the rows whose key is among those that a shell asks for: no false hits.
 

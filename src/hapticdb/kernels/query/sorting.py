@@ -5,13 +5,13 @@ numpy's own sorts cost a kernel two seconds of compile time.
 
 import numpy as np
 
-from hapticdb.kernels._jit import leaf
+from hapticdb.kernels._jit import leaf, maker
 
 SORTED_RUN = np.int64(64)
 """Keys in a run that is sorted by insertion. Larger: slower runs. Smaller: more merging."""
 
 
-@leaf
+@maker
 def sorting_order(keys):
     """Order (U,) that sorts keys (U,): runs sorted by insertion, then merged two by two.
 

@@ -60,7 +60,6 @@ def felt(cells, which, shell, pose, place, law, met, missed, out):
     of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
     Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
     """
-    # arrays get local names: a field that is read in a loop costs a counted reference
     _, _, keys, slots, words, masks, used, payload, _ = cells
     points, _, spheres, groups, run, columns, scratch = shell
     transform = transform_of(pose)

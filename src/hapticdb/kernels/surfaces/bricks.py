@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf
+from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf, maker
 from hapticdb.kernels.curves import compact, z_encode
 
 FIRST_CAPACITY = np.int64(256)
@@ -67,7 +67,7 @@ def _first_slot(key, mask):
     return (mixed >> 20 ^ mixed) & mask
 
 
-@leaf
+@maker
 def new_table(capacity):
     """Return an empty table for that many bricks, a power of two."""
     keys = np.empty(capacity, np.int64)
@@ -82,7 +82,7 @@ def new_table(capacity):
     return _BrickTable(keys, words, slots, recent)
 
 
-@leaf
+@maker
 def grown(table, n_bricks, wanted):
     """Copy the first `n_bricks` bricks into a larger table, with room for `wanted`."""
     capacity = 2 * table.keys.shape[0]
@@ -152,7 +152,7 @@ def bricks_of_run(first, last):
     return ((last - first) >> 3) + 2
 
 
-@leaf
+@maker
 def mark_runs(table, n_bricks, runs, n_runs):
     """Mark the first `n_runs` rows of runs (R, 5) int64; return the table and the bricks in use.
 

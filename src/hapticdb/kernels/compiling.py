@@ -44,9 +44,8 @@ ENTRIES = {
     ),
     "query.contact": "locate_kernel spans_of_keys",
     "resident.cell_table": (
-        "insert_cells remove_cells slots_of_cells fill_cells fill_distances "
-        "curve_keys_of_cells cells_of_curve_keys slots_to_free publish oldest_version_read "
-        "cells_ahead cells_met"
+        "insert_cells remove_cells slots_of_cells fill_cells fill_distances slots_to_free publish "
+        "oldest_version_read cells_ahead cells_met"
     ),
     "resident.near_voxels": "mark_near_voxels",
     "surfaces.sides": "side_votes_kernel nesting_kernel",
@@ -54,13 +53,13 @@ ENTRIES = {
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
-    "resident.sweep": "poses_between unpack find_hits",
+    "resident.sweep": "poses_between find_hits",
     "surfaces.sampling": "eliminate_kernel",
     "hand.direct": "render",
     "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
     "rigid": "poses_of first_not_rigid",
-    "surfaces.bricks": "z_keys_kernel mark_points_kernel count_kernel brick_voxels_kernel",
+    "surfaces.bricks": "mark_points_kernel brick_voxels_kernel",
     "hand.handle": "is_somewhere grip carry",
     "proxy.evaluate": "evaluate",
 }
@@ -88,9 +87,8 @@ _SHELL = ("surfaces.sampling.*", "surfaces.sides.*", "curves.encode_kernel")
 _VOXELIZE = (
     "surfaces.voxelize.*",
     "surfaces.distances.*",
-    "surfaces.bricks.z_keys_kernel",
     "surfaces.bricks.mark_points_kernel",
-    "surfaces.bricks.count_kernel",
+    "curves.encode_kernel",
     "field.packing.pack_kernel",
 )
 _RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel")
@@ -107,6 +105,7 @@ _RESIDENT = (
     "resident.cell_table.*",
     "resident.near_voxels.*",
     "resident.feeling.bounding_spheres",
+    "field.packing.unpack_kernel",
     "query.grouping.group_spans_by_cost",
     *_COST,
 )
@@ -117,11 +116,10 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "shell": _SHELL,
     "calibrate": _COST,
     "touch": (*_SHELL, *_COST, "query.contact.*", "query.refining.*"),
-    "resident": (*_RESIDENT, "field.packing.unpack_kernel"),
+    "resident": _RESIDENT,
     "feel": (
         *_SHELL,
         *_RESIDENT,
-        "field.packing.unpack_kernel",
         "resident.feeling.feel_kernel",
         "hand.direct.*",
         "hand.quasistatic.*",
@@ -130,13 +128,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "motion.*",
         "rigid.*",
     ),
-    "host": (*_RESIDENT, "field.packing.unpack_kernel", "hosting.*"),
-    "replay": (
-        *_RESIDENT,
-        "field.packing.unpack_kernel",
-        "resident.feeling.*",
-        "rigid.poses_of",
-    ),
+    "host": (*_RESIDENT, "hosting.*"),
+    "replay": (*_RESIDENT, "resident.feeling.*", "rigid.poses_of"),
     "sweep": (
         *_SHELL,
         *_RESIDENT,
@@ -145,7 +138,6 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "resident.clearance.*",
         "resident.proving.*",
         "surfaces.nearest.*",
-        "field.packing.unpack_kernel",
         *_RANGES,
     ),
     "extract": (
@@ -160,20 +152,9 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "query.contact.*",
         "query.refining.*",
     ),
-    "proxies": (
-        *_RESIDENT,
-        "field.packing.unpack_kernel",
-        "hand.quasistatic.*",
-        "hand.servo.*",
-        "proxy.linearize.*",
-        "rigid.*",
-    ),
+    "proxies": (*_RESIDENT, "hand.quasistatic.*", "hand.servo.*", "proxy.linearize.*", "rigid.*"),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
-    "large": (
-        *_RESIDENT,
-        "field.packing.unpack_kernel",
-        "large.budget.*",
-    ),
+    "large": (*_RESIDENT, "large.budget.*"),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

@@ -93,6 +93,13 @@ def product(aw, ax, ay, az, bw, bx, by, bz):
 
 
 @leaf
+def turned_by(w, x, y, z, a, b, c):
+    """Vector v = (a, b, c) turned by a unit quaternion: v + 2 q x (q x v + w v)."""
+    ux, uy, uz = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
+    return a + 2.0 * (y * uz - z * uy), b + 2.0 * (z * ux - x * uz), c + 2.0 * (x * uy - y * ux)
+
+
+@leaf
 def turn_of(w, x, y, z):
     """Turn of a unit quaternion, by at most half a revolution."""
     sine = math.sqrt(x * x + y * y + z * z)

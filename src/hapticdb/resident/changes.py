@@ -52,13 +52,10 @@ def known_cells_touched(
     first, last = spans[:, 0] >> CELL_SHIFT, spans[:, 1] >> CELL_SHIFT
     if (last - first + 1).sum() <= FEW_CELLS:
         met = np.concatenate([np.arange(a, b + 1) for a, b in zip(first, last, strict=True)])
-        met = np.unique(met)
-        cells = np.empty(len(met), dtype=np.int64)
-        kernels.cells_of_curve_keys(met, bits, curve, cells)
+        cells = kernels.cells_of_curve_keys(np.unique(met), bits, curve)
         return np.compress(slots_of(cells) != UNKNOWN, cells)
     cells = known()
-    on_curve = np.empty(len(cells), dtype=np.int64)
-    kernels.curve_keys_of_cells(cells, bits, curve, on_curve)
+    on_curve = kernels.curve_keys_of_cells(cells, bits, curve)
     order = np.argsort(on_curve)
     on_curve = on_curve[order]
     # number of spans that hold each cell: +1 at the begin of a span, -1 at its end

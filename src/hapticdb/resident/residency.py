@@ -242,7 +242,7 @@ class Residency:
 
     def warm_up(self) -> None:
         """Compile the kernels that an eviction or a write calls first."""
-        kernels.cells_of_curve_keys(NO_KEYS, self.grid.bits, self.grid.curve_code, NO_KEYS.copy())
+        kernels.cells_of_curve_keys(NO_KEYS, self.grid.bits, self.grid.curve_code)
         self.writer.slots.warm_up()
 
     def load(self, cells: Keys) -> Loaded:

@@ -77,8 +77,7 @@ class CellSource:
     def read(self, cells: Keys, table: CellTable, slots: Keys) -> _CellsRead:
         """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read."""
         grid, shift = self.store.grid, row_shift(self.store.layout)
-        on_curve = np.empty(len(cells), dtype=np.int64)
-        kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code, on_curve)
+        on_curve = kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code)
         order = np.argsort(on_curve)
         on_curve = on_curve[order]
         lows = on_curve << (CELL_SHIFT - shift)

@@ -127,9 +127,7 @@ def find_hits(frames: ResidentFrames, poses: Floats, n_hits: Ints) -> kernels.Fo
 def pairs_of_hits(places: Ints, voxel_table: Ints, store: Store, exclude: Keys) -> Pairs:
     """Pairs of each hit (H,) and each object in its voxel; places (H,) index `voxel_table`."""
     filled = np.flatnonzero(voxel_table >= 0)
-    ijk = np.empty((len(filled), 3), dtype=np.int64)
-    kernels.unpack(voxel_table[filled], ijk)
-    in_voxels = pairs_in_voxels(store, ijk, exclude)
+    in_voxels = pairs_in_voxels(store, kernels.unpack(voxel_table[filled]), exclude)
     rank = np.empty(len(voxel_table), dtype=np.int64)
     rank[filled] = np.arange(len(filled))
     voxel_of_hit = rank[places]

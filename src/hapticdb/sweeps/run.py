@@ -473,6 +473,4 @@ class _Run:
 
 def _unpacked(voxel: int) -> Ints:
     """Indices (1, 3) of a packed voxel."""
-    ijk = np.empty((1, 3), dtype=np.int64)
-    kernels.unpack(np.array([voxel]), ijk)
-    return ijk
+    return kernels.unpack(np.array([voxel]))

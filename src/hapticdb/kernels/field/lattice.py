@@ -40,12 +40,6 @@ def step_of(distance):
 
 
 @leaf
-def distance_of(step):
-    """Distance in voxels of a stored value; h where it is BEYOND."""
-    return min(step, STEPS) * VOXELS_A_STEP
-
-
-@leaf
 def row_place(x, y, z):
     """Index into a row's distances of centre (x, y, z), counted from the brick's first: -1 to 8."""
     return ((x + 1) * ROW_SIDE + (y + 1)) * ROW_SIDE + (z + 1)

@@ -86,12 +86,6 @@ class DistanceFieldLaw(NamedTuple):
 DISTANCE_FIELD = fields_of(DistanceFieldLaw, FLOAT)
 
 
-@leaf
-def _distance_between(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z):
-    """Distance u, voxels, between 8 stored values, at most `STEPS`; x, y, z from centre 000."""
-    return VOXELS_A_STEP * trilinear(q000, q001, q010, q011, q100, q101, q110, q111, x, y, z)
-
-
 def _least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
     """U at a point, in voxels from the grid's origin, from rows first .. end - 1 of its brick.
 
@@ -118,7 +112,7 @@ def _least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
             q101 = min(q101, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE + 1]))
             q110 = min(q110, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1)]))
             q111 = min(q111, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1) + 1]))
-    return _distance_between(
+    return VOXELS_A_STEP * trilinear(
         q000, q001, q010, q011, q100, q101, q110, q111, x - 0.5 - x0, y - 0.5 - y0, z - 0.5 - z0
     )
 

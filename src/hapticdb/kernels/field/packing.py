@@ -317,19 +317,9 @@ def unpack_kernel(data, ends, wanted, out):
 
 
 def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Pack rows of distances.
+    """Pack rows of distances (R, 1000) -> packed bytes (n,), and where each row ends in them (R,).
 
-    Parameters
-    ----------
-    values : NDArray[np.uint8]
-        (R, 1000), stored values as `lattice` has them, k fastest.
-
-    Returns
-    -------
-    data : NDArray[np.uint8]
-        (n,) packed bytes, row after row. Equal rows give equal bytes, whatever stands beside them.
-    ends : NDArray[np.int64]
-        (R,) where the bytes of each row end in `data`.
+    Equal rows give equal bytes, whatever stands beside them.
     """
     rows = np.ascontiguousarray(values, dtype=np.uint8).reshape(-1, ROW_VALUES)
     ends = np.empty(len(rows), dtype=np.int64)
@@ -348,21 +338,9 @@ def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64
 def unpack(
     data: NDArray[np.uint8], ends: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None
 ) -> NDArray[np.uint8]:
-    """Unpack rows of distances.
+    """Unpack the wanted rows (R,) of distances, or all: (R, 1000), unset where not wanted.
 
-    Parameters
-    ----------
-    data : NDArray[np.uint8]
-        (n,) packed bytes, row after row. They may be damaged.
-    ends : NDArray[np.int64]
-        (R,) where the bytes of each row end in `data`.
-    wanted : NDArray[np.bool_] or None
-        (R,) rows to unpack; all unless given.
-
-    Returns
-    -------
-    values : NDArray[np.uint8]
-        (R, 1000). Rows that are not wanted are left unset.
+    data (n,) and ends (R,) as `pack` gives them, or damaged.
 
     Raises
     ------

@@ -120,16 +120,19 @@ def second_derivatives(payload, slot, x, y, z):
 
 
 @inlined
+def _lowest_centre(x, y, z):
+    """Index of the lowest of the 8 centres around a point, and the way from it to the point."""
+    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
+    bx, by, bz = np.int64(tx < 0.0), np.int64(ty < 0.0), np.int64(tz < 0.0)
+    at = cell_place((np.int64(x) & 31) - bx, (np.int64(y) & 31) - by, (np.int64(z) & 31) - bz)
+    return at, tx + bx, ty + by, tz + bz
+
+
+@inlined
 def lower_bound(payload, slot, x, y, z):
     """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
-    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
-    at = cell_place(
-        (np.int64(x) & 31) - np.int64(tx < 0.0),
-        (np.int64(y) & 31) - np.int64(ty < 0.0),
-        (np.int64(z) & 31) - np.int64(tz < 0.0),
-    )
+    at, lx, ly, lz = _lowest_centre(x, y, z)
     # squares of the ways to the lower and the upper centres
-    lx, ly, lz = tx + np.int64(tx < 0.0), ty + np.int64(ty < 0.0), tz + np.int64(tz < 0.0)
     ux, uy, uz = (1.0 - lx) * (1.0 - lx), (1.0 - ly) * (1.0 - ly), (1.0 - lz) * (1.0 - lz)
     lx, ly, lz = lx * lx, ly * ly, lz * lz
     best = 0.0
@@ -149,13 +152,7 @@ def upper_bound(payload, slot, x, y, z):
 
     Infinite if all of them are farther than h from every surface.
     """
-    tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
-    at = cell_place(
-        (np.int64(x) & 31) - np.int64(tx < 0.0),
-        (np.int64(y) & 31) - np.int64(ty < 0.0),
-        (np.int64(z) & 31) - np.int64(tz < 0.0),
-    )
-    lx, ly, lz = tx + np.int64(tx < 0.0), ty + np.int64(ty < 0.0), tz + np.int64(tz < 0.0)
+    at, lx, ly, lz = _lowest_centre(x, y, z)
     best = np.inf
     for corner in range(8):
         dx = 1.0 - lx if corner & 4 else lx

@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 from hapticdb.kernels._jit import FLOAT, fields_of, leaf
-from hapticdb.kernels.rigid import moment, product, turn, turn_of
+from hapticdb.kernels.rigid import moment, product, turn, turn_of, turned_by
 
 BEYOND_CAP = 1.2
 """Most force of the spring, in caps of the device. Larger: the tool is pressed harder than the hand
@@ -84,14 +84,7 @@ def measure_pull(spring, tool, hand, pose, center, follower):
 def lever_in_hand(hand, center):
     """Lever from the handle's origin to the centre (3,) of a tool at the handle, m, world frame."""
     w, x, y, z = hand.quaternion[0], hand.quaternion[1], hand.quaternion[2], hand.quaternion[3]
-    cx, cy, cz = center[0], center[1], center[2]
-    # by the quaternion: c + 2 q_v x (q_v x c + w c)
-    ux, uy, uz = y * cz - z * cy + w * cx, z * cx - x * cz + w * cy, x * cy - y * cx + w * cz
-    return (
-        cx + 2.0 * (y * uz - z * uy),
-        cy + 2.0 * (z * ux - x * uz),
-        cz + 2.0 * (x * uy - y * ux),
-    )
+    return turned_by(w, x, y, z, center[0], center[1], center[2])
 
 
 @leaf

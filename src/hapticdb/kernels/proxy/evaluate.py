@@ -16,7 +16,7 @@ from hapticdb.kernels._jit import FLOATS, entry, leaf, record_of
 from hapticdb.kernels.hand.device_spring import BEYOND_CAP, shortened
 from hapticdb.kernels.hand.step import add_row, factor
 from hapticdb.kernels.records import CONTACT_MODEL
-from hapticdb.kernels.rigid import moment, product, quaternion_by, turn_of
+from hapticdb.kernels.rigid import moment, product, quaternion_by, turn_of, turned_by
 
 STEPS = 5
 """Most Gauss-Newton steps of an evaluation. Larger: nearer to the balance far from the proxy's pose
@@ -30,13 +30,6 @@ WRENCH, WAY, ACTIVE, RESULTS = 0, 6, 7, 8
 """Indices into an evaluation's result (RESULTS,): wrench on the hand about the handle's origin, N
 and N m; way of the tool's farthest point in the hand since the proxy's pose, m; number of contacts
 that push."""
-
-
-@leaf
-def _turned_by(w, x, y, z, a, b, c):
-    """Vector (a, b, c) turned by a unit quaternion."""
-    ux, uy, uz = y * c - z * b + w * a, z * a - x * c + w * b, x * b - y * a + w * c
-    return a + 2.0 * (y * uz - z * uy), b + 2.0 * (z * ux - x * uz), c + 2.0 * (x * uy - y * ux)
 
 
 @leaf
@@ -77,7 +70,7 @@ def _place_contacts(model):
         lever, normal, along, bends = (
             model.levers[n], model.normals[n], model.along[n], model.bends[n],
         )  # fmt: skip
-        rx, ry, rz = _turned_by(tw, tx, ty, tz, lever[0], lever[1], lever[2])
+        rx, ry, rz = turned_by(tw, tx, ty, tz, lever[0], lever[1], lever[2])
         dx = at[0] - first[0] + rx - lever[0]
         dy = at[1] - first[1] + ry - lever[1]
         dz = at[2] - first[2] + rz - lever[2]
@@ -205,7 +198,7 @@ def evaluate(model_record, hand, result):
     """
     model = model_record[()]
     center = model.center
-    rx, ry, rz = _turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
+    rx, ry, rz = turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
     for axis in range(3):
         model.position[axis] = model.tool[axis]
     for part in range(4):

@@ -166,25 +166,16 @@ def locate(
     points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; origin (3,)
     and size in metres; shift 0 for voxel rows, 9 for brick rows.
 
-    Returns
-    -------
-    placed : (N + 1, 6) float64
-        Each point in metres and its normal, world frame; last the centre.
-    asked : (2, N) int64
-        Each point's address and slot. The address is the key on voxel rows, the brick's key << 9 |
-        bit number on brick rows; the slot its row key's place in `keys`; both -1 outside the grid.
-    keys : (U,) int64
-        Distinct row keys, ascending.
+    Returns placed (N + 1, 6): each point in metres and its normal, world frame, last the centre;
+    asked (2, N): each point's address and slot, both -1 outside the grid; keys (U,): distinct row
+    keys, ascending. The address is the key on voxel rows, the brick's key << 9 | bit number on
+    brick rows; the slot is the row key's place in `keys`. An array that a kernel returns costs
+    twice as much as one that it is given, so all are made here.
 
     Raises
     ------
     ValueError
         When the pose is not rigid.
-
-    Notes
-    -----
-    Few arrays cross into the kernel, and it writes into arrays made here: an array that a kernel
-    returns costs 0.6 us, twice as much as an array that it is given.
     """
     total = points.shape[0]
     placed = np.empty((total + 1, 6))

@@ -62,9 +62,9 @@ def _rows_up_to(x, after, bounds, rows_per_bucket):
     return _rows_below_bound(x + 1, after, bounds, rows_per_bucket)
 
 
-@entry(INT, INT, INTS, FLOAT)
-def gap_rows(left, right, bounds, rows_per_bucket):
-    """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
+@leaf
+def _rows_between(left, right, bounds, rows_per_bucket):
+    """Expected rows with a key in [left, right]."""
     if right < left:
         return 0.0
     at = first_bound(left, bounds, np.int64(0))
@@ -72,6 +72,12 @@ def gap_rows(left, right, bounds, rows_per_bucket):
     return _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
         left, at, bounds, rows_per_bucket
     )
+
+
+@entry(INT, INT, INTS, FLOAT)
+def gap_rows(left, right, bounds, rows_per_bucket):
+    """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
+    return _rows_between(left, right, bounds, rows_per_bucket)
 
 
 @entry(INTS, INTS, INTS, INT)
@@ -141,14 +147,7 @@ def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_
     count = 0
     for n in range(lows.shape[0]):
         if count > 0:
-            left, right = highs[count - 1] + 1, lows[n] - 1
-            expected = 0.0
-            if left <= right:
-                at = first_bound(left, bounds, np.int64(0))
-                after = _bound_after(right, bounds, at)
-                expected = _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
-                    left, at, bounds, rows_per_bucket
-                )
+            expected = _rows_between(highs[count - 1] + 1, lows[n] - 1, bounds, rows_per_bucket)
             if expected * row_cost <= descent_cost:
                 highs[count - 1] = highs[n]
                 continue

@@ -19,7 +19,7 @@ from hapticdb.kernels._jit import (
     entry,
     leaf,
 )
-from hapticdb.kernels.curves import compact, key_of, voxel_of
+from hapticdb.kernels.curves import compact, decode, encode, voxel_of
 from hapticdb.kernels.field.lattice import (
     BEYOND,
     CELL_VALUES,
@@ -37,6 +37,7 @@ from hapticdb.kernels.resident.cells import (
     READER_STRIDE,
     REVISION,
     VERSION,
+    Ints,
     brick_bit,
     cell_key,
     cell_of_key,
@@ -56,11 +57,8 @@ NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
 @entry(INTS2, INTS32_2, INT, INTS, INTS)
 def insert_cells(keys, slots, which, new_keys, new_slots):
     """Enter cells (n,) in directory `which`; cells that are there already get the new slots."""
-    capacity = keys.shape[1]
     for n in range(new_keys.shape[0]):
-        at = spread_key(new_keys[n], capacity)
-        while keys[which, at] >= 0 and keys[which, at] != new_keys[n]:
-            at = (at + 1) & (capacity - 1)
+        at = place_in_set(keys[which], new_keys[n])
         slots[which, at] = new_slots[n]
         keys[which, at] = new_keys[n]
 
@@ -70,12 +68,9 @@ def remove_cells(keys, slots, which, old_keys):
     """Remove cells (n,) from directory `which`; later entries of the same run move up."""
     capacity = keys.shape[1]
     for n in range(old_keys.shape[0]):
-        at = spread_key(old_keys[n], capacity)
-        while keys[which, at] >= 0 and keys[which, at] != old_keys[n]:
-            at = (at + 1) & (capacity - 1)
+        at = hole = place_in_set(keys[which], old_keys[n])
         if keys[which, at] < 0:
             continue
-        hole = at
         while True:
             at = (at + 1) & (capacity - 1)
             if keys[which, at] < 0:
@@ -94,6 +89,13 @@ def slots_of_cells(keys, slots, which, asked, out):
     """Write slots (n,) of cells (n,) in directory `which`, UNKNOWN for a cell without an entry."""
     for n in range(asked.shape[0]):
         out[n] = slot_of(keys, slots, which, asked[n])
+
+
+@leaf
+def _is_in(number, numbers):
+    """Whether a number is among numbers (n,), ascending."""
+    at = first_bound(number, numbers, np.int64(0))
+    return at < numbers.shape[0] and numbers[at] == number
 
 
 @leaf
@@ -133,7 +135,6 @@ def fill_cells(
     other cells are skipped.
     """
     n_cells = cell_keys.shape[0]
-    n_excluded = exclude.shape[0]
     has_bits = occupancy.shape[0] > 0
     at = 0
     for row in range(row_keys.shape[0]):
@@ -145,10 +146,8 @@ def fill_cells(
             break
         if cell_keys[at] != cell:
             continue
-        if n_excluded > 0:
-            found = first_bound(row_ids[row], exclude, np.int64(0))
-            if found < n_excluded and exclude[found] == row_ids[row]:
-                continue
+        if _is_in(row_ids[row], exclude):
+            continue
         slot = places[at]
         if has_bits:
             i, j, k = voxel_of(row_key, max(bits - 3, 0), curve)
@@ -196,7 +195,6 @@ def fill_distances(
     without a row stays as it was, and its mask has no bit. Returns the slot that was filled last.
     """
     n_cells = cell_keys.shape[0]
-    n_excluded = exclude.shape[0]
     at = 0
     last_brick = min(1 << bits, 32) - 8
     for row in range(row_keys.shape[0]):
@@ -207,10 +205,8 @@ def fill_distances(
             break
         if cell_keys[at] != cell:
             continue
-        if n_excluded > 0:
-            found = first_bound(row_ids[row], exclude, np.int64(0))
-            if found < n_excluded and exclude[found] == row_ids[row]:
-                continue
+        if _is_in(row_ids[row], exclude):
+            continue
         slot = places[at]
         if slot != before:
             before = slot
@@ -223,22 +219,17 @@ def fill_distances(
     return before
 
 
-@entry(INTS, INT, INT, INTS)
-def curve_keys_of_cells(cells, bits, curve, out):
-    """Write keys on the curve (voxel keys >> 15) of cells (n,), given by directory keys."""
-    level = max(bits - 5, 0)
-    for n in range(cells.shape[0]):
-        ci, cj, ck = cell_of_key(cells[n])
-        out[n] = key_of(ci, cj, ck, level, curve)
+def curve_keys_of_cells(cells: Ints, bits: int, curve: int) -> Ints:
+    """Keys on the curve (voxel keys >> 15) of cells (n,), given by directory keys."""
+    ijk = np.stack([cells >> 32, (cells >> 16) & 0xFFFF, cells & 0xFFFF], axis=1)
+    return encode(ijk, max(bits - 5, 0), curve)
 
 
-@entry(INTS, INT, INT, INTS)
-def cells_of_curve_keys(curve_keys, bits, curve, out):
-    """Write directory keys of cells (n,) on the curve; undoes `curve_keys_of_cells`."""
-    level = max(bits - 5, 0)
-    for n in range(curve_keys.shape[0]):
-        ci, cj, ck = voxel_of(curve_keys[n], level, curve)
-        out[n] = key_of_cell(ci, cj, ck)
+def cells_of_curve_keys(curve_keys: Ints, bits: int, curve: int) -> Ints:
+    """Directory keys of cells (n,) on the curve; undoes `curve_keys_of_cells`."""
+    i, j, k = decode(curve_keys, max(bits - 5, 0), curve).T
+    cells: Ints = (i << 32) | (j << 16) | k
+    return cells
 
 
 @entry(INTS, INTS, BYTES, INT, INT, INT, INTS)

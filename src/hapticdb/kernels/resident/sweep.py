@@ -15,7 +15,6 @@ from hapticdb.kernels._jit import (
     FLOATS3,
     INT,
     INTS,
-    INTS2,
     entry,
     fields_of,
     inlined,
@@ -122,14 +121,10 @@ def unpacked(voxel):
     return voxel >> (2 * AXIS_BITS), (voxel >> AXIS_BITS) & AXIS_MASK, voxel & AXIS_MASK
 
 
-@entry(INTS, INTS2)
-def unpack(voxels, out):
-    """Undo `packed` for voxels (n,) int64 into out (n, 3)."""
-    for n in range(voxels.shape[0]):
-        i, j, k = unpacked(voxels[n])
-        out[n, 0] = i
-        out[n, 1] = j
-        out[n, 2] = k
+def unpack(voxels: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Voxels (n, 3) of numbers (n,)."""
+    rest = voxels >> AXIS_BITS
+    return np.stack([rest >> AXIS_BITS, rest & AXIS_MASK, voxels & AXIS_MASK], axis=1)
 
 
 @inlined

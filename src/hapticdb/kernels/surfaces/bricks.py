@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf, maker
-from hapticdb.kernels.curves import compact, z_encode
+from hapticdb.kernels.curves import Z_ORDER, compact, encode
 
 FIRST_CAPACITY = np.int64(256)
 """Bricks for which a new table has room. A larger value costs each small part time to clear it."""
@@ -167,16 +167,6 @@ def mark_runs(table, n_bricks, runs, n_runs):
         table = grown(table, n_bricks, n_bricks + bricks_of_run(first, last))
 
 
-@entry(INTS, INTS)
-def z_keys_kernel(packed, out):
-    """Z-order keys of the first B bricks. packed (C,) int64; out (B,) int64."""
-    for n in range(out.shape[0]):
-        key = packed[n]
-        out[n] = z_encode(
-            key >> (2 * PACKED_BITS), (key >> PACKED_BITS) & PACKED_MASK, key & PACKED_MASK
-        )
-
-
 @entry(FLOATS2, INT)
 def mark_points_kernel(points, bits):
     """Mark the voxels that hold points (N, 3), half-open. Returns packed keys, words, count."""
@@ -198,25 +188,6 @@ def mark_points_kernel(points, bits):
         n_runs += 1
     table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
     return table.keys, table.words, n_bricks
-
-
-@leaf
-def ones(x):
-    """Count the bits set in x, 0 <= x < 2^32."""
-    x -= (x >> 1) & 0x55555555
-    x = (x & 0x33333333) + ((x >> 2) & 0x33333333)
-    x = (x + (x >> 4)) & 0x0F0F0F0F
-    return ((x * 0x01010101) >> 24) & 0xFF
-
-
-@entry(INTS)
-def count_kernel(words):
-    """Count the bits set in words (W,) int64."""
-    total = 0
-    for n in range(words.shape[0]):
-        word = words[n]
-        total += ones(word & 0xFFFFFFFF) + ones((word >> 32) & 0xFFFFFFFF)
-    return total
 
 
 @entry(INTS, INTS2, INTS2)
@@ -245,8 +216,10 @@ def sorted_bricks(
     packed: NDArray[np.int64], words: NDArray[np.int64], n_bricks: int
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
     """First `n_bricks` of packed keys and words in Z-order: keys (B,), occupancy (B, 64)."""
-    bricks_z = np.empty(n_bricks, dtype=np.int64)
-    z_keys_kernel(packed, bricks_z)
+    keys = packed[:n_bricks]
+    rest = keys >> PACKED_BITS
+    places = np.stack([rest >> PACKED_BITS, rest & PACKED_MASK, keys & PACKED_MASK], axis=1)
+    bricks_z = encode(places, PACKED_BITS, Z_ORDER)
     order = np.argsort(bricks_z)
     return bricks_z[order], words[order].astype("<i8", copy=False).view(np.uint8)
 
@@ -254,45 +227,24 @@ def sorted_bricks(
 def mark_points(
     points: NDArray[np.float64], bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Bricks of the voxels that hold points.
+    """Bricks of the voxels that hold points (N, 3), as `voxelize.voxelize` returns them.
 
-    Parameters
-    ----------
-    points : NDArray[np.float64]
-        (N, 3), in voxels from the grid's origin. Those outside the grid, or not finite, are left
-        out.
-    bits : int
-        Bits an axis of the grid, 1 to 21.
-
-    Returns
-    -------
-    bricks_z : NDArray[np.int64]
-        (B,) Z-order keys of the bricks, ascending, each once.
-    occupancy : NDArray[np.uint8]
-        (B, 64), bit number n the voxel of Z-order n modulo 8, least significant first.
-
-    Notes
-    -----
-    Boxes are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
+    In voxels from the grid's origin; points outside the grid, or not finite, are left out. Boxes
+    are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
     """
     in_voxels = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
     return sorted_bricks(*mark_points_kernel(in_voxels, bits))
 
 
-def _words_of(occupancy: NDArray[np.uint8]) -> NDArray[np.int64]:
-    """Words (B, 8) of occupancies (B, 64), in this machine's byte order."""
-    contiguous = np.ascontiguousarray(occupancy, dtype=np.uint8).reshape(-1, 64)
-    return contiguous.view("<i8").astype(np.int64, copy=False)
-
-
 def count_voxels(occupancy: NDArray[np.uint8]) -> int:
     """Count the voxels set in occupancies (B, 64)."""
-    return int(count_kernel(_words_of(occupancy).reshape(-1)))
+    return int.from_bytes(occupancy.tobytes(), "little").bit_count()
 
 
 def brick_voxels(bricks_z: NDArray[np.int64], occupancy: NDArray[np.uint8]) -> NDArray[np.int64]:
     """Voxels (n, 3) of bricks (B,) with occupancies (B, 64): by brick, then by bit number."""
-    words = _words_of(occupancy)
-    out = np.empty((int(count_kernel(words.reshape(-1))), 3), dtype=np.int64)
+    contiguous = np.ascontiguousarray(occupancy, dtype=np.uint8).reshape(-1, 64)
+    words = contiguous.view("<i8").astype(np.int64, copy=False)
+    out = np.empty((count_voxels(contiguous), 3), dtype=np.int64)
     brick_voxels_kernel(np.ascontiguousarray(bricks_z, dtype=np.int64), words, out)
     return out

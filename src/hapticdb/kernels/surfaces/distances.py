@@ -451,28 +451,15 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
 def band_pieces(
     triangles: NDArray[np.float64], bits: int, rows: int = ROWS_OF_PIECE
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]]:
-    """Band of triangles or points, a bounded number of rows and a bounded time at once.
+    """Band of triangles (T, 3, 3), or points (P, 1, 3), a bounded time and number of rows at once.
 
-    Parameters
-    ----------
-    triangles : NDArray[np.float64]
-        (T, 3, 3) corners of triangles, or (P, 1, 3) points, in voxels from the grid's origin,
-        finite. A triangle may be a line or a point. What lies outside the grid counts where it is
-        near.
-    bits : int
-        Bits an axis of the grid, 1 to 21.
-    rows : int
-        Most rows of a piece; at least `BLOCK_BRICKS`.
+    Corners in voxels from the grid's origin, finite; a triangle may be a line or a point. What lies
+    outside the grid of `bits` bits an axis, 1 to 21, counts where it is near. rows: most of a
+    piece, at least `BLOCK_BRICKS`.
 
-    Yields
-    ------
-    share : float
-        How much is done, 0 to 1.
-    bricks_z : NDArray[np.int64]
-        (R,) Z-order keys of bricks, ascending through all pieces, each once: all bricks of the
-        grid whose row has a distance of up to h. A piece may have none.
-    data, ends : arrays
-        Their packed rows, as `hapticdb.kernels.field.packing.pack` gives them.
+    Yields the share that is done, 0 to 1; the Z-order keys (R,) of all bricks whose row has a
+    distance of up to h, ascending through all pieces, each once; and their packed rows, data and
+    ends, as `packing.pack` gives them. A piece may have none.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64)
     keys = np.empty(rows, dtype=np.int64)

@@ -126,20 +126,15 @@ def distances_to(
 ) -> Floats:
     """Distances (Q,) of places (Q, 3) to a tree's triangles; arguments as for the kernel."""
     nobody = np.full(len(places), -1, dtype=np.int64)
-    return _distances(tree, places, nobody, np.zeros((len(places), 3)), -1.0, enough, farthest)
+    normals = np.zeros((len(places), 3))
+    return distances_to_others(tree, places, nobody, normals, -1.0, farthest, enough)
 
 
 def distances_to_others(
-    tree: TriangleTree, places: Floats, own: Ints, normals: Floats, flat: float, farthest: float
-) -> Floats:
-    """Distances (Q,) of places (Q, 3) to triangles of other bodies than their `own`."""
-    return _distances(tree, places, own, normals, flat, 0.0, farthest)
-
-
-def _distances(
-    tree: TriangleTree, places: Floats, own: Ints, normals: Floats, flat: float, enough: float,
-    farthest: float,
+    tree: TriangleTree, places: Floats, own: Ints, normals: Floats, flat: float, farthest: float,
+    enough: float = 0.0,
 ) -> Floats:  # fmt: skip
+    """Distances (Q,) of places (Q, 3) to triangles of other bodies than their `own`."""
     out = np.empty(len(places))
     distances_kernel(
         tree, np.ascontiguousarray(places), np.ascontiguousarray(own),

@@ -158,20 +158,11 @@ def spread_points(
     spacing: float,
     opposite: float = 0.35,
 ) -> NDArray[np.intp]:
-    """Choose `n_keep` of M candidates, as far from one another as elimination makes them.
+    """Choose `n_keep` of M candidates, as far apart as elimination makes them: ascending indices.
 
-    Parameters
-    ----------
-    points : (M, 3) candidates, uniform over the surface; M >= n_keep.
-    face_of : (M,) face of each.
-    normals : (F, 3) unit normals of the faces, all to the same side of the surface.
-    n_keep : candidates to keep.
-    spacing : distance of neighbours if the points kept were a hexagonal lattice.
-    opposite : reach across a sheet, as a part of the spacing.
-
-    Returns
-    -------
-    (n_keep,) indices, ascending.
+    points (M, 3), uniform over the surface; face_of (M,); normals (F, 3) of the faces, unit, all to
+    the same side; spacing: distance of neighbours if the points kept were a hexagonal lattice;
+    opposite: reach across a sheet, as a part of the spacing.
     """
     cells = _sort_into_cells(points, spacing)
     while cells.crowd > CROWD:  # sheets folded upon one another

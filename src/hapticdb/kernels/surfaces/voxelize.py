@@ -427,16 +427,10 @@ def voxelize_kernel(triangles, bits, resume, most):
 def voxelize_pieces(
     triangles: NDArray[np.float64], bits: int, most: int = MOST_BRICKS
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
-    """Bricks of the voxels that triangles meet, a bounded number at a time.
+    """What `voxelize` returns, a bounded number of bricks at a time, after the share that is done.
 
-    The parameters are those of `voxelize`.
-
-    Yields
-    ------
-    share : float
-        Of the triangles that are done, 0 to 1; within a triangle by its rows.
-    bricks_z, occupancy : arrays
-        As `voxelize` returns them. Pieces may have bricks in common, whose bits add.
+    The share is 0 to 1, within a triangle by its rows. Pieces may have bricks in common, whose bits
+    add.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
     resume = np.array([0, -1, 0, 0], dtype=np.int64)
@@ -451,28 +445,12 @@ def voxelize_pieces(
 def voxelize(
     triangles: NDArray[np.float64], bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Bricks of the voxels that triangles meet.
+    """Bricks of the voxels that triangles (T, 3, 3) meet -> Z-order keys (B,), occupancy (B, 64).
 
-    Parameters
-    ----------
-    triangles : NDArray[np.float64]
-        (T, 3, 3), corners in voxels from the grid's origin, finite. What lies outside the grid is
-        cut off.
-    bits : int
-        Bits an axis of the grid, 1 to 21.
-
-    Returns
-    -------
-    bricks_z : NDArray[np.int64]
-        (B,) Z-order keys of the bricks, ascending, each once.
-    occupancy : NDArray[np.uint8]
-        (B, 64), bit number n the voxel of Z-order n modulo 8, least significant first.
-
-    Notes
-    -----
-    Boxes are closed: a triangle in the plane between two layers of voxels marks both. The result
-    is the union over the triangles, in any order. Holds no interpreter lock and no state
-    of its own, so that threads may voxelize different parts at once.
+    Corners in voxels from the grid's origin, finite; what lies outside the grid of `bits` bits an
+    axis, 1 to 21, is cut off. Keys are ascending, each once; bit number n of an occupancy is the
+    voxel of Z-order n modulo 8, least significant first. Boxes are closed: a triangle in the plane
+    between two layers of voxels marks both. Threads may voxelize different parts at once.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
     resume = np.array([0, -1, 0, 0], dtype=np.int64)

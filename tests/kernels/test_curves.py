@@ -1,7 +1,7 @@
 """The three curves: compared with bitwise definitions in plain Python, and their properties."""
 
 from collections.abc import Callable
-from itertools import pairwise, product
+from itertools import product
 
 import numba
 import numpy as np
@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb.kernels.curves import HILBERT, LEXICOGRAPHIC, Z_ORDER, decode, encode
-from naive import Voxel, z_order
+from naive import Voxel
 
 JIT = not numba.config.DISABLE_JIT
 few = settings(max_examples=300 if JIT else 60, deadline=None)
@@ -98,15 +98,6 @@ def test_every_voxel_of_a_small_grid_has_the_defined_key(bits: int, curve: int) 
 
 
 @curves
-@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
-def test_a_curve_visits_every_voxel_once(bits: int, curve: int) -> None:
-    voxels = cube(bits)
-    keys = encode(voxels, bits, curve)
-    assert np.sort(keys).tolist() == list(range(8**bits))
-    np.testing.assert_array_equal(decode(keys, bits, curve), voxels)
-
-
-@curves
 @few
 @given(chosen=voxels_and_bits())
 def test_any_voxel_returns_from_its_defined_key(
@@ -121,24 +112,6 @@ def test_any_voxel_returns_from_its_defined_key(
     assert [list(DEFINITIONS[curve](key, bits)) for key in keys.tolist()] == voxels
 
 
-@few
-@given(chosen=voxels_and_bits())
-def test_the_z_order_agrees_with_the_oracle_of_the_voxelizer(
-    chosen: tuple[int, list[list[int]]],
-) -> None:
-    bits, voxels = chosen
-    assert encode(np.array(voxels), bits, Z_ORDER).tolist() == [z_order(*v) for v in voxels]
-
-
-@curves
-def test_the_corners_of_the_largest_grid_return(curve: int) -> None:
-    corners = np.array(list(product((0, 1, LAST - 1, LAST), repeat=3)), dtype=np.int64)
-    keys = encode(corners, 21, curve)
-    np.testing.assert_array_equal(decode(keys, 21, curve), corners)
-    assert [list(DEFINITIONS[curve](key, 21)) for key in keys.tolist()] == corners.tolist()
-    assert len(set(keys.tolist())) == len(corners)
-
-
 @curves
 def test_the_keys_of_the_largest_grid_fill_63_bits(curve: int) -> None:
     ends = np.array([0, 2**63 - 1], dtype=np.int64)
@@ -148,22 +121,6 @@ def test_the_keys_of_the_largest_grid_fill_63_bits(curve: int) -> None:
     assert voxels[0].tolist() == [0, 0, 0]
     # the Hilbert curve ends beside its start, the others at the far corner
     assert voxels[1].tolist() == ([LAST, 0, 0] if curve == HILBERT else [LAST] * 3)
-
-
-@curves
-@pytest.mark.parametrize("bits", [1, 7, 21])
-def test_i_is_the_most_significant_axis(bits: int, curve: int) -> None:
-    """The lower half of the keys is the lower half of i."""
-    half = 8**bits // 2
-    keys = np.array([0, half - 1, half, 2 * half - 1], dtype=np.int64)
-    voxels = decode(keys, bits, curve)
-    assert (voxels[:, 0] >> (bits - 1)).tolist() == [0, 0, 1, 1]
-
-
-@pytest.mark.parametrize("bits", [1, 2, 3, 4, 5])
-def test_neighbours_on_the_hilbert_curve_share_a_face(bits: int) -> None:
-    path = decode(np.arange(8**bits), bits, HILBERT)
-    assert (np.abs(np.diff(path, axis=0)).sum(axis=1) == 1).all()
 
 
 @few
@@ -186,13 +143,6 @@ def test_leading_bits_name_the_cube_that_holds_the_voxel(
     for level in range(1, bits):
         parents = encode(np.array(voxels) >> level, bits - level, curve)
         np.testing.assert_array_equal(keys >> (3 * level), parents)
-
-
-@hierarchical
-def test_the_voxels_of_a_cube_have_neighbouring_keys(curve: int) -> None:
-    """Because of this property a brick needs only one key."""
-    keys = encode(cube(3) + np.array([8, 24, 16]), 5, curve)
-    assert all(b - a == 1 for a, b in pairwise(sorted(keys.tolist())))
 
 
 @curves

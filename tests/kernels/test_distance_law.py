@@ -4,7 +4,6 @@ Bands are made by brute force from triangles (`bands`), without a database.
 """
 
 from functools import cache
-from typing import Any
 
 import numpy as np
 import pytest
@@ -280,32 +279,25 @@ def test_a_point_that_counts_is_near_a_voxel(seed: int) -> None:
             assert distance_at((x, y, z), scene.fields.values()) > field.REACH
 
 
-def test_the_reach_stays_inside_the_band() -> None:
-    assert field.ONSET + field.BLENDING == field.REACH < HALF_WIDTH - field.LARGEST_ERROR
-
-
 # --- closed forms (physics.md) -------------------------------------------------------------------
 
 PLANE_AT = 20.0
 
 
 @cache
-def sheet(turn: int = 0, shift: tuple[int, int, int] = (0, 0, 0)) -> Merged:
-    """A square in the plane z = 20 voxels, `turn` quarter turns about x from there, shifted."""
+def sheet() -> Merged:
+    """A square in the plane z = 20 voxels."""
     corners = np.array([[8.0, 8, 0], [56, 8, 0], [56, 56, 0], [8, 56, 0]])
     corners[:, 2] = PLANE_AT
-    square = np.array([corners[[0, 1, 2]], corners[[0, 2, 3]]]) - 32.0
-    for _ in range(turn):
-        square = square[..., [0, 2, 1]] * [1.0, -1.0, 1.0]
-    square = square + 32.0 + np.array(shift)
+    square = np.array([corners[[0, 1, 2]], corners[[0, 2, 3]]])
     return Merged([band_rows(np.array(ORIGIN) + SIZE * square, grid_of())])
 
 
-def frame(scene: Merged, points: Array, normals: Array, **options: Any) -> Array:  # noqa: ANN401
+def frame(scene: Merged, points: Array, normals: Array) -> Array:
     """Wrench (6,) of points (N, 3), voxels from the origin, about the first one's place."""
     placed = np.array(ORIGIN) + SIZE * points
     shell = PointShell(points=placed, normals=normals, center=placed[0])
-    return on_rows(scene, grid_of(), shell, np.eye(4), options.get("exclude", []))[0][0]
+    return on_rows(scene, grid_of(), shell, np.eye(4), [])[0][0]
 
 
 UP = np.array([[0.0, 0.0, 1.0]])
@@ -332,37 +324,6 @@ def test_a_flat_punch_is_averaged_from_ten_points_on(n_points: int) -> None:
     one = frame(sheet(), points[:1], UP)[2]
     assert one == pytest.approx(1000.0 * SIZE * 0.5, rel=0.02)
     assert felt[2] == pytest.approx(one * n_points / max(1.0, n_points / 10), rel=0.02)
-
-
-def test_far_away_is_exactly_zero() -> None:
-    points = np.array([[30.0, 30, PLANE_AT + 1.6], [30, 30, PLANE_AT + 5], [5, 60, 60]])
-    assert not frame(sheet(), points, np.repeat(UP, 3, axis=0)).any()
-
-
-@pytest.mark.parametrize("turn", [1, 2, 3])
-def test_a_quarter_turn_of_both_turns_the_wrench(turn: int) -> None:
-    rng = np.random.default_rng(turn)
-    points = rng.uniform(-8, 8, (50, 3)) * [1, 1, 0.05] + [0.0, 0, PLANE_AT + 1 - 32]
-    normals = rng.normal(size=(50, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    wanted = frame(sheet(), points + 32.0, normals)
-    assert wanted[:3].any()
-    for _ in range(turn):
-        points = points[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
-        normals = normals[:, [0, 2, 1]] * [1.0, -1.0, 1.0]
-        wanted = wanted[[0, 2, 1, 3, 5, 4]] * [1.0, -1.0, 1.0, 1.0, -1.0, 1.0]
-    np.testing.assert_allclose(frame(sheet(turn), points + 32.0, normals), wanted, atol=1e-9)
-
-
-def test_a_shift_by_whole_voxels_keeps_the_wrench() -> None:
-    shift = (3, -5, 6)
-    rng = np.random.default_rng(4)
-    points = rng.uniform(-8, 8, (50, 3)) * [1, 1, 0.05] + [32.0, 32, PLANE_AT + 1]
-    normals = np.repeat(UP, 50, axis=0)
-    wanted = frame(sheet(), points, normals)
-    np.testing.assert_allclose(
-        frame(sheet(0, shift), points + np.array(shift), normals), wanted, atol=1e-9
-    )
 
 
 def test_two_objects_in_one_place_push_once_and_are_both_told() -> None:

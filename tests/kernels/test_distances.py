@@ -17,7 +17,6 @@ from hapticdb.kernels.surfaces.distances import (
     PAIRS_OF_PIECE,
     band_pieces,
 )
-from hapticdb.kernels.surfaces.voxelize import voxelize
 from naive import z_order
 
 JIT = not numba.config.DISABLE_JIT
@@ -164,15 +163,6 @@ def test_rows_agree_where_they_share_centres(seed: int) -> None:
         here = steps[i : i + 10, j : j + 10, k : k + 10]
         assert ((here == -1) | (here == row)).all()
         here[:] = row
-
-
-@pytest.mark.skipif(not JIT, reason="too slow without the JIT")
-def test_every_occupied_brick_has_a_row() -> None:
-    kinds = [random_triangles(7, kind, 30, 128.0) for kind in KINDS]
-    triangles = np.clip(np.concatenate(kinds), 0, 128)
-    occupied, _ = voxelize(triangles, 7)
-    assert len(occupied) > 100
-    assert np.isin(occupied, band_of(triangles, 7)[0]).all()
 
 
 @pytest.mark.skipif(not JIT, reason="too slow without the JIT")

@@ -63,45 +63,6 @@ def test_expected_rows_are_the_overlaps_over_the_widths(
     assert found == pytest.approx(float(wanted), rel=1e-12, abs=1e-13 * eighths * len(bounds))
 
 
-@few
-@given(
-    bounds=bounds_of(small),
-    cuts=st.lists(small, min_size=3, max_size=8, unique=True).map(sorted),
-)
-def test_rows_of_neighbouring_ranges_add(bounds: list[int], cuts: list[int]) -> None:
-    """Ranges are half-open internally, so each key counts exactly once."""
-    keys = as_keys(bounds)
-    whole = gap_rows(cuts[0], cuts[-1] - 1, keys, 2.0)
-    parts = sum(gap_rows(low, high - 1, keys, 2.0) for low, high in pairwise(cuts))
-    assert parts == pytest.approx(whole, rel=1e-12, abs=1e-12)
-
-
-@few
-@given(bounds=bounds_of(small), ends=st.tuples(small, small))
-def test_an_empty_range_holds_no_rows(bounds: list[int], ends: tuple[int, int]) -> None:
-    low, high = sorted(ends)
-    assert gap_rows(high + 1, low, as_keys(bounds), 1.0) == 0.0
-
-
-@pytest.mark.parametrize(
-    ("left", "right", "wanted"),
-    [
-        (5, 5, 2.2),  # two buckets of zero width, and a fifth of the bucket from 5 on
-        (4, 5, 2.4),
-        (4, 4, 0.2),
-        (6, 9, 0.8),
-        (0, 0, 0.2),
-        (0, 20, 4.0),
-        (10, 10, 0.0),  # the last bound closes the last bucket
-        (11, 20, 0.0),
-    ],
-)
-def test_a_bucket_of_zero_width_counts_whole_where_its_value_lies_in_the_range(
-    left: int, right: int, wanted: float
-) -> None:
-    assert gap_rows(left, right, as_keys([0, 5, 5, 5, 10]), 1.0) == pytest.approx(wanted)
-
-
 def test_the_last_key_of_the_largest_grid_is_counted() -> None:
     bounds = as_keys([0, LAST_KEY - 4, LAST_KEY])
     assert gap_rows(LAST_KEY - 1, LAST_KEY, bounds, 8.0) == pytest.approx(2.0)
@@ -170,19 +131,6 @@ def test_a_box_is_covered_by_a_range_a_slab_in_lexicographic_order(
     assert set(encode(voxels_between(low, high), BITS, LEXICOGRAPHIC).tolist()) <= set(keys)
     assert len(set(keys)) == len(keys)
     assert len(ranges) == high[0] - low[0] + 1
-
-
-@pytest.mark.parametrize(
-    ("curve", "bits"),
-    [(curve, bits) for curve in (LEXICOGRAPHIC, Z_ORDER, HILBERT) for bits in (1, 2, 3)]
-    + [(Z_ORDER, 21), (HILBERT, 21)],
-)
-def test_the_whole_grid_lies_in_its_ranges(curve: int, bits: int) -> None:
-    low = np.zeros(3, dtype=np.int64)
-    ranges = ranges_of_box(low, low + (1 << bits) - 1, bits, curve, min(3, bits))
-    assert ranges.min() == 0
-    assert int(ranges.max()) == 8**bits - 1
-    assert sum(high - low + 1 for low, high in ranges.tolist()) == 8**bits
 
 
 @pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])

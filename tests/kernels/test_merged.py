@@ -66,18 +66,6 @@ def test_a_merged_contact_with_a_plane_is_as_stiff_as_single_ones() -> None:
 
 
 @NEEDS_JIT
-def test_merged_contacts_with_a_curved_surface_push_as_single_ones_do() -> None:
-    """A flat tool on a cylinder of 20 voxels: the line of contact lies between merged points."""
-    field = field_of(cylinder(0.1), SIZE, (2, 2, 2))
-    at = np.array([0.0, 0.0, 0.1]) + PRESSED
-    single, merged = hand_over(field, BROAD, at), hand_over(field, BROAD, at, merges_from=FROM)
-    one, other = press(single, at, 0.01), press(merged, at, 0.01)
-    assert merged.follower["merged"] > 1
-    strength = np.linalg.norm(one[30:], axis=1).max()
-    assert np.linalg.norm(other - one, axis=1).max() <= 0.05 * strength
-
-
-@NEEDS_JIT
 def test_with_fewer_near_points_nothing_changes_bit_for_bit() -> None:
     field = field_of(plane([0.0, 0.0, 1.0]), SIZE)
     few = hand_over(field, BROAD, PRESSED, merges_from=len(BROAD) + 1)

@@ -71,11 +71,6 @@ def test_distances_to_planes_come_back(seed: int) -> None:
     check_round_trip(of_planes(seed, 3))
 
 
-@pytest.mark.parametrize("value", [0, 1, 127, 128, 254, 255])
-def test_constant_rows_come_back(value: int) -> None:
-    check_round_trip(np.full((2, 1000), value, np.uint8))
-
-
 def test_every_residual_comes_back() -> None:
     """A row of 255 but for one value has residuals of that value and its opposite."""
     rows = np.full((256, 1000), lattice.BEYOND, np.uint8)

@@ -114,17 +114,6 @@ def test_a_contact_ends_where_the_hand_lifts_off() -> None:
     assert result[WAY] == pytest.approx(3e-3)
 
 
-def test_a_contact_begins_where_the_hand_comes_down() -> None:
-    field = field_of(plane(UP), SIZE)
-    hand = Hand(field, POINT, [0.0, 0.0, ONSET + 3e-3])
-    hand.rest(3)
-    model = model_of(hand)
-    assert not model["wrench"].any()
-    at = handle(hand)
-    at[2] = ONSET - 1e-3
-    assert evaluated(model, at)[2] == pytest.approx(1.0, rel=0.05)
-
-
 def test_a_free_tool_has_no_planes_and_says_how_far_it_may_move() -> None:
     hand = Hand(field_of(plane(UP), SIZE), POINT, [0.0, 0.0, 0.06])
     hand.rest(3)
@@ -211,17 +200,6 @@ def test_many_points_become_few_planes_that_keep_force_and_tilt() -> None:
     # the face resists a tilt with the whole turning spring
     tilt = evaluated(model, turned(at, np.array([0.02, 0.0, 0.0])))
     assert tilt[3] == pytest.approx(-0.02 * hand.spring.turn_stiffness, rel=0.1)
-
-
-@NEEDS_JIT
-def test_equal_states_give_equal_proxies() -> None:
-    def one() -> Model:
-        field = field_of(corner(), SIZE)
-        points = punch(9, 0.6 * SIZE)
-        at = np.array([3.5 * SIZE, 0.0, ONSET - 1e-3])
-        return model_of(pressed(field, points, at, np.array([0.0, 0.0, 4e-3])))
-
-    assert one().tobytes() == one().tobytes()
 
 
 def slid(hand: Hand, path: Floats, period: int) -> tuple[Floats, Floats]:

@@ -1,6 +1,5 @@
 """Voxelizing, compared with the exact oracle in naive.py: random, degenerate and border cases."""
 
-from concurrent.futures import ThreadPoolExecutor
 from fractions import Fraction
 
 import numba
@@ -10,7 +9,6 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from children import PATIENCE
 from hapticdb.kernels.surfaces.voxelize import (
     brick_voxels,
     count_voxels,
@@ -138,12 +136,6 @@ def test_points_equal_the_oracle(rows: list[tuple[float, ...]]) -> None:
 # --- closed forms -------------------------------------------------------------------------------
 
 
-def test_a_face_between_two_layers_marks_both() -> None:
-    square = rectangle([2, 2, 4], [5, 2, 4], [2, 5, 4])
-    expected = {(i, j, k) for i in range(1, 6) for j in range(1, 6) for k in (3, 4)}
-    assert voxels(square, 3) == expected
-
-
 def touched(low: float, high: float, side: int) -> NDArray[np.int64]:
     """Voxels of an axis whose closed boxes meet low..high."""
     return np.arange(max(int(np.ceil(low)) - 1, 0), min(int(np.floor(high)), side - 1) + 1)
@@ -189,30 +181,10 @@ def test_a_wide_triangle_between_two_layers_marks_both(axis: int, layer: int) ->
     np.testing.assert_array_equal(numbers(found), numbers(np.roll(expected, axis, axis=1)))
 
 
-def test_a_face_inside_a_layer_marks_it_alone() -> None:
-    square = rectangle([2.5, 4.5, 2.5], [5.5, 4.5, 2.5], [2.5, 4.5, 5.5])
-    assert voxels(square, 3) == {(i, 4, k) for i in range(2, 6) for k in range(2, 6)}
-
-
-def test_a_lattice_point_marks_its_eight_voxels() -> None:
-    point = np.full((1, 3, 3), 3.0)
-    assert len(voxels(point, 3)) == 8
-
-
 def test_a_separation_below_the_tolerance_touches() -> None:
     for gap, layers in ((5e-10, {3, 4}), (2e-9, {4})):
         square = rectangle([2, 2, 4 + gap], [5, 2, 4 + gap], [2, 5, 4 + gap])
         assert {k for _, _, k in voxels(square, 3)} == layers
-
-
-def test_halving_the_voxel_marks_four_times_as_many() -> None:
-    rng = np.random.default_rng(1)
-    directions = rng.normal(size=(200 if JIT else 8, 3, 3))
-    tris = 64 + 60 * directions / np.linalg.norm(directions, axis=2, keepdims=True)
-    edge = 7 if JIT else 5
-    tris *= 2.0 ** (edge - 7)
-    counts = [sum(count_voxels(voxelize(t[None] * s, 8)[1]) for t in tris) for s in (1, 2)]
-    assert 3.5 < counts[1] / counts[0] < 4.1
 
 
 # --- what the result does not depend on ---------------------------------------------------------
@@ -232,16 +204,6 @@ def test_order_and_split_of_the_triangles_do_not_matter() -> None:
         cuts = np.sort(rng.integers(0, len(tris), 4))
         united = set().union(*(voxels(part, 6) for part in np.split(shuffled, cuts)))
         assert united == voxels(tris, 6)
-
-
-def test_threads_do_not_matter() -> None:
-    parts = [random_triangles(n, 200 if JIT else 8, 5, 64) for n in range(8)]
-    with ThreadPoolExecutor(4) as pool:
-        together = list(pool.map(lambda part: voxelize(part, 6), parts, timeout=PATIENCE))
-    for part, (keys, occupancy) in zip(parts, together, strict=True):
-        alone = voxelize(part, 6)
-        assert np.array_equal(keys, alone[0])
-        assert np.array_equal(occupancy, alone[1])
 
 
 @few
@@ -285,13 +247,6 @@ def test_a_needle_through_the_grid_marks_what_it_passes(axis: int) -> None:
     assert count_voxels(voxelize(needle, bits)[1]) == 2**bits
 
 
-def test_a_diagonal_through_the_grid_costs_its_length() -> None:
-    bits = 18 if JIT else 9
-    diagonal = np.array([[[0.0] * 3, [2.0**bits] * 3, [2.0**bits] * 3]])
-    # n voxels on the diagonal, and six more at each of the n - 1 vertices between them
-    assert count_voxels(voxelize(diagonal, bits)[1]) == 2**bits + 6 * (2**bits - 1)
-
-
 @pytest.mark.parametrize("far", [1e6, 1e30, 1e300])
 def test_a_triangle_far_beyond_the_grid_is_cut_at_its_borders(far: float) -> None:
     sheet = np.array([[[-far, -far, 5.5], [far, -far, 5.5], [0.0, far, 5.5]]])
@@ -324,21 +279,3 @@ def test_bricks_are_sorted_and_their_bits_in_z_order() -> None:
     assert occupancy.tobytes() == b"".join(expected.values())
     assert keys.dtype == np.int64
     assert occupancy.dtype == np.uint8
-
-
-def test_voxels_of_bricks_come_by_brick_then_by_bit() -> None:
-    tris = random_triangles(6, 10 if JIT else 4, 20, 32)
-    keys, occupancy = voxelize(tris, 5)
-    rows = brick_voxels(keys, occupancy)
-    orders = [z_order(*row) for row in rows.tolist()]
-    assert orders == sorted(orders)
-    assert len(rows) == count_voxels(occupancy) == np.unpackbits(occupancy).sum()
-
-
-def test_full_bricks_count_all_their_voxels() -> None:
-    occupancy = np.full((3, 64), 255, np.uint8)
-    assert count_voxels(occupancy) == 3 * 512
-    rows = brick_voxels(np.array([0, 1, 7]), occupancy)
-    assert rows.min() == 0
-    assert rows.max() == 15
-    assert len(np.unique(rows, axis=0)) == 3 * 512

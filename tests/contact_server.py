@@ -68,7 +68,6 @@ async def serve(
             sys.stdout.flush()
             await server.serve(sockets=[listening])
         contacts.close()
-        sys.stderr.write(f"{contacts.n_proxies} {contacts.seconds}\n")
 
 
 def main() -> None:

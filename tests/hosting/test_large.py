@@ -1,7 +1,6 @@
-"""Hosted sessions of large tools: clusters sleep, broad contacts merge, a budget bounds points."""
+"""Hosted sessions of large tools: clusters sleep, broad contacts merge."""
 
 import os
-import socket
 import threading
 import time
 from collections.abc import Iterator
@@ -17,8 +16,6 @@ import hapticdb.realtime.loop
 from banded import write_points
 from children import joined, until
 from hapticdb import Environment, PointShell
-from hapticdb.errors import UsageError
-from hapticdb.hosting.attached import AttachedHost
 from hapticdb.hosting.board import RING, Board
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
@@ -51,7 +48,6 @@ Floats = NDArray[np.float64]
 Frames = NDArray[np.void]
 RATE = 100.0
 """Frames a second: periods so long that a busy machine keeps them."""
-BUDGET = 150
 ABOVE = at(0.0, 0.0, 0.02)
 
 
@@ -106,7 +102,7 @@ def followed(ground: Ground, asked: SeatRequest, frames: Frames) -> Floats:
             ring=anonymous_memory("ring", ring_bytes(8)), n_ring=8, grid=asked.grid,
             shell=asked.shell, device=still(0.02), law=SMOOTH, coupling=asked.coupling,
             handle=Handle(), timing=Timing(RATE), seconds=1.0, staleness=NEVER_STALE,
-            is_waiting=False, budget_points=asked.budget_points,
+            is_waiting=False,
         )
     )  # fmt: skip
     tool = pose_numbers(loop.tool)
@@ -154,11 +150,8 @@ def test_a_recording_has_the_wrenches_of_the_flat_loop_and_replays_bit_for_bit(
     session = ground.host.begin(plate, ABOVE)
     session.record(tmp_path / "s.hdbrec")
     press(session, ground.height)
-    figures = session.figures()
-    assert (figures.left_out_frames, figures.most_left_out) == (0, 0)
     session.end()
     recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
-    assert recording.header.budget_points is None
     poses = np.empty((len(frames), 4, 4))
     poses_of(np.ascontiguousarray(frames["tool"]), poses)
     with CellTable.create(4 << 20, distances=True) as table:
@@ -168,29 +161,6 @@ def test_a_recording_has_the_wrenches_of_the_flat_loop_and_replays_bit_for_bit(
     assert (flat.hits == frames["hits"]).all()
     assert flat.wrenches.any()
     assert replay(recording, ground.env).is_equal
-
-
-def test_a_budget_is_kept_told_recorded_and_replayed_bit_for_bit(
-    ground: Ground, tmp_path: Path
-) -> None:
-    plate = standing_plate()
-    session = ground.host.begin(plate, ABOVE, budget_points=BUDGET)
-    session.record(tmp_path / "s.hdbrec")
-    press(session, ground.height)
-    figures, frames = session.figures(), frames_of(ground, session)
-    asked = ground.host._running[session.id].request
-    session.end()
-    assert 0 < figures.left_out_frames <= figures.frames
-    assert 0 < figures.most_left_out < len(plate)
-    recording, kept = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
-    assert recording.header.budget_points == BUDGET
-    assert (kept["hits"] <= BUDGET).all()
-    assert kept["wrench"].any()
-    replayed = replay(recording, ground.env)
-    assert replayed.is_equal, replayed.describe()
-    assert replayed.n_compared > len(kept) // 2
-    own = followed(ground, asked, frames)
-    assert own[:, :13].tobytes() == np.hstack([frames["tool"], frames["applied"]]).tobytes()
 
 
 def test_a_cell_that_changes_beside_a_sleeping_tool_is_felt(ground: Ground, tmp_path: Path) -> None:
@@ -220,7 +190,7 @@ def test_clusters_sleep_in_a_worker_and_wake_where_they_come_near(ground: Ground
     session.end()
     rests = []
     for number, height in enumerate([0.02, ground.height - 0.001]):
-        seat = board.take(number + 1, "", 0)
+        seat = board.take(number + 1, 0)
         board.seats["is_recorded"][seat] = 1  # only recorded frames sleep
         pose = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
         request = replace(asked, seat=seat, reader=table.join(), pose=pose)
@@ -235,16 +205,3 @@ def test_clusters_sleep_in_a_worker_and_wake_where_they_come_near(ground: Ground
     assert (high >= 0.0).all()
     assert 0 < np.count_nonzero(low < 0.0) < len(low)
     board.close()
-
-
-@pytest.mark.parametrize("budget", [0, -3, 1.5, "many"])
-def test_a_budget_that_is_no_number_of_points_is_refused(ground: Ground, budget: object) -> None:
-    ours, theirs = socket.socketpair()
-    ground.host.serve(ours)
-    attached = AttachedHost(theirs)
-    try:
-        for begin in (ground.host.begin, attached.begin):
-            with pytest.raises(UsageError, match="budget of"):
-                begin(standing_plate(), ABOVE, budget_points=budget)  # type: ignore[arg-type]
-    finally:
-        attached.close()

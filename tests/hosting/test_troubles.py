@@ -7,6 +7,8 @@ import socket
 import threading
 from collections.abc import Iterator
 from pathlib import Path
+from types import SimpleNamespace
+from typing import NoReturn
 
 import pytest
 
@@ -14,7 +16,7 @@ from banded import write_points
 from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
-from hapticdb.hosting.attached import Attachment
+from hapticdb.hosting.attached import serve_attached
 from hapticdb.hosting.board import FREE, LOST, TAKEN, Board
 from hapticdb.hosting.channel import Channel
 from hapticdb.hosting.host import SessionHost
@@ -64,63 +66,53 @@ def is_recorded_further(host: SessionHost, session: HostedSession) -> None:
     until(lambda: len(recording) > before, patience=PATIENCE)
 
 
-def full(*_: object, **__: object) -> HostedSession:
+def full(*_: object, **__: object) -> NoReturn:
     """Fail as a machine that has no more files or memory."""
     raise OSError(errno.EMFILE, "Too many open files", "/secret/path")
 
 
-class Served:
-    """An attachment in a thread, whose host has `ended` the sessions of these ids."""
+def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_fails_at_it(
+    caplog: pytest.LogCaptureFixture,
+) -> None:
+    ended: list[int] = []
 
-    def __init__(self) -> None:
-        ours, theirs = socket.socketpair()
-        self.channel, self.ended = Channel(theirs), list[int]()
-        self.attachment = Attachment(Channel(ours), full, self._call, list)
-        self.thread = threading.Thread(target=self.attachment.serve)
-        self.thread.start()
-
-    def _call(self, word: str, session: int, /, *_: object) -> object:
-        self.ended.append(session)
+    def call(_: str, session: int, /, *_content: object) -> object:
+        ended.append(session)
         if session == 1:
-            raise OSError(errno.ENOMEM, "Cannot allocate memory")
-        return word
+            full()
+        return None
 
-    def leave(self) -> None:
-        self.channel.close()
-        joined(self.thread)
+    begun = iter([1, 2])
 
+    def begin(shell: object, _: object) -> SimpleNamespace:
+        return full() if shell is None else SimpleNamespace(id=next(begun), seat=0)
 
-def test_an_error_of_the_machine_is_answered_and_the_channel_stays(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    served = Served()
+    ours, theirs = socket.socketpair()
+    board = Board.create(1)
+    thread = threading.Thread(target=serve_attached, args=(ours, board, begin, call))
+    thread.start()
+    channel = Channel(theirs)
     try:
+        channel.receive()
         with pytest.raises(HapticDBError, match="its log says why") as found:
-            served.channel.ask("begin", None, None, {})
+            channel.ask("begin", None, None, {})
         assert "/secret" not in str(found.value)
-        assert served.channel.ask("sessions") == []
+        assert [channel.ask("begin", "a tool", None, {})[1] for _ in range(2)] == [1, 2]
     finally:
-        served.leave()
-    assert [record.exc_info is not None for record in caplog.records] == [True]
-
-
-def test_each_session_of_a_process_that_leaves_ends_even_if_one_fails_at_it(
-    caplog: pytest.LogCaptureFixture,
-) -> None:
-    served = Served()
-    served.attachment._begun |= {1, 2}
-    served.leave()
-    assert sorted(served.ended) == [1, 2]
-    assert len(caplog.records) == 1
+        channel.close()
+        joined(thread)
+        board.close()
+    assert sorted(ended) == [1, 2]
+    assert [record.exc_info is not None for record in caplog.records] == [True, True]
 
 
 def test_a_seat_that_is_free_or_anothers_is_not_lost() -> None:
     board = Board.create(1)
-    row = board.take(7, "first", 0)
+    row = board.take(7, 0)
     board.release(row)
     board.lose(row, 7)
     assert board.seats["state"][row] == FREE
-    assert board.take(8, "second", 0) == row
+    assert board.take(8, 0) == row
     board.lose(row, 7)
     assert board.seats["state"][row] == TAKEN
     board.lose(row, 8)
@@ -130,7 +122,7 @@ def test_a_seat_that_is_free_or_anothers_is_not_lost() -> None:
 
 def test_a_worker_that_is_stopped_in_the_middle_of_a_frame_is_waited_for() -> None:
     board = Board.create(1)
-    row = board.take(7, "first", 0)
+    row = board.take(7, 0)
     board.seats["contacts_sequence"][row] = 1  # odd: being written
 
     def go_on() -> None:
@@ -144,7 +136,7 @@ def test_a_worker_that_is_stopped_in_the_middle_of_a_frame_is_waited_for() -> No
 
 def test_a_frame_that_is_never_finished_is_an_error() -> None:
     board = Board.create(1)
-    row = board.take(7, "first", 0)
+    row = board.take(7, 0)
     board.seats["contacts_sequence"][row] = 1
     with pytest.raises(HapticDBError, match="stayed unfinished for 1 s"):
         board.contacts(row)

@@ -19,17 +19,11 @@ LOG = logging.getLogger("hapticdb.hosting")
 
 
 class AttachedHost:
-    """The `SessionHost` of another process. It has the same methods for sessions.
+    """The `SessionHost` of another process, which serves the other end of `sock`.
 
     Frames, contacts and hands are in memory that both processes share; all else goes over the
     socket, one request at a time. The sessions that this process has begun end when it dies or
     closes. Also a context manager.
-
-    Parameters
-    ----------
-    sock : socket
-        End of a pair of sockets of the family AF_UNIX; the other end was given to
-        `SessionHost.serve`. It is owned from now on.
 
     Raises
     ------
@@ -41,7 +35,7 @@ class AttachedHost:
         sock.settimeout(None)
         self._channel = Channel(sock)
         try:
-            (self.url, self.rate), (descriptor,) = self._channel.receive()
+            _, (descriptor,) = self._channel.receive()
         except (EOFError, OSError, ValueError) as error:
             self._channel.close()
             raise HapticDBError("no host answers at the other end of the socket") from error
@@ -58,27 +52,14 @@ class AttachedHost:
         shell: PointShell,
         start: ArrayLike,
         *,
-        where: Words = (),
         exclude: Words = (),
         coupling: Coupling | None = None,
         scale: float = 1.0,
-        label: str = "",
-        budget_points: int | None = None,
     ) -> HostedSession:
         """Begin a session; as `SessionHost.begin`, with its errors."""
-        options = {
-            "where": where, "exclude": exclude, "coupling": coupling, "scale": scale,
-            "label": label, "budget_points": budget_points,
-        }  # fmt: skip
+        options = {"exclude": exclude, "coupling": coupling, "scale": scale}
         seat, session = self._channel.ask("begin", shell, start, options)
         return HostedSession(self._board, seat, session, self._call)
-
-    def sessions(self) -> list[HostedSession]:
-        """All sessions of the host that run now, by their ids; also those of other processes."""
-        return [
-            HostedSession(self._board, seat, session, self._call)
-            for seat, session in self._channel.ask("sessions")
-        ]
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
         return self._channel.ask("call", word, session, *content)
@@ -89,67 +70,32 @@ class AttachedHost:
         self._board.close()
 
 
-class Attachment:
-    """The host's side of an `AttachedHost`.
+def serve_attached(
+    sock: socket.socket, board: Board, begin: Callable[..., HostedSession], call: Calls
+) -> None:
+    """Serve an `AttachedHost` until it leaves, by a host's methods; then end its sessions."""
+    channel = Channel(sock)
+    begun: set[int] = set()
 
-    Parameters
-    ----------
-    channel : Channel
-        To the other process.
-    begin, call, sessions : callable
-        The host's.
-    """
-
-    def __init__(
-        self,
-        channel: Channel,
-        begin: Callable[..., HostedSession],
-        call: Calls,
-        sessions: Callable[[], list[HostedSession]],
-    ) -> None:
-        self._channel, self._begin, self._call, self._sessions = channel, begin, call, sessions
-        self._begun: set[int] = set()
-
-    def serve(self) -> None:
-        """Reply requests until the other process leaves; then end its sessions."""
-        try:
-            while True:
-                self._channel.reply(self._do)
-        except (EOFError, OSError):
-            pass
-        finally:
-            self._channel.close()
-            for session in self._begun:
-                try:
-                    self._call("end", session)
-                except Exception:
-                    LOG.exception("session %d of a process that left did not end well", session)
-
-    def _do(self, ask: Ask, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
+    def do(ask: Ask, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
         if ask.word == "begin":
             shell, start, options = ask.content
-            session = self._begin(shell, start, **options)
-            self._begun.add(session.id)
+            session = begin(shell, start, **options)
+            begun.add(session.id)
             return session.seat, session.id
-        if ask.word == "sessions":
-            return [(one.seat, one.id) for one in self._sessions()]
-        word, session, *content = ask.content
-        return self._call(word, session, *content)
+        word, number, *content = ask.content
+        return call(word, number, *content)
 
-
-def serve_attached(
-    sock: socket.socket,
-    place: tuple[str, float, Board],
-    begin: Callable[..., HostedSession],
-    call: Calls,
-    sessions: Callable[[], list[HostedSession]],
-) -> None:
-    """Serve an `AttachedHost` until it leaves; place: the host's URL, rate and board."""
-    url, rate, board = place
-    channel = Channel(sock)
     try:
-        channel.send((url, rate), [board.descriptor])
-    except OSError:
+        channel.send(None, [board.descriptor])
+        while True:
+            channel.reply(do)
+    except (EOFError, OSError):
+        pass
+    finally:
         channel.close()
-        return
-    Attachment(channel, begin, call, sessions).serve()
+        for number in begun:
+            try:
+                call("end", number)
+            except Exception:
+                LOG.exception("session %d of a process that left did not end well", number)

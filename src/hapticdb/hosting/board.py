@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.kernels.records import FRAME, LABEL_BYTES, MOST_SHOWN, SEAT
+from hapticdb.kernels.records import FRAME, MOST_SHOWN, SEAT
 from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import anonymous_memory
 
@@ -42,18 +42,8 @@ Seats = NDArray[np.void]
 class Board:
     """Seats of hosted sessions in shared memory.
 
-    Parameters
-    ----------
-    descriptor : int
-        File descriptor of the memory of a board that `create` has made, in any process. The board
-        owns it and closes it.
-
-    Attributes
-    ----------
-    seats : Seats
-        (S,) of `SEAT`.
-    rings : Frames
-        (S, RING) of `FRAME`: frame n of a session is at index n modulo RING.
+    descriptor : of the memory of a board that `create` has made; owned from now on; seats (S,) of
+    `SEAT`; rings (S, RING) of `FRAME`: frame n of a session is at index n modulo RING.
     """
 
     def __init__(self, descriptor: int) -> None:
@@ -78,14 +68,8 @@ class Board:
             os.close(self.descriptor)
             self.descriptor = -1
 
-    def take(self, session: int, label: str, worker: int) -> int:
-        """Give a free seat to a session; returns its row. The host alone calls this.
-
-        Raises
-        ------
-        UsageError
-            If no seat is free.
-        """
+    def take(self, session: int, worker: int) -> int:
+        """Give a free seat to a session; returns its row, or UsageError if no seat is free."""
         with self._taking:
             free = np.flatnonzero(self.seats["state"] == FREE)
             if not len(free):
@@ -94,7 +78,6 @@ class Board:
                 )
             row = int(free[0])
             self.seats[row] = np.zeros((), SEAT)
-            self.seats["label"][row] = label.encode()[:LABEL_BYTES]
             self.seats["worker"][row] = worker
             self.seats["id"][row] = session
             self.seats["state"][row] = TAKEN
@@ -111,15 +94,14 @@ class Board:
             if self.seats["state"][row] == TAKEN and self.seats["id"][row] == session:
                 self.seats["state"][row] = LOST
 
-    def put_hand(self, row: int, time: int, pose: NDArray[np.float64] | None) -> None:
-        """Write where the hand is: pose (7,), or None where nobody holds the tool."""
+    def put_hand(self, row: int, time: int, pose: NDArray[np.float64]) -> None:
+        """Write where the hand is (7,), and when."""
         seats = self.seats
         seats["hand_sequence"][row] += 1
-        if pose is not None:
-            seats["hand_pose"][row] = pose
-            seats["n_moves"][row] += 1
+        seats["hand_pose"][row] = pose
+        seats["n_moves"][row] += 1
         seats["hand_time"][row] = time
-        seats["is_held"][row] = pose is not None
+        seats["is_held"][row] = 1
         seats["hand_sequence"][row] += 1
 
     def last_frame(self, row: int) -> Frames | None:

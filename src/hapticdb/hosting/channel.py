@@ -37,13 +37,7 @@ class Reply(NamedTuple):
 
 
 class Channel:
-    """Messages over one end of a pair of sockets.
-
-    Parameters
-    ----------
-    sock : socket
-        A connected stream socket of the family AF_UNIX. The channel owns it.
-    """
+    """Messages over one end of a pair of sockets of the family AF_UNIX, which it owns."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
@@ -57,13 +51,7 @@ class Channel:
         self.sock.sendall(header[sent:] + packed)
 
     def receive(self) -> tuple[Any, list[int]]:
-        """Return the next message and the descriptors that came with it.
-
-        Raises
-        ------
-        EOFError
-            If the other process has closed its end, or has died.
-        """
+        """Next message and the descriptors with it; EOFError if the other process has gone."""
         header, descriptors, _, _ = socket.recv_fds(self.sock, HEADER, MOST_DESCRIPTORS)
         if not header:
             raise EOFError
@@ -104,12 +92,8 @@ class Channel:
     def reply(self, do: Callable[[Ask, list[int]], Any]) -> None:
         """Receive a request, do it, and send its result or the error that it raised.
 
-        An error that is no HapticDBError is logged, and sent as one without its words.
-
-        Parameters
-        ----------
-        do : callable
-            Gets the request and the descriptors that came with it, which are closed afterwards.
+        An error that is no HapticDBError is logged, and sent as one without its words. The
+        descriptors that came with the request are closed afterwards.
 
         Raises
         ------

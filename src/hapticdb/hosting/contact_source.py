@@ -73,16 +73,7 @@ STALENESS_NS = 1_000_000_000
 class ContactSource:
     """A tool in resident cells that follows a remote hand. Also a context manager.
 
-    Parameters
-    ----------
-    cells : ResidentCells
-        Cells with distances; the source is one of their readers until it is closed.
-    shell : PointShell
-        The tool.
-    wish : ProxyWish
-        What the client asked for.
-    rate : float
-        Proxies a second.
+    The source is a reader of the cells until it is closed.
 
     Raises
     ------
@@ -90,9 +81,7 @@ class ContactSource:
         If the cells have no distances, or a number of the wish is out of its range.
     """
 
-    def __init__(
-        self, cells: ResidentCells, shell: PointShell, wish: ProxyWish, rate: float = RATE
-    ) -> None:
+    def __init__(self, cells: ResidentCells, shell: PointShell, wish: ProxyWish) -> None:
         if not cells.has_distances:
             raise UsageError(
                 "contact proxies need distances to surfaces, which this environment lacks: import "
@@ -125,7 +114,7 @@ class ContactSource:
             wish.tool, (float(shell.center[0]), float(shell.center[1]), float(shell.center[2])),
             radius, self._spring.stiffness, self._spring.turn_stiffness, self._spring.cap,
             self._spring.turn_cap, float(contact_stiffness(self._spring, size)), size,
-            ONSET * size, 1.0 / rate,
+            ONSET * size, 1.0 / RATE,
         )  # fmt: skip
         self._computing = threading.Lock()
         self._last: Floats | None = None  # the hand that the tool has followed
@@ -153,14 +142,9 @@ class ContactSource:
                 self._cells.table.leave(row)
 
     def proxy(self, hand: HandState, kept: float = 0.0) -> ProxyState:
-        """Follow a hand and describe the contacts there.
+        """Follow the newest hand, come `kept` seconds ago, and describe the contacts there.
 
-        Parameters
-        ----------
-        hand : HandState
-            The newest hand, in the scene. An open one is let go.
-        kept : float
-            Seconds since it arrived.
+        An open hand is let go.
         """
         with self._computing:
             return self._proxy(hand, kept)

@@ -18,15 +18,14 @@ from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.attached import serve_attached
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.crew import Crew
 from hapticdb.hosting.hosted import HostedSession, Recorded
 from hapticdb.hosting.running import Running
 from hapticdb.hosting.stations import SeatRequest
 from hapticdb.hosting.tables import SharedTables, Words
+from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.compiling import compile_missing, entries_for
-from hapticdb.kernels.records import LABEL_BYTES
 from hapticdb.kernels.rigid import is_rigid
-from hapticdb.pointshell.shell import PointShell, checked_budget
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
@@ -37,7 +36,7 @@ from hapticdb.store.filtering import Filter
 
 LOG = logging.getLogger("hapticdb.hosting")
 MOST_SESSIONS = 64
-"""Most sessions of a host, unless another number is given."""
+"""Most sessions of a host. Larger: more shared memory, 660 kB each."""
 TEND_EVERY = 0.05
 """Seconds between two looks after recordings and processes. Larger: less work, and what has died is
 noticed later. A recording loses frames from 2 s on."""
@@ -46,28 +45,13 @@ LARGEST_SCALE = 1e6
 
 
 class SessionHost:
-    """Hands in an environment, many at once, each felt in real time.
+    """Hands in an environment, `MOST_SESSIONS` at once, each felt in real time.
 
     Sessions run in worker processes, many in each. All sessions that feel the same objects share
     one table of resident cells and its fetching process. Also a context manager.
 
-    Parameters
-    ----------
-    url : str
-        The environment.
-    rate : float
-        Frames a second of each session, 10 to 20,000.
-    budget_bytes : int
-        Memory of each table of cells.
-    processes : int or None
-        Most worker processes; None: one for each processor.
-    most_sessions : int
-        Most sessions at a time.
-
-    Raises
-    ------
-    UsageError
-        If a number is out of its range.
+    url : the environment; rate : frames a second of each session; budget_bytes : memory of each
+    table of cells; processes : most worker processes, one for each processor unless given.
     """
 
     _pid = 0
@@ -80,18 +64,11 @@ class SessionHost:
         rate: float = 1000.0,
         budget_bytes: int = DEFAULT_BUDGET,
         processes: int | None = None,
-        most_sessions: int = MOST_SESSIONS,
     ) -> None:
-        if not 10.0 <= rate <= 20_000.0:
-            raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
-        if not 1 <= most_sessions <= MOST_SESSIONS:
-            raise UsageError(f"{most_sessions} sessions at most: give 1 to {MOST_SESSIONS}")
-        if processes is not None and processes < 1:
-            raise UsageError(f"{processes} worker processes: give 1 or more")
         self.url, self.rate = url, rate
         self._tables = SharedTables(url, budget_bytes)
-        self._board = Board.create(most_sessions)
-        self._crew = Crew(self._board, rate, processes or os.cpu_count() or 1)
+        self._board = Board.create(MOST_SESSIONS)
+        self._workers = Workers(self._board, rate, processes or os.cpu_count() or 1)
         self._running: dict[int, Running] = {}
         self._ids = itertools.count(1)
         self._changing = threading.RLock()
@@ -118,35 +95,23 @@ class SessionHost:
         shell: PointShell,
         start: ArrayLike,
         *,
-        where: Words = (),
         exclude: Words = (),
         coupling: Coupling | None = None,
         scale: float = 1.0,
-        label: str = "",
-        budget_points: int | None = None,
     ) -> HostedSession:
         """Begin a session; its tool waits at `start` until the hand is moved.
 
         Parameters
         ----------
-        shell : PointShell
-            The tool.
         start : array_like
             Pose (4, 4) of hand and tool, scene metres.
-        where, exclude : sequence of int or str
-            Words as of `Environment.find`. The tool feels the objects that `where` chooses (all if
-            it is empty) and `exclude` does not choose.
+        exclude : sequence of int or str
+            Words, as of `Environment.find`, that choose what the tool does not feel.
         coupling : Coupling or None
-            As for `hapticdb.realtime.session.Session`. Unless it has a profile, its hand counts as
-            one that no force moves.
+            Unless it has a profile, its hand counts as one that no force moves.
         scale : float
             S, metres of the scene for a metre of the device, for the coupling's numbers. Poses of
             the hand are the scene's: whoever moves the hand scales them.
-        label : str
-            What the session is called where others see it; cut at 128 bytes.
-        budget_points : int or None
-            Most points near something that a frame looks at; None for all. As for
-            `hapticdb.realtime.session.Session`.
 
         Raises
         ------
@@ -165,13 +130,12 @@ class SessionHost:
             raise UsageError(
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
-        budget = checked_budget(budget_points)
         compile_missing(entries_for("host"))  # here, so that no worker compiles
-        felt = self._tables.checked(where, exclude)
+        felt = self._tables.checked(exclude)
         with self._changing:
             if self._is_closed.is_set():
                 raise UsageError("the host is closed: make another")
-            return self._begin(shell, pose, felt, coupling, scale, label, budget)
+            return self._begin(shell, pose, felt, coupling, scale)
 
     def _begin(
         self,
@@ -180,14 +144,12 @@ class SessionHost:
         felt: Filter,
         coupling: Coupling | None,
         scale: float,
-        label: str,
-        budget: int | None,
     ) -> HostedSession:
         """Take seat, cells and worker for a session; all are given back if one is not to be had."""
         session = next(self._ids)
         with ExitStack() as undo:
-            worker = self._crew.least_busy()
-            seat = self._board.take(session, label[:LABEL_BYTES], worker.number)
+            worker = self._workers.least_busy()
+            seat = self._board.take(session, worker.number)
             undo.callback(self._board.release, seat)
             cells = self._tables.take(felt)
             undo.callback(self._tables.release, cells)
@@ -201,7 +163,6 @@ class SessionHost:
                 seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
                 grid=cells.grid, shell=shell, coupling=settled,
                 pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
-                budget_points=budget,
             ).without_surface()  # fmt: skip
             hand = np.array(request.pose)
             self._board.seats["hand_pose"][seat] = hand
@@ -235,7 +196,6 @@ class SessionHost:
             "set_coupling": self._set_coupling,
             "record": self._record,
             "stop_recording": lambda running: running.stop_recording(self._board),
-            "recording_ended": lambda running: running.recording_ended,
             "end": self._end,
         }
         with self._changing:
@@ -260,10 +220,8 @@ class SessionHost:
             shell=asked.shell,
             rate=self.rate,
             law=SMOOTH,
-            where=running.cells.filter.where,
             exclude=running.cells.filter.exclude,
             coupling=asdict(asked.coupling),
-            budget_points=asked.budget_points,
         )
         running.record(path, header, self._board, replace=replace)
 
@@ -292,10 +250,10 @@ class SessionHost:
         self._served.append(sock)
         threading.Thread(
             target=serve_attached,
-            args=(sock, (self.url, self.rate, self._board), self.begin, self._call, self.sessions),
-
-            daemon=True, name="attached",
-        ).start()  # fmt: skip
+            args=(sock, self._board, self.begin, self._call),
+            daemon=True,
+            name="attached",
+        ).start()
 
     # -- looking after -----------------------------------------------------------------------
 
@@ -346,7 +304,7 @@ class SessionHost:
     @property
     def pids(self) -> list[int]:
         """Process ids of the workers."""
-        return self._crew.pids
+        return self._workers.pids
 
     def close(self) -> None:
         """End all sessions, processes and recordings; a second call does nothing."""
@@ -359,7 +317,7 @@ class SessionHost:
         with self._changing, ExitStack() as ends:
             ends.callback(self._board.close)
             ends.callback(self._tables.close)
-            ends.callback(self._crew.close)
+            ends.callback(self._workers.close)
             for sock in self._served:
                 ends.callback(_shut, sock)
             for running in list(self._running.values()):

@@ -23,15 +23,11 @@ from hapticdb.recording.frame import Frames, State
 class HostedFigures(NamedTuple):
     """Figures of a hosted session so far.
 
-    frames : number of frames; missed : deadlines at which no frame began, because the worker was
-    busy with its sessions or the machine with other work; in_time : share of all deadlines whose
-    frame was done before the next one; lateness : seconds from a deadline to the begin of the
-    session's frame; elapsed : seconds of computing a frame; unknown, held, stale : numbers of
-    frames with a point in a cell that was not resident, with an earlier wrench, and with a database
-    that had not answered for too long; moves : poses of the hand that arrived; worker : number of
-    the worker process; recording_ended : why the recording ended early, None if it did not;
-    left_out_frames, most_left_out : frames in which the budget left out points, and the most points
-    that one frame left out.
+    frames : number of frames; missed : deadlines at which no frame began; in_time : share of all
+    deadlines whose frame was done before the next one; lateness : seconds from a deadline to the
+    begin of the session's frame; elapsed : seconds of computing a frame; unknown, held, stale :
+    numbers of frames with a point in a cell that was not resident, with an earlier wrench, and with
+    a database that had not answered for too long.
     """
 
     frames: int
@@ -42,11 +38,6 @@ class HostedFigures(NamedTuple):
     unknown: int
     held: int
     stale: int
-    moves: int
-    worker: int
-    recording_ended: str | None = None
-    left_out_frames: int = 0
-    most_left_out: int = 0
 
 
 class Recorded(NamedTuple):
@@ -67,37 +58,16 @@ class HostedSession:
     """A hand in an environment that a worker process of the host runs, among others.
 
     `move`, `latest`, `contacts`, `touched` and `figures` read and write shared memory and take
-    microseconds; the others wait for the host. Any process that has the session may call them, but
-    only one may move the hand.
+    microseconds; the others wait for the host, which `call` reaches.
 
-    Parameters
-    ----------
-    board : Board
-        Where the session's seat is.
-    seat : int
-        Row of the board.
-    session : int
-        Id of the session.
-    call : Calls
-        Reaches the host.
-
-    Attributes
-    ----------
-    id : int
-        Number of the session; no other session of the host ever has it.
-    seat : int
-        Row of the board.
-    label : str
-        What the session is called where others see it.
-    lost_frames : int
-        Frames that this session's last recording lacks; known when this object has ended it.
+    id : number that no other session of the host ever has; seat : row of the board; lost_frames :
+    frames that this session's last recording lacks, known when this object has ended it.
     """
 
     def __init__(self, board: Board, seat: int, session: int, call: Calls) -> None:
         self._board, self.seat, self._call = board, seat, call
         self.id = session
         self.lost_frames = 0
-        self.label = board.seats["label"][seat].decode(errors="ignore")
 
     @property
     def is_over(self) -> bool:
@@ -127,10 +97,6 @@ class HostedSession:
         seat = self._open_seat()
         hand = np.concatenate([matrix[:3, 3], quaternion_of(matrix[:3, :3])[0]])
         self._board.put_hand(seat, time.monotonic_ns(), hand)
-
-    def let_go(self) -> None:
-        """Let go of the tool: it stays, and the force falls to zero until the next `move`."""
-        self._board.put_hand(self._open_seat(), time.monotonic_ns(), None)
 
     def latest(self) -> Frames | None:
         """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""
@@ -188,8 +154,6 @@ class HostedSession:
         seat = self._open_seat()
         row = self._board.seats[seat]
         frames, missed = int(row["n_frames"]), int(row["missed"])
-        ended = self._call("recording_ended", self.id)
-        assert ended is None or isinstance(ended, str)  # noqa: S101 - the host tells
         return HostedFigures(
             frames=frames,
             missed=missed,
@@ -199,11 +163,6 @@ class HostedSession:
             unknown=int(row["unknown_frames"]),
             held=int(row["held_frames"]),
             stale=int(row["stale_frames"]),
-            moves=int(row["n_moves"]),
-            worker=int(row["worker"]),
-            recording_ended=ended,
-            left_out_frames=int(row["left_out_frames"]),
-            most_left_out=int(row["most_left_out"]),
         )
 
     def end(self) -> None:

@@ -6,9 +6,9 @@ from pathlib import Path
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
-from hapticdb.hosting.crew import WorkerLink
 from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.stations import SeatRequest
+from hapticdb.hosting.workers import WorkerLink
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT
@@ -21,19 +21,7 @@ FRAME_PATIENCE = 5.0
 
 
 class Running:
-    """A session that a host runs.
-
-    Parameters
-    ----------
-    request : SeatRequest
-        What the worker was told.
-    session : int
-        Id of the session.
-    cells : ResidentCells
-        Its cells, which other sessions may share.
-    worker : WorkerLink
-        The process that runs it.
-    """
+    """A session that a host runs: what its worker was told, its cells, and its worker."""
 
     def __init__(
         self, request: SeatRequest, session: int, cells: ResidentCells, worker: WorkerLink
@@ -42,7 +30,6 @@ class Running:
         self.seat = request.seat
         self._recording: SessionRecording | None = None
         self._taking = threading.Lock()
-        self.recording_ended: str | None = None
 
     def record(self, path: str, header: Header, board: Board, *, replace: bool) -> None:
         """Begin a recording.
@@ -67,7 +54,6 @@ class Running:
         except BaseException:
             board.seats["is_recorded"][self.seat] = 0
             raise
-        self.recording_ended = None
         self._recording = recording
 
     def _first_frame(self, board: Board) -> int:
@@ -90,8 +76,6 @@ class Running:
                 except Exception:
                     recording.ended = "the recording ended early: the host failed at it"
                     raise
-                finally:
-                    self.recording_ended = recording.ended
 
     def stop_recording(self, board: Board) -> Recorded:
         """End the recording, which stays."""
@@ -103,5 +87,4 @@ class Running:
             board.seats["is_recorded"][self.seat] = 0
             if recording is not None:
                 recording.finish()
-                self.recording_ended = recording.ended
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)

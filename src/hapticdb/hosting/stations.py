@@ -48,7 +48,6 @@ class SeatRequest:
     shell: PointShell
     coupling: SettledCoupling
     pose: tuple[float, ...]
-    budget_points: int | None = None
 
     def without_surface(self) -> "SeatRequest":
         """Return the same request without the tool's triangles, which no frame reads."""
@@ -61,12 +60,7 @@ class Stations:
     A session's memory is made beside the loop. The loop sees the session when `is_running` of its
     station is set, which is done last, and leaves it between two periods when that is withdrawn.
 
-    Parameters
-    ----------
-    board : Board
-        The host's board.
-    rate, spin : float
-        Periods a second, and seconds before a deadline at which the loop watches the clock.
+    rate : periods a second; spin : seconds before a deadline at which the loop watches the clock.
     """
 
     def __init__(self, board: Board, rate: float, spin: float) -> None:
@@ -84,7 +78,7 @@ class Stations:
         self._tables: dict[int, CellTable] = {}
         self._arrays: dict[int, tuple[NDArray[np.generic], ...]] = {}
         self._asleep: dict[int, Asleep] = {}
-        self._places: dict[int, int] = {}
+        self._stations_of: dict[int, int] = {}  # by seat
 
     @property
     def n_periods(self) -> int:
@@ -133,17 +127,16 @@ class Stations:
         station["gap"] = USUAL_GAP_NS
         station["began"] = station["last"] = time.monotonic_ns()
         self._requests[n], self._tables[n] = request, table
-        self._places[request.seat] = n
+        self._stations_of[request.seat] = n
         station["is_running"] = 1
 
     def _write_tool(self, n: int, request: SeatRequest) -> None:
         """Make the tool's arrays, and write their addresses."""
         grid, station = request.grid, self._stations[n : n + 1]
-        sleeps = sleeps_by_itself(request.shell, request.budget_points)
+        sleeps = sleeps_by_itself(request.shell, None)
         clusters = clusters_of(request.shell, grid.voxel_size, RUN if sleeps else None)
         n_points = len(request.shell)
-        budget = min(request.budget_points or n_points, n_points)
-        prepare_follower(self._followers[n, ...], n_points, budget if sleeps else None)
+        prepare_follower(self._followers[n, ...], n_points, n_points if sleeps else None)
         met = np.zeros((HOSTED_ROWS, n_points), dtype=np.int64)
         field = np.zeros((FIELD_ROWS, n_points))
         arrays = {
@@ -157,8 +150,7 @@ class Stations:
         station["place"] = (*grid.origin, grid.voxel_size, float(grid.side))
         self._arrays[n] = tuple(arrays.values())
         if sleeps:
-            sleepers = sleepers_of(clusters, request.budget_points)
-            self._write_sleepers(n, Asleep(sleepers, budget, counts_of(1)))
+            self._write_sleepers(n, Asleep(sleepers_of(clusters, None), n_points, counts_of(1)))
 
     def _write_sleepers(self, n: int, asleep: Asleep) -> None:
         """Write the addresses of what frames of a large tool keep."""
@@ -182,18 +174,18 @@ class Stations:
 
     def set_coupling(self, seat: int, coupling: SettledCoupling) -> None:
         """Replace a session's coupling; the loop takes the new one whole, between two frames."""
-        n = self._places[seat]
+        n = self._stations_of[seat]
         which = 1 - int(self._stations["coupling"][n])
         self._stations["springs"][n, which] = coupling.spring()
         self._stations["coupling"][n] = which
 
     def withdraw(self, seat: int) -> None:
         """Have the loop leave a session; `free` may be called two periods later."""
-        self._stations["is_running"][self._places[seat]] = 0
+        self._stations["is_running"][self._stations_of[seat]] = 0
 
     def free(self, seat: int) -> None:
         """Free a session's memory, and tell the fetching process that its tool is gone."""
-        n = self._places.pop(seat)
+        n = self._stations_of.pop(seat)
         request, table = self._requests.pop(n), self._tables.pop(n)
         table.desk.sessions["told"]["is_active"][request.reader] = False
         del self._arrays[n]

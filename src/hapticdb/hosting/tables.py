@@ -14,12 +14,7 @@ Words = Sequence[int | str]
 class SharedTables:
     """Tables of one environment, each with its fetching process, made when they are first needed.
 
-    Parameters
-    ----------
-    url : str
-        The environment.
-    budget_bytes : int
-        Memory of each table.
+    budget_bytes : memory of each table.
     """
 
     def __init__(self, url: str, budget_bytes: int) -> None:
@@ -28,15 +23,12 @@ class SharedTables:
         self._uses: dict[Filter, int] = {}
         self._making = threading.Lock()
 
-    def checked(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; the table of a filter follows what others add and rename.
+    def checked(self, exclude: Words) -> Filter:
+        """Filter that leaves out what the words choose; ObjectNotFoundError if one chooses nothing.
 
-        Raises
-        ------
-        ObjectNotFoundError
-            If a word chooses nothing.
+        The table of a filter follows what others add and rename.
         """
-        felt = Filter(where, exclude)
+        felt = Filter((), exclude)
         if not felt.is_empty:
             with closing(open_store(self.url, read_only=True)) as store:
                 for error in felt.left_out(store.objects(), store.url).missing:
@@ -48,9 +40,8 @@ class SharedTables:
         with self._making:
             if felt not in self._tables:
                 self._tables[felt] = ResidentCells(
-                    self.url, budget_bytes=self._budget_bytes, where=felt.where,
-                    exclude=felt.exclude,
-                )  # fmt: skip
+                    self.url, budget_bytes=self._budget_bytes, exclude=felt.exclude
+                )
                 self._uses[felt] = 0
             self._uses[felt] += 1
             return self._tables[felt]

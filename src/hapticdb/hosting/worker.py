@@ -39,13 +39,7 @@ class WorkerRequest:
 
 
 class Worker:
-    """The sessions of one process and their loop.
-
-    Parameters
-    ----------
-    request : WorkerRequest
-        From the host.
-    """
+    """The sessions of one process and their loop."""
 
     def __init__(self, request: WorkerRequest) -> None:
         self._board = Board(request.board)

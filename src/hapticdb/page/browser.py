@@ -253,7 +253,6 @@ class Browser:
             session = self.site.host.begin(
                 self.tool.shell, matrix(start), exclude=self._unfelt,
                 coupling=Coupling(stiffness=self.stiffness), scale=self.scale,
-                label=self.visitor.name,
             )  # fmt: skip
             undo.callback(session.end)
             session.move(matrix(self.hand))

@@ -12,7 +12,6 @@ import logging
 import time
 from collections.abc import AsyncIterator, Callable, Collection, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass
 from typing import Any
 
 from starlette.responses import PlainTextResponse
@@ -84,18 +83,9 @@ async def is_admitted(websocket: WebSocket, role_of_headers: RoleOfHeaders, n_cl
 
 
 class Contacts:
-    """What the endpoint serves: tools by name, in the cells of one environment.
+    """What the endpoint serves: tools by name, in the cells of one environment, with distances.
 
-    Parameters
-    ----------
-    cells : ResidentCells
-        With distances.
-    tools : mapping of str to PointShell
-        By the names that clients give.
-    rate : float
-        Proxies a second to each client.
-    idle_after : float
-        Seconds without a hand after which a client is dropped.
+    idle_after : seconds without a hand after which a client is dropped.
     """
 
     def __init__(
@@ -103,18 +93,13 @@ class Contacts:
         cells: ResidentCells,
         tools: Mapping[str, PointShell],
         *,
-        rate: float = RATE,
         idle_after: float = IDLE_AFTER,
     ) -> None:
         self._cells, self._tools = cells, dict(tools)
-        self._rate, self._idle = rate, idle_after
+        self._idle = idle_after
         self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="contacts")
         self.n_clients = 0
         """Clients that are connected now."""
-        self.n_proxies = 0
-        """Proxies computed so far."""
-        self.seconds = 0.0
-        """Seconds spent on them in the threads."""
 
     def close(self) -> None:
         """End the threads."""
@@ -134,8 +119,9 @@ class Contacts:
 
     async def _serve(self, websocket: WebSocket, wish: ProxyWish) -> None:
         loop = asyncio.get_running_loop()
-        source = await loop.run_in_executor(self._threads, self._source, wish)
-        state = _Client(self._rate)
+        tool = self._tools[wish.tool]
+        source = await loop.run_in_executor(self._threads, ContactSource, self._cells, tool, wish)
+        state = _Client()
         try:
             await websocket.send_bytes(pack_terms(source.terms))
             async with asyncio.TaskGroup() as group:
@@ -160,10 +146,6 @@ class Contacts:
                 LOG.exception("the cells of contact proxies cannot be fetched any more")
                 raise DatabaseError("cells cannot be fetched any more") from error
 
-    def _source(self, wish: ProxyWish) -> ContactSource:
-        """Tool for a wish."""
-        return ContactSource(self._cells, self._tools[wish.tool], wish, self._rate)
-
     async def _listen(self, websocket: WebSocket, state: "_Client") -> None:
         """Keep the newest hand; read no faster than is allowed."""
         while True:
@@ -179,27 +161,20 @@ class Contacts:
         loop = asyncio.get_running_loop()
         due = loop.time()
         while True:
-            due = max(due + 1.0 / self._rate, loop.time())
+            due = max(due + 1.0 / RATE, loop.time())
             await asyncio.sleep(due - loop.time())
             hand = state.hand
             if hand is None or state.n_unseen > UNSEEN:
                 continue
-            proxy, seconds = await loop.run_in_executor(
-                self._threads, _timed_proxy, source, hand, state.arrived
-            )
-            self.n_proxies += 1
-            self.seconds += seconds
+            proxy = await loop.run_in_executor(self._threads, _proxy, source, hand, state.arrived)
             state.sent = source.n_sent
             await websocket.send_bytes(proxy)
 
 
-@dataclass
 class _Client:
     """What is known of one client."""
 
-    rate: float
-
-    def __post_init__(self) -> None:
+    def __init__(self) -> None:
         self.allowed = TokenBucket(MESSAGES_A_SECOND, BURST)
         self.hand: HandState | None = None
         self.arrived = 0.0
@@ -220,11 +195,8 @@ class _Client:
             self.hand, self.arrived = hand, time.monotonic()
 
 
-def _timed_proxy(source: ContactSource, hand: HandState, arrived: float) -> tuple[bytes, float]:
-    """Message of a proxy, and the seconds that it took."""
-    start = time.perf_counter()
-    message = pack_proxy(source.proxy(hand, time.monotonic() - arrived))
-    return message, time.perf_counter() - start
+def _proxy(source: ContactSource, hand: HandState, arrived: float) -> bytes:
+    return pack_proxy(source.proxy(hand, time.monotonic() - arrived))
 
 
 @contextlib.asynccontextmanager

@@ -1,4 +1,4 @@
-"""Crew: the worker processes of a host, started when sessions need them."""
+"""The worker processes of a host, started when sessions need them."""
 
 import socket
 from collections.abc import Sequence
@@ -22,17 +22,7 @@ fewer processes and less memory, and later frames."""
 
 
 class WorkerLink:
-    """A worker process, from the host.
-
-    Parameters
-    ----------
-    number : int
-        Number of the worker, from 0.
-    board : Board
-        Where its sessions' seats are.
-    rate : float
-        Frames a second.
-    """
+    """A worker process, from the host; `number` counts from 0, `rate` is in frames a second."""
 
     def __init__(self, number: int, board: Board, rate: float) -> None:
         self.number = number
@@ -71,18 +61,8 @@ class WorkerLink:
         self._process.end()
 
 
-class Crew:
-    """Worker processes, `most` at a time.
-
-    Parameters
-    ----------
-    board : Board
-        The host's board.
-    rate : float
-        Frames a second.
-    most : int
-        Most processes.
-    """
+class Workers:
+    """Worker processes of a host, `most` at a time."""
 
     def __init__(self, board: Board, rate: float, most: int) -> None:
         self._board, self._rate, self._most = board, rate, most

@@ -18,12 +18,7 @@ LOOKED_EVERY = 0.2
 class Preparation:
     """Compiles the kernels of some purposes, once, when somebody first waits for them.
 
-    Parameters
-    ----------
-    *purposes : str
-        As `kernels.compiling.PURPOSES` names them.
-    tell : callable
-        Called in the event loop with the progress; not at all if nothing has to be compiled.
+    tell : called in the event loop with the progress; not at all if nothing has to be compiled.
     """
 
     def __init__(self, *purposes: str, tell: Callable[[Compiled], None]) -> None:
@@ -35,10 +30,7 @@ class Preparation:
     async def done(self) -> None:
         """Wait until the kernels are compiled, or `close` is called.
 
-        Raises
-        ------
-        HapticDBError
-            If the process that compiles them cannot be started, or fails.
+        HapticDBError or OSError if the process that compiles them cannot be started, or fails.
         """
         async with self._running:
             if not self._is_done and not self._is_ending.is_set():

@@ -61,18 +61,9 @@ class _SignedIn:
 
 
 class Access:
-    """The tokens of one server, and the browsers that have shown one.
+    """The tokens of one server with their roles, and the browsers that have shown one.
 
-    Parameters
-    ----------
-    tokens : mapping of str to Role
-        The role that each token gives.
-    open_role : Role, optional
-        Role of clients that show nothing. Unless given, they have none.
-    port : int
-        Port of the server, for the name of the cookie.
-    clock : callable
-        Seconds that only grow.
+    open_role : of clients that show nothing; port : of the server, for the name of the cookie.
     """
 
     def __init__(
@@ -106,18 +97,10 @@ class Access:
         return found
 
     def role_of_headers(self, headers: Mapping[str, str]) -> Role | None:
-        """Find the role of a client by the headers of its request.
+        """Role of a client by its request's headers, whose names are in lower case.
 
-        Parameters
-        ----------
-        headers : mapping of str to str
-            With names in lower case, or one that ignores case, such as Starlette's.
-
-        Returns
-        -------
-        Role or None
-            Of its bearer token or its cookie, whose time begins anew; else the open role. None if
-            it may do nothing: also if it shows a bearer token that is wrong.
+        It is that of its bearer token or its cookie, whose time begins anew; else the open role.
+        None if it may do nothing: also if it shows a bearer token that is wrong.
         """
         scheme, _, token = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
@@ -126,7 +109,7 @@ class Access:
         return known.role if known is not None else self.open_role
 
     def cookie_of(self, headers: Mapping[str, str]) -> str:
-        """Take the value of this server's cookie out of a request's headers; empty without one."""
+        """Value of this server's cookie in a request's headers; empty without one."""
         try:
             morsel = SimpleCookie(headers.get("cookie", "")).get(self.cookie_name)
         except CookieError:

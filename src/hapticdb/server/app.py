@@ -35,19 +35,7 @@ def application(
     title: str,
     host_names: tuple[str, ...] = (),
 ) -> ASGIApp:
-    """Put the parts of a server together.
-
-    Parameters
-    ----------
-    served, page, relay, doctor
-        The parts.
-    prefix : str
-        Path under which all is reached; empty, or with a slash in front and none behind.
-    title : str
-        Title of pages.
-    host_names : tuple of str
-        Names under which the server may be reached.
-    """
+    """Put the parts of a server together; `prefix`, `title` and `host_names` as of `Serving`."""
     door = FrontDoor(served.access, page, served.limits, prefix, title)
 
     async def healthz(_: Request) -> Response:

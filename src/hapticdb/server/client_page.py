@@ -28,22 +28,10 @@ LOADER = re.compile(
     re.DOTALL,
 )
 TITLE = "<title>Viser</title>"
-PACKING = 9
-"""Level of gzip, from 1 to 9. Larger: a longer start, and less to send."""
 
 
 class ClientPage(NamedTuple):
-    """The page of a browser.
-
-    Attributes
-    ----------
-    html, packed : bytes
-        The document, and the same by gzip.
-    tag : str
-        Changes with the document.
-    policy : str
-        Its Content-Security-Policy.
-    """
+    """The page of a browser, also packed by gzip; a tag that changes with it, and its policy."""
 
     html: bytes
     packed: bytes
@@ -52,7 +40,7 @@ class ClientPage(NamedTuple):
 
 
 def client_page(title: str) -> ClientPage:
-    """Read viser's client and give it a title (plain words, no markup).
+    """Read viser's client and give it a title of plain words.
 
     Raises
     ------
@@ -73,7 +61,7 @@ def client_page(title: str) -> ClientPage:
     html = text.replace(TITLE, f"<title>{title}</title>").encode()
     return ClientPage(
         html,
-        gzip.compress(html, PACKING),
+        gzip.compress(html),
         f'"{hashlib.sha256(html).hexdigest()[:32]}"',
         _policy([loader["script"].encode(), _program(loader)]),
     )

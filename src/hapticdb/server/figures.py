@@ -11,54 +11,43 @@ class Figures:
     """Counters of one server."""
 
     def __init__(self) -> None:
-        self.registry = CollectorRegistry()
+        self.registry = known = CollectorRegistry()
         self.browsers = Gauge(
-            "hapticdb_browsers", "Browsers that are connected.", ["role"], registry=self.registry
+            "hapticdb_browsers", "Browsers that are connected.", ["role"], registry=known
         )
         self.connections = Counter(
             "hapticdb_browser_connections",
             "Connections of browsers, by how they ended or why they were refused.",
             ["end"],
-            registry=self.registry,
+            registry=known,
         )
         self.devices = Gauge(
-            "hapticdb_devices",
-            "Connections of devices that are open, those that still ask among them.",
-            registry=self.registry,
+            "hapticdb_devices", "Open connections of devices, asking ones too.", registry=known
         )
         self.messages = Counter(
-            "hapticdb_relay_messages",
-            "Messages of browsers that were passed to the page.",
-            registry=self.registry,
+            "hapticdb_relay_messages", "Messages of browsers passed to the page.", registry=known
         )
         self.dropped = Counter(
             "hapticdb_relay_messages_dropped",
             "Messages of browsers that were not passed: malformed, type, role, size or rate.",
             ["reason"],
-            registry=self.registry,
+            registry=known,
         )
         self.relayed = Counter(
-            "hapticdb_relay_bytes",
-            "Bytes of messages, from browsers (in) and to them (out).",
-            ["direction"],
-            registry=self.registry,
-        )
+            "hapticdb_relay_bytes", "From browsers (in) and to them (out).", ["direction"],
+            registry=known,
+        )  # fmt: skip
         self.throttled = Counter(
-            "hapticdb_relay_throttled_seconds",
-            "Seconds for which browsers that sent too much had to wait.",
-            registry=self.registry,
-        )
+            "hapticdb_relay_throttled_seconds", "Waits of browsers that sent too much.",
+            registry=known,
+        )  # fmt: skip
         self.page_starts = Gauge(
-            "hapticdb_page_starts",
-            "How often the page process has been started.",
-            registry=self.registry,
+            "hapticdb_page_starts", "How often the page process was started.", registry=known
         )
         self.database = Histogram(
-            "hapticdb_database_seconds",
-            "Time that the database takes to answer a health check.",
-            buckets=DATABASE_BUCKETS,
-            registry=self.registry,
-        )
+            "hapticdb_database_seconds", "Answers of the database to a health check.",
+            buckets=DATABASE_BUCKETS, registry=known,
+        )  # fmt: skip
         for reason in ("malformed", "type", "role", "size", "rate"):
             self.dropped.labels(reason)
         for direction in ("in", "out"):

@@ -33,13 +33,8 @@ HEADERS = {
 class Guards:
     """Checks Host and Origin of everything that comes in, and adds headers to what goes out.
 
-    Parameters
-    ----------
-    app : ASGI application
-        Gets what passes.
-    host_names : sequence of str
-        Names under which the server may be reached, beside addresses in digits, ``localhost`` and
-        the machine's own name.
+    host_names : under which the server may be reached, beside addresses in digits, ``localhost``
+    and the machine's own name.
     """
 
     def __init__(self, app: ASGIApp, host_names: Sequence[str] = ()) -> None:

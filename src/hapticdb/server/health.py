@@ -48,15 +48,7 @@ class Health(NamedTuple):
 
 
 class Doctor:
-    """Asks the parts of a server whether they work.
-
-    Parameters
-    ----------
-    served : Served
-        The environment, the sessions and the figures.
-    keeper : PageKeeper
-        The page.
-    """
+    """Asks the parts of a server whether they work."""
 
     def __init__(self, served: Served, keeper: PageKeeper) -> None:
         self._served, self._keeper = served, keeper
@@ -119,52 +111,37 @@ class Doctor:
 
 
 class HostCollector(Collector):
-    """Figures of sessions and tables, read when they are asked for.
-
-    Parameters
-    ----------
-    host : SessionHost
-        Where they run.
-    """
+    """Figures of a host's sessions and tables, read when they are asked for."""
 
     def __init__(self, host: SessionHost) -> None:
         self._host = host
 
     def collect(self) -> Iterator[Metric]:
-        """Yield one family of figures after another."""
-        figures = self._figures()
-        yield GaugeMetricFamily("hapticdb_sessions", "Sessions that run.", len(figures))
-        yield GaugeMetricFamily(
-            "hapticdb_workers", "Worker processes that run.", len(self._host.pids)
-        )
-        for name, words, values in (
-            ("frames", "Frames of the sessions that run.", [f.frames for f in figures]),
-            ("missed", "Deadlines at which no frame began.", [f.missed for f in figures]),
-            ("unknown_frames", "Frames with unknown cells.", [f.unknown for f in figures]),
-            ("held_frames", "Frames with an earlier force.", [f.held for f in figures]),
-            ("stale_frames", "Frames without a database.", [f.stale for f in figures]),
-        ):
-            yield GaugeMetricFamily(f"hapticdb_session_{name}", words, float(sum(values)))
-        yield GaugeMetricFamily(
-            "hapticdb_session_rate_hertz", "Frames a second that each session aims at.",
-            self._host.rate,
-        )  # fmt: skip
-        for name, words, spreads in (
-            ("lateness", "From a deadline to its frame.", [f.lateness for f in figures]),
-            ("frame", "Computing a frame.", [f.elapsed for f in figures]),
-        ):
-            family = GaugeMetricFamily(
-                f"hapticdb_session_{name}_seconds", f"{words} Of the worst session.",
-                labels=["quantile"],
-            )  # fmt: skip
-            for quantile, times in (
-                ("0.5", [spread.p50 for spread in spreads]),
-                ("0.99", [spread.p99 for spread in spreads]),
-                ("1", [spread.worst for spread in spreads]),
-            ):
-                family.add_metric([quantile], max(times, default=0.0))
-            yield family
-        yield from self._cells()
+        """Yield one figure after another: sums, and of times and shares the worst."""
+        sessions = self._figures()
+        tables = [cells.figures() for cells in self._host.cells]
+        hit_rates, latencies = ([getattr(t, n) for t in tables] for n in ("hit_rate", "latency"))
+        late, took = ([getattr(f, n).p99 for f in sessions] for n in ("lateness", "elapsed"))
+        for name, words, value in (
+            ("sessions", "Sessions that run.", len(sessions)),
+            ("workers", "Worker processes that run.", len(self._host.pids)),
+            ("session_frames", "Frames of the sessions.", sum(f.frames for f in sessions)),
+            ("session_missed", "Deadlines without a frame.", sum(f.missed for f in sessions)),
+            ("session_unknown_frames", "With unknown cells.", sum(f.unknown for f in sessions)),
+            ("session_held_frames", "With an earlier force.", sum(f.held for f in sessions)),
+            ("session_stale_frames", "Without a database.", sum(f.stale for f in sessions)),
+            ("session_rate_hertz", "Frames a second that are aimed at.", self._host.rate),
+            ("session_lateness_seconds", "From a deadline to its frame, p99.", max([0.0, *late])),
+            ("session_frame_seconds", "Computing a frame, p99.", max([0.0, *took])),
+            ("cell_tables", "Tables of cells.", len(tables)),
+            ("cells_resident", "Cells in memory.", sum(t.resident for t in tables)),
+            ("cells_loaded", "Cells read so far.", sum(t.loaded for t in tables)),
+            ("cells_losses", "How often the database was lost.", sum(t.losses for t in tables)),
+            ("cells_restarts", "Fetchers started again.", sum(t.restarts for t in tables)),
+            ("cells_hit_rate", "Share of cells found in memory.", min([1.0, *hit_rates])),
+            ("cells_latency_seconds", "Median of recent batches.", max([0.0, *latencies])),
+        ):  # fmt: skip
+            yield GaugeMetricFamily(f"hapticdb_{name}", words, float(value))
 
     def _figures(self) -> list[HostedFigures]:
         """Figures of the sessions that run; one may end meanwhile."""
@@ -173,25 +150,3 @@ class HostCollector(Collector):
             with contextlib.suppress(UsageError):
                 found.append(session.figures())
         return found
-
-    def _cells(self) -> Iterator[Metric]:
-        """Figures of the tables of cells, added up; of times the worst."""
-        tables = [cells.figures() for cells in self._host.cells]
-        yield GaugeMetricFamily("hapticdb_cell_tables", "Tables of cells.", len(tables))
-        for name, words, values in (
-            ("bytes", "Memory of the tables.", [t.budget_bytes for t in tables]),
-            ("resident", "Cells in memory.", [t.resident for t in tables]),
-            ("loaded", "Cells read so far.", [t.loaded for t in tables]),
-            ("evicted", "Cells that made room so far.", [t.evicted for t in tables]),
-            ("losses", "How often the database was lost.", [t.losses for t in tables]),
-            ("restarts", "Fetching processes started again.", [t.restarts for t in tables]),
-        ):
-            yield GaugeMetricFamily(f"hapticdb_cells_{name}", words, float(sum(values)))
-        yield GaugeMetricFamily(
-            "hapticdb_cells_hit_rate", "Share of wanted cells that were there; the worst table.",
-            min((t.hit_rate for t in tables), default=1.0),
-        )  # fmt: skip
-        yield GaugeMetricFamily(
-            "hapticdb_cells_latency_seconds", "Median of recent batches; the worst table.",
-            max((t.latency for t in tables), default=0.0),
-        )  # fmt: skip

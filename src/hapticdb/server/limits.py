@@ -80,17 +80,7 @@ class Limits:
 
 
 class TokenBucket:
-    """Limits a rate: amounts that come evenly pass, and so does a burst that is not too large.
-
-    Parameters
-    ----------
-    rate : float
-        Amount that may pass each second, on average.
-    burst : float
-        Amount that may pass at once after a pause.
-    clock : callable
-        Seconds that only grow.
-    """
+    """Lets an amount pass each second, on average, and a burst at once after a pause."""
 
     def __init__(
         self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic

@@ -89,11 +89,8 @@ class _TransformControlsDragStartMessage(_Message, tag=True):
     owner: Name = ""
 
 
-class _TransformControlsDragEndMessage(_Message, tag=True):
+class _TransformControlsDragEndMessage(_TransformControlsDragStartMessage, tag=True):
     """A gizmo is let go."""
-
-    name: Name
-    owner: Name = ""
 
 
 class _ValueUpdate(msgspec.Struct, forbid_unknown_fields=True):
@@ -154,16 +151,10 @@ Reason = Literal["malformed", "type", "role", "size"]
 
 
 class Verdict(NamedTuple):
-    """What becomes of a message: the bytes to send on, or the reason why there are none.
+    """What becomes of a message: the bytes that the page gets, or the reason why there are none.
 
-    Attributes
-    ----------
-    passed : bytes or None
-        What the page gets.
-    reason : str
-        ``malformed``: it is not what viser's client writes; ``type``: a type that our page does
-        not use; ``role``: one that the browser's role may not send; ``size``: too large. Empty if
-        the message passes.
+    ``malformed``: it is not what viser's client writes; ``type``: a type that our page does not
+    use; ``role``: one that the browser's role may not send; ``size``: too large.
     """
 
     passed: bytes | None

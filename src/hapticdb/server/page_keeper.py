@@ -6,7 +6,6 @@ import json
 import logging
 import socket
 from collections.abc import Awaitable, Callable
-from typing import Protocol
 
 from hapticdb.errors import HapticDBError
 from hapticdb.page.link import LONGEST_LINE, announcement, line
@@ -30,13 +29,6 @@ class PageAwayError(HapticDBError):
     """The page process does not answer now; it may be starting again."""
 
 
-class _MakesRequest(Protocol):
-    """Makes the request of a page process, given the descriptors that it inherits."""
-
-    def __call__(self, *, link: int, host: int) -> object:
-        """Return a picklable request."""
-
-
 class PageKeeper:
     """Keeps a page process running.
 
@@ -45,7 +37,8 @@ class PageKeeper:
     work : str
         Function of the process, as `Process` takes it; it sends ``ready`` with its port.
     request : callable
-        Makes the request of each process that is started.
+        Makes the request of each process, of the descriptors of its link and of its way to the
+        host.
     serve_host : callable
         Takes the socket at whose other end the page begins its sessions.
     prepare : callable
@@ -55,7 +48,7 @@ class PageKeeper:
     def __init__(
         self,
         work: str,
-        request: _MakesRequest,
+        request: Callable[[int, int], object],
         serve_host: Callable[[socket.socket], None],
         prepare: Callable[[], Awaitable[None]],
     ) -> None:
@@ -113,7 +106,7 @@ class PageKeeper:
                     own, other = socket.socketpair()
                     pairs.append((ours.enter_context(own), theirs.enter_context(other)))
                 link, host = (other.fileno() for _, other in pairs)
-                request = self._request(link=link, host=host)
+                request = self._request(link, host)
                 process = await asyncio.to_thread(Process, self._work, request, (link, host))
             ours.pop_all()  # nothing failed, so they stay open
         return process, pairs[0][0], pairs[1][0]
@@ -141,10 +134,7 @@ class PageKeeper:
     async def announce(self, port: int, name: str, role: str) -> int:
         """Announce a browser that will connect from a port; returns the page's port.
 
-        Raises
-        ------
-        PageAwayError
-            If the page does not answer.
+        PageAwayError if the page does not answer.
         """
         if not self.is_ready or self._writer is None:
             raise PageAwayError("the page is starting; try again in a few seconds")

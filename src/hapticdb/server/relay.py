@@ -54,19 +54,7 @@ class Closing(Exception):  # noqa: N818 - an end, and not always an error
 
 
 class Relay:
-    """Connects browsers with the page.
-
-    Parameters
-    ----------
-    access : Access
-        Roles of browsers.
-    keeper : PageKeeper
-        The page.
-    limits : Limits
-        What one browser, and all together, may do.
-    figures : Figures
-        Counts what passes and what does not.
-    """
+    """Connects browsers with the page, within their roles and the limits; counts what passes."""
 
     def __init__(
         self, access: Access, keeper: PageKeeper, limits: Limits, figures: Figures

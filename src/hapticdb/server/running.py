@@ -54,37 +54,13 @@ HEADER_BYTES = 16 << 10
 class Serving:
     """What a server is started with.
 
-    Attributes
-    ----------
-    urls : mapping of Role to str
-        The environment's address for each role.
-    tools : tuple of str
-        Files of tools.
-    tokens : mapping of str to Role
-        What each token gives.
-    open_role : Role or None
-        Role of clients without a token.
-    host, port : str, int
-        Where it listens; 0 is a free port.
-    prefix : str
-        Path under which it is reached, such as ``/hapticdb``; empty for none.
-    host_names : tuple of str
-        Names under which it may be reached.
-    folders : tuple of str or None
-        Folders below which objects' files may be read; None: those of the files as imported.
-    certificate, key : str or None
-        Files of TLS.
-    title : str
-        Title of the page.
-    recordings : str or None
-        Folder for recordings of sessions; None: nobody records.
-    limits : Limits
-        What clients may ask for.
-    page : str
-        Function of the page's process.
-    awaits_devices : bool
-        Whether devices on other machines are expected: what hands call is compiled from the start,
-        and not when somebody first feels something.
+    urls : the environment's address for each role; tools : files; tokens : the role that each
+    gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
+    it is reached, such as ``/hapticdb``; folders : below which objects' files may be read, None:
+    those of the files as imported; certificate, key : files of TLS; recordings : folder for
+    recordings of sessions, None: nobody records; page : function of the page's process;
+    awaits_devices : whether what hands call is compiled from the start, for devices on other
+    machines, and not when somebody first feels something.
     """
 
     urls: Mapping[Role, str]
@@ -136,13 +112,10 @@ class _Config(uvicorn.Config):
 
 
 def check(serving: Serving) -> None:
-    """Refuse what must not be served.
+    """Refuse what must not be served, by a UsageError.
 
-    Raises
-    ------
-    UsageError
-        If another machine could reach the server without a token; if a prefix, or the files of
-        TLS, cannot be used.
+    That is a server without a token that another machine could reach; a prefix, or files of TLS,
+    that cannot be used.
     """
     if not is_near(serving.host) and serving.open_role is not None:
         raise UsageError(
@@ -245,7 +218,7 @@ async def run(
     LOG.info("stopped")
 
 
-def _page_request(serving: Serving, *, link: int, host: int) -> PageRequest:
+def _page_request(serving: Serving, link: int, host: int) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
     return PageRequest(
         urls, serving.tools, serving.folders, link, host, serving.recordings, serving.title

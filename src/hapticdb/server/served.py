@@ -12,25 +12,7 @@ from hapticdb.server.limits import Limits
 
 @dataclass(frozen=True)
 class Served:
-    """An environment as one server offers it.
-
-    Attributes
-    ----------
-    urls : mapping of Role to str
-        The environment's address for each role.
-    tools : tuple of str
-        Files of the tools that the operator offers.
-    access : Access
-        What a client may do, by the headers of its request.
-    limits : Limits
-        What one client, and all together, may ask for.
-    figures : Figures
-        Counters for the operator.
-    host : SessionHost
-        Where sessions run.
-    preparation : Preparation
-        Compiles what hands call.
-    """
+    """An environment as one server offers it; `urls` and `tools` as of `Serving`."""
 
     urls: Mapping[Role, str]
     tools: tuple[str, ...]

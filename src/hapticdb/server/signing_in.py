@@ -36,21 +36,7 @@ POLICY = (
 
 
 class FrontDoor:
-    """Answers a browser's first requests: the view, or the form that asks for a token.
-
-    Parameters
-    ----------
-    access : Access
-        Tokens and cookies.
-    page : ClientPage
-        The view.
-    limits : Limits
-        How often tokens may be tried, and the form's size.
-    prefix : str
-        Path under which the server is reached; empty, or with a slash in front and none behind.
-    title : str
-        Title of the form.
-    """
+    """Answers a browser's first requests: the view, or the form that asks for a token."""
 
     def __init__(
         self, access: Access, page: ClientPage, limits: Limits, prefix: str, title: str

@@ -25,11 +25,6 @@ class ServedContacts:
     """The endpoint of one server; its cells and tools are made for the first client.
 
     They are freed when the last client has left.
-
-    Parameters
-    ----------
-    served : Served
-        What the server offers.
     """
 
     def __init__(self, served: Served) -> None:

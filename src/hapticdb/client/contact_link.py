@@ -31,15 +31,7 @@ later."""
 
 
 class ContactLink:
-    """A connection that has been granted a tool.
-
-    Parameters
-    ----------
-    connection : ClientConnection
-        Of the package websockets; the link closes it.
-    terms : ProxyTerms
-        What the server granted.
-    """
+    """A connection that has been granted a tool, on these terms; the link closes it."""
 
     def __init__(self, connection: "ClientConnection", terms: ProxyTerms) -> None:
         self._connection, self.terms = connection, terms
@@ -47,12 +39,8 @@ class ContactLink:
     def receive(self) -> tuple[ProxyState, int]:
         """Wait for the next proxy; returns it and its size in bytes.
 
-        Raises
-        ------
-        ConnectionLostError
-            If the connection has ended; the message has the server's reason.
-        ProtocolError
-            If the message is malformed.
+        ConnectionLostError with the server's reason if the connection has ended, ProtocolError if
+        the message is malformed.
         """
         message = _received(self._connection, None)
         return unpack_proxy(message), len(message)
@@ -70,21 +58,9 @@ class ContactLink:
 
 
 def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
-    """Connect to a server and ask for a tool.
+    """Connect to a server and ask for a tool; `ContactProxy` names the errors.
 
-    Raises
-    ------
-    UsageError
-        If the URL is wrong or the server refuses the wish.
-    AccessError
-        If the server refuses the token, or its certificate is not trusted.
-    BusyError
-        If the server has too many clients.
-    ConnectionLostError
-        If the server cannot be reached, does not answer within `patience` seconds, or does not
-        grant a tool within `GRANTED_WITHIN`.
-    EnvironmentNotFoundError
-        If another server answers there.
+    patience : seconds in which it must answer; it must grant a tool within `GRANTED_WITHIN`.
     """
     connection = open_websocket(parse_address(url), patience)
     try:

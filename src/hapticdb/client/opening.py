@@ -69,11 +69,8 @@ class _ServerAddress(NamedTuple):
 def parse_address(url: str) -> _ServerAddress:
     """Take a URL apart.
 
-    Raises
-    ------
-    UsageError
-        When it is none of a server, has no host, a user, an unknown parameter, or a token that no
-        header can carry.
+    UsageError if it is none of a server, has no host, a user, an unknown parameter, or a token that
+    no header can carry.
     """
     shown = redact(url)
     try:
@@ -106,18 +103,7 @@ def parse_address(url: str) -> _ServerAddress:
 def open_websocket(address: _ServerAddress, patience: float) -> "ClientConnection":
     """Connect to a server straight, without a proxy and without compression.
 
-    Raises
-    ------
-    AccessError
-        If the server refuses the token, or its certificate is not trusted.
-    BusyError
-        If the server has too many clients.
-    ConnectionLostError
-        If the server cannot be reached or does not answer within `patience` seconds.
-    EnvironmentNotFoundError
-        If another server answers there.
-    MissingExtraError
-        If the package websockets is not installed.
+    patience : seconds in which it must answer; `ContactProxy` names the errors.
     """
     try:
         from websockets.sync.client import connect  # noqa: PLC0415 - an extra

@@ -47,12 +47,7 @@ class ForceState(NamedTuple):
 class ProxyForce:
     """Evaluates the newest proxy, blends it in over one period, and lets the force fall in silence.
 
-    Parameters
-    ----------
-    terms : ProxyTerms
-        What the server granted.
-    damping : float
-        B, N s/m: of the hand's motion along the force.
+    terms : what the server granted; damping : B, N s/m, of the hand's motion along the force.
     """
 
     def __init__(self, terms: ProxyTerms, damping: float = 0.0) -> None:

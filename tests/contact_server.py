@@ -12,7 +12,6 @@ import sys
 import threading
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import uvicorn
@@ -20,7 +19,9 @@ from starlette.applications import Starlette
 from starlette.routing import WebSocketRoute
 from starlette.websockets import WebSocket
 
+from hapticdb.hosting.contact_source import ContactSource
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.protocol.contacts import HandState
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Access, Role
 from hapticdb.server.contacts import endpoint
@@ -46,9 +47,9 @@ async def serve(
     """Serve until standard input closes."""
     compute, spent = endpoint._proxy, list[float]()
 
-    def timed(*given: Any) -> bytes:  # noqa: ANN401 - as it takes them
+    def timed(source: ContactSource, hand: HandState, arrived: float) -> bytes:
         began = time.perf_counter()
-        message = compute(*given)
+        message = compute(source, hand, arrived)
         spent.append(time.perf_counter() - began)
         return message
 

@@ -30,18 +30,6 @@ CAMERA = {
 """The first message of viser's client."""
 
 
-WRONG: tuple[object, ...] = (
-    True, False, 0, 1, -1, 1.0, -1e9, "", "x", "Take out", None, [], [0.0], [0.0, 0.0, 0.1],
-    ["a", "b", "c"], [True, 1], [""] * 64,
-)  # fmt: skip
-"""Values that pass the relay; each is wrong for most widgets."""
-
-
-def wrong_messages(uuid: str) -> list[dict[str, object]]:
-    """Messages that pass the relay, with values of wrong types for a widget."""
-    return [{"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": v}} for v in WRONG]
-
-
 @dataclass
 class Running:
     """A server that runs."""

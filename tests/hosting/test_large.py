@@ -1,10 +1,8 @@
 """Hosted sessions of large tools: clusters sleep, broad contacts merge."""
 
 import os
-import threading
 import time
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import NamedTuple
 
@@ -14,17 +12,17 @@ from numpy.typing import NDArray
 
 import hapticdb.realtime.loop
 from banded import write_points
-from children import joined, until
+from children import until
 from hapticdb import Environment, PointShell
-from hapticdb.hosting.board import RING, Board
+from hapticdb.hosting.board import RING
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
-from hapticdb.hosting.stations import SeatRequest, Stations
+from hapticdb.hosting.stations import SeatRequest
 from hapticdb.kernels.records import pose_numbers
 from hapticdb.kernels.resident.cells import WRENCH
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import SMOOTH
-from hapticdb.realtime.deadlines import SPIN, Timing
+from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.drive import MERGES_FROM
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, ring_bytes
@@ -178,30 +176,3 @@ def test_a_cell_that_changes_beside_a_sleeping_tool_is_felt(ground: Ground, tmp_
     finally:
         session.end()
         ground.env.remove(added)
-
-
-def test_clusters_sleep_in_a_worker_and_wake_where_they_come_near(ground: Ground) -> None:
-    """As the worker's own memory says; nothing that others see depends on it."""
-    table = ground.host.cells[0].table
-    board, plate = Board.create(2), standing_plate()
-    stations = Stations(board, RATE, SPIN)
-    session = ground.host.begin(plate, ABOVE)
-    asked = ground.host._running[session.id].request
-    session.end()
-    rests = []
-    for number, height in enumerate([0.02, ground.height - 0.001]):
-        seat = board.take(number + 1, 0)
-        board.seats["is_recorded"][seat] = 1  # only recorded frames sleep
-        pose = (0.0, 0.0, height, 1.0, 0.0, 0.0, 0.0)
-        request = replace(asked, seat=seat, reader=table.join(), pose=pose)
-        stations.begin(request, table)
-        rests.append(stations._asleep[number].sleepers.run_rests[:, 3])
-    thread = threading.Thread(target=stations.run)
-    thread.start()
-    until(lambda: stations.n_periods > 10)
-    stations.stop()
-    joined(thread)
-    high, low = rests
-    assert (high >= 0.0).all()
-    assert 0 < np.count_nonzero(low < 0.0) < len(low)
-    board.close()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 import hapticdb
 from children import until
 from hapticdb.mesh import read_file
-from hapticdb.page.colours import MARKED, colour_of, sent
+from hapticdb.page.colours import MARKED
 from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
@@ -94,19 +94,6 @@ def test_one_browser_hides_and_marks_for_itself(
 _SHOWN: dict[Path, Shown] = {}
 
 
-def test_what_is_marked_has_the_colour_of_marks(shown: Shown) -> None:
-    own, rod = RecordedScene(), next(o.id for o in shown.objects if o.name == "rod")
-    shown.contents.watch(
-        "one", Audience(cast("Any", own)), lambda m: MARKED if m.id == rod else m.colour
-    )
-    colours = [
-        tuple(node.__dict__["batched_colors"][0])
-        for node in own.nodes.values()
-        if node.__dict__["vertices"] is not None
-    ]
-    assert tuple(sent(np.array(MARKED, dtype=np.uint8))) in colours
-
-
 def placed(obj: Object, seed: int) -> NDArray[np.float64]:
     """Another place of an object: turned about the world's z, and shifted."""
     rng = np.random.default_rng(seed)
@@ -155,11 +142,3 @@ def test_removed_objects_are_not_drawn(shown: Shown) -> None:
     left = set(shown.triangles) - gone
     assert are_same(drawn(shown.scene), shown.of(left))
     assert shown.contents.pick([0, 0, -5], [0, 0, 1], lambda i: i in gone) is None
-
-
-def test_colours_do_not_depend_on_other_objects(shown: Shown) -> None:
-    nodes = shown.scene.nodes.values()
-    drawn_in = {tuple(colour) for node in nodes for colour in node.__dict__["batched_colors"]}
-    own = [sent(np.array(colour_of(obj), dtype=np.uint8)) for obj in shown.objects]
-    assert drawn_in == {tuple(colour) for colour in own}
-    assert len(drawn_in) > 2

@@ -10,9 +10,8 @@ import pytest
 
 import hapticdb
 from children import until
-from hapticdb.edits.editor import Editor
 from hapticdb.errors import ConflictError, HapticDBError, UsageError
-from hapticdb.page import database, editing
+from hapticdb.page import database
 from hapticdb.page.editing import Edits
 from hapticdb.page.folders import AllowedFolders
 from hapticdb.sample.write import write_sample
@@ -92,27 +91,6 @@ def test_an_undo_after_another_persons_move_leaves_it(sample: str, tries_again: 
             now = env.object(before.id)
             assert np.array_equal(now.transform, theirs.transform)
             done(edits, 1, lambda own: own.move(now, np.linalg.inv(up @ up)))
-    finally:
-        edits.close()
-
-
-def test_a_person_has_one_editor(sample: str, monkeypatch: pytest.MonkeyPatch) -> None:
-    """It reads all objects when it is made."""
-    made: list[Editor] = []
-
-    def make(env: hapticdb.Environment) -> Editor:
-        made.append(Editor(env))
-        return made[-1]
-
-    monkeypatch.setattr(editing, "Editor", make)
-    edits = Edits(sample, EVERYWHERE)
-    try:
-        for person in (3, 3, 4, 3):
-            done(edits, person, lambda own: own.undo())
-        assert len(made) == 2
-        edits.forget(3)
-        done(edits, 3, lambda own: own.undo())
-        assert len(made) == 3
     finally:
         edits.close()
 

@@ -1,7 +1,6 @@
 """The page reads objects' files below the operator's folders only, and its errors name no place."""
 
 import shutil
-import threading
 from pathlib import Path
 from typing import Any
 
@@ -9,7 +8,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import PATIENCE, until
+from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
 from hapticdb.page.panels.touch import PART
 from hapticdb.page.tabs import TabbedBrowser
@@ -67,22 +66,6 @@ def test_files_outside_the_operators_folders_are_not_read(scene: Path, tmp_path:
         assert {obj.id: obj.revision for obj in env.objects()} == {
             one: revision for one, revision in before.items() if one != chosen
         }
-
-
-def test_files_below_the_folders_are_moved_and_put_back(scene: Path) -> None:
-    with page_of(scene) as (site, person, browser):
-        seen = site.objects[choose(browser, "box.stl")]
-        assert site.edits is not None
-        done: list[str] = []
-        for job in (
-            lambda own: own.move(seen, WAY),
-            lambda own: own.undo(),
-        ):
-            site.edits.ask(browser.number, job, done.append, browser.failed)
-        until(lambda: len(done) == 2 or bool(person.told))
-        person.press("Take this part in hand")
-        until(lambda: browser.taken == seen.id)
-        assert person.told == []
 
 
 def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) -> None:
@@ -182,19 +165,3 @@ def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
         person.choose("Tool", "peg")
         until(lambda: browser.tool is site.tools[1])
         assert person.told == []
-
-
-def test_voxels_are_not_drawn_after_their_box_was_cleared(scene: Path) -> None:
-    with page_of(scene) as (site, person, browser):
-        choose(browser, "box.stl")
-        is_cleared, is_done = threading.Event(), threading.Event()
-        site.database.ask(lambda _: is_cleared.wait(PATIENCE), str, browser.failed)
-        parts = browser.parts
-        person.choose("Voxels", value=True)
-        until(lambda: parts._voxel_box.value)
-        person.choose("Voxels", value=False)
-        until(lambda: not parts._voxel_box.value)
-        site.workers.submit(is_cleared.set)
-        site.database.ask(lambda _: None, lambda _: is_done.set(), browser.failed)
-        assert is_done.wait(PATIENCE)
-        assert parts._voxels is None

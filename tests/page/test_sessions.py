@@ -67,6 +67,7 @@ class Person(Browser):
         )
         site = SimpleNamespace(
             host=host, workers=workers, objects={}, edits=None, free_number=lambda _: None,
+            prepare=lambda: None, link=SimpleNamespace(preparing=""),
             view=SimpleNamespace(contents=SimpleNamespace(leave=lambda _: None)),
             stage=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
         )  # fmt: skip

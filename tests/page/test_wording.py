@@ -4,12 +4,10 @@ import pytest
 
 from hapticdb.page.wording import (
     escaped,
-    force_text,
     note_html,
     plain_name,
     rows_html,
     short_name,
-    torque_text,
 )
 
 HOSTILE = '<img src=x onerror="alert(1)">&amp;</td><script>'
@@ -39,8 +37,3 @@ def test_a_short_name_has_at_most_its_letters_and_keeps_both_ends() -> None:
 def test_names_stay_on_one_line() -> None:
     assert plain_name("a\nb\x1b[31m\u202e") == "a?b?[31m?"
     assert plain_name("") == "(no name)"
-
-
-def test_numbers_have_few_decimals_and_their_unit() -> None:
-    assert force_text(1.23456) == "1.23 N"
-    assert torque_text(0.0314159) == "0.031 N m"

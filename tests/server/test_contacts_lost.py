@@ -55,15 +55,6 @@ def test_the_force_falls_to_zero_when_the_server_stops(mortal: Served, how: int)
             time.sleep(1e-3)
 
 
-def test_the_force_comes_back_with_a_server_that_goes_on(mortal: Served) -> None:
-    with ContactProxy(mortal.url()) as proxy:
-        pressed(mortal, proxy)
-        os.kill(mortal.process.pid, signal.SIGSTOP)
-        falls_to_zero(mortal, proxy)
-        os.kill(mortal.process.pid, signal.SIGCONT)
-        pressed(mortal, proxy)
-
-
 def test_the_force_comes_back_with_a_server_that_is_started_again(mortal: Served) -> None:
     with ContactProxy(mortal.url()) as proxy:
         pressed(mortal, proxy)
@@ -165,15 +156,6 @@ def test_a_connection_that_is_made_while_the_proxy_closes_is_closed(
         (link,) = made
         with pytest.raises(ConnectionLostError):
             link.receive()
-
-
-def test_without_any_proxy_there_is_no_force() -> None:
-    with stalling(lambda c: c.send(pack_terms(TERMS))) as url, ContactProxy(url) as proxy:
-        began = time.monotonic()
-        while time.monotonic() < began + 0.5:
-            assert not proxy.wrench(np.eye(4), STILL).any()
-            time.sleep(1e-3)
-        assert proxy.is_connected
 
 
 def test_the_force_comes_back_after_a_server_that_talks_nonsense(mortal: Served) -> None:

@@ -99,18 +99,6 @@ def test_figures_need_a_token_or_this_machine(server: Running) -> None:
     assert server.ask("/metrics", X_Forwarded_For=far, Authorization=shown)[0].status == 200
 
 
-def test_open_connections_of_devices_are_counted(server: Running) -> None:
-    def is_counted(number: str) -> bool:
-        text = server.ask("/metrics")[1].decode()
-        return f"hapticdb_devices {number}\n" in text
-
-    shown = {"Authorization": f"Bearer a-token-for-{Role.TOUCHER.word}"}
-    address = f"ws://{server.place}{server.prefix}/device/contacts"
-    with connect(address, additional_headers=shown, proxy=None, compression=None):
-        until(lambda: is_counted("1.0"))
-    until(lambda: is_counted("0.0"))
-
-
 def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:
     with server.browser(Role.EDITOR) as healthy, server.browser(Role.EDITOR) as bad:
         for browser in (healthy, bad):
@@ -123,15 +111,6 @@ def test_malformed_and_unknown_messages_reach_nobody(server: Running) -> None:
         text_until(healthy, "is a editor")
     seen = server.ask("/metrics")[1].decode()
     assert 'hapticdb_relay_messages_dropped_total{reason="type"} 1.0' in seen
-
-
-def test_a_client_that_sends_nothing_useful_is_closed(environment: Path) -> None:
-    limits = replace(Limits(), bad_messages=20)
-    serving = Serving(urls(environment), tokens=TOKENS, limits=limits, page="viser_page:work")
-    with running(serving) as server, server.browser(Role.VIEWER) as browser:
-        for _ in range(30):
-            browser.send(b"\xc1")
-        assert close_code(browser) == 1008
 
 
 def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:

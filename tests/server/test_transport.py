@@ -14,7 +14,7 @@ from websockets.sync.client import ClientConnection, connect
 
 from children import PATIENCE, finished
 from hapticdb.client.opening import open_websocket, parse_address
-from hapticdb.errors import AccessError, ConnectionLostError, FileError
+from hapticdb.errors import AccessError, FileError
 from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from hapticdb.server.transports import StrictWebSocket
@@ -76,13 +76,6 @@ def test_a_client_trusts_the_file_that_it_is_given(
     device(f"wss://{secure.place}?token={TOKEN}&ca={certificate[0]}").close()
 
 
-def test_a_client_trusts_what_ssl_cert_file_names(
-    secure: Running, certificate: tuple[str, str], monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("SSL_CERT_FILE", certificate[0])
-    device(f"wss://{secure.place}?token={TOKEN}").close()
-
-
 def test_a_stranger_is_not_trusted_and_gets_no_token(
     secure: Running, tmp_path: Path, environment: Path, certificate: tuple[str, str]
 ) -> None:
@@ -119,11 +112,6 @@ def test_a_browser_uses_the_page_over_tls(secure: Running, certificate: tuple[st
     ) as browser:  # fmt: skip
         sent(browser, CAMERA)
         assert "is a toucher" in text_until(browser, "is a toucher")
-
-
-def test_a_client_without_tls_gets_no_further(secure: Running) -> None:
-    with pytest.raises(ConnectionLostError, match="cannot be reached"):
-        device(f"ws://{secure.place}?token={TOKEN}")
 
 
 @pytest.mark.parametrize("is_secure", [False, True])

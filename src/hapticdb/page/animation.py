@@ -56,13 +56,7 @@ class _Move(NamedTuple):
 
 
 def check_view() -> None:
-    """Refuse in one line where what writes the page is not installed.
-
-    Raises
-    ------
-    MissingExtraError
-        Without the extra `view`.
-    """
+    """Refuse in one line where what writes the page is not installed: MissingExtraError."""
     if importlib.util.find_spec("viser") is None:
         raise MissingExtraError("an animation needs the extra 'view': pip install 'hapticdb[view]'")
 

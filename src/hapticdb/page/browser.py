@@ -49,18 +49,7 @@ class Browser:
 
     Its callbacks run in viser's threads, `tick` in the page's clock, and the work of sessions in
     threads of the site, in one of them at a time: `_beginning` is that one's. No thread waits for
-    the host with `_swapping`, under which the session is exchanged.
-
-    Parameters
-    ----------
-    site : Site
-        What all browsers share.
-    client : ClientHandle
-        The browser, as viser knows it.
-    visitor : Visitor
-        Name and role of the person.
-    number : int
-        Of the browser at this site, freed by `close`.
+    the host with `_swapping`, under which the session is exchanged. `close` frees the number.
     """
 
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:

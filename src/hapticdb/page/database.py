@@ -30,16 +30,7 @@ class DatabaseThread:
     """An environment in a thread of its own, which does the jobs of all browsers in turn.
 
     It is opened for the first job, and for each later one again while it cannot be; such a job
-    fails.
-
-    Parameters
-    ----------
-    url : str
-        The environment.
-    folders : AllowedFolders
-        Where its jobs may read objects' files.
-    read_only : bool
-        Whether its jobs only read.
+    fails. Its jobs may read objects' files below the folders.
     """
 
     def __init__(self, url: str, folders: AllowedFolders, *, read_only: bool = True) -> None:
@@ -56,15 +47,7 @@ class DatabaseThread:
         then: Callable[[Answer], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do a job later, in the database's thread; then call `then` or `failed` there.
-
-        Parameters
-        ----------
-        job : callable
-            Gets the environment.
-        then, failed : callable
-            Get its result, or its error; they should be short.
-        """
+        """Do a job later, in the database's thread; then call `then` or `failed` there, shortly."""
 
         def work() -> None:
             try:

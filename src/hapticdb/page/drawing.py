@@ -61,14 +61,8 @@ def place(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
 class HandDrawing:
     """Hand and tool of the person who looks, in their view alone.
 
-    Parameters
-    ----------
-    client : ClientHandle
-        The browser.
-    diagonal : float
-        Of the scene's box, metres: sizes of arrows and marks follow it.
-    cap : float
-        Greatest force that is sent, N.
+    diagonal : of the scene's box, metres, which sizes of arrows and marks follow; cap : greatest
+    force that is sent, N.
     """
 
     def __init__(self, client: "ClientHandle", diagonal: float, cap: float) -> None:

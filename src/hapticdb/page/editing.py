@@ -27,10 +27,7 @@ class PersonsEdits:
     def move(self, obj: Object, way: NDArray[np.float64]) -> Object:
         """Displace an object, as the person saw it, by (4, 4); returns it as it is now.
 
-        Raises
-        ------
-        ConflictError
-            If somebody has written the object since.
+        ConflictError if somebody has written the object since.
         """
         self._check(obj)
         return self._editor.move(obj.id, way @ obj.transform)
@@ -68,15 +65,7 @@ class PersonsEdits:
 
 
 class Edits:
-    """Edits of all people of a page.
-
-    Parameters
-    ----------
-    url : str
-        The environment, as one who may write reaches it.
-    folders : AllowedFolders
-        Where objects' files may be read.
-    """
+    """Edits of all people of a page, at the environment's address for one who may write."""
 
     def __init__(self, url: str, folders: AllowedFolders) -> None:
         self._url = url
@@ -92,15 +81,8 @@ class Edits:
     ) -> None:
         """Do an edit of a person later; then call `then` or `failed`. Waits for no database.
 
-        Parameters
-        ----------
-        person : int
-            A number that nobody else ever gets, such as viser's id of a client.
-        job : callable
-            Gets the person's edits.
-        then, failed : callable
-            Get its result, or its error, which names neither the environment's address nor its
-            user.
+        person : a number that nobody else ever gets. The error names neither the environment's
+        address nor its user.
         """
 
         def refused(error: HapticDBError) -> None:

@@ -18,18 +18,7 @@ from hapticdb.store.base import Object, Store
 
 
 class AllowedFolders:
-    """Folders below which files may be read.
-
-    Parameters
-    ----------
-    folders : sequence of str
-        Each must exist.
-
-    Raises
-    ------
-    UsageError
-        If a folder is not there.
-    """
+    """Folders below which files may be read; a UsageError if one is not there."""
 
     def __init__(self, folders: Sequence[str | Path]) -> None:
         self._folders = tuple(_resolved(Path(folder)) for folder in folders)
@@ -47,11 +36,8 @@ class AllowedFolders:
     def checked(self, link: str) -> Path:
         """Return the file behind a link, as a path without symbolic links; to be opened as it is.
 
-        Raises
-        ------
-        FileError
-            If the file does not exist, is no plain file, or lies outside the folders, also by a
-            symbolic link. The message names no folder of this machine.
+        FileError if the file does not exist, is no plain file, or lies outside the folders, also by
+        a symbolic link. The message names no folder of this machine.
         """
         try:
             path = Path(link).resolve(strict=True)
@@ -69,15 +55,7 @@ class AllowedFolders:
 
 
 class FoldersEnvironment(Environment):
-    """An environment that reads objects' files below some folders only.
-
-    Parameters
-    ----------
-    store : Store
-        As for `Environment`.
-    folders : AllowedFolders
-        Whatever reads an object's file again raises their `FileError` if the file is outside.
-    """
+    """An environment that reads objects' files below some folders only, else raises `FileError`."""
 
     def __init__(self, store: Store, folders: AllowedFolders) -> None:
         super().__init__(store)

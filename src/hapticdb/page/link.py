@@ -48,21 +48,10 @@ closed. Larger: such a client fills the log longer."""
 class PageRequest(NamedTuple):
     """What the page process is started with.
 
-    Attributes
-    ----------
-    urls : mapping of str to str
-        The environment's address for each role: viewer, toucher, editor. The database decides what
-        each may do.
-    tools : tuple of str
-        Files of the tools to choose from; the first one is chosen at the start.
-    folders : tuple of str or None
-        Folders below which objects' files may be read; None: the folders of the files as imported.
-    link, host : int
-        Descriptors of the sockets to the server (this module) and to the `SessionHost`.
-    recordings : str or None
-        Folder for recordings of sessions; None: nobody records.
-    title : str
-        What stands above the panels.
+    urls : the environment's address for each role: the database decides what each may do; tools :
+    files, the first is chosen at the start; folders : below which objects' files may be read, None:
+    those of the files as imported; link, host : descriptors of the sockets to the server (this
+    module) and to the `SessionHost`; recordings : folder for recordings, None: nobody records.
     """
 
     urls: Mapping[str, str]
@@ -86,13 +75,7 @@ class Visitor(NamedTuple):
 
 
 class PageLink:
-    """The page's end: learns who comes next, and lets nobody else in.
-
-    Parameters
-    ----------
-    descriptor : int
-        Inherited socket, `PageRequest.link`.
-    """
+    """The page's end, on an inherited socket: learns who comes next, and lets nobody else in."""
 
     def __init__(self, descriptor: int) -> None:
         self._socket = socket.socket(fileno=descriptor)
@@ -134,23 +117,14 @@ class PageLink:
         inner.on_client_disconnect(leave)
 
     def announced(self, client_id: int) -> Visitor:
-        """Return who a client of the guarded server is.
-
-        Raises
-        ------
-        KeyError
-            If the client is not connected.
-        """
+        """Return who a client of the guarded server is; KeyError if it is not connected."""
         with self._lock:
             return self._inside[client_id]
 
     def prepare(self, is_ending: Callable[[], bool]) -> None:
         """Wait until the server has compiled what a hand calls; the first call asks for it.
 
-        Raises
-        ------
-        HapticDBError
-            If the page ends before.
+        HapticDBError if the page ends before.
         """
         with self._asking:
             if not self._is_asked:
@@ -199,13 +173,7 @@ class PageLink:
 
 
 class _Nonsense:
-    """Messages that viser fails at: each is one line of the log, and too many end a connection.
-
-    Parameters
-    ----------
-    connections : mapping of int to connection
-        All that are open, by their clients.
-    """
+    """Messages that viser fails at: each is one line of the log, and too many end a connection."""
 
     def __init__(self, connections: Mapping[Any, Any]) -> None:
         self._connections = connections

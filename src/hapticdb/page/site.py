@@ -83,19 +83,7 @@ class Stage:
 
 @dataclass(eq=False)
 class Site:
-    """What all browsers share.
-
-    Attributes
-    ----------
-    server : ViserServer
-        Serves the page.
-    host : AttachedHost
-        Runs the sessions.
-    request : PageRequest
-        The environment's addresses, the operator's tools, folders and title.
-    link : PageLink
-        To the server.
-    """
+    """What all browsers share: viser's server, the host of sessions, and what the page is of."""
 
     server: "ViserServer"
     host: AttachedHost
@@ -214,10 +202,7 @@ class Site:
 def checked_file(folder: Path | None, name: str) -> Path:
     """Path of a recording in the operator's folder, by the name alone.
 
-    Raises
-    ------
-    UsageError
-        If there is no folder, or the name leads out of it.
+    UsageError if there is no folder, or the name leads out of it.
     """
     if folder is None:
         raise UsageError("nothing is recorded here: the operator gave no folder (--recordings)")

@@ -38,18 +38,8 @@ AROUND = 40
 class HeldTool:
     """A tool as the page uses it.
 
-    Attributes
-    ----------
-    name : str
-        Its name for people.
-    sample : callable
-        Makes the tool's shell, which calls kernels.
-    vertices : (V, 3)
-        Corners of its surface, about the tool's middle, metres.
-    faces : (F, 3)
-        Corners of each triangle.
-    is_round : bool
-        Whether it is drawn with smooth shading.
+    sample : makes the tool's shell, which calls kernels; vertices (V, 3) : corners of its surface,
+    about the tool's middle, metres; faces (F, 3); is_round : whether it is shaded smoothly.
     """
 
     name: str
@@ -98,13 +88,7 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
 
 
 def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list[HeldTool]:
-    """Tools of the operator's files, named by their files.
-
-    Raises
-    ------
-    FileError
-        If a file cannot be read, or holds no surface.
-    """
+    """Tools of the operator's files, named by them; FileError if one holds no readable surface."""
     inset = inset_of(voxel_size, smooth=smooth)
     found = []
     for path in map(Path, paths):

@@ -30,12 +30,8 @@ FOLDERS = re.compile(r"""(?<![^\s'"`(\[<=:,;])/(?=[^\s/])(?:[^/\n:'",;]+/)*""")
 def error_text(error: BaseException, addresses: Iterable[str], folders: Iterable[str] = ()) -> str:
     """Words of an error as any browser may read them: without addresses and folders.
 
-    Parameters
-    ----------
-    addresses : iterable of str
-        URLs of the environment, with their passwords or without.
-    folders : iterable of str
-        Known folders; an absolute path in another one is found by its form. Files keep their names.
+    An absolute path in another folder than the known ones is found by its form. Files keep their
+    names.
     """
     if not isinstance(error, HapticDBError):
         return FAULT

@@ -111,13 +111,7 @@ class BrowserScene:
     # -- clicks ------------------------------------------------------------------------------
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Struck | None:
-        """The part that a ray meets first, of those that this browser sees.
-
-        Parameters
-        ----------
-        origin, direction : (3,) array
-            The ray of a click, world frame: `ray_origin` and `ray_direction` of viser's event.
-        """
+        """The part that a ray, world frame, meets first, of those that this browser sees."""
         return self._contents.pick(origin, direction, self._look.sees)
 
     def measure(self, start: ArrayLike, end: ArrayLike) -> float:

@@ -25,10 +25,7 @@ value makes moves cheaper and leaves more nodes after many of them."""
 class Contents:
     """Objects, their nodes and targets; what each audience sees. Safe to use from several threads.
 
-    Parameters
-    ----------
-    audience : Audience
-        Nodes of all browsers together.
+    audience : nodes of all browsers together.
     """
 
     def __init__(self, audience: Audience) -> None:

@@ -30,16 +30,8 @@ radii a shape fills a fifth of the picture's height."""
 class Geometry:
     """Triangles of a node, made when they are sent.
 
-    Attributes
-    ----------
-    key : hashable
-        Equal for equal triangles.
-    make : callable
-        Gives vertices (V, 3) float32 and faces (F, 3) uint32.
-    radius : float
-        Of its bounding box, metres.
-    opacity : float or None
-        Below 1 for what one sees through.
+    key : equal for equal triangles; make : gives vertices (V, 3) float32 and faces (F, 3) uint32;
+    radius : of its bounding box, metres; opacity : below 1 for what one sees through.
     """
 
     key: Hashable

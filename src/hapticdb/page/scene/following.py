@@ -31,13 +31,7 @@ class Followed:
 class Follower:
     """Opens an environment to read, and tells what is committed to it, in a thread of its own.
 
-    Parameters
-    ----------
-    url : str
-        The environment.
-    tell : callable
-        Takes `Followed`, from this thread: first all objects, then each change.
-
+    tell : called from that thread, first with all objects, then with each change.
     """
 
     grid: Grid
@@ -53,13 +47,7 @@ class Follower:
         self._thread = Thread(target=self._run, name="follower", daemon=True)
 
     def start(self) -> None:
-        """Open the environment, tell all of its objects, and follow it from then on.
-
-        Raises
-        ------
-        HapticDBError
-            If the environment cannot be opened or read.
-        """
+        """Open the environment, tell all of its objects, and follow it, or raise a HapticDBError."""
         self._thread.start()
         self._opened.result()
 

@@ -8,16 +8,8 @@ from dataclasses import dataclass, field
 class Branch:
     """A sub-assembly: an element of paths, with all that lies below it.
 
-    Attributes
-    ----------
-    name, path : str
-        Its own element, and the path to it; both '' for the whole environment.
-    branches : list of Branch
-        Sub-assemblies in it, by name.
-    ids : list of int
-        Objects directly in it, by name.
-    count : int
-        All objects below it.
+    name, path : both '' for the whole environment; branches, ids : sub-assemblies and objects
+    directly in it, by name; count : of all objects below it.
     """
 
     name: str

@@ -36,14 +36,8 @@ SHOW_TRIANGLES = 1_000_000
 class ShapeReader:
     """A thread that reads the shapes of objects which it is given, in order.
 
-    Parameters
-    ----------
-    folders : AllowedFolders
-        Where files may be read.
-    show : callable
-        Takes objects with their shapes, as they become known; called from the reader's thread.
-    lost : callable
-        Takes objects whose file is gone, changed or must not be read.
+    show : called from the thread with objects and their shapes, as they become known; lost : with
+    objects whose file is gone, changed or must not be read.
     """
 
     def __init__(

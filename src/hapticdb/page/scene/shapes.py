@@ -18,13 +18,7 @@ _SERIALS = count()
 
 
 class PartShape:
-    """Triangles of one or more objects, in a frame about their own centre.
-
-    Parameters
-    ----------
-    facets : Facets
-        Triangles, metres, part frame.
-    """
+    """Triangles of one or more objects, metres, in a frame about their own centre."""
 
     def __init__(self, facets: Facets) -> None:
         self.serial = next(_SERIALS)

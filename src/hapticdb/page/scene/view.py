@@ -40,20 +40,8 @@ class SceneView:
     as blocks, of objects whose file is gone, has changed or must not be read. All methods may be
     called from any thread. It is a context manager, which closes it.
 
-    Parameters
-    ----------
-    server : viser.ViserServer
-        The server; its scene below ``/parts``, its ground, light, background and first view are
-        this view's.
-    url : str
-        The environment; it is opened to read, by a thread of the view's own.
-    folders : AllowedFolders
-        Where objects' files may be read.
-
-    Raises
-    ------
-    HapticDBError
-        If the environment cannot be opened or read.
+    The server's scene below ``/parts``, its ground, light, background and first view are this
+    view's. HapticDBError if the environment cannot be opened or read.
     """
 
     def __init__(self, server: "ViserServer", url: str, folders: AllowedFolders) -> None:
@@ -122,17 +110,8 @@ class SceneView:
     def move(self, object_id: int, transform: ArrayLike) -> bool:
         """Show an object at a new placement at once, in all browsers, before it is committed.
 
-        The next commit that writes the object replaces the preview; `put_back` takes it back.
-
-        Parameters
-        ----------
-        transform : (4, 4) array
-            world_from_part, metres; the present one's scale.
-
-        Returns
-        -------
-        bool
-            False if there is no such object.
+        transform (4, 4): world_from_part, metres, of the present one's scale. The next commit that
+        writes the object replaces the preview; `put_back` takes it back. False without the object.
         """
         with self._server.atomic():
             moved = self.contents.move(object_id, transform)

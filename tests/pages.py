@@ -89,7 +89,7 @@ def page_of(
             ) as connection:  # fmt: skip
                 person = PagePerson(connection)
                 until(lambda: (person.look(0.05), bool(site.browsers))[1])
-                person.find("Save a picture")
+                person.find("Play")
                 (browser,) = site.browsers.values()
                 assert isinstance(browser, TabbedBrowser)
                 yield site, person, browser

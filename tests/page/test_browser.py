@@ -1,16 +1,13 @@
-"""Browsers come and go, some never answer, and none feels what it does not show."""
+"""Browsers come and go, and none feels what it does not show."""
 
-import threading
 from types import SimpleNamespace
 from typing import Any
 
 import pytest
 
-from hapticdb.errors import UsageError
 from hapticdb.page import process
 from hapticdb.page.browser import Browser
 from hapticdb.page.link import Visitor
-from hapticdb.page.panels.record import RecordPanel
 
 
 class PretendServer:
@@ -108,48 +105,6 @@ def test_a_browser_that_leaves_or_fails_while_its_panels_are_made_leaves_nothing
     assert not site.browsers
     assert not site.numbers
     assert site.forgotten == [7]
-
-
-def test_a_browser_that_sends_no_picture_holds_no_thread_of_the_page() -> None:
-    """Each callback returns at once; one picture is asked for at a time, and its end is told."""
-    asked: list[float] = []
-    answer = threading.Event()
-    told: list[str] = []
-    work: list[Any] = []
-
-    def get_render(*_: object, timeout: float, **__: object) -> None:
-        asked.append(timeout)
-        assert answer.is_set()
-        raise TimeoutError
-
-    def guarded(_: str, act: Any) -> Any:  # noqa: ANN401 - callbacks
-        def call(event: object) -> None:
-            try:
-                act(event)
-            except UsageError as error:
-                told.append(str(error))
-
-        return call
-
-    panel = RecordPanel.__new__(RecordPanel)
-    panel._is_painting = threading.Lock()
-    panel._browser = SimpleNamespace(  # type: ignore[assignment]
-        client=SimpleNamespace(get_render=get_render),
-        guarded=guarded,
-        site=SimpleNamespace(painting=SimpleNamespace(submit=work.append)),
-    )
-    for _ in range(3):
-        guarded("viewer", panel._save_picture)(None)
-    assert len(work) == 1
-    assert not asked
-    assert told == ["a picture is being taken: wait for it"] * 2
-    answer.set()
-    work.pop()()
-    assert asked
-    assert asked[0] < 60.0
-    assert "no picture" in told.pop()
-    guarded("viewer", panel._save_picture)(None)
-    assert len(work) == 1
 
 
 @pytest.mark.parametrize(

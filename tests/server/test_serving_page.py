@@ -15,7 +15,6 @@ def test_the_table_of_limits_is_that_of_the_code() -> None:
         name: getattr(module, name)
         for module, name in (
             (messages, "LARGEST"),
-            (messages, "LARGEST_PICTURE"),
             (access, "SIGNED_IN_SECONDS"),
             (access, "MOST_SIGNED_IN"),
         )

@@ -35,8 +35,6 @@ TICKS = 30.0
 browser."""
 WORKERS = 4
 """Threads that begin sessions, so that a slow one delays no other browser much."""
-PAINTERS = 4
-"""Threads that wait for pictures of browsers. Larger: more slow browsers are waited for at once."""
 
 
 class _Updated(Protocol):
@@ -102,7 +100,6 @@ class Site:
         self.edits: Edits | None = None
         self.workers = ThreadPoolExecutor(WORKERS, thread_name_prefix="page-worker")
         self.sweeping = ThreadPoolExecutor(1, thread_name_prefix="page-sweep")
-        self.painting = ThreadPoolExecutor(PAINTERS, thread_name_prefix="page-painter")
         self.folders = self._allowed()
         if "editor" in request.urls:
             self.edits = Edits(request.urls["editor"], self.folders)
@@ -128,7 +125,6 @@ class Site:
             self._clock.join(5.0)
         for client in list(self.browsers):
             self.leave(client)
-        self.painting.shutdown(wait=False, cancel_futures=True)  # a browser may never answer
         self.sweeping.shutdown(cancel_futures=True)
         self.workers.shutdown(cancel_futures=True)
         self.view.close()

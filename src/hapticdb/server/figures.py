@@ -29,7 +29,7 @@ class Figures:
         )
         self.dropped = Counter(
             "hapticdb_relay_messages_dropped",
-            "Messages of browsers that were not passed: malformed, type, role, size or rate.",
+            "Messages of browsers that were not passed: malformed, type, role or size.",
             ["reason"],
             registry=known,
         )
@@ -48,7 +48,7 @@ class Figures:
             "hapticdb_database_seconds", "Answers of the database to a health check.",
             buckets=DATABASE_BUCKETS, registry=known,
         )  # fmt: skip
-        for reason in ("malformed", "type", "role", "size", "rate"):
+        for reason in ("malformed", "type", "role", "size"):
             self.dropped.labels(reason)
         for direction in ("in", "out"):
             self.relayed.labels(direction)

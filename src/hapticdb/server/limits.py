@@ -23,9 +23,7 @@ class Limits:
         Messages of one browser. A hand on the gizmo sends about 20 a second, the camera 50.
         Larger: one browser may take more of the relay's time.
     bytes_per_second, bytes_at_once : float
-        Bytes of one browser's messages, pictures aside.
-    pictures_per_second, pictures_at_once : float
-        Pictures that one browser sends on request.
+        Bytes of one browser's messages.
     bad_messages : int
         Messages of one connection that do not pass, before it is closed. Larger: a broken client
         fills logs and counters longer.
@@ -62,8 +60,6 @@ class Limits:
     messages_at_once: float = 400.0
     bytes_per_second: float = 256.0 * 1024
     bytes_at_once: float = 1024.0 * 1024
-    pictures_per_second: float = 0.5
-    pictures_at_once: float = 4.0
     bad_messages: int = 100
     throttled_seconds: float = 10.0
     idle_seconds: float = 3600.0

@@ -16,11 +16,8 @@ from hapticdb.server.access import Role
 FARTHEST = 1e9
 """Greatest absolute value of a coordinate, metres, and of any other number. Larger: numbers that
 overflow where they are multiplied."""
-LARGEST_PICTURE = 16 << 20
-"""Most bytes of a picture that a browser sends on request. Larger: pictures of larger windows, and
-more memory for each browser that sends one."""
 LARGEST = 16 << 10
-"""Most bytes of any other message; a long text field fits. Larger: more to decode for each."""
+"""Most bytes of a message; a long text field fits. Larger: more to decode for each."""
 
 Real = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
 Whole = Annotated[int, Meta(ge=-(10**9), le=10**9)]
@@ -112,13 +109,6 @@ class CommandTriggerMessage(_Message, tag=True):
     uuid: Name
 
 
-class GetRenderResponseMessage(_Message, tag=True):
-    """A picture that the page has asked for."""
-
-    payload: Annotated[bytes, Meta(max_length=LARGEST_PICTURE)]
-    render_uuid: Name
-
-
 class _Tag(msgspec.Struct):
     """The type of any message."""
 
@@ -134,7 +124,6 @@ Known = (
     | _TransformControlsDragEndMessage
     | GuiUpdateMessage
     | CommandTriggerMessage
-    | GetRenderResponseMessage
 )
 FOR_HANDS = (
     TransformControlsUpdateMessage,
@@ -163,7 +152,7 @@ class Verdict(NamedTuple):
 
 def judged(message: bytes, role: Role) -> Verdict:
     """Decode a browser's message, and encode anew what may pass."""
-    if len(message) > LARGEST_PICTURE + LARGEST:
+    if len(message) > LARGEST:
         return Verdict(None, "size")
     try:
         decoded = _decoder.decode(message)
@@ -171,19 +160,11 @@ def judged(message: bytes, role: Role) -> Verdict:
         return Verdict(None, "malformed" if _is_known(message) else "type")
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
         return Verdict(None, "malformed")
-    if not isinstance(decoded, GetRenderResponseMessage):
-        if len(message) > LARGEST:
-            return Verdict(None, "size")
-        if not _is_finite(msgspec.structs.astuple(decoded)):
-            return Verdict(None, "malformed")
+    if not _is_finite(msgspec.structs.astuple(decoded)):
+        return Verdict(None, "malformed")
     if role < Role.TOUCHER and isinstance(decoded, FOR_HANDS):
         return Verdict(None, "role")
     return Verdict(_encoder.encode(decoded))
-
-
-def is_large(message: bytes) -> bool:
-    """Whether only a picture may be as large as this message."""
-    return len(message) > LARGEST
 
 
 def _is_known(message: bytes) -> bool:

@@ -19,7 +19,7 @@ from websockets.typing import Subprotocol
 from hapticdb.server.access import Access, Role
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits, TokenBucket
-from hapticdb.server.messages import is_large, judged
+from hapticdb.server.messages import judged
 from hapticdb.server.page_keeper import PageAwayError, PageKeeper
 
 LOG = logging.getLogger("hapticdb.server")
@@ -166,9 +166,6 @@ class Relay:
                 renewed = now
                 if not self._access.renew(cookie):
                     raise Closing(SIGNED_OUT, "signed out", "signed out")
-            if is_large(message) and not strict.pictures.take():
-                strict.refuse("rate")
-                continue
             self._figures.messages.inc()
             try:
                 await upstream.send(verdict.passed)
@@ -196,13 +193,12 @@ class _Strictness:
         self._limits, self._figures = limits, figures
         self._messages = TokenBucket(limits.messages_per_second, limits.messages_at_once)
         self._bytes = TokenBucket(limits.bytes_per_second, limits.bytes_at_once)
-        self.pictures = TokenBucket(limits.pictures_per_second, limits.pictures_at_once)
         self._n_bad = 0
         self._throttled = 0.0
 
     async def wait_for(self, message: bytes) -> None:
         """Wait until the browser may send that message; the browser's own queue grows meanwhile."""
-        size = 0 if is_large(message) else len(message)
+        size = len(message)
         wait = max(self._messages.wait(), self._bytes.wait(size))
         if wait > 0.0:
             self._throttled += wait

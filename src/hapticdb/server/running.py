@@ -27,7 +27,7 @@ from hapticdb.server.figures import Figures
 from hapticdb.server.guards import is_address
 from hapticdb.server.health import Doctor, HostCollector
 from hapticdb.server.limits import Limits
-from hapticdb.server.messages import LARGEST, LARGEST_PICTURE
+from hapticdb.server.messages import LARGEST
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
@@ -253,7 +253,7 @@ def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
         app,
         http=http,
         ws=websocket,
-        ws_max_size=LARGEST_PICTURE + LARGEST,
+        ws_max_size=64 * LARGEST,  # a smaller one that is too large is dropped, and counted
         ws_per_message_deflate=False,  # compressing costs more time than it saves here
         ws_ping_interval=PING_EVERY,
         ws_ping_timeout=PING_PATIENCE,

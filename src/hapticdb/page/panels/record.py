@@ -1,6 +1,5 @@
-"""The tab Record: record what is felt, replay it on a slider of time, save a picture."""
+"""The tab Record: record what is felt, replay it on a slider of time."""
 
-import threading
 import time
 from datetime import UTC, datetime
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -29,11 +28,6 @@ MOST_LISTED = 200
 """Recordings in the list, the newest. Larger: a longer list to search in."""
 LONGEST_REPLAY = 1_000_000
 """Frames of a recording that is replayed: a quarter of an hour at 1 kHz. Larger: more memory."""
-PICTURE = (1080, 1920)
-"""Height and width of a saved picture, pixels. Larger: more detail, and more to send."""
-PICTURE_SECONDS = 30.0
-"""Seconds in which a browser must send a picture. Larger: a slow browser is waited for longer, and
-those that never answer make others wait."""
 NOTHING = "(none)"
 
 
@@ -53,7 +47,6 @@ class RecordPanel:
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
-        self._is_painting = threading.Lock()
         self._replay: Replay | None = None
         self._drawn: list[Any] = []
         self._played_from: tuple[float, float] | None = None
@@ -74,9 +67,6 @@ class RecordPanel:
             self._play = gui.add_button("Play", visible=False)
             self._play.on_click(guard("viewer", self._play_or_pause))
             self._said = gui.add_html("")
-        with gui.add_folder("Picture"):
-            save = gui.add_button("Save a picture")
-            save.on_click(guard("viewer", self._save_picture))
 
     # -- recording ---------------------------------------------------------------------------
 
@@ -209,38 +199,6 @@ class RecordPanel:
         self._said.content = rows_html(
             (("Time", f"{replay.times[n]:.2f} s"), ("Force", force_text(force)))
         )
-
-    # -- a picture ---------------------------------------------------------------------------
-
-    def _save_picture(self, _: object) -> None:
-        """Ask the browser for a picture, in a thread: it may answer late or never."""
-        if not self._is_painting.acquire(blocking=False):
-            raise UsageError("a picture is being taken: wait for it")
-        try:
-            self._browser.site.painting.submit(self._painted)
-        except BaseException:
-            self._is_painting.release()
-            raise
-
-    def _painted(self) -> None:
-        self._browser.guarded("viewer", self._paint)(None)
-        self._is_painting.release()
-
-    def _paint(self, _: object) -> None:
-        import imageio.v3 as iio  # noqa: PLC0415 - comes with the extra `view`
-
-        client = self._browser.client
-        height, width = PICTURE
-        try:
-            picture = client.get_render(
-                height, width, transport_format="jpeg", timeout=PICTURE_SECONDS
-            )
-        except (TimeoutError, RuntimeError) as error:
-            raise UsageError(
-                f"this browser has sent no picture within {PICTURE_SECONDS:g} s: try again later"
-            ) from error
-        content = iio.imwrite("<bytes>", picture[..., :3], extension=".png")
-        client.send_file_download("hapticdb.png", content, save_immediately=True)
 
 
 def _changed(path: "Path") -> float:

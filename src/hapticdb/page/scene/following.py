@@ -47,7 +47,7 @@ class Follower:
         self._thread = Thread(target=self._run, name="follower", daemon=True)
 
     def start(self) -> None:
-        """Open the environment, tell all of its objects, and follow it, or raise a HapticDBError."""
+        """Open the environment, tell all of its objects, and follow it; a HapticDBError if not."""
         self._thread.start()
         self._opened.result()
 

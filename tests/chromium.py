@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 from playwright.sync_api import Browser, Locator, Page, ViewportSize, sync_playwright
 
-from hapticdb.page.scene.stage import FIELD_OF_VIEW, View
+from hapticdb.page.scene.surroundings import FIELD_OF_VIEW, View
 
 Floats = NDArray[np.float64]
 

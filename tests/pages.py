@@ -11,7 +11,7 @@ from websockets.sync.client import connect
 
 import hapticdb
 from children import PATIENCE, until
-from hapticdb.page.link import PageLink, PageRequest, Visitor, line
+from hapticdb.page.connection import PageConnection, PageRequest, Visitor, line
 from hapticdb.page.process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
@@ -79,7 +79,7 @@ def page_of(
         None if recordings is None else str(recordings),
     )  # fmt: skip
     try:
-        site = Site(server, NoHost(), request, PageLink(theirs.detach()))  # type: ignore[arg-type]
+        site = Site(server, NoHost(), request, PageConnection(theirs.detach()))  # type: ignore[arg-type]
         try:
             open_page(site, lambda _: Visitor("Ada", "editor"))
             address = f"ws://127.0.0.1:{server.get_port()}"

@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb.page import process
 from hapticdb.page.browser import Browser
-from hapticdb.page.link import Visitor
+from hapticdb.page.connection import Visitor
 
 
 class PretendServer:

@@ -32,9 +32,9 @@ from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.panels.moving import MOVING_GIZMO
 from hapticdb.page.process import new_server
 from hapticdb.page.scene.picking import Struck
-from hapticdb.page.scene.stage import framing
+from hapticdb.page.scene.surroundings import framing
 from hapticdb.page.scene.view import SceneView
-from hapticdb.page.site import Stage
+from hapticdb.page.site import SceneFacts
 from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from serving import TOKENS, Running, running, urls
@@ -90,28 +90,28 @@ class Aim:
     """
 
     def __init__(self, view: SceneView, env: hapticdb.Environment) -> None:
-        self.stage = stage = Stage.of(view)
-        self.framing, self.up = framing(stage.bounds, view.up), view.up
+        self.facts = facts = SceneFacts.of(view)
+        self.framing, self.up = framing(facts.bounds, view.up), view.up
         eye = self.framing.position
-        ball = tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth)[0]
+        ball = tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth)[0]
         self.radius = ball.radius
-        view_middle = stage.bounds.mean(axis=0)
+        view_middle = facts.bounds.mean(axis=0)
         found: list[tuple[float, int, Floats, Floats]] = []
         for obj in view.objects.values():
             middle = obj.bounds.mean(axis=0)
-            top = middle + stage.up * float((obj.bounds[1] - middle) @ stage.up)
-            over = first_of(view, top + stage.up * stage.diagonal, -stage.up)
-            if over is None or over.id != obj.id or (over.point - view_middle) @ stage.toward < 0.0:
+            top = middle + facts.up * float((obj.bounds[1] - middle) @ facts.up)
+            over = first_of(view, top + facts.up * facts.diagonal, -facts.up)
+            if over is None or over.id != obj.id or (over.point - view_middle) @ facts.toward < 0.0:
                 continue
             place = np.eye(4)
-            place[:3, 3] = over.point + stage.up * ((1.0 - PUSHED) * ball.radius)
+            place[:3, 3] = over.point + facts.up * ((1.0 - PUSHED) * ball.radius)
             seen = first_of(view, eye, over.point - eye)
             if seen is None or seen.id != obj.id:
                 continue
             touched = env.touch(ball.shell, place)
             free = env.touch(ball.shell, place, exclude=(obj.id,))
             if [part.id for part in touched.objects] == [obj.id] and not free.objects:
-                sides = (obj.bounds[1] - obj.bounds[0])[stage.up == 0.0]
+                sides = (obj.bounds[1] - obj.bounds[0])[facts.up == 0.0]
                 found.append((float(np.prod(sides)), obj.id, place[:3, 3], over.point))
         assert found, "no part of the car can be touched alone from above"
         _, self.id, self.contact, self.seen = max(found, key=lambda one: one[0])
@@ -145,14 +145,14 @@ def opened(page: Page) -> Page:
 
 def pull_hand(page: Page, eye: Eye, aim: Aim, to: Floats) -> None:
     """Drag the hand's gizmo by its arrows, level first, then up or down."""
-    turn = tools.start_pose(aim.stage.bounds, aim.stage.up, aim.stage.toward, aim.radius, 0)[:3, :3]
+    turn = tools.start_pose(aim.facts.bounds, aim.facts.up, aim.facts.toward, aim.radius, 0)[:3, :3]
     for axis in turn.T:
         for _ in range(3):  # a pixel is a step: the rest is dragged again
             here = hand_on(page)
             left = float((to - here) @ axis)
             if abs(left) < NEAR * aim.radius:
                 break
-            arrow = axis * (GRABBED * HAND_GIZMO * aim.stage.diagonal)
+            arrow = axis * (GRABBED * HAND_GIZMO * aim.facts.diagonal)
             drag(page, eye, here + arrow, left * axis)
             until(lambda: not np.array_equal(hand_on(page), here), "the hand moves", page)  # noqa: B023 - called now
     assert np.abs(hand_on(page) - to).max() < 2.0 * NEAR * aim.radius
@@ -167,7 +167,7 @@ def around(image: Floats, pixel: tuple[float, float]) -> Floats:
 def test_one_feels_a_part_until_another_moves_it_away(
     server: Running, aim: Aim, tmp_path: Path
 ) -> None:
-    stage = aim.stage
+    facts = aim.facts
     links = {role: f"{server.address}?token={token}" for token, role in TOKENS.items()}
     with chromium() as browser:
         ada = opened(new_page(browser, links[Role.TOUCHER]))
@@ -198,8 +198,8 @@ def test_one_feels_a_part_until_another_moves_it_away(
         ben.get_by_text("Move", exact=True).click()
         ben.get_by_label("Move the chosen part").check()
         ben.wait_for_timeout(1000)
-        arrow = stage.up * (GRABBED * MOVING_GIZMO * stage.diagonal)
-        drag(ben, eye, aim.middle + arrow, stage.up * (0.2 * stage.diagonal))
+        arrow = facts.up * (GRABBED * MOVING_GIZMO * facts.diagonal)
+        drag(ben, eye, aim.middle + arrow, facts.up * (0.2 * facts.diagonal))
         ben.get_by_text("Done", exact=True).wait_for()
         until(lambda: force_on(ada) == 0.0, "the force is zero", ada)
         picture(ben, "4-ben-has-moved", tmp_path)
@@ -210,7 +210,7 @@ def test_one_feels_a_part_until_another_moves_it_away(
         ben.get_by_role("tab", name="Sweep").click()
         field(ben, "Way").click()
         ben.get_by_role("option", name=f"-{'xyz'[aim.up]}", exact=True).click()
-        field(ben, "Length, m").fill(f"{0.5 * stage.diagonal:.3f}")
+        field(ben, "Length, m").fill(f"{0.5 * facts.diagonal:.3f}")
         ben.get_by_role("button", name="Run the sweep").click()
         until(lambda: ": hits" in ben.locator("body").inner_text(), "the hit is told", ben)
         ben.wait_for_timeout(1000)
@@ -220,7 +220,7 @@ def test_one_feels_a_part_until_another_moves_it_away(
 def test_a_page_that_is_closed_in_a_drag_moves_nothing(
     server: Running, aim: Aim, car: Path, tmp_path: Path
 ) -> None:
-    stage = aim.stage
+    facts = aim.facts
     links = {role: f"{server.address}?token={token}" for token, role in TOKENS.items()}
     with chromium() as browser, hapticdb.open(car, read_only=True) as env:
         revision = env.store.revision()
@@ -239,8 +239,8 @@ def test_a_page_that_is_closed_in_a_drag_moves_nothing(
             now = picture(ada, "11-ada-sees", tmp_path)
             return float(np.abs(around(now, spot) - around(before, spot)).mean())
 
-        arrow = stage.up * (GRABBED * MOVING_GIZMO * stage.diagonal)
-        drag(ben, eye, aim.middle + arrow, stage.up * (0.2 * stage.diagonal), lets_go=False)
+        arrow = facts.up * (GRABBED * MOVING_GIZMO * facts.diagonal)
+        drag(ben, eye, aim.middle + arrow, facts.up * (0.2 * facts.diagonal), lets_go=False)
         until(lambda: change() > 8.0, "the part is seen on its way", ada)
         ben.close()
         until(lambda: change() < 2.0, "the part is back", ada)
@@ -267,7 +267,7 @@ def test_a_person_hides_measures_records_and_replays(
         eve.get_by_text("Records ").wait_for()
         eve.get_by_role("tab", name="Touch").click()
         eve.get_by_text("Where the hand is").click()
-        type_place(eve, aim.contact + aim.stage.up * (3.0 * aim.radius))
+        type_place(eve, aim.contact + aim.facts.up * (3.0 * aim.radius))
         eve.wait_for_timeout(1000)
         type_place(eve, aim.contact)
         until(lambda: (force_on(eve) or 0.0) > 0.5, "a force is read", eve)

@@ -16,8 +16,8 @@ import hapticdb
 from children import joined
 from hapticdb.errors import HapticDBError
 from hapticdb.page.browser import Browser
+from hapticdb.page.connection import Visitor
 from hapticdb.page.editing import PersonsEdits
-from hapticdb.page.link import Visitor
 from hapticdb.page.panels.moving import MovingControls
 from hapticdb.sample.write import write_sample
 
@@ -89,7 +89,7 @@ class Table:
         self.site = SimpleNamespace(
             edits=self.edits,
             objects={part.id: part},
-            stage=SimpleNamespace(diagonal=1.0),
+            facts=SimpleNamespace(diagonal=1.0),
             server=SimpleNamespace(get_clients=lambda: self.clients),
             error_text=str,
             view=SimpleNamespace(

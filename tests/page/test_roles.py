@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb.errors import UsageError
 from hapticdb.page.browser import Browser
-from hapticdb.page.link import ROLES, Visitor
+from hapticdb.page.connection import ROLES, Visitor
 from hapticdb.page.site import checked_file
 from hapticdb.page.wording import error_text
 

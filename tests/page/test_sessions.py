@@ -12,7 +12,7 @@ import pytest
 from children import until
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page.browser import Browser
-from hapticdb.page.link import Visitor
+from hapticdb.page.connection import Visitor
 
 PATIENCE = 30.0
 """Seconds in which workers must do what takes them microseconds."""
@@ -67,9 +67,9 @@ class Person(Browser):
         )
         site = SimpleNamespace(
             host=host, workers=workers, objects={}, edits=None, free_number=lambda _: None,
-            prepare=lambda: None, link=SimpleNamespace(preparing=""),
+            prepare=lambda: None, connection=SimpleNamespace(preparing=""),
             view=SimpleNamespace(contents=SimpleNamespace(leave=lambda _: None)),
-            stage=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
+            facts=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
         )  # fmt: skip
         self.client, self.site = client, site  # type: ignore[assignment]
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]

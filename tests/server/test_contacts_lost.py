@@ -27,7 +27,7 @@ from contact_hands import (
     serving,
     started,
 )
-from hapticdb.client import contact_link, contact_proxy
+from hapticdb.client import contact_connection, contact_proxy
 from hapticdb.client.contact_proxy import ContactProxy
 from hapticdb.errors import ConnectionLostError, ProtocolError, UsageError
 from hapticdb.protocol.contacts import ProxyTerms, pack_terms
@@ -115,7 +115,7 @@ def test_a_server_that_accepts_and_never_answers_is_given_up(
 
 
 def test_a_server_that_never_grants_a_tool_is_given_up(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(contact_link, "GRANTED_WITHIN", 0.5)
+    monkeypatch.setattr(contact_connection, "GRANTED_WITHIN", 0.5)
     with (
         stalling(lambda _: None) as url,
         pytest.raises(ConnectionLostError, match="does not answer"),
@@ -132,30 +132,30 @@ def test_a_wrong_damping_is_refused_before_anything_is_connected(damping: float)
 def test_a_connection_that_is_made_while_the_proxy_closes_is_closed(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    made: list[contact_link.ContactLink] = []
+    made: list[contact_connection.ContactConnection] = []
     is_trying, may_go_on = threading.Event(), threading.Event()
 
-    def slow(url: str, *wish: Any) -> contact_link.ContactLink:  # noqa: ANN401 - as `connect`
+    def slow(url: str, *wish: Any) -> contact_connection.ContactConnection:  # noqa: ANN401 - as `connect`
         is_trying.set()
         assert may_go_on.wait(PATIENCE)
-        made.append(contact_link.connect(url, *wish))
+        made.append(contact_connection.connect(url, *wish))
         return made[-1]
 
     monkeypatch.setattr(contact_proxy, "RECONNECT_EVERY", 0.01)
     with stalling(lambda c: c.send(pack_terms(TERMS))) as url:
         proxy = ContactProxy(url)
         monkeypatch.setattr(contact_proxy, "connect", slow)
-        assert proxy._link is not None
-        proxy._link.close()
+        assert proxy._connection is not None
+        proxy._connection.close()
         assert is_trying.wait(PATIENCE)
         monkeypatch.setattr(contact_proxy, "PATIENCE", 0.01)  # `close` waits no longer
         proxy.close()
         may_go_on.set()
         for thread in proxy._threads:
             joined(thread)
-        (link,) = made
+        (connection,) = made
         with pytest.raises(ConnectionLostError):
-            link.receive()
+            connection.receive()
 
 
 def test_the_force_comes_back_after_a_server_that_talks_nonsense(mortal: Served) -> None:

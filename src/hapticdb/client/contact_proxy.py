@@ -17,7 +17,7 @@ from typing import Any, NamedTuple, Self
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.client.contact_link import ContactLink, connect
+from hapticdb.client.contact_connection import ContactConnection, connect
 from hapticdb.client.proxy_force import ForceState, ProxyForce
 from hapticdb.devices.profiles import HAND_STIFFNESS
 from hapticdb.devices.protocol import Reading
@@ -117,8 +117,8 @@ class ContactProxy:
         self._numbers = pose_numbers(self._hand)
         self._is_placed = False
         self._newest: tuple[float, Floats, Floats, int, bool] | None = None
-        self._link: ContactLink | None = connect(url, self._wish, PATIENCE)
-        self.terms: ProxyTerms = self._link.terms
+        self._connection: ContactConnection | None = connect(url, self._wish, PATIENCE)
+        self.terms: ProxyTerms = self._connection.terms
         """What the server granted, in the scene's units."""
         given = 0.5e-3 * self.terms.stiffness * scale if damping is None else damping
         self._force = ProxyForce(self.terms, given / scale)
@@ -146,9 +146,9 @@ class ContactProxy:
         if self._is_closed.is_set():
             return
         self._is_closed.set()
-        link = self._link
-        if link is not None:
-            link.close()
+        connection = self._connection
+        if connection is not None:
+            connection.close()
         for thread in self._threads:
             thread.join(PATIENCE)
 
@@ -194,7 +194,7 @@ class ContactProxy:
     @property
     def is_connected(self) -> bool:
         """Whether the server is connected now."""
-        return self._link is not None
+        return self._connection is not None
 
     def figures(self) -> _LinkFigures:
         """Figures of the connection so far."""
@@ -209,14 +209,14 @@ class ContactProxy:
     def _receive(self) -> None:
         """Take proxies as they come; connect again when the connection is lost."""
         while not self._is_closed.is_set():
-            link = self._link
-            if link is None:
+            connection = self._connection
+            if connection is None:
                 self._reconnect()
                 continue
             try:
-                proxy, size = link.receive()
+                proxy, size = connection.receive()
             except HapticDBError as error:
-                self._lose(link, error)
+                self._lose(connection, error)
                 continue
             now = time.monotonic()
             self._arrived, self._seen = now, proxy.sequence
@@ -227,28 +227,28 @@ class ContactProxy:
             if proxy.echo:
                 self._trips = [*self._trips[-999:], now - proxy.echo_clock - proxy.kept]
 
-    def _lose(self, link: ContactLink, error: HapticDBError) -> None:
+    def _lose(self, connection: ContactConnection, error: HapticDBError) -> None:
         if self._is_closed.is_set():
             return
-        self.error, self._link = error, None
+        self.error, self._connection = error, None
         self._counts[3] += 1
-        link.close()
+        connection.close()
 
     def _reconnect(self) -> None:
         if self._is_closed.wait(RECONNECT_EVERY):
             return
         try:
-            link = connect(self._url, self._wish, PATIENCE)
+            connection = connect(self._url, self._wish, PATIENCE)
         except HapticDBError as error:
             self.error = error
             return
-        if link.terms != self.terms:
-            link.close()
+        if connection.terms != self.terms:
+            connection.close()
             self.error = UsageError("the server has come back with another tool: connect anew")
             return
-        self._link, self.error = link, None
-        if self._is_closed.is_set():  # `close` may have looked before the link was there
-            link.close()
+        self._connection, self.error = connection, None
+        if self._is_closed.is_set():  # `close` may have looked before the connection was there
+            connection.close()
 
     def _send(self) -> None:
         """Send the newest hand again and again."""
@@ -257,11 +257,13 @@ class ContactProxy:
         while not self._is_closed.is_set():
             is_silent = time.monotonic() - self._arrived > SILENT_AFTER
             due = max(due + 1.0 / (SILENT_RATE if is_silent else HANDS_A_SECOND), time.monotonic())
-            newest, link = self._newest, self._link
-            if newest is not None and link is not None and np.isfinite(newest[1]).all():
+            newest, connection = self._newest, self._connection
+            if newest is not None and connection is not None and np.isfinite(newest[1]).all():
                 sequence += 1
                 clock, hand, velocity, buttons, is_open = newest
                 state: dict[str, Any] = {"buttons": buttons, "seen": self._seen, "is_open": is_open}
                 with suppress(ConnectionLostError):  # the receiving thread sees it, too
-                    link.send(HandState(sequence, clock, hand[:3], hand[3:], velocity, **state))
+                    connection.send(
+                        HandState(sequence, clock, hand[:3], hand[3:], velocity, **state)
+                    )
             time.sleep(max(due - time.monotonic(), 0.0))

@@ -87,8 +87,10 @@ def parse_address(url: str) -> _ServerAddress:
     for pair in parts.query.split("&") if parts.query else []:
         key, equals, value = pair.partition("=")
         if key not in given or not equals:
-            place = shown.partition("?")[0]  # a misspelt token is not shown either
-            raise UsageError(f"{place}: a server's URL has the parameters token and ca, no others")
+            without_query = shown.partition("?")[0]  # a misspelt token is not shown either
+            raise UsageError(
+                f"{without_query}: a server's URL has the parameters token and ca, no others"
+            )
         given[key] = unquote(value)
     token = given["token"] or os.environ.get(TOKEN_VARIABLE, "")
     if not (token.isascii() and token.isprintable()) or " " in token:
@@ -96,8 +98,8 @@ def parse_address(url: str) -> _ServerAddress:
     if given["ca"] and scheme == "ws":
         raise UsageError(f"{shown}: ca is for wss://, whose server shows a certificate")
     host = f"[{parts.hostname}]" if ":" in parts.hostname else parts.hostname
-    place = (host if port is None else f"{host}:{port}") + parts.path.rstrip("/")
-    return _ServerAddress(f"{scheme}://{place}{ENDPOINT}", token, given["ca"], shown)
+    authority = (host if port is None else f"{host}:{port}") + parts.path.rstrip("/")
+    return _ServerAddress(f"{scheme}://{authority}{ENDPOINT}", token, given["ca"], shown)
 
 
 def open_websocket(address: _ServerAddress, patience: float) -> "ClientConnection":

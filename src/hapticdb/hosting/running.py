@@ -8,7 +8,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.board import Board
 from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.stations import SeatRequest
-from hapticdb.hosting.workers import WorkerLink
+from hapticdb.hosting.workers import WorkerProcess
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT
@@ -24,7 +24,7 @@ class Running:
     """A session that a host runs: what its worker was told, its cells, and its worker."""
 
     def __init__(
-        self, request: SeatRequest, session: int, cells: ResidentCells, worker: WorkerLink
+        self, request: SeatRequest, session: int, cells: ResidentCells, worker: WorkerProcess
     ) -> None:
         self.request, self.session, self.cells, self.worker = request, session, cells, worker
         self.seat = request.seat

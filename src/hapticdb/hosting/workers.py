@@ -21,7 +21,7 @@ FILLED = 8
 fewer processes and less memory, and later frames."""
 
 
-class WorkerLink:
+class WorkerProcess:
     """A worker process, from the host; `number` counts from 0, `rate` is in frames a second."""
 
     def __init__(self, number: int, board: Board, rate: float) -> None:
@@ -66,32 +66,32 @@ class Workers:
 
     def __init__(self, board: Board, rate: float, most: int) -> None:
         self._board, self._rate, self._most = board, rate, most
-        self._links: list[WorkerLink] = []
+        self._processes: list[WorkerProcess] = []
         self._next = 0
 
     @property
     def pids(self) -> list[int]:
         """Process ids of those that run."""
-        return [link.pid for link in self._links if link.is_alive]
+        return [process.pid for process in self._processes if process.is_alive]
 
-    def least_busy(self) -> WorkerLink:
+    def least_busy(self) -> WorkerProcess:
         """Worker for one more session: the one with the fewest, or a new one if all are filled."""
-        for link in [link for link in self._links if not link.is_alive]:
-            self._links.remove(link)
-            link.close()
+        for process in [process for process in self._processes if not process.is_alive]:
+            self._processes.remove(process)
+            process.close()
         seats = self._board.seats
         counts = [
-            int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == link.number)))
-            for link in self._links
+            int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == process.number)))
+            for process in self._processes
         ]
         if not counts or (min(counts) >= FILLED and len(counts) < self._most):
-            self._links.append(WorkerLink(self._next, self._board, self._rate))
+            self._processes.append(WorkerProcess(self._next, self._board, self._rate))
             self._next += 1
-            return self._links[-1]
-        return self._links[int(np.argmin(counts))]
+            return self._processes[-1]
+        return self._processes[int(np.argmin(counts))]
 
     def close(self) -> None:
         """End all workers."""
-        for link in self._links:
-            link.close()
-        self._links.clear()
+        for process in self._processes:
+            process.close()
+        self._processes.clear()

@@ -18,7 +18,7 @@ from hapticdb.ingest.originals import found_parts
 from hapticdb.mesh import Part
 from hapticdb.page import colours
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
-from hapticdb.page.scene.stage import set_stage
+from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.poses import quaternion_of
 from hapticdb.store.attributes import AXES, up_axis
@@ -117,7 +117,7 @@ def _recorded(
     axis = up_axis(env.objects()) if up is None else AXES.index(up)
     paths = [_shown_poses(found) for found in steps]
     box = _box_of(steps, paths)
-    set_stage(server, box, axis)
+    add_surroundings(server, box, axis)
     server.scene.world_axes.visible = False
     exclude |= {obj.id for found in steps for obj in found.parts}
     facets = _standing(env, box, exclude)

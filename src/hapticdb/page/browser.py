@@ -14,8 +14,8 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.page import checks, colours
-from hapticdb.page.drawing import HandDrawing, add_tool, place
-from hapticdb.page.link import Visitor
+from hapticdb.page.connection import Visitor
+from hapticdb.page.drawing import HandDrawing, add_tool, put_at
 from hapticdb.page.scene.browser import BrowserScene
 from hapticdb.page.site import Site
 from hapticdb.page.tools import HeldTool, start_pose
@@ -61,7 +61,7 @@ class Browser:
         self.taken: int | None = None
         self.tool: HeldTool = site.tools[0]
         self.stiffness = 1000.0
-        self.scale = site.stage.diagonal / HAND_WIDTH
+        self.scale = site.facts.diagonal / HAND_WIDTH
         self.session: HostedSession | None = None
         self._unfelt: list[int] = []
         self.hand = self._start()
@@ -74,12 +74,12 @@ class Browser:
         self._is_closed = False
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
-        self.drawing = HandDrawing(client, site.stage.diagonal, CAP)
+        self.drawing = HandDrawing(client, site.facts.diagonal, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
     # -- what a page with panels shows, too ------------------------------------------------------
 
-    def place_changed(self) -> None:
+    def hand_moved(self) -> None:
         """Show where the hand is now."""
 
     def tool_changed(self) -> None:
@@ -142,7 +142,7 @@ class Browser:
         def act(event: Event) -> None:
             self.move_hand(checks.pose_of(event.target.position, event.target.wxyz))
             if event.phase == "end":
-                self.place_changed()
+                self.hand_moved()
 
         self.guarded("toucher", act)(event)
 
@@ -158,8 +158,8 @@ class Browser:
     def put_hand(self, pose: Floats) -> None:
         """Put hand and gizmo at a pose (4, 4)."""
         self.move_hand(pose)
-        place(self.drawing.gizmo, self.hand)
-        self.place_changed()
+        put_at(self.drawing.gizmo, self.hand)
+        self.hand_moved()
 
     def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
         """Hold another tool, at a pose (7,) or at the start."""
@@ -169,7 +169,7 @@ class Browser:
             self.drawing.hold(tool, self.colour, self.hand)
             self.begin_anew(keeps_tool=False)
             self.tool_changed()
-            self.place_changed()
+            self.hand_moved()
 
     def put_back(self) -> None:
         """Put the part in hand back to its place; the first tool takes its place in the hand."""
@@ -309,8 +309,8 @@ class Browser:
             session.set_coupling(Coupling(stiffness=self.stiffness))
 
     def _start(self) -> Floats:
-        stage = self.site.stage
-        pose = start_pose(stage.bounds, stage.up, stage.toward, self.tool.radius, self.number)
+        facts = self.site.facts
+        pose = start_pose(facts.bounds, facts.up, facts.toward, self.tool.radius, self.number)
         return seven(pose)
 
     def _share(self) -> None:
@@ -324,7 +324,7 @@ class Browser:
             anchor="bottom-center",
         )  # fmt: skip
         unseen = self.client.scene.add_frame(f"{name}/name", show_axes=False, visible=False)
-        place(node, self.hand)
+        put_at(node, self.hand)
         self._shown = np.full(7, np.inf)
         self._shared = [unseen, label, node]
 
@@ -349,13 +349,13 @@ class Browser:
             self._tell_lost_frames(session)
         frame = None if session is None else session.latest()
         if session is None or frame is None:
-            self.waits(self.site.link.preparing)
+            self.waits(self.site.connection.preparing)
             return
         one = frame[0]
         tool, wrench = np.array(one["tool"]), np.array(one["applied"])
         shared = self._shared
-        if shared and has_moved(tool, self._shown, self.site.stage.diagonal):
-            place(shared[-1], tool)
+        if shared and has_moved(tool, self._shown, self.site.facts.diagonal):
+            put_at(shared[-1], tool)
             self._shown = tool
         points, _ = session.contacts()
         touched = [self.site.objects[i] for i in session.touched() if i in self.site.objects]

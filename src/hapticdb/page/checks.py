@@ -61,12 +61,12 @@ def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.floa
 
 def pose_of(position: object, wxyz: object) -> NDArray[np.float64]:
     """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here."""
-    place = numbers_of(position, 3, FARTHEST, "a place")
+    point = numbers_of(position, 3, FARTHEST, "a place")
     turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
     length = float(np.linalg.norm(turn))
     if length < 1e-6:
         raise UsageError("a turn: give a quaternion that is not zero")
     pose = np.eye(4)
     pose[:3, :3] = rotation_of(turn / length)[0]
-    pose[:3, 3] = place
+    pose[:3, 3] = point
     return pose

@@ -52,7 +52,7 @@ def add_tool(
     )
 
 
-def place(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
+def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
     """Put a node at a pose (7,): metres, unit quaternion, scalar first."""
     node.position = pose[:3]
     node.wxyz = pose[3:]
@@ -101,7 +101,7 @@ class HandDrawing:
         if self._ghost is not None:
             self._ghost.remove()
         self.gizmo.visible = True
-        place(self.gizmo, pose)
+        put_at(self.gizmo, pose)
         self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
 
     def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:

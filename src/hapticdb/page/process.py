@@ -7,7 +7,7 @@ import time
 from typing import TYPE_CHECKING
 
 from hapticdb.hosting.attached import AttachedHost
-from hapticdb.page.link import PageLink, PageRequest, Visitor
+from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
@@ -29,12 +29,12 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     Sends the message ``ready`` with viser's port once browsers can connect.
     """
     server = new_server()
-    link = PageLink(request.link)
-    link.guard(server)
+    connection = PageConnection(request.server)
+    connection.guard(server)
     try:
         with AttachedHost(socket.socket(fileno=request.host)) as host:
-            site = Site(server, host, request, link)
-            open_page(site, link.announced)
+            site = Site(server, host, request, connection)
+            open_page(site, connection.announced)
             sender.send("ready", server.get_port())
             try:
                 while not parent_is_gone():

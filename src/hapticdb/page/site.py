@@ -16,10 +16,10 @@ from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.hosting.attached import AttachedHost
 from hapticdb.page import tools
+from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.editing import Edits
 from hapticdb.page.folders import AllowedFolders
-from hapticdb.page.link import PageLink, PageRequest
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
 from hapticdb.store.connect import open_store
@@ -51,7 +51,7 @@ class _Updated(Protocol):
 
 
 @dataclass(frozen=True, eq=False)
-class Stage:
+class SceneFacts:
     """Where everything happens: the box of all objects (2, 3), metres, and which way is up.
 
     up, toward : unit vectors, the second level and towards the first eye; is_smooth : whether
@@ -65,8 +65,8 @@ class Stage:
     is_smooth: bool
 
     @classmethod
-    def of(cls, view: SceneView) -> "Stage":
-        """Stage of a view's objects; an empty environment has the box of its grid."""
+    def of(cls, view: SceneView) -> "SceneFacts":
+        """SceneFacts of a view's objects; an empty environment has the box of its grid."""
         box, objects = view.contents.box(), view.objects.values()
         bounds = view.grid.bounds if box is None else box
         toward = np.eye(3)[(view.up + 2) % 3]
@@ -86,7 +86,7 @@ class Site:
     server: "ViserServer"
     host: AttachedHost
     request: PageRequest
-    link: PageLink
+    connection: PageConnection
     browsers: dict[int, _Updated] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
@@ -105,11 +105,11 @@ class Site:
             self.edits = Edits(request.urls["editor"], self.folders)
         self.view = SceneView(self.server, self.url, self.folders)
         self.objects = self.view.objects
-        self.stage = stage = Stage.of(self.view)
+        self.facts = facts = SceneFacts.of(self.view)
         self.database = DatabaseThread(self.url, self.folders)
         self.tools = [
-            *tools.from_files(request.tools, stage.voxel_size, smooth=stage.is_smooth),
-            *tools.built_in(stage.diagonal, stage.voxel_size, smooth=stage.is_smooth),
+            *tools.from_files(request.tools, facts.voxel_size, smooth=facts.is_smooth),
+            *tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth),
         ]
         self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
         self.view.on_edit = self._learn
@@ -134,7 +134,7 @@ class Site:
 
     def prepare(self) -> None:
         """Wait until what a hand calls is compiled; HapticDBError if the page ends before."""
-        self.link.prepare(self._is_ending.is_set)
+        self.connection.prepare(self._is_ending.is_set)
 
     def take_number(self) -> int:
         """Return the smallest number that no browser has: it decides a tool's colour and place."""

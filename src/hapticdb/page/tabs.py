@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hapticdb.page import checks
 from hapticdb.page.browser import Browser
-from hapticdb.page.link import Visitor
+from hapticdb.page.connection import Visitor
 from hapticdb.page.panels.parts import PartsPanel
 from hapticdb.page.panels.record import RecordPanel
 from hapticdb.page.panels.sweeps import SweepPanel
@@ -38,9 +38,9 @@ class TabbedBrowser(Browser):
         if visitor.may("toucher"):
             self.take_in_hand(self.tool)
 
-    def place_changed(self) -> None:
+    def hand_moved(self) -> None:
         """Show where the hand is now."""
-        self.touch.show_place()
+        self.touch.show_hand()
 
     def tool_changed(self) -> None:
         """Show which tool is in the hand now."""

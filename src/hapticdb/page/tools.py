@@ -152,11 +152,11 @@ def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
         ],
         axis=-1,
     )
-    ring, place = np.meshgrid(np.arange(len(profile) - 1), np.arange(AROUND), indexing="ij")
+    ring, corner = np.meshgrid(np.arange(len(profile) - 1), np.arange(AROUND), indexing="ij")
     low, high = ring * AROUND, (ring + 1) * AROUND
-    after = (place + 1) % AROUND
-    lower = np.stack([low + place, low + after, high + after], axis=-1)
-    upper = np.stack([low + place, high + after, high + place], axis=-1)
+    after = (corner + 1) % AROUND
+    lower = np.stack([low + corner, low + after, high + after], axis=-1)
+    upper = np.stack([low + corner, high + after, high + corner], axis=-1)
     faces = np.concatenate([lower.reshape(-1, 3), upper.reshape(-1, 3)])
     vertices, number = np.unique(np.round(rings.reshape(-1, 3), 9), axis=0, return_inverse=True)
     faces = number.reshape(-1)[faces]
@@ -191,10 +191,12 @@ def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number
     middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     side = np.cross(up, toward)
     steps = (number + 1) // 2 * (1 if number % 2 else -1)
-    place = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
-    place = place + toward * (0.35 * float(np.abs(toward) @ half)) + side * (2.6 * radius * steps)
+    position = middle + up * (float(np.abs(up) @ half) + 1.3 * radius)
+    position = (
+        position + toward * (0.35 * float(np.abs(toward) @ half)) + side * (2.6 * radius * steps)
+    )
     pose = np.eye(4)
-    pose[:3, 3] = place
+    pose[:3, 3] = position
     upright = np.column_stack([side, np.cross(up, side), up])
     pose[:3, :3] = upright
     return pose

@@ -106,9 +106,9 @@ def _program(loader: re.Match[str]) -> bytes:
 
 def _bytes_of(digits: NDArray[np.uint8]) -> bytes:
     """Bytes of a text in base 88; the last digits hold one byte less than they are."""
-    place = np.zeros(256, np.int64)
-    place[np.frombuffer(ALPHABET, np.uint8)] = np.arange(88)
-    values = place[digits]
+    value_of = np.zeros(256, np.int64)
+    value_of[np.frombuffer(ALPHABET, np.uint8)] = np.arange(88)
+    values = value_of[digits]
     rest = len(values) % 5
     whole = values[: len(values) - rest].reshape(-1, 5) @ 88 ** np.arange(4, -1, -1)
     tail = 0

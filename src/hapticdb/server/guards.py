@@ -99,5 +99,5 @@ def is_address(name: str) -> bool:
 
 def _is_same(origin: str, host: str) -> bool:
     """Whether an origin is the host that the request went to; a proxy may have ended TLS."""
-    scheme, mark, place = origin.lower().partition("://")
-    return bool(mark) and scheme in {"http", "https"} and place == host.lower()
+    scheme, mark, authority = origin.lower().partition("://")
+    return bool(mark) and scheme in {"http", "https"} and authority == host.lower()

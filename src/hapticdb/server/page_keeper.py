@@ -8,7 +8,7 @@ import socket
 from collections.abc import Awaitable, Callable
 
 from hapticdb.errors import HapticDBError
-from hapticdb.page.link import LONGEST_LINE, announcement, line
+from hapticdb.page.connection import LONGEST_LINE, announcement, line
 from hapticdb.realtime.processes import Process
 
 LOG = logging.getLogger("hapticdb.server")
@@ -37,8 +37,8 @@ class PageKeeper:
     work : str
         Function of the process, as `Process` takes it; it sends ``ready`` with its port.
     request : callable
-        Makes the request of each process, of the descriptors of its link and of its way to the
-        host.
+        Makes the request of each process, of the descriptors of its sockets to the server and to
+        the host.
     serve_host : callable
         Takes the socket at whose other end the page begins its sessions.
     prepare : callable
@@ -98,16 +98,16 @@ class PageKeeper:
         LOG.info("the page is ready", extra={"pid": process.pid})
 
     async def _begun(self) -> tuple[Process, socket.socket, socket.socket]:
-        """Begin a page process; it, and our ends of its link and of its way to the host."""
+        """Begin a page process; it, and our ends of its sockets to us and to the host."""
         with contextlib.ExitStack() as ours:
             pairs = []
             with contextlib.ExitStack() as theirs:
                 for _ in range(2):
                     own, other = socket.socketpair()
                     pairs.append((ours.enter_context(own), theirs.enter_context(other)))
-                link, host = (other.fileno() for _, other in pairs)
-                request = self._request(link, host)
-                process = await asyncio.to_thread(Process, self._work, request, (link, host))
+                server, host = (other.fileno() for _, other in pairs)
+                request = self._request(server, host)
+                process = await asyncio.to_thread(Process, self._work, request, (server, host))
             ours.pop_all()  # nothing failed, so they stay open
         return process, pairs[0][0], pairs[1][0]
 

@@ -19,7 +19,7 @@ from hapticdb.errors import UsageError
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.preparing import Preparation
 from hapticdb.kernels.compiling import Compiled
-from hapticdb.page.link import PageRequest
+from hapticdb.page.connection import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
 from hapticdb.server.client_page import client_page
@@ -218,10 +218,10 @@ async def run(
     LOG.info("stopped")
 
 
-def _page_request(serving: Serving, link: int, host: int) -> PageRequest:
+def _page_request(serving: Serving, server: int, host: int) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
     return PageRequest(
-        urls, serving.tools, serving.folders, link, host, serving.recordings, serving.title
+        urls, serving.tools, serving.folders, server, host, serving.recordings, serving.title
     )
 
 

@@ -92,7 +92,7 @@ class MovingControls:
             start = np.eye(4)
             start[:3, 3] = obj.bounds.mean(axis=0)
             self._held = _HeldPart(obj, start, start)
-            size = browser.site.stage.diagonal
+            size = browser.site.facts.diagonal
             self._gizmo = browser.client.scene.add_transform_controls(
                 "/move", scale=MOVING_GIZMO * size, line_width=3.5, position=start[:3, 3],
                 disable_sliders=True, depth_test=False,
@@ -137,8 +137,8 @@ class MovingControls:
                     return
                 self._is_dragged = True
                 if event.phase != "end":  # everyone sees where it goes
-                    place = held.way_to(pose) @ held.object.transform
-                    self._browser.site.view.move(held.object.id, place)
+                    placement = held.way_to(pose) @ held.object.transform
+                    self._browser.site.view.move(held.object.id, placement)
                 elif self._browser.has_gone:  # viser ends the drags of a lost browser, too
                     self.leave()
                 else:

@@ -264,7 +264,7 @@ class PartsPanel:
                 return
             self._voxels = self._client.scene.add_point_cloud(
                 "/voxels", places, colours.of_object(obj.id), point_shape="square",
-                point_size=0.9 * self._browser.site.stage.voxel_size, precision="float32",
+                point_size=0.9 * self._browser.site.facts.voxel_size, precision="float32",
             )  # fmt: skip
             if not self._voxel_box.value:
                 self._clear_voxels()
@@ -276,8 +276,8 @@ class PartsPanel:
     def _take_out(self, _: object) -> None:
         browser = self._browser
         obj = self._browser.only_chosen()
-        stage = browser.site.stage
-        inset = tools.inset_of(stage.voxel_size, smooth=stage.is_smooth)
+        facts = browser.site.facts
+        inset = tools.inset_of(facts.voxel_size, smooth=facts.is_smooth)
 
         def shell(env: Environment) -> PointShell:
             return env.shell(obj.id, points=tools.PART_POINTS, inset=inset)

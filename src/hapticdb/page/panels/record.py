@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import FileError, UsageError
 from hapticdb.page import checks, colours
 from hapticdb.page.browser import Browser
-from hapticdb.page.drawing import place
+from hapticdb.page.drawing import put_at
 from hapticdb.page.site import checked_file
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import force_text, note_html, rows_html
@@ -131,7 +131,7 @@ class RecordPanel:
         self._show_at(0.0)
 
     def _draw(self, recording: Recording) -> None:
-        scene, size = self._browser.client.scene, self._browser.site.stage.diagonal
+        scene, size = self._browser.client.scene, self._browser.site.facts.diagonal
         shell = recording.header.shell
         assert self._replay is not None  # noqa: S101 - just read
         way = self._replay.tools[:: max(1, len(self._replay.tools) // 500), :3]
@@ -192,7 +192,7 @@ class RecordPanel:
         n = min(int(np.searchsorted(replay.times, at)), len(replay.times) - 1)
         tool, wrench = replay.tools[n], replay.wrenches[n]
         cloud, arrow = self._drawn[:2]
-        place(cloud, tool)
+        put_at(cloud, tool)
         drawing = self._browser.drawing
         drawing.point(arrow, tool[:3], wrench[:3])
         force = float(np.linalg.norm(wrench[:3]))

@@ -11,7 +11,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.database import opened
-from hapticdb.page.drawing import add_tool, place
+from hapticdb.page.drawing import add_tool, put_at
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
@@ -66,9 +66,9 @@ class SweepPanel:
         )
         self._what = gui.add_dropdown("What", ("the chosen part", "the tool"))
         self._way = gui.add_dropdown(
-            "Way", tuple(WAYS), initial_value=f"+{'xyz'[int(browser.site.stage.up.argmax())]}"
+            "Way", tuple(WAYS), initial_value=f"+{'xyz'[int(browser.site.facts.up.argmax())]}"
         )
-        diagonal = browser.site.stage.diagonal
+        diagonal = browser.site.facts.diagonal
         self._farthest = 10.0 * diagonal
         self._length = gui.add_number(
             "Length, m", round(0.25 * diagonal, 3), min=0.0, max=self._farthest, step=0.001
@@ -139,11 +139,11 @@ class SweepPanel:
         pose = moment.pose.copy()
         pose[:3, 3] += pose[:3, :3] @ middle
         node = add_tool(scene, "/swept", ghost, colours.MARK, 0.4)
-        place(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
+        put_at(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
         self._drawn = [node]
         if len(found.marks):
             word = "first hit" if swept.caught is None else "caught"
-            size = self._browser.site.stage.diagonal
+            size = self._browser.site.facts.diagonal
             self._drawn.append(
                 scene.add_point_cloud(
                     "/swept_hits", found.marks, (255, 214, 0), point_size=0.007 * size,

@@ -64,7 +64,7 @@ class TouchPanel:
         home = gui.add_button("Back to the start", color="gray")
         home.on_click(browser.guarded("toucher", self._go_home))
         with gui.add_folder("Where the hand is", expand_by_default=False):
-            step = round(browser.site.stage.diagonal / 500, 4)
+            step = round(browser.site.facts.diagonal / 500, 4)
             self._place = gui.add_vector3(
                 "Place, m", tuple(np.round(browser.hand[:3], 4)), step=step
             )
@@ -107,10 +107,10 @@ class TouchPanel:
         if event.client is None:  # set by the page
             return
         browser = self._browser
-        place = checks.numbers_of(event.target.value, 3, checks.FARTHEST, "a place")
-        pose = checks.pose_of(place, browser.hand[3:])
+        position = checks.numbers_of(event.target.value, 3, checks.FARTHEST, "a place")
+        pose = checks.pose_of(position, browser.hand[3:])
         browser.move_hand(pose)
-        browser.drawing.gizmo.position = place
+        browser.drawing.gizmo.position = position
 
     def _stiffen(self, event: "GuiEvent[Any]") -> None:
         self._browser.set_stiffness(
@@ -140,7 +140,7 @@ class TouchPanel:
         self._tool.options = options
         put(self._tool, browser.tool.name if self._is_of_the_list else PART)
 
-    def show_place(self) -> None:
+    def show_hand(self) -> None:
         """Show where the hand is."""
         if hasattr(self, "_place"):
             x, y, z = (round(float(value), 4) for value in self._browser.hand[:3])

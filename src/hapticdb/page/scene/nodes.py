@@ -203,8 +203,8 @@ def _runs(members: list[Member]) -> list[list[Member]]:
     centers = np.array([member.box.mean(axis=0) for member in members])
     low = centers.min(axis=0)
     size = max(float((centers - low).max()), 1e-12)
-    cells = np.minimum((centers - low) / size * 1024, 1023).astype(np.int64)
-    order = np.argsort(_interleaved(cells), kind="stable").tolist()
+    steps = np.minimum((centers - low) / size * 1024, 1023).astype(np.int64)
+    order = np.argsort(_interleaved(steps), kind="stable").tolist()
     runs: list[list[Member]] = []
     n_triangles = 0
     for index in order:
@@ -218,10 +218,10 @@ def _runs(members: list[Member]) -> list[list[Member]]:
     return runs
 
 
-def _interleaved(cells: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Z-order (n,) of cells (n, 3) below 1024."""
-    order = np.zeros(len(cells), dtype=np.int64)
+def _interleaved(steps: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Z-order (n,) of steps (n, 3) below 1024."""
+    order = np.zeros(len(steps), dtype=np.int64)
     for bit in range(10):
         for axis in range(3):
-            order |= ((cells[:, axis] >> bit) & 1) << (3 * bit + axis)
+            order |= ((steps[:, axis] >> bit) & 1) << (3 * bit + axis)
     return order

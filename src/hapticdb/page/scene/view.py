@@ -19,7 +19,7 @@ from hapticdb.page.scene.following import Followed, Follower
 from hapticdb.page.scene.names import Branch, found_ids, tree_of
 from hapticdb.page.scene.reading import ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
-from hapticdb.page.scene.stage import set_stage
+from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 
@@ -52,7 +52,7 @@ class SceneView:
         """Called from a thread after each commit, the view's own or another's, is shown."""
         self._is_closed = Event()
         self._tree: Branch | None = None
-        self._staged = False
+        self._is_surrounded = False
         self.up = 2
         """Number of the axis that points up: 0 for x, 1 for y, 2 for z."""
         self.revision = -1
@@ -140,7 +140,7 @@ class SceneView:
                     anew.append(obj)
             self.contents.add(anew)
             self.revision = followed.revision
-            self._set_stage()
+            self._add_surroundings()
         if anew:
             self._reader.read(anew)
         if self.on_edit is not None:
@@ -153,12 +153,12 @@ class SceneView:
             obj.id not in known or known[obj.id].name != obj.name for obj in followed.written
         )
 
-    def _set_stage(self) -> None:
+    def _add_surroundings(self) -> None:
         box = self.contents.box()
-        if not self._staged and box is not None:
-            self._staged = True
+        if not self._is_surrounded and box is not None:
+            self._is_surrounded = True
             self.up = up_axis(self.contents.records.values())
-            set_stage(self._server, box, self.up)
+            add_surroundings(self._server, box, self.up)
 
     def _show_shapes(self, found: Sequence[ShapedObject]) -> None:
         with self._server.atomic():

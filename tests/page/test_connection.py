@@ -11,12 +11,12 @@ from websockets.sync.client import connect
 from websockets.typing import Subprotocol
 
 from children import until
-from hapticdb.page.link import (
+from hapticdb.page.connection import (
     BREAKS_RULES,
     LATE,
     LONGEST_WORDS,
     MOST_FAILED,
-    PageLink,
+    PageConnection,
     Visitor,
     announcement,
 )
@@ -26,11 +26,11 @@ PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
 
 
 @pytest.fixture
-def page() -> Iterator[tuple[socket.socket, PageLink, viser.ViserServer]]:
+def page() -> Iterator[tuple[socket.socket, PageConnection, viser.ViserServer]]:
     ours, theirs = socket.socketpair()
     ours.settimeout(20.0)
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    link = PageLink(theirs.detach())
+    link = PageConnection(theirs.detach())
     link.guard(server)
     yield ours, link, server
     server.stop()
@@ -52,7 +52,7 @@ def said(ours: socket.socket) -> dict[str, object]:
 
 
 def test_an_announced_browser_is_let_in_under_its_name(
-    page: tuple[socket.socket, PageLink, viser.ViserServer],
+    page: tuple[socket.socket, PageConnection, viser.ViserServer],
 ) -> None:
     ours, link, server = page
     sock = bound()
@@ -70,7 +70,7 @@ def test_an_announced_browser_is_let_in_under_its_name(
     until(lambda: _is_gone(link))
 
 
-def _is_gone(link: PageLink) -> bool:
+def _is_gone(link: PageConnection) -> bool:
     try:
         link.announced(0)
     except KeyError:
@@ -79,7 +79,7 @@ def _is_gone(link: PageLink) -> bool:
 
 
 def test_whoever_was_not_announced_is_sent_away_with_nothing(
-    page: tuple[socket.socket, PageLink, viser.ViserServer],
+    page: tuple[socket.socket, PageConnection, viser.ViserServer],
 ) -> None:
     ours, _, server = page
     server.scene.add_label("/secret", "secret")
@@ -97,7 +97,7 @@ def test_whoever_was_not_announced_is_sent_away_with_nothing(
 
 
 def test_a_port_is_good_for_one_connection(
-    page: tuple[socket.socket, PageLink, viser.ViserServer],
+    page: tuple[socket.socket, PageConnection, viser.ViserServer],
 ) -> None:
     ours, _, server = page
     sock = bound()
@@ -113,7 +113,7 @@ def test_a_port_is_good_for_one_connection(
 
 
 def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
-    page: tuple[socket.socket, PageLink, viser.ViserServer],
+    page: tuple[socket.socket, PageConnection, viser.ViserServer],
     caplog: pytest.LogCaptureFixture,
     capfd: pytest.CaptureFixture[str],
 ) -> None:

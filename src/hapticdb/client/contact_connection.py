@@ -1,4 +1,4 @@
-"""ContactLink: one connection to a server's contact endpoint, its opening and its messages."""
+"""One connection to a server's contact endpoint, its opening and its messages."""
 
 import socket
 from contextlib import suppress
@@ -30,8 +30,8 @@ are made then, and at a server's first start its kernels. Larger: a server that 
 later."""
 
 
-class ContactLink:
-    """A connection that has been granted a tool, on these terms; the link closes it."""
+class ContactConnection:
+    """A connection that has been granted a tool, on these terms; it is owned."""
 
     def __init__(self, connection: "ClientConnection", terms: ProxyTerms) -> None:
         self._connection, self.terms = connection, terms
@@ -57,7 +57,7 @@ class ContactLink:
             self._connection.close()
 
 
-def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
+def connect(url: str, wish: ProxyWish, patience: float) -> ContactConnection:
     """Connect to a server and ask for a tool; `ContactProxy` names the errors.
 
     patience : seconds in which it must answer; it must grant a tool within `GRANTED_WITHIN`.
@@ -65,7 +65,7 @@ def connect(url: str, wish: ProxyWish, patience: float) -> ContactLink:
     connection = open_websocket(parse_address(url), patience)
     try:
         _send(connection, pack_wish(wish))
-        return ContactLink(connection, unpack_terms(_received(connection, GRANTED_WITHIN)))
+        return ContactConnection(connection, unpack_terms(_received(connection, GRANTED_WITHIN)))
     except BaseException:
         connection.close()
         raise

@@ -44,7 +44,7 @@ def framing(box: NDArray[np.float64], up: int) -> View:
     return View(center + way * radius / np.sin(FIELD_OF_VIEW / 2), center)
 
 
-def set_stage(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
+def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
     """Light, background, ground and first view for objects in a box (2, 3), metres."""
     scene, radius = server.scene, max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
     scene.set_up_direction(tuple(np.eye(3)[up]))
@@ -67,23 +67,23 @@ def set_stage(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
 def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
     """Lines below the objects, a power of ten of metres apart."""
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
-    cell = 10.0 ** np.floor(np.log10(radius / 2))
-    place = box.mean(axis=0)
-    place = np.round(place / (10 * cell)) * 10 * cell
-    place[up] = box[0, up]
-    edge = float(np.ceil(GROUND_EDGE * radius / cell) * cell)
+    spacing = 10.0 ** np.floor(np.log10(radius / 2))
+    center = box.mean(axis=0)
+    center = np.round(center / (10 * spacing)) * 10 * spacing
+    center[up] = box[0, up]
+    edge = float(np.ceil(GROUND_EDGE * radius / spacing) * spacing)
     scene.add_grid(
         "/ground",
         edge,
         edge,
         plane=PLANES[up],
-        cell_size=float(cell),
-        section_size=float(10 * cell),
+        cell_size=float(spacing),
+        section_size=float(10 * spacing),
         cell_color=LINE,
         section_color=SECTION,
         cell_thickness=0.7,
         section_thickness=1.0,
         fade_distance=6 * radius,
         fade_from="origin",
-        position=tuple(place),
+        position=tuple(center),
     )

@@ -50,14 +50,14 @@ class PageRequest(NamedTuple):
 
     urls : the environment's address for each role: the database decides what each may do; tools :
     files, the first is chosen at the start; folders : below which objects' files may be read, None:
-    those of the files as imported; link, host : descriptors of the sockets to the server (this
+    those of the files as imported; server, host : descriptors of the sockets to the server (this
     module) and to the `SessionHost`; recordings : folder for recordings, None: nobody records.
     """
 
     urls: Mapping[str, str]
     tools: tuple[str, ...]
     folders: tuple[str, ...] | None
-    link: int
+    server: int
     host: int
     recordings: str | None = None
     title: str = ""
@@ -74,7 +74,7 @@ class Visitor(NamedTuple):
         return ROLES.index(self.role) >= ROLES.index(role)
 
 
-class PageLink:
+class PageConnection:
     """The page's end, on an inherited socket: learns who comes next, and lets nobody else in."""
 
     def __init__(self, descriptor: int) -> None:
@@ -179,9 +179,9 @@ class _Nonsense:
         self._connections = connections
         self._failed: dict[int, int] = {}
 
-    def contain(self, place: Any) -> None:  # noqa: ANN401 - the server, or a connection
+    def contain(self, handler: Any) -> None:  # noqa: ANN401 - the server, or a connection
         """Let nothing out that viser raises where it handles a message."""
-        handle = place._handle_incoming_message  # noqa: SLF001 - viser has no public place
+        handle = handler._handle_incoming_message  # noqa: SLF001 - viser shows it nowhere else
 
         async def handled(client_id: int, message: "Message") -> None:
             try:
@@ -189,7 +189,7 @@ class _Nonsense:
             except Exception as error:  # noqa: BLE001 - viser checks little of what it is sent
                 await self._fail(int(client_id), message, error)
 
-        place._handle_incoming_message = handled  # noqa: SLF001 - likewise
+        handler._handle_incoming_message = handled  # noqa: SLF001 - likewise
 
     def forget(self, client: int) -> None:
         """Forget a client that has gone."""

@@ -39,7 +39,7 @@ from paper.workload import slide_poses
 TESTS = Path(__file__).parent.parent / "tests"
 sys.path.insert(0, str(TESTS))
 
-from contact_server import TOKEN, save_shell  # noqa: E402 - of the tests' folder
+from contact_server import TOKEN  # noqa: E402 - of the tests' folder
 
 Floats = NDArray[np.float64]
 Line = dict[str, Any]
@@ -191,10 +191,10 @@ def lines_of(
     url: str, shell: PointShell, cases: Sequence[Case], folder: Path
 ) -> tuple[list[Line], float]:
     """Figures of all paths in an environment, and the server's seconds for a proxy."""
-    save_shell(folder / "ball.npz", shell)
+    shell.save(folder / "ball.npz")
     program = str(TESTS / "contact_server.py")
     with subprocess.Popen(
-        [sys.executable, program, url, f"ball={folder / 'ball.npz'}"],
+        [sys.executable, program, url, str(folder / "ball.npz")],
         stdin=subprocess.PIPE, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
     ) as process:  # fmt: skip
         try:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from websockets.sync.client import ClientConnection, connect
 
 from children import PATIENCE, PIPE, child
-from contact_server import TOKEN, save_shell
+from contact_server import TOKEN
 from feel.ground import Ground
 from feel.scenes import plane
 from feel.tools import flat_tool
@@ -77,7 +77,7 @@ def serving(folder: Path, **options: float) -> Iterator[Served]:
     with Ground.of_scenes(folder, [plane("level", np.eye(3))], SIZE, distances=True) as ground:
         origin = ground.origins["level"]
     (url,) = folder.glob("*.db")
-    save_shell(folder / "plate.npz", flat_tool(3, SIZE, np.eye(3)))
+    flat_tool(3, SIZE, np.eye(3)).save(folder / "plate.npz")
     with started(str(url), folder / "plate.npz", origin, **options) as server:
         yield server
 
@@ -88,7 +88,7 @@ def started(url: str, plate: Path, origin: Floats, **options: float) -> Iterator
     program = str(Path(__file__).with_name("contact_server.py"))
     given = [f"--{name}={value}" for name, value in options.items()]
     with child(
-        [sys.executable, program, url, f"plate={plate}", *given], stdin=PIPE, stderr=None
+        [sys.executable, program, url, str(plate), *given], stdin=PIPE, stderr=None
     ) as process:
         try:
             yield Served(process, origin, url, plate)

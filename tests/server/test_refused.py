@@ -19,7 +19,7 @@ from children import PATIENCE
 from hapticdb.protocol.contacts import ProxyWish, pack_wish
 from hapticdb.protocol.header import CloseCode
 from hapticdb.server.access import Access, Role
-from hapticdb.server.contacts.serving import ServedContacts
+from hapticdb.server.contacts import Contacts
 from hapticdb.server.guards import Guards
 from hapticdb.server.limits import Limits
 from hapticdb.server.served import Served
@@ -150,15 +150,15 @@ class Asking:
 def test_a_wrong_wish_is_refused_before_cells_and_tools_are_made(
     message: bytes, code: CloseCode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def made(_: ServedContacts) -> None:
+    def made(_: Contacts) -> None:
         raise AssertionError
 
-    monkeypatch.setattr(ServedContacts, "_open", made)
+    monkeypatch.setattr(Contacts, "_open", made)
     access = Access({"a-token-for-toucher": Role.TOUCHER})
     served = cast(
         "Served", type("", (), {"access": access, "tools": (str(tmp_path / "plate.stl"),)})
     )
     asking = Asking(message)
-    asyncio.run(ServedContacts(served).serve(cast("WebSocket", asking)))
+    asyncio.run(Contacts(served).serve(cast("WebSocket", asking)))
     assert asking.closed is not None
     assert asking.closed[0] == code

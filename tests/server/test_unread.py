@@ -5,6 +5,7 @@ import contextlib
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
+from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 
 import pytest
@@ -14,15 +15,14 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocket, WebSocketState
 
 from children import PATIENCE
-from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.server import relay
-from hapticdb.server.access import Access
-from hapticdb.server.contacts import endpoint
-from hapticdb.server.contacts.endpoint import Contacts
+from hapticdb.server import contacts, relay
+from hapticdb.server.access import Access, Role
+from hapticdb.server.contacts import Contacts
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
+from hapticdb.server.served import Served
 from hapticdb.server.transports import StrictWebSocket
 
 OPENING = (
@@ -106,6 +106,10 @@ class Unwilling:
     headers = Headers()
 
     @staticmethod
+    async def accept() -> None:
+        pass
+
+    @staticmethod
     async def receive() -> dict[str, object]:
         return {"type": "websocket.receive", "bytes": b"malformed"}
 
@@ -118,16 +122,12 @@ class Unwilling:
 def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
-    monkeypatch.setattr(endpoint, "CLOSING_WITHIN", 0.01)
-    contacts = Contacts(cast("ResidentCells", None), {})
-
-    async def work() -> None:
-        attending = contacts.attend(cast("WebSocket", Unwilling()))
-        await asyncio.wait_for(attending, PATIENCE)
-
-    asyncio.run(work())
-    assert contacts.n_clients == 0
-    contacts.close()
+    monkeypatch.setattr(contacts, "CLOSING_WITHIN", 0.01)
+    access = Access({}, open_role=Role.TOUCHER)
+    served = cast("Served", SimpleNamespace(access=access, tools=()))
+    endpoint = Contacts(served)
+    asyncio.run(asyncio.wait_for(endpoint.serve(cast("WebSocket", Unwilling())), PATIENCE))
+    assert endpoint.n_clients == 0
 
 
 def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:

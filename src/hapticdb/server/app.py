@@ -11,7 +11,7 @@ from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
 from hapticdb.server.client_page import ClientPage
-from hapticdb.server.contacts.serving import ServedContacts
+from hapticdb.server.contacts import Contacts
 from hapticdb.server.guards import Guards
 from hapticdb.server.health import Doctor
 from hapticdb.server.relay import Relay
@@ -51,7 +51,7 @@ def application(
         text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
         return Response(text, media_type="text/plain; version=0.0.4")
 
-    contacts = ServedContacts(served)
+    contacts = Contacts(served)
 
     async def device(websocket: WebSocket) -> None:
         with served.figures.devices.track_inprogress():

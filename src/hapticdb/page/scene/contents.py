@@ -51,13 +51,6 @@ class Contents:
             return len(self._audiences[ALL][0].names)
 
     @property
-    def n_triangles(self) -> int:
-        """Triangles of all objects that have their shape."""
-        with self.lock:
-            shapes = [member.shape for member in self._members.values()]
-            return sum(shape.n_triangles for shape in shapes if shape is not None)
-
-    @property
     def bytes_sent(self) -> int:
         """Bytes of all arrays that were sent to all browsers, each browser counted once."""
         return self._audiences[ALL][0].bytes_sent

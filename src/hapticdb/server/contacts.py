@@ -10,8 +10,9 @@ import asyncio
 import contextlib
 import logging
 import time
-from collections.abc import AsyncIterator, Callable, Collection, Mapping
+from collections.abc import AsyncIterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
 from typing import Any
 
 from starlette.responses import PlainTextResponse
@@ -19,6 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
 from hapticdb.hosting.contact_source import RATE, ContactSource
+from hapticdb.page.tools import BUILT_IN, POINTS, built_in, inset_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
     HandState,
@@ -32,8 +34,12 @@ from hapticdb.protocol.header import CloseCode, OtherVersionError
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket
+from hapticdb.server.served import Served
+from hapticdb.store.base import scene_bounds
 
 LOG = logging.getLogger("hapticdb.server")
+FAILED = "this environment cannot be felt by contact proxies now: its operator finds why in the log"
+"""Reason of a close frame, 123 bytes at most."""
 MOST_CLIENTS = 16
 """Most clients at a time. Larger: more remote hands, each about 1 ms of computing in 10 ms."""
 MESSAGES_A_SECOND = 1000.0
@@ -59,75 +65,120 @@ LARGEST = 1024
 """Bytes of the largest message that is accepted."""
 REASON_BYTES = 120
 """Most bytes of a close frame's reason: WebSocket allows 123."""
-
-
-RoleOfHeaders = Callable[[Mapping[str, str]], Role | None]
-"""Finds the role of a client by the headers of its request; see `server.access`."""
-
-
-async def is_admitted(websocket: WebSocket, role_of_headers: RoleOfHeaders, n_clients: int) -> bool:
-    """Whether a client may be accepted. It is told if it may not feel, or is one too many.
-
-    A browser, which has an origin, may not feel here.
-    """
-    role = role_of_headers(websocket.headers)
-    if role is None or role < Role.TOUCHER or "origin" in websocket.headers:
-        await websocket.close(1008)  # before it is accepted: the answer is 403
-        return False
-    if n_clients >= MOST_CLIENTS:
-        await websocket.send_denial_response(
-            PlainTextResponse("too many remote hands: try again later\n", 503)
-        )
-        return False
-    return True
+THREADS = 4
+"""Threads that compute proxies. Larger: more hands at a time share the processors."""
 
 
 class Contacts:
-    """What the endpoint serves: tools by name, in the cells of one environment, with distances.
+    """The endpoint of one server; its cells and tools are made for the first client.
 
-    idle_after : seconds without a hand after which a client is dropped.
+    They are freed when the last client has left.
     """
 
-    def __init__(
-        self,
-        cells: ResidentCells,
-        tools: Mapping[str, PointShell],
-        *,
-        idle_after: float = IDLE_AFTER,
-    ) -> None:
-        self._cells, self._tools = cells, dict(tools)
-        self._idle = idle_after
-        self._threads = ThreadPoolExecutor(max_workers=4, thread_name_prefix="contacts")
+    def __init__(self, served: Served) -> None:
+        self._served = served
+        self._tool_names = {Path(file).stem for file in served.tools} or {*BUILT_IN}
+        self._changing = asyncio.Lock()
+        self._threads: ThreadPoolExecutor | None = None
+        self._cells: ResidentCells | None = None
+        self._tools: dict[str, PointShell] = {}
         self.n_clients = 0
         """Clients that are connected now."""
 
-    def close(self) -> None:
-        """End the threads."""
-        self._threads.shutdown(wait=True, cancel_futures=True)
+    async def serve(self, websocket: WebSocket) -> None:
+        """Serve one client until it leaves.
 
-    async def attend(self, websocket: WebSocket, wish: ProxyWish | None = None) -> None:
-        """Serve one accepted client until it leaves.
-
-        wish: what its first message asks for, if that has been read already.
+        It is accepted at once, and granted its tool when cells and tools are there: that takes
+        seconds for the first one, in which pings are answered; a minute where kernels are compiled
+        first.
         """
+        if not await self._is_admitted(websocket):
+            return
         self.n_clients += 1
         try:
-            async with refusing(websocket):
-                await self._serve(websocket, wish or await read_wish(websocket, self._tools))
+            await websocket.accept()
+            async with _refusing(websocket):
+                # read before the wait: uvicorn answers no ping while a message is not taken
+                wish = await self._read_wish(websocket)
+                cells = await self._opened()
+                if cells is None:
+                    await websocket.close(int(CloseCode.FAILED), FAILED)
+                else:
+                    await self._attend(websocket, wish, cells)
         finally:
             self.n_clients -= 1
+            await asyncio.shield(self._rest())
 
-    async def _serve(self, websocket: WebSocket, wish: ProxyWish) -> None:
-        loop = asyncio.get_running_loop()
-        tool = self._tools[wish.tool]
-        source = await loop.run_in_executor(self._threads, ContactSource, self._cells, tool, wish)
+    async def _is_admitted(self, websocket: WebSocket) -> bool:
+        """Whether a client may be accepted. It is told if it may not feel, or is one too many.
+
+        A browser, which has an origin, may not feel here.
+        """
+        role = self._served.access.role_of_headers(websocket.headers)
+        if role is None or role < Role.TOUCHER or "origin" in websocket.headers:
+            await websocket.close(1008)  # before it is accepted: the answer is 403
+            return False
+        if self.n_clients >= MOST_CLIENTS:
+            await websocket.send_denial_response(
+                PlainTextResponse("too many remote hands: try again later\n", 503)
+            )
+            return False
+        return True
+
+    async def _read_wish(self, websocket: WebSocket) -> ProxyWish:
+        """Wait for a client's first message, and judge it; TimeoutError after `FIRST_WITHIN`."""
+        wish = unpack_wish(await asyncio.wait_for(_receive(websocket), FIRST_WITHIN))
+        if not wish.tool and len(self._tool_names) == 1:
+            return wish._replace(tool=next(iter(self._tool_names)))
+        if wish.tool not in self._tool_names:
+            known = ", ".join(sorted(self._tool_names))
+            raise UsageError(f"no tool of that name: there are {known}")
+        return wish
+
+    # -- cells and tools ---------------------------------------------------------------------
+
+    async def _opened(self) -> ResidentCells | None:
+        """Cells, made if need be with the tools; None if that fails now."""
+        async with self._changing:
+            if self._cells is None:
+                try:
+                    await self._served.preparation.done()
+                    await asyncio.to_thread(self._open)
+                except HapticDBError:
+                    LOG.exception("contact proxies cannot be served")
+            return self._cells
+
+    def _open(self) -> None:
+        served = self._served
+        cells = ResidentCells(served.urls[Role.TOUCHER], distances=True)
+        try:
+            self._tools = _tools(served.tools, cells)
+        except BaseException:
+            cells.close()
+            raise
+        self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="contacts")
+        self._cells = cells
+
+    async def _rest(self) -> None:
+        """Free cells and tools if nobody feels them."""
+        async with self._changing:
+            if not self.n_clients and self._cells is not None and self._threads is not None:
+                cells, self._cells = self._cells, None
+                await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
+                await asyncio.to_thread(cells.close)
+
+    # -- one client --------------------------------------------------------------------------
+
+    async def _attend(self, websocket: WebSocket, wish: ProxyWish, cells: ResidentCells) -> None:
+        loop, tool = asyncio.get_running_loop(), self._tools[wish.tool]
+        source = await loop.run_in_executor(self._threads, ContactSource, cells, tool, wish)
         state = _Client()
         try:
             await websocket.send_bytes(pack_terms(source.terms))
             async with asyncio.TaskGroup() as group:
                 group.create_task(self._answer(websocket, state, source))
-                group.create_task(self._supervise())
-                await self._listen(websocket, state)
+                group.create_task(self._supervise(cells))
+                await _listen(websocket, state)
         except* WebSocketDisconnect:
             pass
         except* (HapticDBError, TimeoutError) as errors:
@@ -135,26 +186,16 @@ class Contacts:
         finally:  # in a thread, because a proxy may just be computed
             await asyncio.shield(loop.run_in_executor(None, source.close))
 
-    async def _supervise(self) -> None:
+    async def _supervise(self, cells: ResidentCells) -> None:
         """Let the process that fetches cells be started again if it has ended."""
         loop = asyncio.get_running_loop()
         while True:
             await asyncio.sleep(LOOKS_EVERY)
             try:
-                await loop.run_in_executor(self._threads, self._cells.supervise)
+                await loop.run_in_executor(self._threads, cells.supervise)
             except HapticDBError as error:
                 LOG.exception("the cells of contact proxies cannot be fetched any more")
                 raise DatabaseError("cells cannot be fetched any more") from error
-
-    async def _listen(self, websocket: WebSocket, state: "_Client") -> None:
-        """Keep the newest hand; read no faster than is allowed."""
-        while True:
-            message = await asyncio.wait_for(_receive(websocket), self._idle)
-            wait = state.allowed.wait()
-            if wait > 0.0:
-                await asyncio.sleep(wait)
-            state.allowed.take()
-            state.take(unpack_hand(message))
 
     async def _answer(self, websocket: WebSocket, state: "_Client", source: ContactSource) -> None:
         """Send a proxy for the newest hand, at the rate."""
@@ -199,8 +240,19 @@ def _proxy(source: ContactSource, hand: HandState, arrived: float) -> bytes:
     return pack_proxy(source.proxy(hand, time.monotonic() - arrived))
 
 
+async def _listen(websocket: WebSocket, state: _Client) -> None:
+    """Keep the newest hand; read no faster than is allowed."""
+    while True:
+        message = await asyncio.wait_for(_receive(websocket), IDLE_AFTER)
+        wait = state.allowed.wait()
+        if wait > 0.0:
+            await asyncio.sleep(wait)
+        state.allowed.take()
+        state.take(unpack_hand(message))
+
+
 @contextlib.asynccontextmanager
-async def refusing(websocket: WebSocket) -> AsyncIterator[None]:
+async def _refusing(websocket: WebSocket) -> AsyncIterator[None]:
     """Close the connection with a plain reason if the block fails."""
     try:
         yield
@@ -224,19 +276,6 @@ async def _refuse(websocket: WebSocket, code: int, reason: str) -> None:
                 await websocket.close(int(code), short)
 
 
-async def read_wish(websocket: WebSocket, tools: Collection[str]) -> ProxyWish:
-    """Wait for a client's first message, and judge it; TimeoutError after `FIRST_WITHIN`.
-
-    tools : names of the tools that there are.
-    """
-    wish = unpack_wish(await asyncio.wait_for(_receive(websocket), FIRST_WITHIN))
-    if not wish.tool and len(tools) == 1:
-        return wish._replace(tool=next(iter(tools)))
-    if wish.tool not in tools:
-        raise UsageError(f"no tool of that name: there are {', '.join(sorted(tools))}")
-    return wish
-
-
 async def _receive(websocket: WebSocket) -> bytes:
     """Wait for the next binary message."""
     event: Mapping[str, Any] = await websocket.receive()
@@ -248,3 +287,14 @@ async def _receive(websocket: WebSocket) -> bytes:
     if len(message) > LARGEST:
         raise ProtocolError(f"a message of {len(message)} bytes: at most {LARGEST} may be sent")
     return bytes(message)
+
+
+def _tools(files: tuple[str, ...], cells: ResidentCells) -> dict[str, PointShell]:
+    """The operator's tools by the names of their files, in their own frames; else two probes."""
+    size = cells.grid.voxel_size
+    if files:
+        inset = inset_of(size, smooth=True)
+        return {Path(file).stem: PointShell.from_file(file, POINTS, inset=inset) for file in files}
+    bounds = scene_bounds(cells.first_objects)
+    diagonal = 0.0 if bounds is None else float(((bounds[1] - bounds[0]) ** 2).sum() ** 0.5)
+    return {tool.name: tool.shell for tool in built_in(diagonal, size, smooth=True)}

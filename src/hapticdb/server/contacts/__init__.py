@@ -1,1 +1,0 @@
-"""The endpoint of remote hands that feel by contact proxies."""

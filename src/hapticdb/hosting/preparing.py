@@ -18,10 +18,10 @@ LOOKED_EVERY = 0.2
 class Preparation:
     """Compiles the kernels of some purposes, once, when somebody first waits for them.
 
-    tell : called in the event loop with the progress; not at all if nothing has to be compiled.
+    tell : called in the event loop with words on the progress, if anything has to be compiled.
     """
 
-    def __init__(self, *purposes: str, tell: Callable[[Compiled], None]) -> None:
+    def __init__(self, purposes: tuple[str, ...], tell: Callable[[str], object]) -> None:
         self._purposes, self._tell = purposes, tell
         self._running = asyncio.Lock()
         self._is_done = False
@@ -46,7 +46,9 @@ class Preparation:
                 if message is not None:
                     if message.word == "done":
                         return
-                    loop.call_soon_threadsafe(self._tell, message.content)
+                    now: Compiled = message.content
+                    text = f"preparing the hand: {now.done} of {now.total} kernels ..."
+                    loop.call_soon_threadsafe(self._tell, text)
                 elif process.wait(0.0):
                     raise HapticDBError("the process that compiles kernels ended too early")
 

@@ -10,13 +10,12 @@ from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.types import ASGIApp
 from starlette.websockets import WebSocket
 
-from hapticdb.server.client_page import ClientPage
 from hapticdb.server.contacts import Contacts
+from hapticdb.server.front_page import ClientPage, FrontDoor
 from hapticdb.server.guards import Guards
 from hapticdb.server.health import Doctor
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
-from hapticdb.server.signing_in import FrontDoor
 
 LOG = logging.getLogger("hapticdb.server")
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})

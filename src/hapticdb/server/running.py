@@ -18,12 +18,11 @@ import uvicorn
 from hapticdb.errors import UsageError
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.preparing import Preparation
-from hapticdb.kernels.compiling import Compiled
 from hapticdb.page.connection import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
-from hapticdb.server.client_page import client_page
 from hapticdb.server.figures import Figures
+from hapticdb.server.front_page import client_page
 from hapticdb.server.guards import is_address
 from hapticdb.server.health import Doctor, HostCollector
 from hapticdb.server.limits import Limits
@@ -179,12 +178,12 @@ async def run(
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
 
-        def tell(now: Compiled) -> None:
-            note(text := f"preparing the hand: {now.done} of {now.total} kernels ...")
+        def tell(text: str) -> None:
+            note(text)
             keeper.tell("preparing", text)
 
         purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))
-        preparation = Preparation(*purposes, tell=tell)
+        preparation = Preparation(purposes, tell)
         served = Served(
             serving.urls, serving.tools, access, serving.limits, Figures(), host, preparation
         )

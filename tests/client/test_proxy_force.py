@@ -55,14 +55,6 @@ def test_the_force_is_that_of_both_springs_in_series() -> None:
     assert fed(ProxyForce(TERMS), 0.2, -2e-3)[-1] == pytest.approx(2e-3 * SERIES, rel=1e-3)
 
 
-def test_the_force_rises_within_the_fade_at_first() -> None:
-    forces = fed(ProxyForce(TERMS), 0.1, -2e-3)
-    steps = np.diff(np.concatenate([[0.0], forces]))
-    assert forces[0] == 0.0
-    assert steps.max() < 2.0 * forces[-1] * STEP / FADE
-    assert forces[round(FADE / STEP) + 2] == pytest.approx(forces[-1], rel=0.05)
-
-
 def test_nothing_pulls_beside_the_surface() -> None:
     force = ProxyForce(TERMS)
     fed(force, 0.2, -2e-3)

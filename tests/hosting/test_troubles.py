@@ -120,20 +120,6 @@ def test_a_seat_that_is_free_or_anothers_is_not_lost() -> None:
     board.close()
 
 
-def test_a_worker_that_is_stopped_in_the_middle_of_a_frame_is_waited_for() -> None:
-    board = Board.create(1)
-    row = board.take(7, 0)
-    board.seats["contacts_sequence"][row] = 1  # odd: being written
-
-    def go_on() -> None:
-        board.seats["n_contacts"][row] = 2
-        board.seats["contacts_sequence"][row] = 2
-
-    threading.Timer(0.2, go_on).start()
-    assert len(board.contacts(row)) == 2
-    board.close()
-
-
 def test_a_frame_that_is_never_finished_is_an_error() -> None:
     board = Board.create(1)
     row = board.take(7, 0)

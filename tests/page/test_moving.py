@@ -219,15 +219,6 @@ def test_another_persons_move_refuses_the_drag_and_stays(table: Table) -> None:
     assert np.allclose(table.placement, up(0.001) @ theirs.transform)
 
 
-def test_a_click_on_the_gizmo_shows_what_came_while_it_was_held(table: Table) -> None:
-    table.drag(0.0, "start")
-    table.env.move(table.id, up(-0.003) @ table.placement)
-    table.see()
-    table.drag(0.0, "end")
-    assert table.edits.asked == []
-    assert len(table.gizmos) == 2
-
-
 def test_a_drag_of_a_gizmo_that_was_replaced_is_dropped(table: Table) -> None:
     table.drag(0.002, "start", "update")
     table.controls.follow()

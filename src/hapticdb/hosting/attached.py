@@ -52,12 +52,13 @@ class AttachedHost:
         shell: PointShell,
         start: ArrayLike,
         *,
+        where: Words = (),
         exclude: Words = (),
         coupling: Coupling | None = None,
         scale: float = 1.0,
     ) -> HostedSession:
         """Begin a session; as `SessionHost.begin`, with its errors."""
-        options = {"exclude": exclude, "coupling": coupling, "scale": scale}
+        options = {"where": where, "exclude": exclude, "coupling": coupling, "scale": scale}
         seat, session = self._channel.ask("begin", shell, start, options)
         return HostedSession(self._board, seat, session, self._call)
 

@@ -95,6 +95,7 @@ class SessionHost:
         shell: PointShell,
         start: ArrayLike,
         *,
+        where: Words = (),
         exclude: Words = (),
         coupling: Coupling | None = None,
         scale: float = 1.0,
@@ -105,8 +106,9 @@ class SessionHost:
         ----------
         start : array_like
             Pose (4, 4) of hand and tool, scene metres.
-        exclude : sequence of int or str
-            Words, as of `Environment.find`, that choose what the tool does not feel.
+        where, exclude : sequence of int or str
+            Words as of `Environment.find`. The tool feels the objects that `where` chooses (all if
+            it is empty) and `exclude` does not choose.
         coupling : Coupling or None
             Unless it has a profile, its hand counts as one that no force moves.
         scale : float
@@ -131,7 +133,7 @@ class SessionHost:
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
         compile_missing(entries_for("host"))  # here, so that no worker compiles
-        felt = self._tables.checked(exclude)
+        felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():
                 raise UsageError("the host is closed: make another")
@@ -220,6 +222,7 @@ class SessionHost:
             shell=asked.shell,
             rate=self.rate,
             law=SMOOTH,
+            where=running.cells.filter.where,
             exclude=running.cells.filter.exclude,
             coupling=asdict(asked.coupling),
         )

@@ -23,12 +23,12 @@ class SharedTables:
         self._uses: dict[Filter, int] = {}
         self._making = threading.Lock()
 
-    def checked(self, exclude: Words) -> Filter:
-        """Filter that leaves out what the words choose; ObjectNotFoundError if one chooses nothing.
+    def checked(self, where: Words, exclude: Words) -> Filter:
+        """Filter of the words; ObjectNotFoundError if one of them chooses nothing.
 
         The table of a filter follows what others add and rename.
         """
-        felt = Filter((), exclude)
+        felt = Filter(where, exclude)
         if not felt.is_empty:
             with closing(open_store(self.url, read_only=True)) as store:
                 for error in felt.left_out(store.objects(), store.url).missing:
@@ -40,8 +40,9 @@ class SharedTables:
         with self._making:
             if felt not in self._tables:
                 self._tables[felt] = ResidentCells(
-                    self.url, budget_bytes=self._budget_bytes, exclude=felt.exclude
-                )
+                    self.url, budget_bytes=self._budget_bytes, where=felt.where,
+                    exclude=felt.exclude,
+                )  # fmt: skip
                 self._uses[felt] = 0
             self._uses[felt] += 1
             return self._tables[felt]

@@ -297,6 +297,13 @@ def test_a_closed_host_leaves_no_process_and_refuses_sessions(
         host.begin(sphere, ABOVE)
 
 
+def test_numbers_out_of_range_are_refused(env: Environment) -> None:
+    with pytest.raises(UsageError, match="give 10 to"):
+        SessionHost(env.url, rate=5.0)
+    with pytest.raises(UsageError, match="give 1 or more"):
+        SessionHost(env.url, processes=0)
+
+
 def test_the_other_end_of_a_closed_socket_is_an_error() -> None:
     ours, theirs = socket.socketpair()
     ours.close()

@@ -65,6 +65,10 @@ class SessionHost:
         budget_bytes: int = DEFAULT_BUDGET,
         processes: int | None = None,
     ) -> None:
+        if not 10.0 <= rate <= 20_000.0:
+            raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
+        if processes is not None and processes < 1:
+            raise UsageError(f"{processes} worker processes: give 1 or more")
         self.url, self.rate = url, rate
         self._tables = SharedTables(url, budget_bytes)
         self._board = Board.create(MOST_SESSIONS)

@@ -3,6 +3,7 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import contextlib
+import os
 import signal
 import socket
 import threading
@@ -34,10 +35,12 @@ from crashes import (  # noqa: F401 - fixtures among them
 )
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
+from hapticdb.errors import StuckError
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
+from hapticdb.store.postgres.connecting import answering
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.postgres.private_server import PrivateServer, _children_of
 from servers import Place
 from validity import Contents, assert_valid, contents, valid_contents
 
@@ -155,6 +158,30 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
         assert_valid(env)
         assert env.store.revision() == N_PARTS + 2
     proxy.close()
+
+
+def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
+    server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The server and its children are stopped: the connection stays, and nothing answers."""
+    monkeypatch.setattr(answering, "SILENCE_S", 0.3)
+    monkeypatch.setattr(answering, "ANSWER_S", 1.0)
+    with small(url, file) as env:
+        pid = server._postmaster()
+        assert pid is not None
+        family = [pid, *_children_of(pid)]
+        try:
+            for member in family:
+                os.kill(member, signal.SIGSTOP)
+            with pytest.raises(StuckError, match="did not answer a new client") as told:
+                env.move(7, PLACE)
+        finally:
+            for member in family:
+                os.kill(member, signal.SIGCONT)
+        assert "\n" not in str(told.value)
+        env.move(7, PLACE)
+        np.testing.assert_array_equal(env.object(7).transform, PLACE)
+        assert_valid(env)
 
 
 # --- one connection -----------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from psycopg import sql
 from hapticdb.errors import ConnectionLostError, DatabaseError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting.answering import SilentServerError
 from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS, Link
 from hapticdb.store.postgres.connecting.wire import Parameter
 from hapticdb.store.refusals import check_outside
@@ -198,6 +199,8 @@ class ServerConnection(Link):
                 self._depth -= 1
             try:
                 self.command("COMMIT")
+            except SilentServerError:  # it may still be done when the server goes on
+                return result, False
             except psycopg.Error as error:
                 if not failures.is_lost(error):
                     raise

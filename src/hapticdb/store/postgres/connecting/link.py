@@ -2,8 +2,8 @@
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
 statement. It waits by polling the socket. So Ctrl-C interrupts the wait, and a server that stops
-answering causes an error instead of a hang. Statements that may take long have no limit: there the
-operating system tells of a network that is cut (`KEEPALIVES`).
+answering causes an error instead of a hang, also during statements that may take long
+(`hapticdb.store.postgres.connecting.answering`).
 """
 
 import contextlib
@@ -18,9 +18,9 @@ import psycopg
 from psycopg import pq
 from psycopg.errors import error_from_result
 
-from hapticdb.errors import StuckError
 from hapticdb.store.postgres.address import Address
-from hapticdb.store.postgres.connecting import failures
+from hapticdb.store.postgres.connecting import answering, failures
+from hapticdb.store.postgres.connecting.answering import Peer, SilentServerError
 from hapticdb.store.postgres.connecting.wire import Parameter
 
 Result = TypeVar("Result")
@@ -47,13 +47,6 @@ CONNECT_SECONDS = 10
 """Seconds that a server may take to accept a connection, unless the URL says otherwise."""
 GRACE_MS = 3000
 """Milliseconds that the network and a busy server may add to the server's own time limit."""
-KEEPALIVES = {
-    "keepalives_idle": 10,
-    "keepalives_interval": 5,
-    "keepalives_count": 3,
-    "tcp_user_timeout": 25_000,
-}
-"""libpq's parameters, unless the URL gives them: a host that is gone is noticed in 25 seconds."""
 
 
 class _Connection(psycopg.Connection[tuple[Any, ...]]):
@@ -67,7 +60,7 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
             raise self.link.given_up
         try:
             return super().wait(self.link.until_out_of_patience(gen), *args, **options)
-        except StuckError as error:
+        except SilentServerError as error:
             self.link.given_up = error
             self.close()
             raise
@@ -87,7 +80,7 @@ class Link:
         self._conninfo = conninfo
         self.is_read_only = read_only
         self._leisure = 0
-        self.given_up: StuckError | None = None
+        self.given_up: SilentServerError | None = None
         self.connect()
 
     # -- connecting --------------------------------------------------------------------------
@@ -97,15 +90,14 @@ class Link:
 
         seconds : that the server may take to accept the connection, unless the URL says otherwise.
         """
-        wanted: dict[str, Any] = {"connect_timeout": math.ceil(seconds), **KEEPALIVES}
-        ours = {name: value for name, value in wanted.items() if f"{name}=" not in self._conninfo}
+        given = "connect_timeout=" in self._conninfo
         try:
             made = _Connection.connect(
                 self._conninfo,
                 autocommit=True,
                 client_encoding="utf8",
                 fallback_application_name="hapticdb",
-                **ours,
+                connect_timeout=None if given else math.ceil(seconds),
             )
         # from None: psycopg's message, which a traceback would show, may hold the password
         except psycopg.OperationalError as error:
@@ -119,6 +111,7 @@ class Link:
         self._prepared: dict[str, bytes] = {}
         self._pgconn = made.pgconn
         self._limit_ms: int | None = 1000 * CONNECT_SECONDS
+        self._peer = Peer.of(made.pgconn)
         self._poller = select.poll()
         self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
         try:
@@ -215,7 +208,7 @@ class Link:
 
     @contextlib.contextmanager
     def unhurried(self) -> Iterator[None]:
-        """Wait without a limit inside: for statements that may take long."""
+        """Wait as long as the server answers others inside: for statements that may take long."""
         self._leisure += 1
         try:
             yield
@@ -258,27 +251,50 @@ class Link:
 
     def _wait(self) -> None:
         """Wait until the socket can be read or written."""
-        if not self._poller.poll(self._patience_ms):
-            raise self._stuck()
+        left_ms = self._patience_ms
+        silence_ms = int(1000 * answering.SILENCE_S)
+        while True:
+            step_ms = silence_ms if left_ms is None else min(left_ms, silence_ms)
+            if self._poller.poll(step_ms):
+                return
+            if left_ms is not None:
+                left_ms -= step_ms
+                if left_ms <= 0:
+                    raise self._stuck()
+            self._check_answers()
 
     def until_out_of_patience(
         self, waiting: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
         """Run psycopg's own waiting for a statement, but no longer than `_wait` would."""
-        started = time.monotonic()
+        started = heard = time.monotonic()
         try:
             wanted = next(waiting)
             while True:
                 ready = yield wanted
-                most = self._patience_ms
-                if not ready and most is not None and 1000 * (time.monotonic() - started) > most:
+                now, most = time.monotonic(), self._patience_ms
+                if ready:
+                    heard = now
+                elif most is not None and 1000 * (now - started) > most:
                     raise self._stuck()
+                elif now - heard > answering.SILENCE_S:
+                    self._check_answers()
+                    heard = time.monotonic()
                 wanted = waiting.send(ready)
         except StopIteration as end:
             return cast("Result", end.value)
 
-    def _stuck(self) -> StuckError:
-        return StuckError(
+    def _check_answers(self) -> None:
+        """Give the statement up if the server does not answer a new client either."""
+        if self._peer is not None and not self._peer.answers():
+            raise SilentServerError(
+                f"{self.shown} sends nothing and did not answer a new client within "
+                f"{answering.ANSWER_S:.3g} s: the server, or the way to it, hangs; try again when "
+                "it answers"
+            )
+
+    def _stuck(self) -> SilentServerError:
+        return SilentServerError(
             f"{self.shown} did not answer within {self._patience_ms} ms: "
             "the server, or the way to it, hangs"
         )

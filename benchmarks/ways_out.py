@@ -28,7 +28,7 @@ from hapticdb import Environment, Extraction, GridOptions, ImportOptions
 from hapticdb.ingest.originals import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import write_sample
-from hapticdb.sweeps.record import depth_record
+from hapticdb.sweeps.record import plain
 
 Floats = NDArray[np.float64]
 BITS = 11
@@ -121,7 +121,7 @@ def _record(env: Environment, question: Question, found: Extraction) -> dict[str
             "end_m": found.way.poses[-1][:3, 3].tolist(),
             "clearance_m": found.way.clearance,
             "proved_from_m": found.way.rest_from,
-            "depths": [depth_record(one) for one in found.way.depths],
+            "depths": plain(found.way.depths),
         }
         if found.way.clearance is not None:
             standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))

@@ -13,12 +13,8 @@ from hapticdb.kernels import curves
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
-CURVE_CODES = {
-    "lexicographic": curves.LEXICOGRAPHIC,
-    "z": curves.Z_ORDER,
-    "hilbert": curves.HILBERT,
-}
-"""Numbers of the curves for kernels."""
+CURVE_CODES = {"lexicographic": 0, "z": 1, "hilbert": 2}
+"""Numbers of the curves, as in `kernels.curves`: to read them there would load numba."""
 MAX_BITS = 21
 """Most bits on one axis: three axes fit into the 63 bits of a key."""
 BRICK_BITS = 3

@@ -14,6 +14,7 @@ from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import hapticdb
 from slide_paths import write_along
@@ -114,18 +115,6 @@ def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:
     return Tool(mesh, path, hand, shell, poses)
 
 
-def random_rotations(rng: np.random.Generator, n: int) -> Floats:
-    """Uniformly distributed rotations (n, 3, 3)."""
-    q = rng.normal(size=(n, 4))
-    w, x, y, z = (q / np.sqrt((q * q).sum(axis=1, keepdims=True))).T
-    rows = [
-        [1.0 - 2.0 * (y * y + z * z), 2.0 * (x * y - w * z), 2.0 * (x * z + w * y)],
-        [2.0 * (x * y + w * z), 1.0 - 2.0 * (x * x + z * z), 2.0 * (y * z - w * x)],
-        [2.0 * (x * z - w * y), 2.0 * (y * z + w * x), 1.0 - 2.0 * (x * x + y * y)],
-    ]
-    return np.ascontiguousarray(np.moveaxis(np.array(rows), 2, 0))
-
-
 def choose_poses(
     env: hapticdb.Environment, shell: hapticdb.PointShell, path: Floats, n_poses: int
 ) -> Floats:
@@ -133,7 +122,7 @@ def choose_poses(
     rng = np.random.default_rng(SEED)
     size, objects = env.grid.voxel_size, env.objects()
     poses = np.tile(np.eye(4), (n_poses, 1, 1))
-    poses[:, :3, :3] = random_rotations(rng, n_poses)
+    poses[:, :3, :3] = Rotation.random(n_poses, rng).as_matrix()
     chosen, share = rng.integers(len(objects), size=n_poses), rng.random(n_poses)
     places = rng.normal(scale=size, size=(n_poses, 3))
     for at in np.unique(chosen):

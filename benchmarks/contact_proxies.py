@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 import hapticdb
 import page_tables
 import records
-from delaying import READY_WITHIN, DelayingRelay
+from delaying import READY_WITHIN, delayed
 from feel.couplings import SmoothHand, Terms, posed, straight
 from feel.ground import Ground
 from feel.scenes import concave_corner, convex_edge, plane, slope_axes
@@ -150,8 +150,8 @@ def along(case: Case, port: int, seconds: float) -> Line:
     ages: list[float] = []
     waits: list[float] = []
     with (
-        DelayingRelay(port, seconds) as relay,
-        ContactProxy(f"ws://127.0.0.1:{relay.port}?token={TOKEN}", damping=0.0) as proxy,
+        delayed(port, seconds) as relay_port,
+        ContactProxy(f"ws://127.0.0.1:{relay_port}?token={TOKEN}", damping=0.0) as proxy,
     ):
         begun = time.monotonic()
         while (passed := time.monotonic() - begun) < READY_WITHIN:

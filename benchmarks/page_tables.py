@@ -53,99 +53,95 @@ def facts(found: Result) -> str:
 # --- in real time --------------------------------------------------------------------------------
 
 
-def _times(spread: Mapping[str, float], shares: Sequence[str] = ("p50", "p99")) -> str:
-    """Percentiles of times, microseconds, in one cell of a table."""
-    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in shares)
+def _times(spread: Mapping[str, float]) -> str:
+    """Median and 99th percentile of times, microseconds."""
+    return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in ("p50", "p99"))
+
+
+def listed(cells: Sequence[Result], columns: Mapping[str, Callable[[Result], str]]) -> str:
+    """Table with a row a cell; the columns by their heads."""
+    return table(list(columns), [[text(one) for text in columns.values()] for one in cells])
 
 
 def sessions(results: Results) -> str:
     """Rates, and times in microseconds, beside those of an empty loop."""
-    rows = [
-        [
-            one["engine"],
-            f"{one['rate']:,.0f}",
-            f"{one['loop']['rate']:,.0f}",
-            _times(one["loop"]["lateness"]),
-            _times(one["loop"]["elapsed"]),
-            f"{one['empty']['rate']:,.0f}",
-            _times(one["empty"]["lateness"]),
-        ]
-        for one in results["realtime"]["sessions"]
-    ]
-    head = ["engine", "asked, Hz", "reached", "late", "computing", "empty loop: reached", "late"]
-    return table(head, rows)
+    return listed(
+        results["realtime"]["sessions"],
+        {
+            "engine": lambda one: one["engine"],
+            "asked, Hz": lambda one: f"{one['rate']:,.0f}",
+            "reached": lambda one: f"{one['loop']['rate']:,.0f}",
+            "late": lambda one: _times(one["loop"]["lateness"]),
+            "computing": lambda one: _times(one["loop"]["elapsed"]),
+            "empty loop: reached": lambda one: f"{one['empty']['rate']:,.0f}",
+            "empty loop: late": lambda one: _times(one["empty"]["lateness"]),
+        },
+    )
 
 
 def frames(results: Results) -> str:
     """Microseconds of the dense bitmap, and the others' times as multiples of it."""
-    rows = [
-        [
-            one["part"],
-            f"{one['points']:,}",
-            f"{one['us_per_frame']['dense']:,.1f}",
-            f"{one['ratio']['flat']:.2f}",
-            f"{one['ratio']['clusters']:.2f}",
-        ]
-        for one in results["realtime"]["frames"]
-    ]
-    head = [
-        "frame",
-        "points",
-        "dense bitmap in memory, us",
-        "flat loop over cells",
-        "with clusters",
-    ]
-    return table(head, rows)
+    return listed(
+        results["realtime"]["frames"],
+        {
+            "frame": lambda one: one["part"],
+            "points": lambda one: f"{one['points']:,}",
+            "dense bitmap in memory, us": lambda one: f"{one['us_per_frame']['dense']:,.1f}",
+            "flat loop over cells": lambda one: f"{one['ratio']['flat']:.2f}",
+            "with clusters": lambda one: f"{one['ratio']['clusters']:.2f}",
+        },
+    )
 
 
 def laws(results: Results) -> str:
     """Microseconds a frame under both laws, and their ratio."""
-    rows = [
-        [
-            one["part"],
-            f"{one['points']:,}",
-            *(f"{one['us_per_frame'][law]:,.1f}" for law in ("plane", "smooth")),
-            f"{one['ratio']:.2f}",
-        ]
-        for one in results["realtime"]["laws"]
-    ]
-    return table(["frame", "points", "plane, us", "smooth, us", "smooth / plane"], rows)
+    return listed(
+        results["realtime"]["laws"],
+        {
+            "frame": lambda one: one["part"],
+            "points": lambda one: f"{one['points']:,}",
+            "plane, us": lambda one: f"{one['us_per_frame']['plane']:,.1f}",
+            "smooth, us": lambda one: f"{one['us_per_frame']['smooth']:,.1f}",
+            "smooth / plane": lambda one: f"{one['ratio']:.2f}",
+        },
+    )
 
 
 def edits(results: Results) -> str:
     """Milliseconds from the commit of an edit to the first frame that felt it."""
-    rows = [
-        [
-            one["engine"],
-            f"{one['edits']}",
-            f"{one['voxels']:,}",
-            *(f"{ms:.1f}" for ms in one["felt_after_ms"].values()),
-        ]
-        for one in results["realtime"]["edits"]
-    ]
-    head = ["engine", "moves", "voxels", "median, ms", "90 % within, ms", "worst, ms"]
-    return table(head, rows)
+    cells = results["realtime"]["edits"]
+    columns: dict[str, Callable[[Result], str]] = {
+        "engine": lambda one: one["engine"],
+        "moves": lambda one: f"{one['edits']}",
+        "voxels": lambda one: f"{one['voxels']:,}",
+        **{
+            head: lambda one, at=at: f"{[*one['felt_after_ms'].values()][at]:.1f}"
+            for at, head in enumerate(("median, ms", "90 % within, ms", "worst, ms"))
+        },
+    }
+    return listed(cells, columns)
 
 
 def large_shells(results: Results) -> str:
     """Medians of the loops and p99 of the sleeping ones, without and with a budget, us."""
-    rows = []
-    for one in results["large_shells"]["lines"]:
-        us, near = one["us"], 100 * one["near_share"]
-        within = us.get("budget")
-        rows.append(
-            [
-                f"{one['points']:,}",
-                f"{near:.1f} %" if near < 10 else f"{near:.0f} %",
-                one["law"],
-                *(f"{us[way]['p50']:,.0f}" for way in ("flat", "sleeping")),
-                f"{us['sleeping']['p99']:,.0f}",
-                f"{one['ratio']['sleeping']:.2f}",
-                *(f"{within[p]:,.0f}" if within else NONE for p in ("p50", "p99")),
-            ]
-        )
-    head = ["points", "near", "law", "flat, us", "sleeping, us", "p99", "of the flat loop"]
-    return table([*head, "budget, us", "p99"], rows)
+
+    def within(one: Result, share: str) -> str:
+        return f"{one['us']['budget'][share]:,.0f}" if one["us"].get("budget") else NONE
+
+    return listed(
+        results["large_shells"]["lines"],
+        {
+            "points": lambda one: f"{one['points']:,}",
+            "near": lambda one: f"{100 * one['near_share']:.{int(one['near_share'] < 0.1)}f} %",
+            "law": lambda one: one["law"],
+            "flat, us": lambda one: f"{one['us']['flat']['p50']:,.0f}",
+            "sleeping, us": lambda one: f"{one['us']['sleeping']['p50']:,.0f}",
+            "p99": lambda one: f"{one['us']['sleeping']['p99']:,.0f}",
+            "of the flat loop": lambda one: f"{one['ratio']['sleeping']:.2f}",
+            "budget, us": lambda one: within(one, "p50"),
+            "budget, p99": lambda one: within(one, "p99"),
+        },
+    )
 
 
 # --- docs/query.md, docs/paths.md, docs/protocol.md -----------------------------------------------
@@ -179,22 +175,23 @@ def ways_out(results: Results) -> str:
 
 def contact_proxies(results: Results) -> str:
     """Round trips (median), ages (p50 / p99) and errors, with their shares of the force."""
-    rows = []
-    for one in results["contact_proxies"]["lines"]:
-        error, force, age = one["error"], one["force"], one["age"]
-        rows.append(
-            [
-                one["path"],
-                f"{1e3 * one['added']:.0f}",
-                f"{1e3 * one['round_trip']:.1f}",
-                f"{1e3 * age['p50']:.0f} / {1e3 * age['p99']:.0f}",
-                f"{error['rms']:.2f} ({100 * error['rms'] / force['rms']:.1f} %)",
-                f"{error['max']:.2f} ({100 * error['max'] / force['max']:.0f} %)",
-                f"{one['bytes']:.0f}",
-            ]
-        )
-    head = ["path", "added, ms", "round trip, ms", "age, ms", "RMS error, N"]
-    return table([*head, "largest, N", "bytes"], rows)
+
+    def error(one: Result, kind: str, digits: int) -> str:
+        size = one["error"][kind]
+        return f"{size:.2f} ({100 * size / one['force'][kind]:.{digits}f} %)"
+
+    return listed(
+        results["contact_proxies"]["lines"],
+        {
+            "path": lambda one: one["path"],
+            "added, ms": lambda one: f"{1e3 * one['added']:.0f}",
+            "round trip, ms": lambda one: f"{1e3 * one['round_trip']:.1f}",
+            "age, ms": lambda one: " / ".join(f"{1e3 * one['age'][p]:.0f}" for p in ("p50", "p99")),
+            "RMS error, N": lambda one: error(one, "rms", 1),
+            "largest, N": lambda one: error(one, "max", 0),
+            "bytes": lambda one: f"{one['bytes']:.0f}",
+        },
+    )
 
 
 # --- pages ----------------------------------------------------------------------------------------

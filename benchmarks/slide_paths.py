@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
 import hapticdb
@@ -30,10 +30,8 @@ SAMPLE_LENGTH = 4.28
 """Length of the sample car, metres."""
 ALONG_VOXELS = 10_000_000
 """Voxels that are read at most to make a path: a gigabyte. The largest objects come first."""
-
 STEEPEST = 1.2
 """Slope of the tool's own way, rise over run: where the scene falls off faster, it glides down."""
-
 DENSER = 4
 """Poses tried for each one kept: so many that equal steps of the tool can be picked among them."""
 
@@ -58,13 +56,12 @@ class _HeightMap(NamedTuple):
         return np.asarray(np.where(inside, heights, -np.inf))
 
 
-def heights_of_voxels(centers: ArrayLike, voxel_size: float) -> _HeightMap:
+def _heights_of(centers: Floats, voxel_size: float) -> _HeightMap:
     """Map of the tops of voxels; centers (V, 3) and voxel_size in metres."""
-    points = np.asarray(centers, dtype=np.float64).reshape(-1, 3)
-    corner = points[:, :2].min(axis=0) - 0.5 * voxel_size
-    cell = np.floor((points[:, :2] - corner) / voxel_size).astype(np.int64)
+    corner = centers[:, :2].min(axis=0) - 0.5 * voxel_size
+    cell = np.floor((centers[:, :2] - corner) / voxel_size).astype(np.int64)
     top = np.full(tuple(cell.max(axis=0) + 1), -np.inf)
-    np.maximum.at(top, (cell[:, 0], cell[:, 1]), points[:, 2] + 0.5 * voxel_size)
+    np.maximum.at(top, (cell[:, 0], cell[:, 1]), centers[:, 2] + 0.5 * voxel_size)
     return _HeightMap(corner, voxel_size, top)
 
 
@@ -138,18 +135,12 @@ def _evenly(poses: Floats, reach: float, count: int) -> NDArray[np.int64]:
     return np.searchsorted(way, np.linspace(0.0, way[-1], count)).clip(0, len(poses) - 1)
 
 
-def slide_over_voxels(
-    centers: ArrayLike, voxel_size: float, tool_points: ArrayLike, count: int = 1000
-) -> Floats:
+def _slide(centers: Floats, voxel_size: float, tool: Floats, count: int) -> Floats:
     """Poses (count, 4, 4) that slide a tool over voxels, pressed in by 0.5 to 1.5 voxels.
 
     A step is a voxel or two: in a scene too long for that, the path keeps to its middle.
-
-    centers (V, 3) of voxels and voxel_size in metres; tool_points (N, 3) of the tool's surface,
-    metres, tool frame, its underside towards -z. Neighbouring poses are nearly equally far apart.
     """
-    map_ = heights_of_voxels(centers, voxel_size)
-    tool = np.asarray(tool_points, dtype=np.float64).reshape(-1, 3)
+    map_ = _heights_of(centers, voxel_size)
     reach = float(np.ptp(tool[:, :2], axis=0).max())
     places = _walk(map_, reach, DENSER * count, count * voxel_size)
     run = float(np.linalg.norm(places[1] - places[0]))
@@ -189,12 +180,11 @@ def write_along(
     return wrench, home / "path.csv"
 
 
-def slide_along(
-    env: Environment, tool_points: NDArray[np.float64], frames: int
-) -> NDArray[np.float64]:
+def slide_along(env: Environment, tool_points: Floats, frames: int) -> Floats:
     """Poses (frames, 4, 4) that slide a tool over the largest objects of an environment.
 
     The path follows a map of the voxels' heights, whose size does not depend on the grid.
+    tool_points (N, 3) of the tool's surface, metres, tool frame, its underside towards -z.
     """
     chosen, total = [], 0
     for obj in sorted(env.objects(), key=lambda obj: (-obj.voxels, obj.id)):
@@ -208,10 +198,10 @@ def slide_along(
     tops = [_tops(env.grid.centers(env.voxels(obj.id)), step) for obj in chosen]
     centers = np.concatenate(tops)
     centers[:, 2] -= 0.5 * (step - size)  # the map adds half a cell: the tops stay where they are
-    return slide_over_voxels(centers, step, tool_points, frames)
+    return _slide(centers, step, tool_points, frames)
 
 
-def _tops(centers: NDArray[np.float64], step: float) -> NDArray[np.float64]:
+def _tops(centers: Floats, step: float) -> Floats:
     """Highest of the centres (V, 3) in each column of a map of that step, metres."""
     columns = np.floor(centers[:, :2] / step).astype(np.int64)
     order = np.lexsort((centers[:, 2], columns[:, 1], columns[:, 0]))

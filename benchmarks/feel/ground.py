@@ -34,14 +34,8 @@ CELL = 32.0
 class Ground:
     """An opened environment with all its scenes in memory. Also a context manager.
 
-    Parameters
-    ----------
-    url : path
-        An environment; `of_scenes` makes one.
-    origins : dict
-        Origin (3,) of each scene, metres, world frame.
-    distances : bool
-        Whether the cells have distances to surfaces, which the environment must hold then.
+    url : an environment, which `of_scenes` makes; origins : origin (3,) of each scene, metres,
+    world frame; distances : whether the cells have distances, which the environment must hold then.
     """
 
     def __init__(

@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from page_tables import NONE, table
+from page_tables import NONE, listed, table
 
 Cell = Mapping[str, Any]
 LAWS = ("plane", "smooth")
@@ -130,13 +130,12 @@ def table_of(cells: Sequence[Cell]) -> str:
 def walls_of(cells: Sequence[Cell]) -> str:
     """The stiffest walls of the smooth law: a line for each grip, rate and delay."""
     (found,) = [cell for cell in cells if cell["measure"] == "z_width"]
-    rows = [
-        [
-            case["grip"],
-            f"{case['rate']:,.0f}",
-            f"{1e3 * case['delay']:g}",
-            number_text(case["stiffness"]),
-        ]
-        for case in found["cases"]
-    ]
-    return table(["grip", "rate, Hz", "delay, ms", "stiffest wall, N/m"], rows)
+    return listed(
+        found["cases"],
+        {
+            "grip": lambda case: case["grip"],
+            "rate, Hz": lambda case: f"{case['rate']:,.0f}",
+            "delay, ms": lambda case: f"{1e3 * case['delay']:g}",
+            "stiffest wall, N/m": lambda case: number_text(case["stiffness"]),
+        },
+    )

@@ -45,21 +45,9 @@ FIRM = grip_of("firm grip", 1000.0, 0.5)
 class Person:
     """A hand on a device, in one period after another.
 
-    Parameters
-    ----------
-    grip : Grip
-        How the device is held.
-    period : float
-        Seconds.
-    delay : float
-        Seconds from sending a force until it acts, a whole number of periods.
-    start : (3,) array
-        Where hand and device are, at rest, metres.
-
-    Attributes
-    ----------
-    position, velocity : (3,) arrays
-        Of the device, m and m/s.
+    grip : how the device is held; period : seconds; delay : seconds from sending a force until it
+    acts, a whole number of periods; start (3,): where hand and device are, at rest, metres.
+    position, velocity (3,) are the device's, m and m/s.
     """
 
     def __init__(self, grip: Grip, period: float, delay: float, start: Floats) -> None:

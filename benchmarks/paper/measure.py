@@ -94,22 +94,10 @@ def in_turns(
 ) -> list[Cell]:
     """Measure all alternatives over all poses and return a cell for each.
 
-    Parameters
-    ----------
-    alternatives : sequence
-        What is compared.
-    poses : (M, 4, 4)
-        world_from_tool.
-    limit_s : float
-        Seconds of frames that each may take. An alternative that reaches it stops, and its cell is
-        marked `cut_short`.
-    warm : int
-        Untimed frames of each before.
-    asked_rows : (M,) ints, optional
-        Rows under each pose's own keys: what is read beyond them is a false hit.
+    poses (M, 4, 4): world_from_tool; limit_s : seconds of frames that each may take: one that
+    reaches it stops, and its cell is marked `cut_short`; warm : untimed frames of each before;
+    asked_rows (M,): rows under each pose's own keys: what is read beyond them is a false hit.
 
-    Notes
-    -----
     The poses are cut into chunks. Every alternative runs each chunk once. In one turn the
     alternatives run different chunks, in an order drawn anew for each turn. So an alternative does
     not profit from pages that the one before it has just brought into the cache, and what disturbs

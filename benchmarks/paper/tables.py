@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator, Sequence
 from typing import NamedTuple
 
-from page_tables import NONE, facts, table, us_text
+from page_tables import NONE, facts, listed, table, us_text
 from paper.cells import (
     FRAME_US,
     IN_THE_SERVER,
@@ -51,20 +51,20 @@ def time_text(cell: Cell | None) -> str:
 
 def table_1(results: Results) -> str:
     """Voxels, objects and cells of the data space."""
-    rows = [
-        [
-            cell["environment"],
-            f"{cell['objects']:,}",
-            f"{cell['object_voxels']:,}",
-            f"{cell['distinct_voxels']:,}",
-            f"{cell['cells_of_space']:.2g} ({cell['bits']} bits an axis)",
-            f"{cell['rows_brick']:,}",
-            bytes_text(cell["bytes_brick"]),
-        ]
-        for cell in cells_of(results, "table1")
-    ]
-    head = ["environment", "objects", "object voxels", "distinct voxels", "cells of the data space"]
-    return table([*head, "rows (bricks)", "size (bricks)"], rows)
+    return listed(
+        cells_of(results, "table1"),
+        {
+            "environment": lambda cell: cell["environment"],
+            "objects": lambda cell: f"{cell['objects']:,}",
+            "object voxels": lambda cell: f"{cell['object_voxels']:,}",
+            "distinct voxels": lambda cell: f"{cell['distinct_voxels']:,}",
+            "cells of the data space": lambda cell: (
+                f"{cell['cells_of_space']:.2g} ({cell['bits']} bits an axis)"
+            ),
+            "rows (bricks)": lambda cell: f"{cell['rows_brick']:,}",
+            "size (bricks)": lambda cell: bytes_text(cell["bytes_brick"]),
+        },
+    )
 
 
 def figure_8(results: Results) -> str:
@@ -217,18 +217,10 @@ def auto(results: Results) -> str:
     rows = []
     for (engine, layout), found in ratios.items():
         found.sort()
-        close = sum(ratio <= AUTO_CLOSE for ratio in found)
-        middle = found[len(found) // 2]
-        rows.append(
-            [
-                engine,
-                named(layout),
-                f"{len(found)}",
-                f"{close}",
-                f"{middle:.2f}",
-                f"{found[-1]:.2f}",
-            ]
-        )
+        counts = len(found), sum(ratio <= AUTO_CLOSE for ratio in found)
+        middle_and_worst = found[len(found) // 2], found[-1]
+        numbers = [*map(str, counts), *(f"{ratio:.2f}" for ratio in middle_and_worst)]
+        rows.append([engine, named(layout), *numbers])
     return table(["engine", "layout", "groups", "within 10 %", "middle ratio", "worst"], rows)
 
 

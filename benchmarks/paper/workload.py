@@ -126,16 +126,7 @@ def regions(env: Environment, count: int, seed: int = SEED, windows: int = WINDO
     Density is the share of occupied voxels in a window of 64^3 around a voxel drawn from the
     surface; the windows are those at the 10th, 50th and 90th percentile.
 
-    Parameters
-    ----------
-    env : Environment
-        At least as large as one window; bricks are read much faster than voxels.
-    count : int
-        Poses in each.
-    seed : int
-        Of the drawn voxels and poses.
-    windows : int
-        How many are measured.
+    count : poses in each; windows : how many are measured, around voxels drawn with the seed.
     """
     rng = np.random.default_rng(seed)
     side = min(WINDOW, env.grid.side)

@@ -11,7 +11,7 @@ from hapticdb.mesh import SUFFIXES
 from mutate_files import FORMATS
 
 SCRIPT = Path(__file__).parent.parent / "mutate_files.py"
-FILES = 6000 if is_every() else 1500
+FILES = 6000 if is_every() else 600
 
 
 @pytest.mark.skipif(sys.platform != "linux", reason="memory is counted as Linux counts it")

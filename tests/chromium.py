@@ -34,6 +34,10 @@ if (!new URLSearchParams(location.search).has("token"))
 """
 """Run before the page's own code. Else viser draws fewer pixels where it finds that it is slow, and
 two pictures of the same scene differ."""
+TWO_PICTURES = """new Promise(done => {
+    setTimeout(done, 20000)
+    requestAnimationFrame(() => requestAnimationFrame(done))
+})"""
 PATIENCE = 120.0
 """Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
 DRAGGED_STEPS = 6
@@ -134,12 +138,19 @@ class Eye:
         )
 
 
+def drawn(page: Page) -> None:
+    """Wait until two more pictures of the page have been drawn, as long as each may take."""
+    page.evaluate(TWO_PICTURES)
+
+
 def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats, *, lets_go: bool = True) -> None:
     """Drag what is at a place (3,) by a way (3,), metres, with the pointer."""
     start, end = np.array(eye.pixel(grabbed)), np.array(eye.pixel(grabbed + way))
     page.mouse.move(*start)
-    page.wait_for_timeout(400)  # a gizmo notices the pointer when it is drawn next
+    page.wait_for_timeout(400)
+    drawn(page)  # a gizmo notices the pointer when it is drawn next
     page.mouse.down()
+    drawn(page)
     for share in np.linspace(0.0, 1.0, DRAGGED_STEPS)[1:]:
         page.mouse.move(*(start + share * (end - start)))
         page.wait_for_timeout(60)  # viser sends 20 places of a gizmo a second

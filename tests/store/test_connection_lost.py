@@ -18,7 +18,7 @@ import pytest
 import hapticdb
 from assemblies import placement
 from children import PATIENCE, child, joined, until
-from command_line import command, command_that_halts, tool, wait_for_an_object
+from command_line import command, tool
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
     N_PARTS,
@@ -34,15 +34,13 @@ from crashes import (  # noqa: F401 - fixtures among them
     url,
 )
 from hapticdb import Environment, PointShell
-from hapticdb.cli import main
 from hapticdb.errors import StuckError
 from hapticdb.query.frame import STRATEGIES, Strategy
-from hapticdb.store.base import Layout
 from hapticdb.store.postgres.connecting import answering
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer, _children_of
 from servers import Place
-from validity import Contents, assert_valid, contents, valid_contents
+from validity import Contents, assert_valid, contents
 
 
 class Proxy:
@@ -255,26 +253,6 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
 
 
 # --- Ctrl-C -------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-def test_an_interrupted_import_is_finished_by_the_same_command(
-    place: Place, undisturbed: dict[Layout, Contents], tmp_path: Path, file: Path
-) -> None:
-    where = place()
-    text = file.read_text()
-    args = ("import", where, file, "--bits", 7, "--layout", "voxel", "--jobs", 1)
-    with child(command_that_halts(N_PARTS // 2, *args)) as importing:
-        wait_for_an_object(where, importing)
-        importing.send_signal(signal.SIGINT)
-        _, err = importing.communicate(timeout=PATIENCE)
-    assert importing.returncode == 130, err
-    assert err.strip().endswith("the same command goes on from there")
-    assert len(valid_contents(where)[0]) < N_PARTS
-    assert main(["import", where, str(file), "--bits", "7"]) == 0
-    assert valid_contents(where) == undisturbed["voxel"]
-    assert file.read_text() == text
-    assert not list(tmp_path.iterdir())
 
 
 def test_an_interrupted_touch_leaves_nothing_behind(

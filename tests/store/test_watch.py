@@ -2,24 +2,18 @@
 
 import contextlib
 import itertools
-import sys
-import threading
+import os
 from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
 import psycopg
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from psycopg import sql
 
 import hapticdb
-from children import finished, joined
-from crashes import server, template  # noqa: F401 - fixtures
 from hapticdb import Grid
-from hapticdb.store.base import SupportsWatch
-from hapticdb.store.connect import create_store, open_store
+from hapticdb.store.connect import create_store
 from hapticdb.store.postgres import watching
 from hapticdb.store.postgres.address import LONGEST_NAME, parse
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -31,16 +25,8 @@ from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import is_noticed, write_voxels
 from servers import Place
 
-ROOT = Path(__file__).parent.parent.parent
 GRID = Grid(0.005, (0, 0, 0), 7)
 VOXEL = np.array([[1, 2, 3]])
-WRITE = """
-import sys
-import numpy as np
-from hapticdb.store.connect import open_store
-from hapticdb.testing import write_voxels
-write_voxels(open_store(sys.argv[1]), np.array([[4, 5, 6]]), "of another process")
-"""
 
 
 @pytest.fixture
@@ -64,21 +50,6 @@ numbers = itertools.count()
 def write(where: str) -> None:
     with hapticdb.open(where) as env:
         write_voxels(env.store, VOXEL, f"{next(numbers)}")
-
-
-# --- both engines -------------------------------------------------------------------------------
-
-
-def test_a_commit_of_another_process_is_noticed_by_one_that_only_watches(
-    file: str, url: str
-) -> None:
-    for where in (file, url):
-        with contextlib.closing(open_store(where, read_only=True)) as reader:
-            assert isinstance(reader, SupportsWatch)
-            reader.watch()
-            finished([sys.executable, "-c", WRITE, where], check=True)
-            assert is_noticed(reader)
-            assert not reader.has_changed()
 
 
 # --- SQLite -------------------------------------------------------------------------------------
@@ -131,31 +102,6 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
 
     monkeypatch.setattr(watching.Watch, "_ask", counted)
     return found
-
-
-def test_notifications_during_reads_neither_disturb_nor_get_lost(
-    url: str, reader: PostgresStore, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(watching, "HEARING_S", 1e9)
-    reader.watch()
-    key = GRID.encode(VOXEL) >> 9
-    n_writes = 50
-
-    def write_many() -> None:
-        with hapticdb.open(url) as env:
-            for _ in range(n_writes):
-                write_voxels(env.store, VOXEL, f"{next(numbers)}")
-
-    writer = threading.Thread(target=write_many, daemon=True)
-    writer.start()
-    seen = 0
-    while writer.is_alive():
-        for n_found in (len(reader.lookup(key)), len(reader.objects())):
-            assert n_found >= seen
-            seen = n_found
-    joined(writer)
-    assert len(reader.lookup(key)) == len(reader.objects()) == n_writes
-    assert is_noticed(reader)
 
 
 def test_a_reader_that_lost_its_connection_listens_again(
@@ -228,8 +174,6 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
 
 
 def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.Connection) -> None:
-    page = " ".join((ROOT / "docs" / "format.md").read_text().split())
-    assert "channel `hapticdb_NAME`, NAME being the schema's, with the revision as payload" in page
     channel = f"hapticdb_{parse(url).environment}"
     admin.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
     write(url)
@@ -238,9 +182,96 @@ def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.
     assert [(n.channel, n.payload) for n in heard] == [(channel, "1"), (channel, "2")]
 
 
-@given(st.lists(st.text(min_size=1, max_size=LONGEST_NAME), min_size=2, max_size=2, unique=True))
-def test_every_environment_has_a_channel_of_its_own_that_the_server_takes(names: list[str]) -> None:
-    fitting = [name.encode()[:LONGEST_NAME].decode(errors="ignore") for name in names]
-    channels = {channel_of(name) for name in fitting}
-    assert len(channels) == len(set(fitting))
+def test_long_names_have_channels_of_their_own_that_the_server_takes() -> None:
+    names = ["n" * LONGEST_NAME, "n" * (LONGEST_NAME - 1) + "m", "語" * 21, "語" * 20 + "本"]
+    channels = {channel_of(name) for name in names}
+    assert len(channels) == len(names)
     assert all(len(channel.encode()) <= LONGEST_NAME for channel in channels)
+
+
+# --- notifications from roles without rights -----------------------------------------------------
+
+FORGED = [
+    "",
+    "nonsense",
+    "-1",
+    "0",
+    "²",
+    "9" * 5000,
+    "9223372036854775807",
+    "1e300",
+    "\x1b[2J",
+    "x" * 7999,
+]
+
+
+@pytest.fixture
+def stranger(database: str, admin: psycopg.Connection) -> Iterator[psycopg.Connection]:
+    """A connection of a role that has no right on any environment."""
+    role = sql.Identifier(f"stranger {os.getpid()} {next(numbers)}")
+    admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(role))
+    with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
+        connection.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(role))
+        yield connection
+    admin.execute(sql.SQL("DROP ROLE {}").format(role))
+
+
+def test_words_of_strangers_on_the_channel_hide_no_edit(
+    url: str,
+    reader: PostgresStore,
+    stranger: psycopg.Connection,
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    """Each edit is noticed by its own notification, as without forged ones."""
+    monkeypatch.setattr(watching, "HEARING_S", 1e9)
+    channel = channel_of(parse(url).environment)
+    with pytest.raises(psycopg.errors.InsufficientPrivilege):
+        stranger.execute(sql.SQL("SELECT * FROM {}.change").format(sql.Identifier(channel[9:])))
+    seen: dict[bool, list[int]] = {False: [], True: []}
+    reader.watch()
+    for is_forged in (False, True):
+        for payload in FORGED:
+            if is_forged:
+                stranger.execute(
+                    "SELECT pg_notify(%s, %s || n) FROM generate_series(1, 200) AS n",
+                    (channel, payload[:7990]),
+                )
+                stranger.execute("SELECT pg_notify(%s, %s)", (channel, payload))
+                reader.has_changed()
+            write(url)
+            assert is_noticed(reader)
+            seen[is_forged].append(reader.revision())
+    n = len(FORGED)
+    assert seen == {False: list(range(1, n + 1)), True: list(range(n + 1, 2 * n + 1))}
+
+
+def test_a_flood_of_notifications_leads_to_few_round_trips(
+    url: str,
+    reader: PostgresStore,
+    stranger: psycopg.Connection,
+    asked: list[int],
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    class Clock:
+        now = 1e6
+
+        def monotonic(self) -> float:
+            return self.now
+
+    clock = Clock()
+    monkeypatch.setattr(watching, "time", clock)
+    reader.watch()
+    asked.clear()
+    channel = channel_of(parse(url).environment)
+    for n in range(100):  # the fetching process looks each millisecond
+        clock.now += 1e-3
+        stranger.execute(
+            "SELECT pg_notify(%s, %s::text || n) FROM generate_series(1, 20) n", (channel, n)
+        )
+        reader.objects()  # a read also receives waiting notifications
+        assert not reader.has_changed()
+    assert 1 <= len(asked) <= 0.1 / watching.HINTED_S
+    write(url)
+    reader.objects()
+    clock.now += watching.HINTED_S
+    assert reader.has_changed()

@@ -1,8 +1,6 @@
 """The strategy `auto`: a lookup of all keys, or a scan of ranges where many keys share few."""
 
-from dataclasses import replace
 from pathlib import Path
-from typing import NoReturn
 
 import numpy as np
 import pytest
@@ -10,86 +8,13 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.query.auto import (
-    KEYS_PER_RANGE,
-    grouping_threshold,
-    ranges_worth_scanning,
-)
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.frame import STRATEGIES
-from hapticdb.query.grouping import cbgroup
-from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import Keys, Layout, Store
+from hapticdb.store.base import Layout, Store
 from hapticdb.testing import floor_voxels, write_voxels
-from servers import Place
 
-THRESHOLD = 100
-QUANTILES = QuantileVector(np.arange(0, 40_001, 100, dtype=np.int64), 40_000)
-CLOSE = CostModel(1.0, 10.0, 0.0, 1.0, 100.0)
-"""Gaps of at most 10 rows are closed; `QUANTILES` expects a row a key."""
-ONE_RANGE = replace(CLOSE, descent=1e9)
-NO_GAP_CLOSED = replace(CLOSE, descent=0.0, row=1e9)
-
-
-def clusters(*sizes: int) -> Keys:
-    """Runs of neighbouring keys, 100 keys apart: CBGroup makes a range of each."""
-    starts = np.cumsum([0, *(size + 100 for size in sizes)])
-    return np.concatenate([np.arange(n) + at for n, at in zip(sizes, starts, strict=False)])
-
-
-def forbidden(*_: object, **__: object) -> NoReturn:
-    pytest.fail("statistics were asked for")
-
-
-# --- the rule -----------------------------------------------------------------------------------
-
-
-def test_a_frame_below_the_threshold_is_looked_up_without_any_statistics() -> None:
-    keys = np.arange(THRESHOLD - 1, dtype=np.int64)
-    assert ranges_worth_scanning(keys, THRESHOLD, forbidden) is None
-    assert ranges_worth_scanning(keys[:0], THRESHOLD, forbidden) is None
-
-
-def test_an_engine_that_groups_keys_itself_always_looks_them_up() -> None:
-    assert ranges_worth_scanning(np.arange(10**6, dtype=np.int64), None, forbidden) is None
-
-
-@pytest.mark.parametrize(
-    ("sizes", "is_scanned"),
-    [
-        ([THRESHOLD], True),
-        ([2] * 50, True),  # as many ranges as half the keys
-        ([2] * 50 + [3], True),
-        ([2] * 50 + [1], False),  # a range more than half the keys
-        ([1] * 100, False),
-    ],
-)
-def test_ranges_are_scanned_where_they_hold_two_keys_or_more(
-    sizes: list[int], *, is_scanned: bool
-) -> None:
-    keys = clusters(*sizes)
-    expected = cbgroup(keys, QUANTILES, CLOSE)
-    assert len(expected.lows) == len(sizes)
-    assert KEYS_PER_RANGE == 2
-    ranges = ranges_worth_scanning(keys, THRESHOLD, lambda: (QUANTILES, CLOSE))
-    if not is_scanned:
-        assert ranges is None
-        return
-    assert ranges is not None
-    np.testing.assert_array_equal(ranges, expected)
-
-
-# --- the threshold of an engine -----------------------------------------------------------------
-
-
-def test_postgres_groups_keys_itself_from_version_17_on(place: Place) -> None:
-    with make_scene(place()) as env:
-        major = int(env.engine.removeprefix("PostgreSQL ").split(".")[0])
-        assert grouping_threshold(env.store) == (None if major >= 17 else 256)
-
-
-# --- frames -------------------------------------------------------------------------------------
-
+ONE_RANGE = CostModel(1.0, 1e9, 0.0, 1.0, 100.0)
+NO_GAP_CLOSED = CostModel(1.0, 0.0, 0.0, 1e9, 100.0)
 BITS: dict[Layout, int] = {"voxel": 6, "brick": 9}
 
 

@@ -9,7 +9,6 @@ from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from hapticdb import Grid
-from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.grouping import Ranges, box_ranges, cbgroup, maxgap
@@ -79,11 +78,6 @@ def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
             wanted.append((first, brick))
             first = None
     assert as_pairs(found) == wanted
-
-
-def test_a_negative_maxgap_is_refused() -> None:
-    with pytest.raises(UsageError, match="MAXGAP -1"):
-        maxgap(as_keys([1]), as_keys([1]), as_keys([1]), -1)
 
 
 # --- CBGroup ------------------------------------------------------------------------------------
@@ -175,12 +169,6 @@ def test_a_gap_that_costs_as_much_as_a_descent_is_closed() -> None:
     keys = as_keys([1, 6])  # four keys between
     assert len(cbgroup(keys, quantiles, costs_of(4.0, 1.0)).lows) == 1
     assert len(cbgroup(keys, quantiles, costs_of(3.99, 1.0)).lows) == 2
-
-
-def test_an_empty_environment_is_asked_for_one_range() -> None:
-    nothing = QuantileVector(as_keys([0, 0]), 0)
-    ranges = cbgroup(as_keys([3, 70, 5000]), nothing, costs_of(1.0, 1.0))
-    assert as_pairs(ranges) == [(3, 5000)]
 
 
 # --- boxes --------------------------------------------------------------------------------------

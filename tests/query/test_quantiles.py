@@ -1,6 +1,5 @@
 """The quantile vector against counted rows; the cost model and its calibration."""
 
-import json
 import math
 from collections.abc import Iterator
 from dataclasses import replace
@@ -15,7 +14,7 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
-from hapticdb.query.calibration import _cautious, calibrate
+from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import MAX_RESOLUTION, QuantileVector
@@ -65,24 +64,6 @@ def test_all_rows_lie_between_the_lowest_and_the_highest_key(
     assert quantiles.rows_between(-1, min(keys) - 1) == 0.0
 
 
-@pytest.mark.parametrize("n_rows", [1, 2, 7, 100])
-def test_a_bucket_a_row_counts_neighbouring_keys_exactly(n_rows: int) -> None:
-    """Each key has one row, whose bucket ends at the key."""
-    quantiles = vector_of(list(range(10, 10 + n_rows)), n_rows)
-    assert quantiles.rows_per_bucket == 1.0
-    for left in range(11, 10 + n_rows):
-        for right in range(left, 9 + n_rows):
-            assert quantiles.rows_between(left, right) == right - left + 1
-
-
-def test_a_key_of_many_rows_counts_by_its_rows() -> None:
-    """Half of all rows have one key: a histogram without ties would spread them over a range."""
-    quantiles = vector_of([*range(100), *[1000] * 200, *range(2000, 2100)], 100)
-    assert quantiles.rows_between(1000, 1000) == pytest.approx(200, abs=8)
-    assert quantiles.rows_between(1001, 1999) == pytest.approx(0, abs=8)
-    assert quantiles.rows_between(100, 999) == pytest.approx(0, abs=8)
-
-
 @pytest.mark.parametrize("resolution", [0, -1, MAX_RESOLUTION + 1])
 def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: int) -> None:
     with pytest.raises(UsageError, match=f"{resolution} quantiles"):
@@ -91,19 +72,7 @@ def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: in
 
 # --- the cost model -----------------------------------------------------------------------------
 
-figures = st.floats(0, 1e9, allow_nan=False)
 MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0)
-
-
-@few
-@given(values=st.lists(figures, min_size=7, max_size=7), spread=figures)
-def test_a_cost_model_returns_from_its_figures(values: list[float], spread: float) -> None:
-    """Also when they were written as text, as a store keeps them."""
-    names = [name for name in vars(MODEL) if name != "spread"]
-    model = CostModel.from_figures(dict(zip(names, values, strict=True)))
-    model = replace(model, spread={"row": spread, "descent": 0.0})
-    assert CostModel.from_figures(model.figures()) == model
-    assert CostModel.from_figures(json.loads(json.dumps(model.figures()))) == model
 
 
 def test_figures_that_another_version_has_kept_still_serve() -> None:
@@ -111,37 +80,11 @@ def test_figures_that_another_version_has_kept_still_serve() -> None:
     assert CostModel.from_figures(older | {"lookup": 7.0, "lookup.spread": 0.5}) == MODEL
 
 
-@few
-@given(values=st.lists(st.floats(0.01, 1e6), min_size=3, max_size=3), factor=st.floats(1, 100))
-def test_rows_with_distances_cost_so_many_times_more(values: list[float], factor: float) -> None:
-    descent, block, row = values
-    plain = replace(MODEL, descent=descent, block=block, row=row, caution=2.0, distances=factor)
-    found = plain.with_distances
-    assert found.row_in_gap == pytest.approx(factor * plain.row_in_gap)
-    assert found.descent == descent
-    assert found.with_distances == found
-
-
 def test_cautious_grouping_closes_fewer_gaps() -> None:
     keys = np.arange(0, 4000, 40, dtype=np.int64)
     quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
     assert len(cbgroup(keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
     assert len(cbgroup(keys, quantiles, replace(MODEL, caution=3.0)).lows) == len(keys)
-
-
-@pytest.mark.parametrize("rows_in_a_gap", [0, 1, 50])
-def test_caution_grows_with_what_small_gaps_turn_out_to_hold(rows_in_a_gap: int) -> None:
-    """One row expected in each gap: it pays to close them when they are empty, not when full."""
-    keys = np.arange(0, 4000, 40, dtype=np.int64)
-    quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 100)
-    model = replace(MODEL, descent=2.0, block=0.0, row=1.0)
-
-    def count(lows: NDArray[np.int64], highs: NDArray[np.int64]) -> int:
-        return int(((highs - lows) // 40).sum()) * rows_in_a_gap + len(keys)
-
-    fitted = _cautious(model, [keys], quantiles, count)
-    closed = len(cbgroup(keys, quantiles, fitted).lows) == 1
-    assert closed == (rows_in_a_gap < 2)
 
 
 # --- calibration --------------------------------------------------------------------------------

@@ -14,10 +14,6 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.kernels import law as kernels
-from hapticdb.kernels.query import contact, refining
-from hapticdb.kernels.records import RESULTS
-from hapticdb.kernels.resident.cells import CONTACTS, HITS
-from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
@@ -44,48 +40,6 @@ def penalty(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # t
 
 
 kernels.define(PenaltyNumbers, kernels.Leaves(respond=penalty))
-
-
-class NearNumbers(NamedTuple):
-    """A law that feels what its payload says, hit or not."""
-
-    stiffness: float
-
-
-def sample_rows(law, payload, counts, first, end, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """Least distance that the payload has for a whole row, voxels."""
-    least = np.inf
-    for row in range(first, end):
-        if counts[row]:
-            least = min(least, float(payload[row, 0]))
-    return least
-
-
-def sample_slot(law, payload, slot, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """Distance that the payload has for a whole slot, voxels."""
-    return float(payload[slot, 0])
-
-
-def reach(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """One voxel."""
-    return 1.0
-
-
-def felt_within(law):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """Anywhere in a brick that holds a voxel: as far as its corners are from one another."""
-    return 8.0 * 3.0**0.5
-
-
-kernels.define(
-    NearNumbers,
-    kernels.Leaves(
-        penalty,
-        reach=reach,
-        felt_within=felt_within,
-        sample_rows=sample_rows,
-        sample_slot=sample_slot,
-    ),
-)
 
 
 class Penalty:
@@ -151,46 +105,3 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) 
         assert felt.hits[n] == felt.contacts[n] == len(wanted.hits)
         n_felt += len(wanted.hits)
     assert n_felt > 0
-
-
-@pytest.mark.long
-def test_a_payload_lets_a_law_feel_points_that_are_no_hits(env: Environment) -> None:
-    """A payload of zeros: everything in a brick that holds a voxel is felt, and hits stay hits."""
-    shell, pose, law = shell_of(300), poses()[0], NearNumbers(STIFFNESS)
-    grid = env.grid
-    located = contact.locate(
-        shell.points, shell.normals, shell.center, pose, np.array(grid.origin), SIZE, BITS,
-        grid.curve_code, 9,
-    )  # fmt: skip
-    rows = env.store.lookup(located.keys)
-    nothing = np.empty(0, dtype=np.int64)
-    origin = np.array(grid.origin)
-
-    def refined(payload: NDArray[np.uint8]) -> refining.Refined:
-        return refining.refine(*located, *rows[:3], payload, nothing, origin, SIZE, law)
-
-    wrench, hits, _, _, apart, depths = refined(np.zeros((len(rows), 1), dtype=np.uint8))
-    wanted = expected(shell, pose)
-    is_near = np.isin(located.keys[located.asked[1]], rows.keys) & (located.asked[1] >= 0)
-    assert hits.tolist() == wanted.hits
-    assert sorted([*hits.tolist(), *apart.tolist()]) == np.flatnonzero(is_near).tolist()
-    assert len(apart) > 0
-    assert (depths == 0.5 * SIZE).all()
-    with CellTable.create(LEAST_BUDGET) as table:
-        frames = ResidentFrames(Residency(env.store, table), shell, Penalty())
-        frames.feel(pose[None])
-        cells = table.cells._replace(payload=np.zeros((table.n_slots, 1), dtype=np.uint8))
-        out = np.zeros((1, RESULTS))
-        place, met = frames.residency.place, np.empty(300, dtype=np.int64)
-        with table.reading() as reader:
-            feel_kernel(
-                cells, reader, frames.clusters, pose[None], place, law, met, frames.missed, out
-            )
-        frames.close()
-    assert out[0, :6].tolist() == wrench.tolist()
-    assert met[: int(out[0, HITS])].tolist() == wanted.hits
-    assert out[0, CONTACTS] == is_near.sum()
-    far = refined(np.full((len(rows), 1), 2, dtype=np.uint8))
-    assert far[1].tolist() == wanted.hits
-    assert far[4].size == 0
-    assert far[0].tolist() == [*wanted.force, *wanted.torque]

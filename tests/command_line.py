@@ -1,10 +1,12 @@
 """The command line as tests use it: run in an empty folder, on a small environment."""
 
+import contextlib
+import os
+import pty
 import shutil
 import sys
 from collections.abc import Callable
 from pathlib import Path
-from subprocess import Popen
 from typing import Any
 
 import numpy as np
@@ -12,7 +14,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from children import until
+from children import child
 from hapticdb.cli import main
 from hapticdb.query.cost_model import CostModel, machine_name
 
@@ -40,51 +42,18 @@ def command(*args: object) -> list[str]:
     return [sys.executable, "-m", "hapticdb", *map(str, args)]
 
 
-HALTING = """
-import sys, time
-from hapticdb.cli import main
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.store.postgres.tables.writing import PostgresWriter
-from hapticdb.store.sqlite.tables.writing import SQLiteWriter
-
-left = int(sys.argv.pop(1))
-
-def halting(add):
-    def until_told(writer, record, rows):
-        global left
-        if left == 0:
-            time.sleep(600)
-        left -= 1
-        return add(writer, record, rows)
-    return until_told
-
-for kind in (SQLiteWriter, PostgresWriter):
-    kind.add = halting(kind.add)
-sys.exit(main())
-"""
-
-
-def command_that_halts(n_objects: int, *args: object) -> list[str]:
-    """Arguments of a command that writes so many objects and then waits until a signal ends it."""
-    return [sys.executable, "-c", HALTING, str(n_objects), *map(str, args)]
-
-
-def wait_for_an_object(url: Path | str, child: "Popen[str]") -> None:
-    """Wait until an import or a copy has committed an object."""
-
-    def is_there() -> bool:
-        assert child.poll() is None, "it ended before it could be interrupted"
-        return count_objects(url) > 0
-
-    until(is_there)
-
-
-def count_objects(url: Path | str) -> int:
-    try:
-        with hapticdb.open(url, read_only=True) as env:
-            return len(env.objects())
-    except hapticdb.errors.EnvironmentNotFoundError:
-        return 0
+def on_terminal(*args: object) -> str:
+    """What a terminal shows of a command in a process of its own."""
+    ours, theirs = pty.openpty()
+    with child(command(*args), stdout=theirs, stderr=theirs) as process:
+        os.close(theirs)
+        seen = b""
+        with contextlib.suppress(OSError):  # the other side is closed
+            while chunk := os.read(ours, 4096):
+                seen += chunk
+    os.close(ours)
+    assert process.returncode == 0
+    return seen.decode()
 
 
 def refused(result: tuple[int, str, str], *words: str) -> str:

@@ -18,15 +18,6 @@ def ids_in(scene: Path) -> list[int]:
         return [obj.id for obj in env.objects()]
 
 
-@pytest.mark.parametrize(
-    "words",
-    [("--exclude", "box[01],3"), ("--exclude", "box1", "--exclude", "1,3")],
-)
-def test_exclude_takes_names_and_patterns(run: Run, scene: Path, words: tuple[str, ...]) -> None:
-    out = run("touch", scene, *TOUCH, "--json", *words)[1]
-    assert [json.loads(line)["hits"] for line in out.splitlines()] == [0, 0, 0]
-
-
 def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
     """The same words for touch, sweep and feel; --exclude leaves out some of what is chosen."""
 

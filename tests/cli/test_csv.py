@@ -154,6 +154,10 @@ def test_a_damaged_recording_leaves_no_file_unless_it_may_end_there(
     assert not list(recording.parent.glob("*frames.csv*"))
     code, out, _ = run("replay", "felt.hdbrec", "--csv", "frames.csv", "--until-damage")
     assert (code, out) == (0, "frames.csv: 4,096 frames\n")
+    recording.write_bytes(content[:-100])
+    code, out, err = run("replay", "felt.hdbrec", "--csv", "cut.csv")
+    assert (code, out) == (0, "cut.csv: 4,096 frames\n")
+    assert "bytes are an incomplete chunk" in err
 
 
 def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -15,16 +15,9 @@ import pytest
 import hapticdb
 from children import PATIENCE, child, descendants, named, until
 from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
-from hapticdb import PointShell
 from hapticdb.cli.values import size_bytes
-from hapticdb.kernels import compiling
-from hapticdb.kernels.compiling import entries_for
-from hapticdb.realtime import session
-from hapticdb.recording import replay
-from hapticdb.recording.file import Frames, Recorder, Recording
-from hapticdb.resident.frames import LARGE_FROM
+from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
-from recordings import header
 
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
@@ -112,26 +105,6 @@ def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path)
     assert (code, err) == (0, OPENED)
     assert out.startswith("equal: ")
     refused(run(*feel(*PLAY), "--record", "felt.hdbrec", "--append"), "budget_points")
-
-
-@pytest.mark.usefixtures("scene")
-def test_feel_and_replay_announce_the_kernels_of_large_tools(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """As if this machine had compiled all kernels but those."""
-    large = set(entries_for("large")) - set(entries_for("feel", "replay"))
-    monkeypatch.setattr(compiling, "missing", lambda names: sorted(large.intersection(names)))
-    for place in (compiling, session, replay):
-        monkeypatch.setattr(place, "compile_missing", lambda *_: 0)
-    PointShell.sphere(0.01, LARGE_FROM).save("large.npz")
-    short = (*PLAY, "--seconds", 0.2, "--no-baseline", "--replace", "--record", "felt.hdbrec")
-    tools = {"small": feel(), "large": ("feel", "scene.db", "--tool", "large.npz")}
-    for tool, budget, is_told in (("small", (), 0), ("small", (40,), 1), ("large", (), 1)):
-        more = ("--budget-points", *budget) if budget else ()
-        for words in ((*tools[tool], *short, *more), ("replay", "felt.hdbrec")):
-            code, _, err = run(*words)
-            said = err.count(f"compiling, once: {len(large)} kernel")
-            assert (code, said) == (0, is_told), err
 
 
 @pytest.mark.usefixtures("scene")
@@ -246,43 +219,6 @@ def test_a_session_that_ends_without_its_database_fails(scene: Path) -> None:
     assert lost.startswith("scene.db ")
     assert len(err.splitlines()) == 1
     assert err.startswith("hapticdb: scene.db ")
-
-
-@pytest.mark.long
-def test_a_recording_that_was_cut_off_or_damaged_is_told(run: Run, scene: Path) -> None:
-    path = scene.with_name("felt.hdbrec")
-    args = feel("--device", "random", "--at", ABOVE, "--rate", 2000, "--seconds", 6)
-    assert run(*args, "--record", path)[0] == 0
-    whole = path.read_bytes()
-    path.write_bytes(whole[:-100])
-    code, out, err = run("replay", path)
-    assert (code, out.startswith("equal: ")) == (0, True)
-    assert re.fullmatch(
-        r"hapticdb: .*felt\.hdbrec: the last [\d,]+ bytes are an incomplete chunk.*\n"
-        r"hapticdb: .*felt\.hdbrec names .*scene\.db, which is opened\n",
-        err,
-    )
-    start = path.stat().st_size - len(whole) + len(whole) // 2
-    path.write_bytes(whole[:start] + b"?" * 64 + whole[start + 64 :])
-    refused(run("replay", path, scene), "damaged at frame", "--until-damage")
-    code, out, err = run("replay", path, "scene.db", "--until-damage")
-    assert (code, out.startswith("equal: "), err) == (0, True, "")
-
-
-@pytest.mark.usefixtures("scene")
-def test_a_replay_of_nothing_is_one_line(run: Run) -> None:
-    refused(run("replay", "nowhere.hdbrec"), "no recording at nowhere.hdbrec")
-    refused(run("replay", "path.csv"), "path.csv")
-
-
-def test_a_replay_that_compares_no_frame_says_so_and_fails(run: Run, scene: Path) -> None:
-    with hapticdb.open(scene) as env:
-        empty = header(environment=scene.name, grid=env.grid)
-    path = scene.with_name("empty.hdbrec")
-    Recorder(path, empty).close()
-    assert run("replay", path)[:2] == (1, "nothing to compare: 0 skipped (unknown or held)\n")
-    code, out, _ = run("replay", path, "--json")
-    assert (code, json.loads(out)["compared"]) == (1, 0)
 
 
 @pytest.mark.long

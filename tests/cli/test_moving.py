@@ -3,9 +3,6 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
-import os
-import pty
-import signal
 from dataclasses import replace
 from pathlib import Path
 
@@ -14,23 +11,22 @@ import pytest
 
 import hapticdb
 from assemblies import voxel_set
-from children import PATIENCE, child
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
     boxes,
-    command,
-    command_that_halts,
     made,
+    on_terminal,
     refused,
     rows_of,
     run,
     scene,
-    wait_for_an_object,
 )
 from hapticdb import Grid
 from hapticdb.cli.verbs import moving
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.testing import blob, voxel_object, write_voxels
+from hapticdb.store.base import Object, Rows
+from hapticdb.store.sqlite.tables.writing import SQLiteWriter
+from hapticdb.testing import voxel_object, write_voxels
 
 # -- copy -----------------------------------------------------------------------------------------
 
@@ -50,19 +46,11 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
     )
 
 
-def test_a_second_copy_has_nothing_to_do(run: Run, scene: Path) -> None:
-    assert run("copy", scene, "b.db")[0] == 0
-    before = rows_of(Path("b.db"))
-    assert run("copy", scene, "b.db") == (
-        0,
-        "b.db: complete already (3 objects), nothing to do\n",
-        "",
-    )
-    assert rows_of(Path("b.db")) == before == rows_of(scene)
-
-
 def test_a_copy_goes_on_with_what_is_missing(run: Run, scene: Path) -> None:
     assert run("copy", scene, "b.db")[0] == 0
+    done = "b.db: complete already (3 objects), nothing to do\n"
+    assert run("copy", scene, "b.db") == (0, done, "")
+    assert rows_of(Path("b.db")) == rows_of(scene)
     assert run("remove", "b.db", 2)[0] == 0
     assert "1 object copied" in (out := run("copy", scene, "b.db")[1])
     assert out.endswith("; 2 were there already\n")
@@ -119,12 +107,6 @@ def test_a_copy_that_cannot_be_leaves_nothing(
     assert rows_of(scene) == before
 
 
-def test_a_part_that_stands_elsewhere_is_a_conflict(run: Run, scene: Path) -> None:
-    assert run("copy", scene, "b.db")[0] == 0
-    assert run("move", "b.db", 2, "--translate", "0,0,0.01")[0] == 0
-    refused(run("copy", scene, "b.db"), "object 2 (box1)", "in another place")
-
-
 # -- diff -----------------------------------------------------------------------------------------
 
 
@@ -163,22 +145,6 @@ def test_differences_are_told_a_line_each(run: Run, scene: Path) -> None:
     assert found["only_in_b"] == found["changed"] == found["voxels"] == []
 
 
-def test_voxels_that_differ_are_counted(run: Run, tmp_path: Path) -> None:
-    del tmp_path
-    ijk = blob(1, (20, 20, 20))
-    for name, voxels in (("a.db", ijk[3:]), ("b.db", ijk[:-2])):
-        with hapticdb.create(name, Grid(0.01, (0, 0, 0), 6)) as env:
-            obj = env.store.add(
-                voxel_object(env.grid, ijk), rows_of_voxels(voxels, env.grid, "brick")
-            )
-            assert obj == 1
-    code, out, _ = run("diff", "a.db", "b.db")
-    assert code == 1
-    _, _, row, _, total = out.splitlines()
-    assert row.split()[:6] == ["1", "voxels", "other", "voxels", "2", "3"]
-    assert total.startswith("1 difference; 2 voxels only in A, 3 voxels only in B, ")
-
-
 def test_many_differences_are_cut_and_counted(run: Run, scene: Path) -> None:
     assert run("copy", scene, "b.db")[0] == 0
     with hapticdb.open("b.db") as env:
@@ -206,50 +172,33 @@ def test_a_diff_with_nothing_is_an_error(run: Run, args: list[str]) -> None:
     refused(run("diff", *args), "no environment at none.db")
 
 
-# -- the process ----------------------------------------------------------------------------------
+# -- interrupted, and on a terminal ---------------------------------------------------------------
 
 
-def test_a_copy_that_is_interrupted_says_that_it_goes_on(run: Run, tmp_path: Path) -> None:
-    source, target = tmp_path / "a.db", tmp_path / "b.db"
-    with hapticdb.create(source, Grid(0.01, (0, 0, 0), 8)) as env:
-        for n in range(6):
-            write_voxels(env.store, blob(n, (30 + 4 * n, 100, 100)), f"blob {n}")
-    urls = [str(source), str(target)]
-    args = command_that_halts(3, "copy", *urls, "--layout", "voxel")
-    with child(args) as copying:
-        wait_for_an_object(target, copying)
-        copying.send_signal(signal.SIGINT)
-        _, err = copying.communicate(timeout=PATIENCE)
-    assert copying.returncode == 130
-    assert err.splitlines() == [
-        "hapticdb: interrupted; what went over is whole, and the same command goes on from there"
-    ]
-    code, out, _ = run("copy", source, target, "--layout", "voxel")
-    assert code == 0
-    assert "were there already" in out
-    assert run("diff", source, target)[0] == 0
+def test_a_copy_that_is_interrupted_says_that_it_goes_on(
+    run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    add, left = SQLiteWriter.add, [1]
+
+    def interrupted(writer: SQLiteWriter, record: Object, rows: Rows) -> int:
+        if not left:
+            raise KeyboardInterrupt
+        left.pop()
+        return add(writer, record, rows)
+
+    with monkeypatch.context() as patched:
+        patched.setattr(SQLiteWriter, "add", interrupted)
+        code, _, err = run("copy", scene, "b.db")
+    assert code == 130
+    assert "the same command goes on from there" in err
+    assert "2 objects copied" in (out := run("copy", scene, "b.db")[1])
+    assert out.endswith("; 1 were there already\n")
+    assert run("diff", scene, "b.db")[0] == 0
 
 
 @pytest.mark.usefixtures("run")
-def test_a_terminal_sees_a_bar_with_objects(scene: Path) -> None:
-    ours, theirs = pty.openpty()
-    args = command("copy", scene, "b.db")
-    with child(args, stderr=theirs) as copying:
-        os.close(theirs)
-        seen = b""
-        while chunk := read_terminal(ours):
-            seen += chunk
-    os.close(ours)
-    assert copying.returncode == 0
-    assert b"objects" in seen
-
-
-def read_terminal(ours: int) -> bytes:
-    """Bytes written to the terminal; empty once the other side is closed."""
-    try:
-        return os.read(ours, 4096)
-    except OSError:
-        return b""
+def test_a_terminal_sees_a_bar(scene: Path) -> None:
+    assert "copying" in on_terminal("copy", scene, "b.db")
 
 
 # -- upgrade --------------------------------------------------------------------------------------
@@ -276,8 +225,3 @@ def test_an_upgrade_says_what_it_did_and_what_it_left_out(run: Run, tmp_path: Pa
     assert found["objects"] == 3
     assert 0 < found["rows"] < found["bytes"]
     assert run("upgrade", "e.db")[1] == "e.db: complete already (3 objects), nothing to do\n"
-
-
-def test_the_layout_voxel_cannot_be_upgraded(run: Run, scene: Path) -> None:
-    run("copy", scene, "v.db", "--layout", "voxel")
-    refused(run("upgrade", "v.db"), "has the layout voxel, which has no distances")

@@ -3,15 +3,12 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
-import os
-import pty
 from pathlib import Path
 
 import pytest
 import trimesh
 
-from children import child
-from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, on_terminal, refused, run  # noqa: F401 - fixtures
 from hapticdb.cli import columns, main
 from hapticdb.cli.verbs.listing import PAGE
 
@@ -64,26 +61,11 @@ def test_a_pipe_has_every_object_in_whole_lines(run: Run, bolts: Path) -> None:
 
 
 def test_a_terminal_has_as_many_as_it_shows(bolts: Path) -> None:
-    ours, theirs = pty.openpty()
-    with child(command("objects", bolts), stdout=theirs, stderr=theirs) as listing:
-        os.close(theirs)
-        seen = b""
-        while chunk := _read(ours):
-            seen += chunk
-    os.close(ours)
-    assert listing.returncode == 0
-    *lines, last = seen.decode().splitlines()
+    *lines, last = on_terminal("objects", bolts).splitlines()
     assert last == f"hapticdb: {PAGE} of 61 objects; --limit 0 shows all"
     text = "".join(lines)
     assert "bolt_39" in text
     assert "bolt_40" not in text
-
-
-def _read(ours: int) -> bytes:
-    try:
-        return os.read(ours, 4096)
-    except OSError:
-        return b""
 
 
 # -- columns --------------------------------------------------------------------------------------

@@ -2,12 +2,9 @@
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
-import json
 import re
 import shutil
 import signal
-import sys
-from collections.abc import Iterator
 from contextlib import AbstractContextManager
 from pathlib import Path
 from subprocess import Popen
@@ -18,22 +15,17 @@ from psycopg import sql
 
 from children import PATIENCE, child, finished
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
-    test_a_move_that_cannot_be_changes_nothing,
     test_calibrate_prints_figures_with_their_spread,
     test_info_json_has_the_documented_keys,
     test_info_speaks_to_people,
-    test_remove_takes_all_or_nothing,
     test_statistics_are_renewed_after_many_edits,
 )
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
-from hapticdb.store.connect import beside, redact
+from hapticdb.store.connect import redact
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
-from servers import FOUND, SETTINGS, Place, named
-
-PASSWORD = "h@nter:2/#?&%"  # noqa: S105 - nobody's
-ESCAPED = "h%40nter%3A2%2F%23%3F%26%25"
+from servers import Place
 
 
 @pytest.fixture
@@ -71,104 +63,20 @@ def test_an_import_holds_the_rows_of_one_into_a_file(
     assert rows_of(url) == before
 
 
-def test_a_touch_prints_what_it_prints_on_a_file(run: Run, scene: str, made: Path) -> None:
-    args = ("--tool", "tool.npz", "--poses", "path.csv", "--json")
-    felt = [
-        [line.split('"query"')[0] for line in run("touch", url, *args)[1].splitlines()]
-        for url in (scene, made / "scene.db")
-    ]
-    assert felt[0] == felt[1]
-    assert len(felt[0]) == len(PLACES)
-
-
-def test_info_names_the_environment_and_the_server(
-    run: Run, scene: str, admin: psycopg.Connection
-) -> None:
-    found = json.loads(run("info", scene, "--json")[1])
-    assert found["name"] == parse(scene).environment
-    version = admin.execute("SHOW server_version").fetchone()
-    assert version is not None
-    assert found["engine"] == f"PostgreSQL {version[0].split()[0]}"
-
-
-# -- passwords are not shown ----------------------------------------------------------------------
-
-LINES: tuple[tuple[str, ...], ...] = (
-    ("info",),
-    ("info", "--json"),
-    ("objects",),
-    ("objects", "--json"),
-    ("info", "--calibrate"),
-    ("move", "1", "--translate", "0,0,0.01"),
-    ("move", "1", "--translate", "90,0,0"),
-    ("touch", "--tool", "tool.npz", "--poses", "path.csv"),
-    ("touch", "--tool", "tool.npz", "--poses", "path.csv", "--exclude", "77"),
-    ("remove", "77"),
-    ("remove", "1"),
-    ("import", "tool.stl"),
-)
-
-
-def test_a_password_never_shows(run: Run, scene: str) -> None:
-    for url in (f"{scene}&password={ESCAPED}", f"{beside(scene, 'none')}&password={ESCAPED}"):
-        for verb, *rest in LINES:
-            code, out, err = run("--debug", verb, url, *rest)
-            assert code in {0, 2}, err
-            for secret in (ESCAPED, PASSWORD, "nter"):
-                assert secret not in out + err
-
-
-@pytest.mark.parametrize(
-    "secret", ["h@nter", "h/nter@x", "hunter?@y", "7/hunter", "h#nter", "h%nter"]
-)
-def test_a_password_that_should_have_been_escaped_is_refused_unseen(run: Run, secret: str) -> None:
-    url = f"postgresql://me:{secret}@localhost:1/x"
-    assert "nter" not in refused(run("info", url), "%40")
-    assert "nter" not in run("--debug", "info", url)[2]
-
-
 # -- failures that only a server has --------------------------------------------------------------
 
 
 def test_no_server_is_one_line(run: Run, tmp_path: Path) -> None:
     refused(run("info", f"postgresql:///x?host={tmp_path}"), "cannot be reached")
     refused(run("info", "postgresql://127.0.0.1:1/x"), "cannot be reached", "refused")
+    unescaped = "postgresql://me:h@nter@localhost:1/x"
+    assert "nter" not in refused(run("info", unescaped), "%40")
 
 
 def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> None:
     url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", parse(database).conninfo)
     refused(run("info", url), '"nowhere" does not exist', "createdb")
     refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")
-
-
-def test_psycopg_missing_is_one_line(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setitem(sys.modules, "psycopg", None)
-    refused(run("info", "postgresql://host/x"), "pip install 'hapticdb[postgres]'")
-
-
-@pytest.fixture(params=[found for found in FOUND if not isinstance(found, str)], ids=named)
-def server(request: pytest.FixtureRequest, tmp_path: Path) -> Iterator[PrivateServer]:
-    """A server for one test."""
-    started = PrivateServer.at(tmp_path / "plant", request.param, SETTINGS)
-    started.start()
-    yield started
-    started.stop()
-
-
-def test_a_wrong_password_and_a_missing_role_are_one_line(run: Run, server: PrivateServer) -> None:
-    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
-        connection.execute("CREATE ROLE locked LOGIN PASSWORD 'right'")
-        rules = server.folder / "data" / "pg_hba.conf"
-        rules.write_text("local all locked scram-sha-256\n" + rules.read_text())
-        connection.execute("SELECT pg_reload_conf()").fetchall()
-    url = server.conninfo().replace("user=hapticdb", "user=")
-    for user, words in (
-        ("locked&password=wr0ng", ("authentication failed", "~/.pgpass")),
-        ("locked", ("no password", "~/.pgpass")),
-        ("nobody_here", ('"nobody_here" does not exist', "pg_hba.conf")),
-    ):
-        assert "wr0ng" not in refused(run("info", url + user), *words)
-    refused(run("info", f"{url}locked&password=right"), "no environment")
 
 
 # -- a private server -----------------------------------------------------------------------------

@@ -45,12 +45,6 @@ def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
     assert "the tool is inside an object: nothing is felt" in capsys.readouterr().err
 
 
-def test_a_session_without_such_a_tool_says_nothing(capsys: pytest.CaptureFixture[str]) -> None:
-    notes = session_page.Notes()
-    notes.look(session(is_loose=False))
-    assert capsys.readouterr().err == ""
-
-
 @pytest.mark.parametrize(
     ("figures", "said"),
     [

@@ -84,14 +84,6 @@ def test_a_saved_shell_is_told_what_it_lacks(run: Run, scene: Path) -> None:
     assert "how well the points cover the tool is not known: give its mesh" in out.splitlines()[0]
 
 
-@pytest.mark.usefixtures("free")
-def test_nothing_near_is_said_as_a_bound(run: Run, scene: Path) -> None:
-    out = run("sweep", scene, *TOOL, "--path", "free.csv", "--clearance", 0.02)[1]
-    assert ", nothing nearer than 20 mm" in out.splitlines()[0]
-    out = run("sweep", scene, *TOOL, "--path", "free.csv", "--clearance", 0)[1]
-    assert out.splitlines()[0].endswith("samples")
-
-
 @pytest.mark.usefixtures("through")
 def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
     code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--points", 50)
@@ -187,21 +179,6 @@ def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
     refused(run(*sweep, "--csv", "-", "--json"), "only one")
     refused(run(*sweep, "--csv", "hit.csv"), "--csv")
     refused(run(*sweep, "--tolerance", 0), "tolerance")
-
-
-def test_a_part_moves_by_displacements_from_where_it_sits(run: Run, scene: Path) -> None:
-    poses(scene.parent / "out.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.3))
-    assert run("sweep", scene, "--part", 2, "--path", "out.csv")[0] == 0
-    poses(scene.parent / "aside.csv", (0.0, 0.0, 0.0), (0.2, 0.0, 0.0))
-    code, out, _ = run("sweep", scene, "--part", 2, "--path", "aside.csv", "--json")
-    found = json.loads(out)
-    assert code == 1
-    assert [one["name"] for one in found["objects"]] == ["box2"]
-    tool = found["tool"]
-    assert (tool["parts"], tool["excluded"]) == ([2], [2])
-    assert 0.25 * 0.0125 < tool["spacing"] < 0.5 * 0.0125  # voxels of 12.5 mm
-    more = ("--exclude", 3)
-    assert run("sweep", scene, "--part", 2, "--path", "aside.csv", *more)[0] == 0
 
 
 @pytest.mark.long

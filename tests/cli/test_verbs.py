@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import PLACES, Run, boxes, made, poses, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
+from command_line import Run, boxes, made, poses, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
 from hapticdb.query.frame import STRATEGIES
 
 Scene = Path | str

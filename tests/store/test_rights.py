@@ -3,6 +3,7 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import contextlib
+import json
 import os
 import socket
 import threading
@@ -308,9 +309,13 @@ def test_a_right_withdrawn_from_an_open_environment_is_told(
 
 
 def test_grant_speaks_one_line(run: Run, url: str, roles: dict[Right, str]) -> None:
-    code, out, err = run("grant", url, roles["toucher"], "--as", "toucher")
+    words = ("grant", url, roles["toucher"], "--as", "toucher")
+    code, out, err = run(*words)
     assert (code, err, len(out.splitlines())) == (0, "", 1)
     assert f"{roles['toucher']} may read and touch" in out
+    found = json.loads(run(*words, "--json")[1])
+    assert list(found) == ["environment", "role", "right"]
+    assert (found["role"], found["right"]) == (roles["toucher"], "toucher")
     refused(run("grant", url, "nobody at all", "--as", "viewer"), "createuser")
     refused(run("grant", url, roles["viewer"]), "--as")
     refused(run("grant", url, roles["viewer"], "--as", "owner"), "viewer")
@@ -432,6 +437,8 @@ def test_a_password_comes_from_where_libpq_takes_it(
     url = guarded.conninfo().replace("user=hapticdb", "user=anna")
     with pytest.raises(AccessError, match="no password"):
         hapticdb.open(url)
+    with pytest.raises(AccessError, match='"nobody_here" does not exist'):
+        hapticdb.open(url.replace("user=anna", "user=nobody_here"))
     for wrong in (f"{url}&password={MARK}", url.replace("///", f"//:{MARK}@/")):
         with pytest.raises(AccessError, match="authentication failed") as caught:
             hapticdb.open(wrong)

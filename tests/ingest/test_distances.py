@@ -9,7 +9,7 @@ from bands import band_of
 from hapticdb.errors import FileError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest import voxelizing
-from hapticdb.ingest.layout import bricks_of_rows, merged, rows_of_bricks
+from hapticdb.ingest.layout import bricks_of_rows
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.kernels.field.lattice import BEYOND
 from hapticdb.kernels.field.packing import unpack
@@ -61,22 +61,6 @@ def test_either_curve_gives_a_brick_the_same_distances(tmp_path: Path) -> None:
     np.testing.assert_array_equal(found[0].keys, keys)
     np.testing.assert_array_equal(found[0].distances.data, data)
     np.testing.assert_array_equal(found[0].distances.ends, ends)
-
-
-def test_batches_of_rows_join_with_their_distances(tmp_path: Path) -> None:
-    part, grid = a_part(tmp_path), a_grid("hilbert")
-    rows, n_voxels = rows_of_part(part, grid, "brick", distances=True)
-    third = len(rows) // 3
-    batches = [rows.part(0, third), rows.part(third, third), rows.part(third, len(rows))]
-    parts = [bricks_of_rows(batch, grid, "brick") for batch in batches]
-    again, n_again = rows_of_bricks(merged(parts), grid, "brick")
-    assert n_again == n_voxels
-    np.testing.assert_array_equal(again.keys, rows.keys)
-    np.testing.assert_array_equal(again.occupancy, rows.occupancy)
-    assert rows.distances is not None
-    assert again.distances is not None
-    np.testing.assert_array_equal(again.distances.data, rows.distances.data)
-    np.testing.assert_array_equal(again.distances.ends, rows.distances.ends)
 
 
 def test_a_cloud_has_distances_to_its_points(tmp_path: Path) -> None:

@@ -329,20 +329,6 @@ def test_a_complete_file_is_left_as_it_is(tmp_path: Path, file: Path) -> None:
     assert rows_of(database) == before
 
 
-def test_geometry_that_has_changed_is_told(tmp_path: Path) -> None:
-    database = tmp_path / "e.db"
-    both = write_obj(tmp_path / "both.obj", assembly(2))
-    import_one(database, both, small_options())
-    before = rows_of(database)
-    changed = assembly(3)
-    changed["box 1"] = box((0, 0, 0), (0.01, 0.01, 0.02))
-    write_obj(both, changed)
-    line = refusal(import_one(database, both), hapticdb.errors.GeometryChangedError)
-    assert "both.obj" in line
-    assert "'box 1' has changed" in line
-    assert rows_of(database) == before
-
-
 def test_rows_do_not_depend_on_the_number_of_jobs(tmp_path: Path) -> None:
     many = write_obj(tmp_path / "many.obj", assembly(40))
     found: list[Rows] = []
@@ -360,17 +346,6 @@ def test_progress_grows_to_the_whole(tmp_path: Path, file: Path) -> None:
     assert {(p.link, p.parts_total) for p in seen} == {(str(file), 7)}
     voxels = np.cumsum([o.voxels for o in report.added])
     assert [p.voxels for p in seen] == voxels.tolist()
-
-
-@pytest.mark.parametrize("options", [{"jobs": 0}, {"curve": "lexicographic", "layout": "brick"}])
-def test_options_that_cannot_be_are_refused_before_anything_is_made(
-    tmp_path: Path, file: Path, options: dict[str, str]
-) -> None:
-    with pytest.raises(hapticdb.errors.UsageError):
-        import_one(tmp_path / "e.db", file, small_options(**options))  # type: ignore[arg-type]
-    with pytest.raises(hapticdb.errors.UsageError, match="name at least one"):
-        hapticdb.import_files(tmp_path / "e.db", [])
-    assert left_behind(tmp_path) == []
 
 
 @pytest.mark.parametrize("name", ["car\udcff", "car\0"])
@@ -409,15 +384,3 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
     assert calls == [names[0], names[1], *names[1:]]
     assert [obj.name for obj in report.added] == names
     assert report.present == 0
-
-
-def test_a_part_that_stays_in_the_way_is_told(
-    tmp_path: Path, file: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def refused(_: SQLiteWriter, record: Object, rows: base.Rows) -> int:
-        assert rows
-        raise present_already(record, "a.db")
-
-    monkeypatch.setattr(SQLiteWriter, "add", refused)
-    with pytest.raises(hapticdb.errors.EnvironmentExistsError, match="remove it first"):
-        import_one(tmp_path / "a.db", file)

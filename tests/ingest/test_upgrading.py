@@ -18,10 +18,8 @@ from children import child
 from hapticdb import Environment, ImportOptions, upgrade_environment
 from hapticdb.check import check_environment
 from hapticdb.ingest.files import ImportProgress
-from hapticdb.ingest.upgrading import is_as_stored
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import parse_in_process
-from hapticdb.store.base import Rows
 from servers import Place
 
 EVERYWHERE = np.array([0]), np.array([2**62])
@@ -50,8 +48,9 @@ def file(tmp_path: Path) -> Path:
 
 
 @pytest.fixture
-def plain(file: Path, tmp_path: Path) -> Path:
-    """An environment without distances; its first object has been moved."""
+def plain(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
+    """An environment without distances, compared in pieces; its first object has been moved."""
+    monkeypatch.setattr("hapticdb.ingest.upgrading.ROWS_AT_ONCE", 3)
     hapticdb.import_files(tmp_path / "plain.db", [file], small_options(distances=False))
     with hapticdb.open(tmp_path / "plain.db") as env:
         placed = env.object(1).transform.copy()
@@ -191,32 +190,6 @@ def test_an_object_with_other_voxels_than_its_file_gives_is_left_out(plain: Path
     assert [obj.id for obj in objects] == [2]
     assert "its voxels are not those that its file gives now" in str(error)
     assert report.upgraded == N_PARTS - 1
-
-
-def test_voxels_are_compared_bit_by_bit_in_pieces(
-    plain: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    """A row more, a row less or another bit is found, wherever a piece ends."""
-    with hapticdb.open(plain) as env:
-        obj = env.object(1)
-        rows = env.store.rows_of(1, *EVERYWHERE)
-        n = len(rows)
-        for at_once in (1, 3, n - 1, n, n + 1):
-            monkeypatch.setattr("hapticdb.ingest.upgrading.ROWS_AT_ONCE", at_once)
-            assert is_as_stored(env.store, obj, rows)
-            for row in (0, n // 2, n - 1):
-                rest = rows.picked(np.delete(np.arange(n), row))
-                assert not is_as_stored(env.store, obj, rest)
-                bits = rows.occupancy.copy()
-                bits[64 * row + 5] ^= 16
-                other = Rows(rows.keys, rows.ids, bits)
-                assert not is_as_stored(env.store, obj, other)
-            for key in (rows.keys[0] - 1, rows.keys[-1] + 1):
-                keys = np.sort(np.append(rows.keys, key))
-                more = Rows(
-                    keys, np.append(rows.ids, 1), np.append(rows.occupancy, rows.occupancy[:64])
-                )
-                assert not is_as_stored(env.store, obj, more)
 
 
 def test_the_layout_voxel_is_refused(file: Path, tmp_path: Path) -> None:

@@ -6,15 +6,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from children import PATIENCE
 from hapticdb.errors import FileError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportOptions, ImportProgress, import_files
 from hapticdb.ingest.layout import Bricks
 from hapticdb.ingest.voxelizing import (
-    ShareCallback,
     bricks_of_pieces,
-    in_threads,
     pieces_of_points,
 )
 from hapticdb.kernels.surfaces import voxelize
@@ -77,23 +74,6 @@ def test_a_cloud_is_marked_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
     np.testing.assert_array_equal(bricks.keys, whole[0])
     np.testing.assert_array_equal(bricks.occupancy, whole[1])
     assert bricks_of_pieces(pieces_of_points(points[:0], BITS), "a part").keys.shape == (0,)
-
-
-def test_threads_stop_at_the_next_share_when_nobody_wants_their_results() -> None:
-    began = threading.Barrier(3, timeout=PATIENCE)
-
-    def work(item: int, share: ShareCallback) -> int:
-        if item == 0:
-            return item
-        if item < 3:
-            began.wait(PATIENCE)
-        while True:
-            share(0.5)
-
-    results = in_threads(range(9), work, 2)
-    assert next(results) == 0
-    began.wait(PATIENCE)
-    results.close()
 
 
 def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(

@@ -210,15 +210,6 @@ def test_a_column_that_unpacks_to_more_than_its_frames_is_damage(tmp_path: Path)
         read(path)
 
 
-@repeatedly
-@given(payload=st.binary(min_size=1, max_size=300), n_frames=st.integers(1, 20))
-def test_a_payload_of_anything_is_damage(tmp_path: Path, payload: bytes, n_frames: int) -> None:
-    path = tmp_path / "s.hdbrec"
-    chunk = Chunk(0, n_frames, len(payload), zlib.crc32(payload))
-    path.write_bytes(HEADER.packed() + chunk.packed() + payload)
-    assert read(path, until_damage=True) == b""
-
-
 def sealed(text: bytes, n_points: int = 1, n_text: int | None = None, number: int = 1) -> bytes:
     """A header with any content and the right checksum."""
     counts = PREAMBLE.pack(MAGIC, number, len(text) if n_text is None else n_text, n_points, 0)[:-4]

@@ -10,7 +10,7 @@ from hapticdb import Environment, Grid, PointShell, TangentPlane
 from hapticdb.errors import GridError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.recording.file import FRAME, Frames, Header, Recorder, Recording, State
-from hapticdb.recording.replay import replay, resident, touching
+from hapticdb.recording.replay import replay, touching
 from hapticdb.testing import blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0.0, 0.0, 0.0), 6)
@@ -71,22 +71,6 @@ def test_the_same_revision_gives_the_same_bits(env: Environment, session: Record
     assert (
         found.describe() == "equal: 60 frames at the same revision 2, 0 skipped (unknown or held)"
     )
-
-
-def test_a_replay_asks_for_cells_and_feels_what_a_touch_of_each_frame_does(
-    env: Environment, session: Recording, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    header = session.header
-    with monkeypatch.context() as patched:
-        patched.setattr(Environment, "touch", None)
-        assert replay(session, env).is_equal
-    poses = np.tile(np.eye(4), (50, 1, 1))
-    poses[:, :3, 3] = np.random.default_rng(2).uniform(0.05, 0.25, (50, 3))
-    with resident(env, header.shell, header.law) as feel:
-        for found, wanted in zip(
-            feel(poses), touching(env, header.shell, header.law)(poses), strict=True
-        ):
-            assert found.tobytes() == wanted.tobytes()
 
 
 def test_a_filter_is_replayed_as_it_was_felt(

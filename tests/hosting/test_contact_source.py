@@ -87,25 +87,21 @@ def felt(source: ContactSource, places: Floats, delay: int) -> Floats:
     return near
 
 
-@pytest.mark.parametrize(("delay", "bound"), [(0, 0.08), (10, 0.10), (50, 0.20)])
-def test_proxies_go_round_a_convex_edge_as_the_coupling_does(
-    tmp_path: Path, delay: int, bound: float
-) -> None:
+def test_proxies_go_round_a_convex_edge_as_the_coupling_does(tmp_path: Path) -> None:
     """RMS error as a share of the force; the hand goes 0.5 mm from one proxy to the next.
 
     The ball rolls over its points, so the force of the coupling itself jumps between them.
     """
     url, places, forces = round_the_edge(tmp_path)
-    with (
-        ResidentCells(url, budget_bytes=64 << 20, distances=True) as cells,
-        ContactSource(cells, ball(RADIUS, SIZE, 300), ProxyWish()) as source,
-    ):
-        near = felt(source, places, delay)
-        assert source.share == 1.0  # sliding is no shaking
-    error = float(np.sqrt(((near - forces) ** 2).sum(axis=1).mean()))
     force = float(np.sqrt((forces**2).sum(axis=1).mean()))
     assert force > 1.0
-    assert error < bound * force
+    with ResidentCells(url, budget_bytes=64 << 20, distances=True) as cells:
+        for delay, bound in ((0, 0.08), (10, 0.10), (50, 0.20)):
+            with ContactSource(cells, ball(RADIUS, SIZE, 300), ProxyWish()) as source:
+                near = felt(source, places, delay)
+                assert source.share == 1.0  # sliding is no shaking
+            error = float(np.sqrt(((near - forces) ** 2).sum(axis=1).mean()))
+            assert error < bound * force
 
 
 def test_a_tip_in_a_narrow_gap_gets_proxies_that_its_client_reads(tmp_path: Path) -> None:
@@ -136,20 +132,11 @@ def proxies_of(source: ContactSource, places: Floats) -> list[ProxyState]:
     ]
 
 
-def push_of_planes(source: ContactSource) -> Floats:
-    """Force (3,) of the planes in contact of a source's last proxy, N."""
-    model = source.model
-    n = int(model["n_planes"])
-    depths = np.maximum(model["depths"][:n], 0.0)
-    strengths = model["contact"] * model["weights"][:n] * depths
-    return np.asarray(strengths @ model["normals"][:n])
-
-
 BROAD = in_z_order(128, 64)
 """Places of a flat tool's points, in the order of a curve: twice as many as are merged."""
 
 
-def test_proxies_of_a_broad_tool_are_merged_and_push_as_single_contacts_do(tmp_path: Path) -> None:
+def test_proxies_of_a_broad_tool_are_merged_and_push_as_the_spring_does(tmp_path: Path) -> None:
     """The tool comes down by 5 mm, 4 mm of them in contact, slides, and leaves."""
     floor = plane("floor", np.eye(3))
     with Ground.of_scenes(tmp_path, [floor], SIZE, distances=True) as ground:
@@ -165,25 +152,14 @@ def test_proxies_of_a_broad_tool_are_merged_and_push_as_single_contacts_do(tmp_p
     )
     aside = np.concatenate([np.zeros(20), np.linspace(0.0, 0.01, 20), np.full(20, 0.01)])
     places = origin + np.column_stack([aside, np.zeros(60), heights])
-    with ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells:
-        with ContactSource(cells, tool, ProxyWish()) as source:
-            merged = proxies_of(source, places[:40])
-            pushes = push_of_planes(source)
-            assert 1 < source._follower["merged"] <= 64
-            merged += proxies_of(source, places[40:])
-            assert source._follower["merged"] == 1
-        with ContactSource(cells, tool, ProxyWish()) as source:
-            source._follower["merges_from"] = 0
-            source._follower["is_large"] = False
-            single = proxies_of(source, places[:40])
-            alone = push_of_planes(source)
-            assert source._follower["merged"] == 1
-            single += proxies_of(source, places[40:])
-    ours, theirs = (np.array([proxy.wrench for proxy in some]) for some in (merged, single))
-    assert theirs[39, 2] == pytest.approx(4.0, rel=0.02, abs=1000.0 * SIZE * 2.75 / 508)
-    np.testing.assert_allclose(ours[:, :3], theirs[:, :3], atol=0.03)
-    np.testing.assert_allclose(ours[:, 3:], theirs[:, 3:], atol=2e-4)
-    np.testing.assert_allclose(pushes, ours[39, :3], atol=0.03)
-    np.testing.assert_allclose(alone, theirs[39, :3], atol=0.03)
-    np.testing.assert_allclose(merged[39].stiffness, single[39].stiffness, atol=1.0)
+    with (
+        ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells,
+        ContactSource(cells, tool, ProxyWish()) as source,
+    ):
+        merged = proxies_of(source, places[:40])
+        assert 1 < source._follower["merged"] <= 64
+        merged += proxies_of(source, places[40:])
+        assert source._follower["merged"] == 1
+    ours = np.array([proxy.wrench for proxy in merged])
+    assert ours[39, 2] == pytest.approx(4.0, rel=0.02, abs=1000.0 * SIZE * 2.75 / 508 + 0.03)
     assert not ours[-1].any()

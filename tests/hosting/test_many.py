@@ -2,40 +2,18 @@
 
 import os
 import signal
-import time
-from collections.abc import Iterator
 
 import numpy as np
-import pytest
 
-from banded import write_points
-from children import PATIENCE, until
+from children import until
 from hapticdb import Environment, PointShell
 from hapticdb.hosting.host import SessionHost
-from hapticdb.hosting.hosted import HostedSession
 from hapticdb.recording.frame import State
+from hosting.test_host import ABOVE, PRESSED, press, pushed
 from realtime.hands import at
-from realtime.sessions import floor_points
-from realtime.worlds import make
 
 RATE = 250.0
 """Frames a second of the tests' sessions."""
-ABOVE, PRESSED = at(0.0, 0.0, 0.02), at(0.0, 0.0, 0.004)
-"""Poses of the ball of 12 mm: over the floor at z = 0, and pressed into it."""
-
-
-@pytest.fixture(scope="module")
-def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    """A floor just under z = 0, with distances."""
-    with make(tmp_path_factory.mktemp("many"), bits=6) as made:
-        write_points(made.store, floor_points(31.5), "floor")
-        yield made
-
-
-def pushed(session: HostedSession) -> float:
-    """Force along z that the hand feels now, N."""
-    last = session.latest()
-    return 0.0 if last is None else float(last["applied"][0, 2])
 
 
 def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
@@ -44,12 +22,7 @@ def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
     with SessionHost(env.url, rate=RATE, budget_bytes=16 << 20, processes=1) as host:
         sessions = [host.begin(sphere, ABOVE) for _ in range(64)]
         assert len(host.cells) == len(host.pids) == 1
-        deadline = time.monotonic() + PATIENCE
-        while not all(pushed(session) > 0.5 for session in sessions):
-            assert time.monotonic() < deadline
-            for session in sessions:
-                session.move(PRESSED)
-            time.sleep(0.03)
+        press(sessions, lambda: all(pushed(session) > 0.5 for session in sessions))
         for session in sessions[::2]:
             session.end()
         assert [one.id for one in host.sessions()] == [one.id for one in sessions[1::2]]
@@ -77,11 +50,7 @@ def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
 ) -> None:
     with SessionHost(env.url, rate=RATE, budget_bytes=16 << 20) as host:
         session = host.begin(sphere, ABOVE)
-        deadline = time.monotonic() + PATIENCE
-        while pushed(session) < 0.5:
-            assert time.monotonic() < deadline
-            session.move(PRESSED)
-            time.sleep(0.03)
+        press([session], lambda: pushed(session) > 0.5)
         fetching = host.cells[0].pid
         os.kill(fetching, signal.SIGSTOP)
         try:

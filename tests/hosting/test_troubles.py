@@ -12,31 +12,21 @@ from typing import NoReturn
 
 import pytest
 
-from banded import write_points
 from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.board import FREE, LOST, TAKEN, Board
+from hapticdb.hosting.board import Board
 from hapticdb.hosting.channel import Channel
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.realtime.session_recording import SessionRecording
 from realtime.hands import at
-from realtime.sessions import floor_points
-from realtime.worlds import make
 
 ABOVE = at(0.0, 0.0, 0.02)
 """A pose of the ball of 12 mm over the floor at z = 0."""
 PATIENCE = 30.0
 """Seconds in which the host must do what takes it milliseconds."""
-
-
-@pytest.fixture(scope="module")
-def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    with make(tmp_path_factory.mktemp("troubles"), bits=6) as made:
-        write_points(made.store, floor_points(31.5), "floor")
-        yield made
 
 
 @pytest.fixture(scope="module")
@@ -104,20 +94,6 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
         board.close()
     assert sorted(ended) == [1, 2]
     assert [record.exc_info is not None for record in caplog.records] == [True, True]
-
-
-def test_a_seat_that_is_free_or_anothers_is_not_lost() -> None:
-    board = Board.create(1)
-    row = board.take(7, 0)
-    board.release(row)
-    board.lose(row, 7)
-    assert board.seats["state"][row] == FREE
-    assert board.take(8, 0) == row
-    board.lose(row, 7)
-    assert board.seats["state"][row] == TAKEN
-    board.lose(row, 8)
-    assert board.seats["state"][row] == LOST
-    board.close()
 
 
 def test_a_frame_that_is_never_finished_is_an_error() -> None:

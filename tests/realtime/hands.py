@@ -94,14 +94,6 @@ class Noted(Slow):
         self.path.write_bytes(wrench.tobytes())
 
 
-class Talking(Slow):
-    """A hand whose driver prints to standard output."""
-
-    def read(self) -> Reading:
-        print("driver: hello", flush=True)  # noqa: T201 - that is the test
-        return super().read()
-
-
 class Beckoned(Slow):
     """A hand that rests at the start of its path until a file exists."""
 

@@ -10,8 +10,11 @@ from numpy.typing import NDArray
 import children
 from children import PATIENCE
 from hapticdb import Environment, PointShell
+from hapticdb.kernels.rigid import poses_of
+from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
+from hapticdb.recording.replay import touching
 from hapticdb.resident.frames import LARGE_FROM
 from hapticdb.testing import floor_voxels, write_voxels
 
@@ -61,15 +64,14 @@ def standing_plate() -> PointShell:
     return shell
 
 
-def lying_plate() -> PointShell:
-    """A plate of twice as many points, all of which touch a floor at once."""
-    ij = in_z_order(128, 64)
-    x, y = (ij[:, 0] - 63.5) * 2e-4, (ij[:, 1] - 31.5) * 3e-4
-    return PointShell(
-        np.column_stack([x, y, np.zeros(len(ij))]), np.tile((0.0, 0.0, 1.0), (len(ij), 1)),
-        np.zeros(3),
-    )  # fmt: skip
-
-
 def recorded(path: Path) -> Recorded:
     return np.concatenate(list(Recording(path).frames()))
+
+
+def felt_at(
+    env: Environment, shell: PointShell, frames: Recorded, law: ForceLaw
+) -> NDArray[np.float64]:
+    """Wrenches (n, 6) of touches at the tool's recorded poses."""
+    poses = np.empty((len(frames), 4, 4))
+    poses_of(np.ascontiguousarray(frames["tool"]), poses)
+    return touching(env, shell, law)(poses)[0]

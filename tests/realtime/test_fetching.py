@@ -14,8 +14,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+import children
 import hapticdb
-from children import PATIENCE
 from hapticdb import Environment, Grid, HapticDBError, PointShell
 from hapticdb.devices.scripted import RandomHand
 from hapticdb.errors import DatabaseError
@@ -29,7 +29,7 @@ from hapticdb.realtime.fetching import (
 )
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.wishes import Motion, Wish
-from hapticdb.resident.table import HEARTBEAT, LEAST_BUDGET, LOST, CellTable
+from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
 from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, expected, ids_by_voxel, make, move, scatter
@@ -39,15 +39,9 @@ RADIUS_M = 0.012
 Pose = NDArray[np.float64]
 
 
-def until(claim: Callable[[], bool], do: Callable[[], object] = lambda: None) -> bool:
-    """Whether a claim comes true in time while an action is repeated."""
-    deadline = time.monotonic() + PATIENCE
-    while not claim():
-        if time.monotonic() > deadline:
-            return False
-        do()
-        time.sleep(1e-3)
-    return True
+def until(claim: Callable[[], object], do: Callable[[], object] = lambda: None) -> None:
+    """Wait until a claim holds while an action is repeated."""
+    children.until(lambda: (do(), claim())[1], 1e-3)
 
 
 class Side:
@@ -59,7 +53,6 @@ class Side:
         self.row = self.reader.row
         self.session = table.desk.sessions[self.row, ...]
         self.told = np.zeros((), TOLD)
-        self.radius = RADIUS_M
 
     def be_at(
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
@@ -69,7 +62,7 @@ class Side:
         self.told["is_active"] = True
         self.told["tool"] = self.told["handle"] = pose[:3, 3]
         self.told["velocity"] = 0.0 if velocity is None else velocity[:3]
-        self.told["radius"] = self.radius
+        self.told["radius"] = RADIUS_M
         servo.tell(self.session, self.told, self.reader.missed)
         return found
 
@@ -284,7 +277,7 @@ def test_the_heartbeat_waits_for_an_answer(
         return revision()
 
     monkeypatch.setattr(step.fetcher.store, "revision", counted, raising=False)
-    assert until(lambda: bool(asked), step.round)
+    until(lambda: bool(asked), step.round)
     heard = int(control[HEARTBEAT])
     step.run(0.5 * CONFIRM_EVERY)
     assert (len(asked), int(control[HEARTBEAT])) == (1, heard)
@@ -341,41 +334,6 @@ def test_objects_are_named_and_named_anew_after_a_write(tmp_path: Path, sphere: 
     assert asked() == []
 
 
-def test_sessions_share_a_table(world: Environment, sphere: PointShell) -> None:
-    step = LockStep(world, sphere)
-    other = Side(step.table, world.grid, sphere)
-    pose = np.eye(4)
-    pose[:3, 3] = np.array(world.grid.origin) + 0.2
-    other.be_at(pose)
-    step.warm_start()
-    for _ in range(50):
-        step.round()
-    assert other.is_served
-    assert other.reader.feel(pose)[2] == step.side.reader.feel(step.pose)[2] == 0
-    step.table.leave(other.row)
-    step.round()
-    assert len(step.fetcher.tracker.sessions) == 1
-
-
-def test_a_tool_too_large_for_the_budget_is_fetched_for_as_far_as_it_goes(
-    tmp_path: Path, sphere: PointShell
-) -> None:
-    """Fetching stops when the table is full: no cell is requested again and again."""
-    env = make(tmp_path, bits=9)
-    n = env.grid.side >> 5
-    write_voxels(env.store, 32 * block((0, 0, 0), (n - 1, n - 1, n - 1)) + 7)
-    step = LockStep(env, sphere, budget=LEAST_BUDGET)
-    step.side.radius = 0.5
-    step.frame()
-    for _ in range(60):
-        step.round()
-    loaded = step.fetcher.residency.n_loaded
-    for _ in range(20):
-        assert not step.fetcher.round()
-    assert step.fetcher.residency.n_loaded == loaded
-    assert step.side.reader.feel(step.pose)[2] == 0
-
-
 # --- with a process of its own ------------------------------------------------------------------
 
 
@@ -399,39 +357,16 @@ def test_a_process_brings_in_what_is_told_and_notices_writes(
     side = Side(resident.table, world.grid, sphere)
     pose = np.eye(4)
     side.be_at(pose)
-    assert until(lambda: side.is_served)
+    until(lambda: side.is_served)
     assert side.reader.feel(pose)[0] == expected(ids_by_voxel(world), world.grid, sphere, pose).hits
     with hapticdb.open(world.url) as editor:
         move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
         naive = expected(ids_by_voxel(editor), world.grid, sphere, pose)
     assert len(naive.hits) > 10
-    assert until(lambda: side.reader.feel(pose)[0] == naive.hits)
+    until(lambda: side.reader.feel(pose)[0] == naive.hits)
     figures = resident.figures()
     assert figures.resident > 0
     assert figures.restarts == figures.losses == 0
-
-
-def test_a_database_that_goes_away_silences_the_heartbeat_until_it_is_back(
-    world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
-) -> None:
-    side = Side(resident.table, world.grid, sphere)
-    side.be_at(np.eye(4))
-    assert until(lambda: side.is_served)
-    assert not resident.is_lost
-    away.touch()
-    assert until(lambda: resident.is_lost)
-    silent = int(resident.table.cells.control[HEARTBEAT])
-    time.sleep(1.2)
-    assert resident.table.cells.control[HEARTBEAT] == silent
-    with hapticdb.open(world.url) as editor:
-        move(editor.store, 1, block((240, 240, 240), (270, 270, 256)))
-        naive = expected(ids_by_voxel(editor), world.grid, sphere, np.eye(4))
-    away.unlink()
-    assert until(lambda: not resident.is_lost)
-    assert until(lambda: side.reader.feel(np.eye(4))[0] == naive.hits)
-    resident.supervise()
-    assert resident.restarts == 0
-    assert resident.figures().losses >= 1
 
 
 @pytest.mark.long
@@ -450,12 +385,12 @@ def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
         os.kill(resident.pid, signal.SIGKILL)
         if n == 2:
             away.touch()
-        assert until(lambda n=n: resident.restarts == n + 1, resident.supervise)  # type: ignore[misc]
+        until(lambda n=n: resident.restarts == n + 1, resident.supervise)  # type: ignore[misc]
         if n == 2:
             time.sleep(1.0)
             away.unlink()
         side.be_at(pose)
-        assert until(lambda: side.is_served)
+        until(lambda: side.is_served)
         found = side.reader.feel(pose)
         assert (found[0], found[2]) == (expected(ids, world.grid, sphere, pose).hits, 0)
 

@@ -3,7 +3,6 @@
 import dataclasses
 import io
 import pickle
-import re
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -11,11 +10,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from devices.readings import FAULTS, MOMENTS, Change
 from hapticdb import PointShell, TangentPlane
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Device
-from hapticdb.errors import DeviceError, HapticDBError
+from hapticdb.errors import DeviceError
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
@@ -60,27 +58,15 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
     with cells.table.reading() as row:
 
         def ran(device: Device, **options: object) -> Ran:
-            given: dict[str, object] = {"seconds": 0.3, "staleness": 60.0, "is_waiting": False}
             rate = float(str(options.pop("rate", 500.0)))
             request = LoopRequest(
-                descriptor=cells.table.descriptor,
-                n_slots=cells.table.n_slots,
-                row=row,
-                ring=memory,
-                n_ring=N_RING,
-                grid=cells.grid,
-                shell=sphere,
-                device=device,
-                law=TangentPlane(),
-                coupling=DIRECT,
-                handle=Handle(),
-                timing=Timing(rate),
-                seconds=0.3,
-                staleness=60.0,
-                is_waiting=False,
-            )
+                descriptor=cells.table.descriptor, n_slots=cells.table.n_slots, row=row,
+                ring=memory, n_ring=N_RING, grid=cells.grid, shell=sphere, device=device,
+                law=TangentPlane(), coupling=DIRECT, handle=Handle(), timing=Timing(rate),
+                seconds=0.3, staleness=60.0, is_waiting=False,
+            )  # fmt: skip
             heard = io.BytesIO()
-            work(dataclasses.replace(request, **(given | options)), MessageSender(heard))  # type: ignore[arg-type]
+            work(dataclasses.replace(request, **options), MessageSender(heard))  # type: ignore[arg-type]
             said = list(messages(heard.getvalue()))
             assert [message.word for message in said] == ["running", "done"]
             answer = said[-1].content
@@ -131,23 +117,6 @@ def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> No
     assert not frames["hand_velocity"][is_open].any()
 
 
-def test_a_kernel_compiled_while_the_loop_runs_is_told(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    class Kernel:
-        signatures: list[str] = []  # noqa: RUF012 - of one test
-
-    class Compiling(Slow):
-        def read(self):  # type: ignore[no-untyped-def]  # noqa: ANN202 - as its base
-            if self.reads == 50:
-                Kernel.signatures.append("one more")
-            return super().read()
-
-    monkeypatch.setattr(subject, "ENTRIES", [Kernel()])
-    with pytest.raises(HapticDBError, match="a kernel was compiled while the loop ran"):
-        run(Compiling(still(0.03), 1 << 30, 0.0))
-
-
 def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = Unplugged(still(0.010), 100)
@@ -173,25 +142,13 @@ def test_a_hand_that_never_knows_its_place_is_an_error(
         run(Lost(still(0.010), 1 << 30, 0.0))
 
 
-def test_a_reading_of_the_wrong_kind_ends_the_loop_without_force(run: Run) -> None:
-    change, told = FAULTS[0]
-    hand = Odd(still(0.010), change, first=100)
-    with pytest.raises(DeviceError, match=rf"^Odd\.read\(\) returned {told}.*; expected [^\n]+$"):
-        run(hand, seconds=60.0)
-    assert any(wrench.any() for wrench in hand.pushed)
-    assert not hand.pushed[-1].any()
-
-
-@pytest.mark.parametrize(("change", "told"), [MOMENTS[0], MOMENTS[3], MOMENTS[-1]])
-def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(
-    run: Run, change: Change, told: str
-) -> None:
-    hand = Odd(still(0.010), change, first=60, n_reads=50)
+def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: Run) -> None:
+    nowhere = np.full(6, np.nan)
+    hand = Odd(still(0.010), lambda r: r._replace(velocity=nowhere), first=60, n_reads=50)
     answer, frames = run(hand, seconds=0.5)
     counts = answer.counts
     assert counts.nowhere_frames == 50
-    assert counts.bad_reading is not None
-    assert re.match(rf"Odd\.read\(\) returned {told}; expected ", counts.bad_reading)
+    assert str(counts.bad_reading).startswith("Odd.read() returned numbers that are not finite")
     assert np.isfinite(frames["tool"]).all()
     forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
     assert forces[-1] > 0.0

@@ -14,13 +14,14 @@ import pytest
 from numpy.typing import NDArray
 
 import hapticdb
-from closed_forms import field_of, plane
-from hapticdb import Grid, PointShell, TangentPlane
+from banded import write_points
+from feel.tools import flat_tool
+from hapticdb import Grid, TangentPlane
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import DeviceError
 from hapticdb.kernels.hand.holding import RISE_FRAMES
-from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells, spread_key
+from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling
@@ -32,6 +33,7 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable, anonymous_memory
 from hapticdb.testing import write_voxels
 from realtime.hands import at
+from realtime.sessions import floor_points
 from realtime.worlds import block, cells_of
 
 Floats = NDArray[np.float64]
@@ -47,53 +49,20 @@ LATE = 10 * 10**9
 
 
 class World:
-    """A floor of voxels of 5 mm about the world's origin; all cells are resident."""
+    """A floor in voxels of 5 mm about the world's origin; all cells are resident."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, has_distances: bool) -> None:
         self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
-        self.table = CellTable.create(4 << 20)
+        self.table = CellTable.create(4 << 20, distances=has_distances)
         with (
             tempfile.TemporaryDirectory() as folder,
             hapticdb.create(Path(folder) / "world.db", self.grid) as env,
         ):
-            write_voxels(env.store, FLOOR)
+            if has_distances:
+                write_points(env.store, floor_points(MIDDLE - 1.1))
+            else:
+                write_voxels(env.store, FLOOR)
             Residency(env.store, self.table).make_resident(cells_of(self.grid))
-
-    def close(self) -> None:
-        self.table.close()
-
-
-class SmoothWorld:
-    """Cells of a `World`'s size with distances: full below z = 0."""
-
-    def __init__(self) -> None:
-        field = field_of(plane((0.0, 0.0, 1.0)), SIZE)
-        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
-        self.table = CellTable.create(4 << 20, distances=True)
-        cells = self.table.cells
-        is_cell = field.cells.keys[0] >= 0
-        for key, slot in zip(
-            field.cells.keys[0, is_cell], field.cells.slots[0, is_cell], strict=True
-        ):
-            at = int(spread_key(key, np.int64(self.table.capacity)))
-            while cells.keys[0, at] >= 0:
-                at = (at + 1) % self.table.capacity
-            cells.keys[:, at], cells.slots[:, at] = key, slot
-        for name in ("words", "masks", "payload"):
-            filled = getattr(field.cells, name)
-            getattr(cells, name)[: len(filled)] = filled
-
-    def close(self) -> None:
-        self.table.close()
-
-
-def punch(n_across: int, pitch: float = 0.002) -> PointShell:
-    """A flat square of points, facing down."""
-    across = (np.arange(n_across) - (n_across - 1) / 2.0) * pitch
-    x, y = np.meshgrid(across, across, indexing="ij")
-    points = np.stack([x.ravel(), y.ravel(), np.zeros(n_across**2)], axis=1)
-    normals = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    return PointShell(points, normals, np.zeros(3), is_closed=False)
 
 
 class Pressing:
@@ -112,24 +81,22 @@ class Pressing:
 
 
 @pytest.fixture(params=["plane", "smooth"])
-def world(
-    request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch
-) -> Iterator[World | SmoothWorld]:
+def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     """A floor that is felt directly, or through the coupling."""
     monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
-    made = World() if request.param == "plane" else SmoothWorld()
+    made = World(has_distances=request.param == "smooth")
     yield made
-    made.close()
+    made.table.close()
     signal.signal(signal.SIGTERM, before)
 
 
-def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> LoopRequest:
+def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
     hold = float(str(options.pop("hold", 0.02)))
     law: ForceLaw = TangentPlane()
     coupling: DirectRendering | SettledCoupling = Coupling().direct(SCRIPTED, 1.0, 0.01)
-    if isinstance(world, SmoothWorld):
+    if world.table.has_distances:
         law = DistanceField()
         coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
     given: dict[str, object] = {"is_waiting": True, "seconds": 1.0}
@@ -140,7 +107,7 @@ def requested(world: World | SmoothWorld, hand: Pressing, **options: object) -> 
         ring=anonymous_memory("frames", ring_bytes(N_RING)),
         n_ring=N_RING,
         grid=world.grid,
-        shell=punch(6),
+        shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
         device=hand,
         law=law,
         coupling=replace(coupling, hold=hold),
@@ -160,7 +127,7 @@ def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
     return used
 
 
-def pressed(world: World | SmoothWorld, hand: Pressing, **options: object) -> Loop:
+def pressed(world: World, hand: Pressing, **options: object) -> Loop:
     """A loop whose tool was placed in the air and then pressed on the floor."""
     loop = Loop(requested(world, hand, **options))
     loop.warm_up()
@@ -200,7 +167,7 @@ class Summoning(Pressing):
         return super().read()
 
 
-def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World | SmoothWorld) -> None:
+def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> None:
     """No frame raises the force by more than one share, even a frame as long as the wait."""
     hand = Summoning(0.02)
     loop = pressed(world, hand, hold=1e-3)
@@ -217,7 +184,7 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World | Sm
 
 
 def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(
-    world: World | SmoothWorld,
+    world: World,
 ) -> None:
     """The frame returns the reading it used, and that reading is the one that is recorded."""
     hand = Summoning(0.02)
@@ -229,7 +196,7 @@ def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(
     assert used.pose[2, 3] == loop.hand["position"][2] == -0.02
 
 
-def test_a_loop_takes_back_what_it_asked_for(world: World | SmoothWorld) -> None:
+def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     """A whole run: a hand leaves the floor while the database keeps answering."""
 
     class Leaving(Pressing):
@@ -251,7 +218,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World | SmoothWorld) -> None
     assert not world.table.desk.sessions["n_asked"].any()
 
 
-def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World | SmoothWorld) -> None:
+def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
     hand = Pressing(-0.004)
     loop = Loop(requested(world, hand))
     loop.warm_up()
@@ -267,7 +234,7 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World | Sm
 
 @pytest.mark.parametrize("when", ["apply", "close"])
 def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
-    world: World | SmoothWorld, when: str
+    world: World, when: str
 ) -> None:
     class Ended(SystemExit):
         pass

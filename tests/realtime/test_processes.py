@@ -92,13 +92,6 @@ def test_a_request_of_the_script_itself_is_refused_with_the_way_out(
         process.receive(LONG)
 
 
-def test_silence_is_no_message() -> None:
-    with Process(WORKERS, ("wait", None), []) as process:
-        assert process.receive(LONG) == Message("waiting")
-        assert process.receive(0.01) is None
-        assert process.is_alive
-
-
 def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:

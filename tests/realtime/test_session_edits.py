@@ -1,56 +1,42 @@
 """A running session feels edits of the environment, on both engines."""
 
-import time
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.kernels.rigid import poses_of
-from hapticdb.query.law import TangentPlane
+from hapticdb.query.law import PLANE
 from hapticdb.realtime.session import Session
 from hapticdb.recording.frame import State
-from hapticdb.recording.replay import touching
 from hapticdb.testing import floor_voxels
 from realtime.hands import stroking
-from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
+from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
 from realtime.worlds import SIZE, make, move
 from servers import Place
 
 
-def felt_at(env: Environment, shell: PointShell, frames: Recorded) -> NDArray[np.float64]:
-    poses = np.empty((len(frames), 4, 4))
-    poses_of(np.ascontiguousarray(frames["tool"]), poses)
-    return touching(env, shell, TangentPlane())(poses)[0]
-
-
 def test_edits_are_felt_and_no_frame_mixes_two_revisions(
-    sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
+    sphere: PointShell, tmp_path: Path
 ) -> None:
     """The floor moves 6 mm down under a hand that presses 2 mm into it, and returns."""
     with floored(make(tmp_path, bits=6)) as env:
-        check_edits(env, sphere, tmp_path, record_property)
+        check_edits(env, sphere, tmp_path / "edited.hdbrec")
 
 
 @pytest.mark.long
 def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
-    place: Place, sphere: PointShell, tmp_path: Path, record_property: Callable[..., None]
+    place: Place, sphere: PointShell, tmp_path: Path
 ) -> None:
     grid = Grid(SIZE, (-32 * SIZE,) * 3, 6)
     with floored(hapticdb.create(place(), grid, layout="brick")) as env:
-        check_edits(env, sphere, tmp_path, record_property)
+        check_edits(env, sphere, tmp_path / "edited.hdbrec")
 
 
-def check_edits(
-    edited: Environment, sphere: PointShell, tmp_path: Path, note: Callable[..., None]
-) -> None:
+def check_edits(edited: Environment, sphere: PointShell, path: Path) -> None:
     up = floor_voxels(edited.grid, width=48)
     down = up - np.array([0, 0, 3])
-    path = tmp_path / "edited.hdbrec"
     with Session(
         edited.url, sphere, stroking(0.010, 0.4, loops=True), law="plane", rate=RATE, record=path,
         staleness=NEVER_STALE,
@@ -58,11 +44,9 @@ def check_edits(
         for ijk in (down, up, down):
             n_frames = session.n_frames
             until(lambda n=n_frames: session.n_frames > n + 250, session)  # type: ignore[misc]
-            started = time.monotonic()
             move(edited.store, 1, ijk)
             revision = edited.store.revision()
             until(lambda r=revision: last_revision(session) == r, session)  # type: ignore[misc]
-            note("seconds until felt", time.monotonic() - started)
         session.wait(0.3)
         session.stop()
     frames = recorded(path)
@@ -73,7 +57,7 @@ def check_edits(
     for ijk, these in ((down, revisions[1::2]), (up, revisions[::2])):
         move(edited.store, 1, ijk)
         mine = frames[np.isin(frames["revision"], these)]
-        np.testing.assert_array_equal(felt_at(edited, sphere, mine), mine["wrench"])
+        np.testing.assert_array_equal(felt_at(edited, sphere, mine, PLANE), mine["wrench"])
         assert mine["wrench"].any() == (ijk is up)
 
 

@@ -135,9 +135,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
     env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first signal interrupts the start, the second the cleaning up after the first."""
-
-    close = Session.close
-    signals = iter([KeyboardInterrupt()])
+    close, signals = Session.close, iter([KeyboardInterrupt()])
 
     def interrupted(*_: object) -> None:
         raise KeyboardInterrupt

@@ -22,20 +22,9 @@ _openings = itertools.count()
 class Troubled:
     """Passes calls to another store, with delays and errors.
 
-    Parameters
-    ----------
-    store : Store
-        The store that answers.
-    latency, jitter : float
-        Seconds that are added to each round trip: `latency`, and a random part of `jitter`.
-    errors : float
-        Probability that a round trip fails.
-    away : path or None
-        While this file exists, every round trip fails.
-    seed : int
-        Seed of jitter and errors; each store opened in a process gets other random numbers.
-    wait : callable
-        Called with seconds to let pass.
+    Each round trip takes `latency` and a random part of `jitter`, seconds, and fails with the
+    probability `errors`, or while the file `away` exists. `wait` lets seconds pass. Each store
+    opened in a process gets other random numbers.
     """
 
     def __init__(

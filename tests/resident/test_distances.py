@@ -88,20 +88,6 @@ def test_cells_hold_the_least_distances_of_all_objects(
             assert (check(residency, kept) > 0) == bool(kept)
 
 
-def test_a_cell_without_a_voxel_holds_the_distances_that_reach_into_it(
-    tmp_path: Path, table: CellTable
-) -> None:
-    env = make(tmp_path, bits=6)
-    write_points(env.store, np.array([[31.0, 12.5, 12.5]]))
-    residency = Residency(env.store, table)
-    beside = np.array([1 << 32])
-    residency.make_resident(beside)
-    (slot,) = residency.slots_of(beside)
-    assert slot > 0
-    assert not table.cells.words[slot].any()
-    assert table.cells.masks[slot] == 1 << 5  # brick (0, 1, 1)
-
-
 def test_distances_follow_what_another_user_moves(tmp_path: Path, table: CellTable) -> None:
     """A voxel moves within its cell, next to a border: the cell beside is read again, too."""
     env = make(tmp_path, 6)

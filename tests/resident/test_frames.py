@@ -72,33 +72,26 @@ def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed:
     env.close()
 
 
-def test_a_path_longer_than_the_table_is_felt_in_parts(tmp_path: Path) -> None:
+def test_a_path_longer_than_the_table_is_felt_in_parts_and_a_larger_tool_is_refused(
+    tmp_path: Path,
+) -> None:
     """512 cells, nearly all with voxels, in a table with fewer slots."""
     env = make(tmp_path, bits=8)
     rng = np.random.default_rng(0)
-    ijk = np.unique(rng.integers(0, 256, (60_000, 3)), axis=0)
-    write_voxels(env.store, ijk)
+    write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
     shell, poses = cloud(60, extent=0.03), poses_in(env.grid, 200, beyond=0.0)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
         assert table.n_slots < 512
         felt = ResidentFrames(residency, shell).feel(poses)
         assert residency.writer.n_evicted > 0
+        larger = ResidentFrames(residency, cloud(5000, extent=0.1))
+        with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
+            larger.feel(np.eye(4))
     assert not felt.unknown.any()
     for n in range(0, 200, 20):
         touch = env.touch(shell, poses[n])
         assert (felt.wrenches[n, :3] + 0.0).tobytes() == (touch.force + 0.0).tobytes()
-
-
-def test_a_tool_larger_than_the_table_is_told_so(tmp_path: Path) -> None:
-    env = make(tmp_path, bits=8)
-    rng = np.random.default_rng(0)
-    write_voxels(env.store, np.unique(rng.integers(0, 256, (60_000, 3)), axis=0))
-    shell = cloud(5000, extent=0.1)
-    with CellTable.create(LEAST_BUDGET) as table:
-        frames = ResidentFrames(Residency(env.store, table), shell)
-        with pytest.raises(UsageError, match=r"more than fit into .*give a larger budget"):
-            frames.feel(np.eye(4))
 
 
 def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Path) -> None:

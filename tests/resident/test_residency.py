@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 import hapticdb
 from children import joined
 from hapticdb import Environment, PointShell
-from hapticdb.errors import GridError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cell_key
 from hapticdb.resident import changes
@@ -131,38 +131,33 @@ def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) ->
         record = replace(voxel_object(env.grid, ijk, name), attributes={"material": material})
         return env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout))
 
+    def check_cells(residency: Residency, *left_out: int) -> None:
+        residency.make_resident(cells_of(env.grid)[:40])
+        assert check(residency, voxels_by_cell(env, left_out))
+
     env = make(tmp_path)
     named("a1", 0, "steel"), named("a2", 1, "wood"), named("b", 2, "steel")
     store = open_store(env.url, read_only=True)
     by_material = Residency(store, table, ["b"], where=["material=steel"])
     with CellTable.create(LEAST_BUDGET) as other:
         by_name = Residency(store, other, where=["a*"])
-        residencies: tuple[tuple[Residency, tuple[int, ...]], ...] = (
-            (by_material, (2, 3)),
-            (by_name, (3,)),
-        )
-        for residency, left_out in residencies:
-            residency.make_resident(cells_of(env.grid)[:40])
-            assert check(residency, voxels_by_cell(env, left_out))
+        check_cells(by_material, 2, 3)
+        check_cells(by_name, 3)
         named("c", 3, "steel"), named("d", 3, "wood")
-        residencies = ((by_material, (2, 3, 5)), (by_name, (3, 4, 5)))
-        for residency, left_out in residencies:
-            assert residency.refresh() == 2
-            residency.make_resident(cells_of(env.grid)[:40])
-            assert check(residency, voxels_by_cell(env, left_out))
-            assert residency.exclude.tolist() == list(left_out)
+        assert by_material.refresh() == by_name.refresh() == 2
+        check_cells(by_material, 2, 3, 5)
+        check_cells(by_name, 3, 4, 5)
+        assert by_name.exclude.tolist() == [3, 4, 5]
         env.remove(3)
         named("a*", 9, "wood")
-        residencies = ((by_material, (2, 5, 6)), (by_name, (1, 2, 4, 5)))
-        for residency, left_out in residencies:
+        for residency in (by_material, by_name):
             residency.refresh()
-            residency.make_resident(cells_of(env.grid)[:40])
-            assert check(residency, voxels_by_cell(env, left_out))
+        check_cells(by_material, 2, 5, 6)
+        check_cells(by_name, 1, 2, 4, 5)
         before = by_name.revision
         move(env.store, 1, block((5, 5, 5), (9, 9, 9)))
         assert (by_name.refresh(), by_name.revision) == (1, before + 1)
-        by_name.make_resident(cells_of(env.grid)[:40])
-        assert check(by_name, voxels_by_cell(env, (1, 2, 4, 5)))
+        check_cells(by_name, 1, 2, 4, 5)
     store.close()
 
 
@@ -308,30 +303,11 @@ def test_slots_of_a_load_that_failed_are_used_again(
     check(residency, voxels_by_cell(env))
 
 
-def test_another_environment_in_the_same_place_is_refused(tmp_path: Path, table: CellTable) -> None:
-    residency = Residency(make(tmp_path).store, table)
-    with pytest.raises(GridError, match="another environment than before"):
-        residency.reopened(make(tmp_path, bits=6).store)
-
-
 def two_of_one_grid(tmp_path: Path) -> list[Environment]:
     folders = [tmp_path / "first", tmp_path / "second"]
     for folder in folders:
         folder.mkdir()
     return list(map(make, folders))
-
-
-def test_another_file_of_the_same_grid_makes_all_unknown(tmp_path: Path, table: CellTable) -> None:
-    """Also when both files have the same revisions."""
-    env, other = two_of_one_grid(tmp_path)
-    write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
-    write_voxels(other.store, block((60, 60, 60), (70, 70, 70)))
-    residency = Residency(env.store, table)
-    residency.load(residency.missing(cells_of(env.grid))[:100])
-    residency.reopened(other.store)
-    check(residency, voxels_by_cell(other))
-    residency.load(residency.missing(cells_of(env.grid))[:100])
-    assert check(residency, voxels_by_cell(other)) > 0
 
 
 def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
@@ -13,23 +12,15 @@ from numpy.typing import NDArray
 
 from banded import move_points, write_points
 from hapticdb import Environment, PointShell
-from hapticdb.kernels.field.law import DistanceFieldLaw
-from hapticdb.kernels.large.sleeping import BLOCK, REST, way_of_box
+from hapticdb.kernels.large.sleeping import BLOCK, REST
+from hapticdb.query.law import SMOOTH, ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.sleepers import boxes_of_blocks
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.testing import write_voxels
 from realtime.worlds import block, make, move, scatter, turned
 
 Poses = NDArray[np.float64]
-
-
-class Smooth:
-    """The distance law of 1000 N/m."""
-
-    stiffness = 1000.0
-    for_kernels = DistanceFieldLaw(stiffness)
 
 
 def rod(n_points: int, seed: int, length: float) -> PointShell:
@@ -110,7 +101,9 @@ def test_a_tool_far_from_everything_looks_at_no_point(tmp_path: Path) -> None:
 
 
 @contextmanager
-def scene(folder: Path, law: str) -> Iterator[tuple[Environment, Any, Callable[[int], None]]]:
+def scene(
+    folder: Path, law: str
+) -> Iterator[tuple[Environment, ForceLaw | None, Callable[[int], None]]]:
     """An environment with an object near the middle, its law, and what moves the object."""
     env = make(folder, bits=7 if law == "plane" else 6)
     points = np.argwhere(np.ones((8, 8, 8))) / 1.5 + 30.0
@@ -125,7 +118,7 @@ def scene(folder: Path, law: str) -> Iterator[tuple[Environment, Any, Callable[[
         else:
             move_points(env.store, 1, points + np.array([at - 62.0, 0.0, 0.0]))
 
-    yield env, None if law == "plane" else Smooth(), place
+    yield env, None if law == "plane" else SMOOTH, place
     env.close()
 
 
@@ -241,28 +234,3 @@ def test_no_sleeping_point_comes_near_a_voxel(
         assert is_asleep.any()
         assert not inside[is_asleep].any()
     env.close()
-
-
-@given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=20)
-def test_no_run_goes_further_than_its_block_however_the_tool_turns(seed: int) -> None:
-    """The bound holds for the naive way of each centre on each axis, and is reached by a corner."""
-    rng = np.random.default_rng(seed)
-    spheres = np.column_stack([rng.normal(0, 0.1, (150, 3)), rng.uniform(0, 0.02, 150)])
-    boxes = boxes_of_blocks(spheres)
-    assert len(boxes) == 3
-    before, after = (turned(rng, rng.normal(0, 0.1, 3)) for _ in range(2))
-    if rng.random() < 0.5:
-        after = before.copy()
-        after[:3, 3] += rng.normal(0, 1e-3, 3)
-    rests = np.zeros((3, REST + 1))
-    rests[:, :REST] = before[:3].ravel()
-    change = after - before
-    ways = np.abs(spheres[:, :3] @ change[:3, :3].T + change[:3, 3]).max(axis=1)
-    signs = np.array(np.meshgrid([-1, 1], [-1, 1], [-1, 1])).reshape(3, 8).T
-    for n in range(3):
-        bound = way_of_box(boxes, rests, n, tuple(after[:3].ravel()))
-        assert ways[n * BLOCK : (n + 1) * BLOCK].max() <= bound + 1e-12
-        corners = boxes[n, :3] + signs * boxes[n, 3:6]
-        furthest = np.abs(corners @ change[:3, :3].T + change[:3, 3]).max()
-        assert abs(furthest - bound) <= 1e-12

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels.large.waking import WOKEN
 from hapticdb.kernels.resident import cell_table
 from hapticdb.kernels.resident.cells import CHANGES_KEPT, UNKNOWN
-from hapticdb.query.law import DistanceField, ForceLaw
+from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -25,7 +25,7 @@ from realtime.worlds import cells_of
 from resident.test_sleeping import rod, same, scene, walk
 
 Poses = NDArray[np.float64]
-LAWS: dict[str, ForceLaw | None] = {"plane": None, "distance": DistanceField()}
+LAWS = ["plane", "distance"]
 
 
 class World(NamedTuple):
@@ -61,11 +61,11 @@ class World(NamedTuple):
 def world(folder: Path, law: str) -> Iterator[World]:
     """An object near the middle of a grid of 4^3 cells, or 2^3 with distances."""
     with (
-        scene(folder, law) as (env, _, place),
+        scene(folder, law) as (env, for_frames, place),
         CellTable.create(4 << 20, distances=law == "distance") as table,
     ):
         residency = Residency(open_store(env.url, read_only=True), table)
-        yield World(residency, LAWS[law], place, cells_of(env.grid))
+        yield World(residency, for_frames, place, cells_of(env.grid))
 
 
 def expect_same(sleeping: ResidentFrames, flat: ResidentFrames, poses: Poses) -> FeltFrames:
@@ -130,25 +130,6 @@ def test_clusters_far_from_a_changed_cell_sleep_on(tmp_path: Path, law: str) -> 
         made.evict(made.cells[:1] + (0 if law == "distance" else (1 << 16) + 1))
         expect_same(sleeping, flat, pose)
         assert 0 < kept.state[WOKEN] < 0.8 * asleep
-
-
-@pytest.mark.parametrize("law", LAWS)
-def test_a_tool_sleeps_on_while_cells_are_fetched(tmp_path: Path, law: str) -> None:
-    """A cell that becomes known was counted as occupied, so none of the rests ends."""
-    with world(tmp_path, law) as made:
-        half = len(made.cells) // 2
-        made.load(made.cells[half:])
-        sleeping, flat = (made.frames(4000, 1, 0.1, run) for run in (16, 0))
-        pose = np.eye(4)[None]
-        pose[:, :3, 3] = (0.03, 0.05, 0.05) if law == "plane" else (0.01, 0.03, 0.03)
-        expect_same(sleeping, flat, pose)
-        kept = sleeping.sleepers
-        assert kept is not None
-        assert (kept.run_rests[:, 3] >= 0.0).any()
-        for cell in made.cells[:half]:
-            made.load(np.array([cell]))
-            expect_same(sleeping, flat, pose)
-        assert kept.state[WOKEN] == 0
 
 
 def test_all_clusters_wake_when_changes_were_lost(tmp_path: Path) -> None:

@@ -1,5 +1,7 @@
 """Stands in for `forcedimension_core.dhd` 1.0.0: its calls, argument forms and return codes."""
 
+# ruff: noqa: N802, N803 - the SDK's names
+
 import sys
 from collections.abc import MutableSequence, Sequence
 from types import ModuleType
@@ -37,10 +39,10 @@ class FakeDhd(ModuleType):
             return -1
         return 0
 
-    def errorGetLast(self) -> int:  # noqa: N802 - the SDK's name
+    def errorGetLast(self) -> int:
         return self.error
 
-    def errorGetLastStr(self) -> str:  # noqa: N802
+    def errorGetLastStr(self) -> str:
         return SAID[self.error]
 
     def open(self) -> int:
@@ -49,38 +51,35 @@ class FakeDhd(ModuleType):
             return -1
         return self._code("open")
 
-    def openSerial(self, serial: int) -> int:  # noqa: N802
+    def openSerial(self, serial: int) -> int:
         if serial not in self.serials:
             self.error = NO_DEVICE_FOUND
             return -1
         return self._code("openSerial", serial)
 
-    def close(self, ID: int = -1) -> int:  # noqa: N803 - the SDK's name
+    def close(self, ID: int = -1) -> int:
         return self._code("close", ID)
 
-    def stop(self, ID: int = -1) -> int:  # noqa: N803
+    def stop(self, ID: int = -1) -> int:
         return self._code("stop", ID)
 
-    def enableForce(self, enable: bool, ID: int = -1) -> int:  # noqa: N802, N803
+    def enableForce(self, enable: bool, ID: int = -1) -> int:
         return self._code("enableForce", enable, ID)
 
-    def hasWrist(self, ID: int = -1) -> bool:  # noqa: N802, N803
+    def hasWrist(self, ID: int = -1) -> bool:
         assert ID == 0
         return self.wrist
 
-    def hasActiveWrist(self, ID: int = -1) -> bool:  # noqa: N802, N803
+    def hasActiveWrist(self, ID: int = -1) -> bool:
         assert ID == 0
         return self.active_wrist
 
-    def getPosition(self, out: MutableSequence[float], ID: int = -1) -> int:  # noqa: N802, N803
+    def getPosition(self, out: MutableSequence[float], ID: int = -1) -> int:
         out[0], out[1], out[2] = self.position
         return self._code("getPosition", ID)
 
-    def getPositionAndOrientationFrame(  # noqa: N802
-        self,
-        p_out: MutableSequence[float],
-        matrix_out: Sequence[MutableSequence[float]],
-        ID: int = -1,  # noqa: N803
+    def getPositionAndOrientationFrame(
+        self, p_out: MutableSequence[float], matrix_out: Sequence[MutableSequence[float]], ID: int
     ) -> int:
         p_out[0], p_out[1], p_out[2] = self.position
         for i in range(3):
@@ -95,33 +94,20 @@ class FakeDhd(ModuleType):
         out[0], out[1], out[2] = values
         return self._code(*call)
 
-    def getLinearVelocity(  # noqa: N802
-        self,
-        out: MutableSequence[float],
-        ID: int = -1,  # noqa: N803
-    ) -> int:
+    def getLinearVelocity(self, out: MutableSequence[float], ID: int = -1) -> int:
         return self._velocity(out, self.linear, "getLinearVelocity", ID)
 
-    def getAngularVelocityRad(  # noqa: N802
-        self,
-        out: MutableSequence[float],
-        ID: int = -1,  # noqa: N803
-    ) -> int:
+    def getAngularVelocityRad(self, out: MutableSequence[float], ID: int = -1) -> int:
         return self._velocity(out, self.angular, "getAngularVelocityRad", ID)
 
-    def getButtonMask(self, ID: int = -1) -> int:  # noqa: N802, N803
+    def getButtonMask(self, ID: int = -1) -> int:
         self.calls.append(("getButtonMask", ID))
         return self.mask
 
-    def setForce(self, f: Sequence[float], ID: int = -1) -> int:  # noqa: N802, N803
+    def setForce(self, f: Sequence[float], ID: int = -1) -> int:
         return self._code("setForce", [f[0], f[1], f[2]], ID) or self.push_code
 
-    def setForceAndTorque(  # noqa: N802
-        self,
-        f: Sequence[float],
-        t: Sequence[float],
-        ID: int = -1,  # noqa: N803
-    ) -> int:
+    def setForceAndTorque(self, f: Sequence[float], t: Sequence[float], ID: int = -1) -> int:
         code = self._code("setForceAndTorque", [f[0], f[1], f[2]], [t[0], t[1], t[2]], ID)
         return code or self.push_code
 

@@ -1,19 +1,81 @@
 """Which objects count as a device, and a simulated device on a hand without a valid pose."""
 
 import re
-from pathlib import Path
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from devices.readings import FAULTS, FORMS, MOMENTS, Change
 from hapticdb import PointShell, Session
 from hapticdb.devices.protocol import Reader, Reading
 from hapticdb.devices.scripted import Line
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import DeviceError, UsageError
 from realtime.hands import Odd, still
+
+Change = Callable[[Any], object]
+
+
+def placed(reading: Reading, row: int, column: int, value: float) -> Reading:
+    """The reading with one number of its pose replaced."""
+    pose = reading.pose.copy()
+    pose[row, column] = value
+    return reading._replace(pose=pose)
+
+
+def turned(reading: Reading, factor: float) -> Reading:
+    """The reading with its rotation multiplied by a factor."""
+    pose = reading.pose.copy()
+    pose[:3, :3] *= factor
+    return reading._replace(pose=pose)
+
+
+def unwritable(reading: Reading) -> Reading:
+    """The reading with read-only arrays."""
+    pose, velocity = reading.pose.copy(), reading.velocity.copy()
+    pose.flags.writeable = velocity.flags.writeable = False
+    return reading._replace(pose=pose, velocity=velocity)
+
+
+FAULTS: list[tuple[Change, str]] = [
+    (lambda r: r._replace(pose=np.eye(4)[None]), r"a pose that is an array \(1, 4, 4\) of float64"),
+    (lambda r: r._replace(pose=np.eye(4).tolist()), "a pose that is of the type list"),
+    (lambda r: r._replace(pose=None), "a pose that is None"),
+    (lambda r: r._replace(pose=np.eye(4) + 0j), r"a pose that is an array .* of complex128"),
+    (lambda r: r._replace(pose=np.eye(4).astype(str)), "a pose that is an array .* of <U32"),
+    (lambda r: r._replace(pose=np.ma.array(np.eye(4))), r"a pose that is a masked array \(4, 4\)"),
+    (lambda r: r._replace(velocity=np.zeros((6, 1))), r"a velocity that is an array \(6, 1\)"),
+    (lambda r: r._replace(velocity=0.0), "a velocity that is of the type float"),
+    (lambda r: r._replace(buttons=1.0), "buttons that are of the type float"),
+    (lambda r: r._replace(buttons=-1), "buttons that are -1"),
+    (lambda r: r._replace(buttons=1 << 31), "buttons that are 2147483648"),
+    (lambda _: None, "None"),
+    (tuple, "of the type tuple"),
+]
+"""Changes of a reading to what is none, and the error text for each."""
+MOMENTS: list[tuple[Change, str]] = [
+    (lambda r: placed(r, 1, 1, np.inf), "numbers that are not finite"),
+    (lambda r: r._replace(velocity=np.full(6, np.nan)), "numbers that are not finite"),
+    (lambda r: placed(r, 2, 3, 1e7), r"numbers beyond 1e\+06"),
+    (lambda r: r._replace(velocity=np.full(6, -1e7)), r"numbers beyond 1e\+06"),
+    (lambda r: turned(r, 1.01), "a pose that is no rigid transform"),
+    (lambda r: turned(r, -1.0), "a pose that is no rigid transform"),
+    (lambda r: placed(r, 0, 1, 0.1), "a pose that is no rigid transform"),
+    (lambda r: placed(r, 3, 0, 1.0), "a pose that is no rigid transform"),
+]
+"""Changes of a reading to what is no place."""
+FORMS: list[Change] = [
+    lambda r: r._replace(pose=np.asfortranarray(r.pose)),
+    lambda r: r._replace(pose=np.tile(r.pose, (2, 2))[4:, 4:], velocity=np.zeros(12)[::2]),
+    lambda r: r._replace(pose=r.pose.astype(np.float32), velocity=r.velocity.astype(np.float32)),
+    lambda r: r._replace(pose=r.pose.astype(">f8")),
+    lambda r: r._replace(velocity=np.zeros(6, dtype=np.int64)),
+    lambda r: turned(r, 1.0 + 1e-4),
+    lambda r: r._replace(buttons=np.int32(0)),
+    unwritable,
+]
+"""Other forms of a reading, that are taken."""
 
 
 class Mute:
@@ -38,7 +100,6 @@ class Rows:
         ),
         ([np.eye(4)], r"of the type list .*Player\(times, poses\)$"),
         ("path.csv", r"of the type str .*Path\(file\)$"),
-        (Path("path.csv"), r"Path\(file\)$"),
         (Rows(), r"of the type Rows .*Player\(\*recording\.poses\(\)\)$"),
         (Line, r"Line is a class"),
         (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.devices\.scripted"),

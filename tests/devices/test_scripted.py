@@ -12,17 +12,17 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from hapticdb import write_poses
-from hapticdb.devices.protocol import Device, Reading, SupportsClose, SupportsEnd, SupportsOpen
+from hapticdb.devices.protocol import Device, Reading
 from hapticdb.devices.scripted import CYCLE, Line, Path, Player, RandomHand, capped, pose_at
 from hapticdb.errors import UsageError
 from hapticdb.poses import quaternion_of, rotation_of
 
 
-class Hands:
-    """A clock that a test sets, in seconds."""
+class SetClock:
+    """A clock in seconds that only a test moves."""
 
-    def __init__(self) -> None:
-        self.now = 100.0
+    def __init__(self, now: float = 0.0) -> None:
+        self.now = now
 
     def __call__(self) -> float:
         return self.now
@@ -40,7 +40,7 @@ def quarter(axis: int) -> NDArray[np.float64]:
 TURNED = quarter(1) @ quarter(2)
 TURNED[:3, 3] = 0.2, -0.1, 0.4
 
-MAKERS: dict[str, Callable[[Hands], Device]] = {
+MAKERS: dict[str, Callable[[SetClock], Device]] = {
     "player": lambda clock: Player([0.0, 0.5, 2.0], [np.eye(4), TURNED, quarter(0)], clock=clock),
     "line": lambda clock: Line((0, 0, 0), TURNED, 0.3, clock=clock),
     "random": lambda clock: RandomHand(TURNED, 3, 0.5, 4.0, clock=clock),
@@ -61,7 +61,7 @@ def difference(before: Reading, after: Reading, seconds: float) -> NDArray[np.fl
     return np.concatenate([after.pose[:3, 3] - before.pose[:3, 3], angular]) / seconds
 
 
-def read_at(device: Device, clock: Hands, seconds: float) -> Reading:
+def read_at(device: Device, clock: SetClock, seconds: float) -> Reading:
     """The reading so many seconds after the device's start at 100 s."""
     clock.now = 100.0 + seconds
     return kept(device.read())
@@ -71,7 +71,7 @@ def read_at(device: Device, clock: Hands, seconds: float) -> Reading:
 @given(instant=st.floats(0.01, 40.0))
 @settings(max_examples=10, deadline=None)
 def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, instant: float) -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     device = MAKERS[name](clock)
     device.read()
     h = 1e-5
@@ -87,7 +87,7 @@ def test_poses_are_rigid_and_velocities_are_what_they_change_by(name: str, insta
 
 @pytest.mark.parametrize("name", MAKERS)
 def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     device = MAKERS[name](clock)
     read_at(device, clock, 0.0)
     read_at(device, clock, 0.3)
@@ -100,7 +100,7 @@ def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
 
 
 def test_a_script_starts_at_its_first_read() -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     line = Line((1, 2, 3), (2, 2, 3), 0.5, clock=clock)
     clock.now = 5000.0
     assert line.read().pose[:3, 3].tolist() == [1.0, 2.0, 3.0]
@@ -110,7 +110,7 @@ def test_a_script_starts_at_its_first_read() -> None:
 
 
 def test_a_path_that_is_over_rests_at_its_last_pose() -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     player = Player([3.0, 4.0, 5.0], [np.eye(4), TURNED, quarter(2)], clock=clock)
     assert not player.is_over
     player.read()
@@ -124,7 +124,7 @@ def test_a_path_that_is_over_rests_at_its_last_pose() -> None:
 
 
 def test_turns_between_poses_are_even() -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     player = Player([0.0, 3.0], [np.eye(4), quarter(2)], clock=clock)
     player.read()
     third = read_at(player, clock, 1.0)
@@ -133,7 +133,7 @@ def test_turns_between_poses_are_even() -> None:
 
 
 def test_a_path_that_loops_is_never_over() -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     places = [pose_at((x, 0.0, 0.0)) for x in (0.0, 1.0, 0.0)]
     line = Player([0.0, 1.0, 2.0], places, loops=True, clock=clock)
     line.read()
@@ -146,7 +146,7 @@ def test_a_path_that_loops_is_never_over() -> None:
 @given(speed=st.floats(0.05, 2.0), seed=st.integers(0, 1000))
 @settings(max_examples=5, deadline=None)
 def test_a_random_hand_peaks_at_the_speed_asked_for(speed: float, seed: int) -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     hand = RandomHand((1, 2, 3), seed, speed, 2.0 * speed, 0.3, clock=clock)
     start = kept(hand.read())
     assert np.allclose(start.pose, pose_at((1, 2, 3)), atol=1e-12)
@@ -161,14 +161,13 @@ def test_a_random_hand_peaks_at_the_speed_asked_for(speed: float, seed: int) -> 
 
 
 def test_the_same_seed_is_the_same_motion() -> None:
-    hands = []
-    for seed in (4, 4, 5):
-        clock = Hands()
+    def pose(seed: int) -> object:
+        clock = SetClock(100.0)
         hand = RandomHand((0, 0, 0), seed, clock=clock)
         hand.read()
-        hands.append(read_at(hand, clock, 1.3).pose)
-    assert np.array_equal(hands[0], hands[1])
-    assert not np.array_equal(hands[0], hands[2])
+        return read_at(hand, clock, 1.3).pose.tolist()
+
+    assert pose(4) == pose(4) != pose(5)
 
 
 def test_a_hand_that_would_have_to_shake_faster_than_hands_do_is_refused() -> None:
@@ -177,7 +176,7 @@ def test_a_hand_that_would_have_to_shake_faster_than_hands_do_is_refused() -> No
 
 
 def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
-    clock = Hands()
+    clock = SetClock(100.0)
     poses = np.tile(np.eye(4), (4, 1, 1))
     poses[1:, 0, 3] = 0.1, 0.1, 0.3
     write_poses(tmp_path / "p.csv", poses)
@@ -191,7 +190,7 @@ def test_a_file_without_times_runs_at_a_speed(tmp_path: FilePath) -> None:
 def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
     file = tmp_path / "p.csv"
     file.write_text("x,y,z,qw,qx,qy,qz,t\n0,0,0,1,0,0,0,1\n1,0,0,1,0,0,0,2\n1,1,0,1,0,0,0,5\n")
-    clock = Hands()
+    clock = SetClock(100.0)
     path = Path(file, clock=clock)
     path.read()
     assert path.duration == 4.0
@@ -203,11 +202,9 @@ def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
     "make",
     [
         lambda: Player([0.0, 0.0], [np.eye(4)] * 2),
-        lambda: Player([0.0], [np.eye(4)] * 2),
         lambda: Player([], np.empty((0, 4, 4))),
         lambda: Player([0.0, math.nan], [np.eye(4)] * 2),
         lambda: Line((0, 0, 0), (0, 0, 0)),
-        lambda: Line((0, 0, 0), (0, 1)),
         lambda: Line((0, 0, 0), (0, 0, 1), speed=0.0),
     ],
 )
@@ -215,14 +212,6 @@ def test_scripts_that_cannot_be_are_refused(make: Callable[[], Device]) -> None:
     with pytest.raises(UsageError) as caught:
         make()
     assert "\n" not in str(caught.value)
-
-
-def test_scripts_end_but_need_no_opening() -> None:
-    line = Line((0, 0, 0), (1, 0, 0))
-    assert isinstance(line, SupportsEnd)
-    assert not isinstance(line, SupportsOpen | SupportsClose)
-    line.apply(np.ones(6))
-    assert line.read().buttons == 0
 
 
 @given(st.lists(st.floats(-1e3, 1e3), min_size=6, max_size=6))

@@ -8,21 +8,12 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from devices.test_scripted import SetClock
 from hapticdb.devices.protocol import Reading, SupportsEnd
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
 from hapticdb.poses import quaternion_of, rotation_of
-
-
-class SetClock:
-    """A clock that only a test moves."""
-
-    def __init__(self) -> None:
-        self.now = 0.0
-
-    def __call__(self) -> float:
-        return self.now
 
 
 class Still:

@@ -3,14 +3,14 @@
 import math
 import pickle
 import sys
-import time
 from collections.abc import Callable, Iterator
 from types import ModuleType
+from typing import TypeVar
 
 import numpy as np
 import pytest
 
-from children import PATIENCE
+from children import PATIENCE, until
 from devices.fake_dhd import FakeDhd
 from devices.fake_dhd import install as install_dhd
 from devices.fake_haply import IDENTITY, FakeHaply, vector
@@ -44,13 +44,12 @@ def haply() -> Iterator[FakeHaply]:
         yield fake
 
 
-def eventually(claim: Callable[[], bool]) -> bool:
-    deadline = time.monotonic() + PATIENCE
-    while not claim():
-        if time.monotonic() > deadline:
-            return False
-        time.sleep(0.002)
-    return True
+D = TypeVar("D", bound=SupportsOpen)
+
+
+def opened(device: D) -> D:
+    device.open()
+    return device
 
 
 # --- all of them --------------------------------------------------------------------------------
@@ -127,8 +126,7 @@ def test_velocity_is_the_difference_over_the_window() -> None:
 
 
 def test_force_dimension_reports_pose_velocity_and_buttons(dhd: FakeDhd) -> None:
-    device = ForceDimensionDevice()
-    device.open()
+    device = opened(ForceDimensionDevice())
     reading = device.read()
     assert reading.pose[:3, 3].tolist() == [0.01, 0.02, 0.03]
     assert reading.pose[:3, :3].tolist() == dhd.rows
@@ -139,41 +137,34 @@ def test_force_dimension_reports_pose_velocity_and_buttons(dhd: FakeDhd) -> None
 
 
 def test_force_dimension_is_capped_in_force_and_torque(dhd: FakeDhd) -> None:
-    device = ForceDimensionDevice(4711)
-    device.open()
+    device = opened(ForceDimensionDevice(4711))
     assert dhd.calls[0] == ("openSerial", 4711)
     device.apply(PUSH)
-    name, force, torque, opened = dhd.calls[-1]
-    assert (name, opened) == ("setForceAndTorque", 0)
+    name, force, torque, number = dhd.calls[-1]
+    assert (name, number) == ("setForceAndTorque", 0)
     assert np.allclose(np.array(force), [4.2, 0.0, 5.6])
     assert np.allclose(np.array(torque), [0.0, 0.2, 0.0])
 
 
 def test_force_dimension_without_a_wrist_is_upright_and_pushes_straight(dhd: FakeDhd) -> None:
     dhd.wrist = dhd.active_wrist = False
-    device = ForceDimensionDevice()
-    device.open()
+    device = opened(ForceDimensionDevice())
     reading = device.read()
     assert np.array_equal(reading.pose[:3, :3], np.eye(3))
     assert reading.pose[:3, 3].tolist() == dhd.position
     assert reading.velocity.tolist() == [0.1, 0.2, 0.3, 0.0, 0.0, 0.0]
     device.apply(PUSH)
-    name, force, opened = dhd.calls[-1]
-    assert (name, opened) == ("setForce", 0)
+    name, force, number = dhd.calls[-1]
+    assert (name, number) == ("setForce", 0)
     assert np.allclose(np.array(force), [4.2, 0.0, 5.6])
 
 
-def test_force_dimension_has_no_speed_before_two_positions(dhd: FakeDhd) -> None:
-    dhd.velocity_code = -1
-    device = ForceDimensionDevice()
-    device.open()
+def test_force_dimension_takes_no_speed_yet_and_saturated_motors_for_what_they_are(
+    dhd: FakeDhd,
+) -> None:
+    dhd.velocity_code, dhd.push_code = -1, 2
+    device = opened(ForceDimensionDevice())
     assert device.read().velocity.tolist() == [0.0] * 6
-
-
-def test_force_dimension_takes_saturated_motors_for_what_they_are(dhd: FakeDhd) -> None:
-    dhd.push_code = 2
-    device = ForceDimensionDevice()
-    device.open()
     device.apply(PUSH)
     assert dhd.calls[-1][0] == "setForceAndTorque"
 
@@ -187,8 +178,7 @@ def test_force_dimension_that_is_not_there_is_told(dhd: FakeDhd) -> None:
 
 
 def test_force_dimension_that_is_unplugged_is_told(dhd: FakeDhd) -> None:
-    device = ForceDimensionDevice()
-    device.open()
+    device = opened(ForceDimensionDevice())
     dhd.is_plugged = False
     with pytest.raises(DeviceError, match="communication error"):
         device.read()
@@ -206,8 +196,7 @@ def test_force_dimension_that_is_unplugged_is_told(dhd: FakeDhd) -> None:
 def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
     hd: FakeHd, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    device = OpenHapticsDevice("Left")
-    device.open()
+    device = opened(OpenHapticsDevice("Left"))
     reading = device.read()
     assert np.allclose(reading.pose[:3, 3], [0.01, 0.02, 0.03])
     assert reading.pose[:3, 1].tolist() == [0.0, 0.0, 1.0]  # the second column
@@ -220,26 +209,24 @@ def test_openhaptics_turns_millimetres_and_columns_into_a_pose(
 
 
 def test_openhaptics_pushes_what_was_applied_capped(hd: FakeHd) -> None:
-    device = OpenHapticsDevice()
-    device.open()
+    device = opened(OpenHapticsDevice())
     assert set(map(tuple, hd.forces)) == {(0.0, 0.0, 0.0)}
 
     def is_pushed() -> bool:
         device.apply(PUSH)
         return bool(np.allclose(hd.forces[-1], [1.98, 0.0, 2.64]))
 
-    assert eventually(is_pushed)
+    until(is_pushed)
     device.close()
 
 
 def test_openhaptics_lets_a_force_go_that_no_other_follows(hd: FakeHd) -> None:
     now = [0.0]
-    device = OpenHapticsDevice(clock=lambda: now[0])
-    device.open()
+    device = opened(OpenHapticsDevice(clock=lambda: now[0]))
     device.apply(PUSH)
-    assert eventually(lambda: hd.forces[-1] != [0.0, 0.0, 0.0])
+    until(lambda: hd.forces[-1] != [0.0, 0.0, 0.0])
     now[0] = 0.06
-    assert eventually(lambda: hd.forces[-1] == [0.0, 0.0, 0.0])
+    until(lambda: hd.forces[-1] == [0.0, 0.0, 0.0])
     device.close()
 
 
@@ -260,8 +247,7 @@ def test_openhaptics_that_fails_to_start_is_let_go(hd: FakeHd, code: int) -> Non
 
 
 def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
-    device = OpenHapticsDevice()
-    device.open()
+    device = opened(OpenHapticsDevice())
     hd.is_plugged = False
 
     def is_told() -> bool:
@@ -271,7 +257,7 @@ def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
             return "silent" in str(error)
         return False
 
-    assert eventually(is_told)
+    until(is_told)
     device.close()
 
 
@@ -280,8 +266,7 @@ def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
 
 def test_haply_reports_what_the_service_says(haply: FakeHaply) -> None:
     haply.velocity = vector(0.1, 0.2, 0.3)
-    device = HaplyDevice(url=haply.url)
-    device.open()
+    device = opened(HaplyDevice(url=haply.url))
     reading = device.read()
     assert reading.pose[:3, 3].tolist() == [0.0, -0.12, 0.15]
     assert np.array_equal(reading.pose[:3, :3], np.eye(3))
@@ -292,8 +277,7 @@ def test_haply_reports_what_the_service_says(haply: FakeHaply) -> None:
 
 
 def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
-    device = HaplyDevice("049D", url=haply.url)
-    device.open()
+    device = opened(HaplyDevice("049D", url=haply.url))
     for _ in range(3):
         device.read()
         device.apply(PUSH)
@@ -307,8 +291,7 @@ def test_haply_is_told_forces_capped_and_nothing_else(haply: FakeHaply) -> None:
 
 
 def test_haply_reads_the_newest_state_whatever_was_asked_before(haply: FakeHaply) -> None:
-    device = HaplyDevice(url=haply.url)
-    device.open()
+    device = opened(HaplyDevice(url=haply.url))
     for n in range(5):
         device.apply(PUSH)
         haply.position = vector(0.01 * n, 0.0, 0.0)
@@ -332,8 +315,7 @@ def test_haply_takes_turns_and_buttons_from_the_grip(
     half = math.sqrt(0.5)
     turned = {"w": half, "x": 0.0, "y": 0.0, "z": half}
     haply.grips = {kind: [{"device_id": "61548", "state": {"orientation": turned, **state}}]}
-    device = HaplyDevice(url=haply.url)
-    device.open()
+    device = opened(HaplyDevice(url=haply.url))
     reading = device.read()
     assert np.allclose(reading.pose[:3, 0], [0.0, 1.0, 0.0])
     assert reading.buttons == buttons
@@ -358,25 +340,20 @@ def test_haply_without_the_service_is_told(haply: FakeHaply) -> None:
     assert "\n" not in str(caught.value)
 
 
-def test_haply_that_goes_silent_is_told(haply: FakeHaply) -> None:
-    device = HaplyDevice(url=haply.url)
-    device.open()
+@pytest.mark.parametrize("stops", [False, True])
+def test_haply_that_goes_silent_or_whose_service_stops_is_told(
+    haply: FakeHaply, stops: bool
+) -> None:
+    device = opened(HaplyDevice(url=haply.url))
     device.read()
+    if stops:
+        haply.unplug()
     haply.answers = False
     with pytest.raises(DeviceError, match="is gone"):
         device.read()
-    device.close()
-
-
-def test_haply_whose_service_stops_is_told(haply: FakeHaply) -> None:
-    device = HaplyDevice(url=haply.url)
-    device.open()
-    device.read()
-    haply.unplug()
-    with pytest.raises(DeviceError, match="is gone"):
-        device.read()
-    with pytest.raises(DeviceError, match="is gone"):
-        device.apply(PUSH)
+    if stops:
+        with pytest.raises(DeviceError, match="is gone"):
+            device.apply(PUSH)
     device.close()
 
 

@@ -14,7 +14,7 @@ import pytest
 from numpy.typing import NDArray
 from websockets.sync.client import ClientConnection, connect
 
-from children import PATIENCE, PIPE, child
+from children import PATIENCE, PIPE, child, until
 from contact_server import TOKEN
 from feel.ground import Ground
 from feel.scenes import plane
@@ -101,42 +101,34 @@ def pressed(served: Served, proxy: ContactProxy) -> Floats:
 
     The server has to see the hand while it is free: where it sees it first, it puts the tool.
     """
-    until = time.monotonic() + 30.0
-    while not proxy.told.is_fresh and time.monotonic() < until:
-        proxy.wrench(served.pose(-0.002), STILL)
-        time.sleep(2e-3)
+    free = served.pose(-0.002)
+    until(lambda: (proxy.wrench(free, STILL), proxy.told.is_fresh)[1], every=2e-3)
     for depth in np.linspace(-0.002, DEPTH, 200):
         proxy.wrench(served.pose(depth), STILL)
         time.sleep(2e-3)
-    while time.monotonic() < until:
-        wrench = proxy.wrench(served.pose(DEPTH), STILL)
-        if wrench[2] == pytest.approx(1000.0 * DEPTH, rel=0.06):
-            return wrench
-        time.sleep(1e-3)
-    pytest.fail(f"no force within 30 s: {wrench}, {proxy.told}, {proxy.figures()}")
+    full = pytest.approx(1000.0 * DEPTH, rel=0.06)
+    until(lambda: proxy.wrench(served.pose(DEPTH), STILL)[2] == full, every=1e-3)
+    return proxy.wrench(served.pose(DEPTH), STILL)
 
 
-def falls_to_zero(served: Served, proxy: ContactProxy) -> list[tuple[float, float]]:
-    """Times and forces until there is none."""
-    began, felt = time.monotonic(), []
-    while time.monotonic() < began + 20.0:
-        force = proxy.wrench(served.pose(DEPTH), STILL)[2]
-        felt.append((time.monotonic() - began, force))
-        if force == 0.0:
-            return felt
-        time.sleep(1e-3)
-    pytest.fail("the force stays")
+def falls_to_zero(served: Served, proxy: ContactProxy) -> list[float]:
+    """Forces along z until there is none."""
+    felt: list[float] = []
 
+    def is_gone() -> bool:
+        felt.append(float(proxy.wrench(served.pose(DEPTH), STILL)[2]))
+        return felt[-1] == 0.0
 
-def opened(served: Served, token: str = TOKEN) -> ClientConnection:
-    return connect(
-        f"ws://127.0.0.1:{served.port}/device/contacts", compression=None, proxy=None,
-        additional_headers={"Authorization": f"Bearer {token}"}, open_timeout=30,
-    )  # fmt: skip
+    until(is_gone, every=1e-3)
+    return felt
 
 
 def granted(served: Served) -> ClientConnection:
-    connection = opened(served)
+    """A connection to which the server has granted its tool."""
+    connection = connect(
+        f"ws://127.0.0.1:{served.port}/device/contacts", compression=None, proxy=None,
+        additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=30,
+    )  # fmt: skip
     connection.send(pack_wish(ProxyWish()))
     assert unpack_terms(connection.recv(30)).tool == "plate"  # type: ignore[arg-type]
     return connection

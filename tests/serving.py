@@ -62,19 +62,13 @@ class Running:
 
     def browser(self, role: Role | None = None, **headers: str) -> ClientConnection:
         """Connect as viser's client does."""
-        shown = {"Origin": f"http://{self.place}"} | headers
-        if role is not None:
-            shown["Authorization"] = f"Bearer a-token-for-{role.word}"
-        address = f"ws://{self.place}{self.prefix}"
-        return connect(
-            address, subprotocols=PROTOCOL, additional_headers=shown, proxy=None, compression=None,
-            open_timeout=PATIENCE,
-        )  # fmt: skip
+        shown = {} if role is None else {"Authorization": f"Bearer a-token-for-{role.word}"}
+        return browser_at(self.place + self.prefix, **shown | headers)
 
 
-def browser_at(place: str, token: str) -> ClientConnection:
-    """Connect to the page at a host and port, as viser's client does."""
-    shown = {"Origin": f"http://{place}", "Authorization": f"Bearer {token}"}
+def browser_at(place: str, **headers: str) -> ClientConnection:
+    """Connect to the page at a host, port and prefix, as viser's client does."""
+    shown = {"Origin": f"http://{place.partition('/')[0]}"} | headers
     return connect(
         f"ws://{place}", subprotocols=PROTOCOL, additional_headers=shown, proxy=None,
         compression=None, open_timeout=PATIENCE,

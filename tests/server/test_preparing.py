@@ -30,7 +30,8 @@ def test_the_page_is_there_before_the_kernels_and_a_closed_server_compiles_no_mo
     with child(view, env=cold) as process:
         assert process.stdout is not None
         place, _, token = process.stdout.readline().strip().partition("/?token=")
-        with browser_at(place.removeprefix("http://"), token) as connection:
+        place = place.removeprefix("http://")
+        with browser_at(place, Authorization=f"Bearer {token}") as connection:
             person = PagePerson(connection)
             told = "preparing the hand: 0 of "
             until(lambda: (person.look(0.05), any(told in text for text in person.received))[1])

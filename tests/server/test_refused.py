@@ -7,7 +7,9 @@ import socket
 from collections.abc import AsyncIterator
 from http.client import HTTPConnection
 from pathlib import Path
-from typing import cast
+from types import SimpleNamespace
+from typing import Any
+from unittest.mock import AsyncMock
 
 import pytest
 import uvicorn
@@ -22,7 +24,6 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.contacts import Contacts
 from hapticdb.server.guards import Guards
 from hapticdb.server.limits import Limits
-from hapticdb.server.served import Served
 from hapticdb.server.transports import limited
 
 UPGRADE = (
@@ -119,26 +120,6 @@ def test_a_refused_websocket_logs_no_error(host: str, caplog: pytest.LogCaptureF
     assert caplog.records == []
 
 
-class Asking:
-    """A WebSocket that asks for something, and keeps why it is closed."""
-
-    application_state = WebSocketState.CONNECTED
-
-    def __init__(self, message: bytes) -> None:
-        self.headers = {"authorization": "Bearer a-token-for-toucher"}
-        self.message = message
-        self.closed: tuple[int, str] | None = None
-
-    async def accept(self) -> None:
-        pass
-
-    async def receive(self) -> dict[str, object]:
-        return {"type": "websocket.receive", "bytes": self.message}
-
-    async def close(self, code: int, reason: str) -> None:
-        self.closed = code, reason
-
-
 @pytest.mark.parametrize(
     ("message", "code"),
     [
@@ -155,10 +136,11 @@ def test_a_wrong_wish_is_refused_before_cells_and_tools_are_made(
 
     monkeypatch.setattr(Contacts, "_open", made)
     access = Access({"a-token-for-toucher": Role.TOUCHER})
-    served = cast(
-        "Served", type("", (), {"access": access, "tools": (str(tmp_path / "plate.stl"),)})
+    served: Any = SimpleNamespace(access=access, tools=(str(tmp_path / "plate.stl"),))
+    asking = AsyncMock(
+        application_state=WebSocketState.CONNECTED,
+        headers={"authorization": "Bearer a-token-for-toucher"},
     )
-    asking = Asking(message)
-    asyncio.run(Contacts(served).serve(cast("WebSocket", asking)))
-    assert asking.closed is not None
-    assert asking.closed[0] == code
+    asking.receive.return_value = {"type": "websocket.receive", "bytes": message}
+    asyncio.run(Contacts(served).serve(asking))
+    assert asking.close.await_args.args[0] == code

@@ -2,24 +2,10 @@
 
 import re
 
-from hapticdb.server import access, messages
 from hapticdb.server.limits import Limits
 from sources import ROOT
 
 PAGE = (ROOT / "docs" / "serving.md").read_text()
-
-
-def test_the_table_of_limits_is_that_of_the_code() -> None:
-    shown = dict(re.findall(r"^\| `(\w+)` \| ([\d.]+) \|", PAGE, re.MULTILINE))
-    known = vars(Limits()) | {
-        name: getattr(module, name)
-        for module, name in (
-            (messages, "LARGEST"),
-            (access, "SIGNED_IN_SECONDS"),
-            (access, "MOST_SIGNED_IN"),
-        )
-    }
-    assert {name: float(value) for name, value in shown.items()} == known
 
 
 def test_the_unit_waits_longer_than_the_server_needs_to_stop() -> None:

@@ -7,12 +7,13 @@ import time
 from collections.abc import AsyncIterator, Callable
 from types import SimpleNamespace
 from typing import Any, NoReturn, cast
+from unittest.mock import AsyncMock
 
 import pytest
 import uvicorn
 from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketState
+from starlette.websockets import WebSocketState
 
 from children import PATIENCE
 from hapticdb.server import contacts, relay
@@ -24,11 +25,8 @@ from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 from hapticdb.server.transports import StrictWebSocket
+from server.test_refused import UPGRADE
 
-OPENING = (
-    b"GET / HTTP/1.1\r\nHost: 127.0.0.1\r\nUpgrade: websocket\r\nConnection: Upgrade\r\n"
-    b"Sec-WebSocket-Version: 13\r\nSec-WebSocket-Key: AAAAAAAAAAAAAAAAAAAAAA==\r\n\r\n"
-)
 MORE_THAN_BUFFERS = bytes(16 << 20)
 
 
@@ -43,7 +41,7 @@ async def unread(app: ASGIApp, *, ping: float | None) -> AsyncIterator[uvicorn.S
     with socket.create_server(("127.0.0.1", 0)) as listening:
         serving = asyncio.create_task(server.serve([listening]))
         with socket.create_connection(listening.getsockname(), PATIENCE) as client:
-            client.sendall(OPENING)
+            client.sendall(UPGRADE.format(host="127.0.0.1").encode())
             yield server
         server.should_exit = True
         await asyncio.wait_for(serving, PATIENCE)
@@ -99,24 +97,16 @@ def test_a_client_that_does_not_read_the_last_message_is_cut(
     asyncio.run(work())
 
 
-class Unwilling:
+def unwilling() -> Any:  # noqa: ANN401 - in place of a WebSocket
     """A WebSocket that sends something malformed and takes no close frame."""
 
-    application_state = WebSocketState.CONNECTED
-    headers = Headers()
-
-    @staticmethod
-    async def accept() -> None:
-        pass
-
-    @staticmethod
-    async def receive() -> dict[str, object]:
-        return {"type": "websocket.receive", "bytes": b"malformed"}
-
-    @staticmethod
     async def close(*_: object) -> NoReturn:
         await asyncio.sleep(2.0 * PATIENCE)
         raise AssertionError
+
+    made = AsyncMock(application_state=WebSocketState.CONNECTED, headers=Headers(), close=close)
+    made.receive.return_value = {"type": "websocket.receive", "bytes": b"malformed"}
+    return made
 
 
 def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
@@ -126,7 +116,7 @@ def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
     access = Access({}, open_role=Role.TOUCHER)
     served = cast("Served", SimpleNamespace(access=access, tools=()))
     endpoint = Contacts(served)
-    asyncio.run(asyncio.wait_for(endpoint.serve(cast("WebSocket", Unwilling())), PATIENCE))
+    asyncio.run(asyncio.wait_for(endpoint.serve(unwilling()), PATIENCE))
     assert endpoint.n_clients == 0
 
 
@@ -136,7 +126,7 @@ def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.Monke
     served = Relay(Access({}), cast("PageKeeper", None), Limits(), figures)
 
     async def work() -> None:
-        await asyncio.wait_for(served.browser(cast("WebSocket", Unwilling())), PATIENCE)
+        await asyncio.wait_for(served.browser(unwilling()), PATIENCE)
 
     asyncio.run(work())
     assert b'hapticdb_browser_connections_total{end="refused"} 1.0' in figures.text()

@@ -143,7 +143,7 @@ def drawn(page: Page) -> None:
     page.evaluate(TWO_PICTURES)
 
 
-def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats, *, lets_go: bool = True) -> None:
+def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats) -> None:
     """Drag what is at a place (3,) by a way (3,), metres, with the pointer."""
     start, end = np.array(eye.pixel(grabbed)), np.array(eye.pixel(grabbed + way))
     page.mouse.move(*start)
@@ -154,8 +154,7 @@ def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats, *, lets_go: bool = 
     for share in np.linspace(0.0, 1.0, DRAGGED_STEPS)[1:]:
         page.mouse.move(*(start + share * (end - start)))
         page.wait_for_timeout(60)  # viser sends 20 places of a gizmo a second
-    if lets_go:
-        page.mouse.up()
+    page.mouse.up()
     page.wait_for_timeout(300)
 
 

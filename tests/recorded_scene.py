@@ -1,5 +1,7 @@
 """A scene that records what a browser would draw, and an environment of a few parts."""
 
+# ruff: noqa: ANN401 - properties of viser's nodes
+
 from pathlib import Path
 from typing import Any
 
@@ -7,6 +9,7 @@ import numpy as np
 import trimesh
 from numpy.typing import NDArray
 from scipy.spatial import cKDTree
+from scipy.spatial.transform import Rotation
 
 import hapticdb
 
@@ -14,7 +17,7 @@ import hapticdb
 class RecordedNode:
     """A node that was added; its properties may be set, as of viser's handles."""
 
-    def __init__(self, nodes: "RecordedScene", name: str, **props: Any) -> None:  # noqa: ANN401
+    def __init__(self, nodes: "RecordedScene", name: str, **props: Any) -> None:
         self._nodes = nodes
         self._name = name
         self.visible = True
@@ -29,27 +32,16 @@ class RecordedScene:
 
     def __init__(self) -> None:
         self.nodes: dict[str, RecordedNode] = {}
-        self.n_added = 0
 
-    def add_batched_meshes_simple(
-        self,
-        name: str,
-        vertices: NDArray[np.float32],
-        faces: NDArray[np.uint32],
-        wxyzs: NDArray[np.float64],
-        positions: NDArray[np.float64],
-        **props: Any,  # noqa: ANN401
+    def add_batched_meshes_simple(  # as viser's
+        self, name: str, vertices: Any, faces: Any, wxyzs: Any, positions: Any, **props: Any
     ) -> RecordedNode:
-        self.n_added += 1
-        given: dict[str, Any] = {
-            "batched_wxyzs": np.asarray(wxyzs, np.float32),
-            "vertices": vertices,
-        }
-        given |= {"batched_positions": np.asarray(positions, np.float32), "faces": faces}
-        self.nodes[name] = RecordedNode(self, name, **given, **props)
+        props |= {"batched_wxyzs": np.asarray(wxyzs, np.float32), "vertices": vertices}
+        props |= {"batched_positions": np.asarray(positions, np.float32), "faces": faces}
+        self.nodes[name] = RecordedNode(self, name, **props)
         return self.nodes[name]
 
-    def add_frame(self, name: str, **props: Any) -> RecordedNode:  # noqa: ANN401
+    def add_frame(self, name: str, **props: Any) -> RecordedNode:
         self.nodes[name] = RecordedNode(self, name, vertices=None, **props)
         return self.nodes[name]
 
@@ -71,18 +63,9 @@ def drawn(shared: RecordedScene, own: RecordedScene | None = None) -> NDArray[np
             props["batched_wxyzs"], props["batched_positions"], sizes, strict=True
         ):
             if size.any():
-                found.append((corners * size) @ turned(wxyz).T + position)
+                turn = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
+                found.append((corners * size) @ turn.T + position)
     return np.concatenate(found)
-
-
-def turned(wxyz: NDArray[np.float32]) -> NDArray[np.float64]:
-    """Rotation (3, 3) of a unit quaternion."""
-    w, x, y, z = (float(value) for value in wxyz)
-    return np.array([
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ])  # fmt: skip
 
 
 def are_same(one: NDArray[np.float64], other: NDArray[np.float64]) -> bool:

@@ -2,6 +2,7 @@
 
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -10,101 +11,31 @@ from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
 
 
-class PretendServer:
-    """viser's server as far as `open_page` needs it: connects and disconnects clients."""
-
-    def __init__(self) -> None:
-        nothing = SimpleNamespace(
-            set_panel_label=lambda *_: None,
-            configure_theme=lambda **_: None,
-            main_panel=SimpleNamespace(dock_right=lambda: None, set_width=lambda _: None),
-        )
-        self.gui = nothing
-        self.scene = SimpleNamespace(world_axes=SimpleNamespace(visible=True))
-        self.clients: dict[int, Any] = {}
-
-    def on_client_connect(self, call: Any) -> None:  # noqa: ANN401 - a callback
-        self.connect = call
-
-    def on_client_disconnect(self, call: Any) -> None:  # noqa: ANN401 - a callback
-        self.disconnect = call
-
-    def get_clients(self) -> dict[int, Any]:
-        return dict(self.clients)
-
-
-class PretendSite:
-    """A site whose workers work at once."""
-
-    def __init__(self) -> None:
-        self.server = PretendServer()
-        self.title = "a scene"
-        self.browsers: dict[int, Any] = {}
-        self.numbers: set[int] = set()
-        self.forgotten: list[object] = []
-        self.view = SimpleNamespace(contents=SimpleNamespace(leave=self.forgotten.append))
-        self.workers = SimpleNamespace(submit=lambda work, client: work(client))
-
-    def begin(self) -> None:
-        pass
-
-    def leave(self, client: int) -> None:
-        if client in self.browsers:
-            self.browsers.pop(client).close()
-
-    def take_number(self) -> int:
-        self.numbers.add(len(self.numbers))
-        return len(self.numbers) - 1
-
-    def free_number(self, number: int) -> None:
-        self.numbers.discard(number)
-
-
-@pytest.fixture
-def site(monkeypatch: pytest.MonkeyPatch) -> PretendSite:
-    made = PretendSite()
-
-    class PretendBrowser:
-        def __init__(self, site: PretendSite, client: Any, visitor: Visitor, number: int) -> None:  # noqa: ANN401
-            self.site, self.client, self.number = site, client, number
-            if visitor.name == "leaves":
-                site.server.clients.clear()
-                site.server.disconnect(client)
-            if visitor.name == "breaks":
-                raise OSError("no room")
-
-        def close(self) -> None:
-            self.site.free_number(self.number)
-
-    monkeypatch.setattr(process, "TabbedBrowser", PretendBrowser)
-    return made
-
-
-def connect(site: PretendSite, name: str) -> None:
-    client = SimpleNamespace(client_id=7)
-    process.open_page(site, lambda _: Visitor(name, "viewer"))  # type: ignore[arg-type]
-    site.server.clients[7] = client
-    site.server.connect(client)
-
-
-def test_a_browser_that_stays_is_known_until_it_leaves(site: PretendSite) -> None:
-    connect(site, "stays")
-    assert list(site.browsers) == [7]
-    assert site.numbers == {0}
-    site.server.disconnect(site.server.clients.pop(7))
-    assert not site.browsers
-    assert not site.numbers
-
-
+@pytest.mark.parametrize("fails", [False, True])
 def test_a_browser_that_leaves_or_fails_while_its_panels_are_made_leaves_nothing(
-    site: PretendSite,
+    fails: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    connect(site, "leaves")
-    with pytest.raises(OSError, match="no room"):
-        connect(site, "breaks")
-    assert not site.browsers
-    assert not site.numbers
-    assert site.forgotten == [7]
+    site, client = MagicMock(browsers={}), SimpleNamespace(client_id=7)
+    connected = site.server.on_client_connect
+    site.server.get_clients.return_value = {}  # it has gone when the panels are made
+
+    def made(*_: object) -> Any:  # noqa: ANN401 - in place of a TabbedBrowser
+        if fails:
+            raise OSError("no room")
+        return MagicMock()
+
+    monkeypatch.setattr(process, "TabbedBrowser", made)
+    process.open_page(site, lambda _: Visitor("Ada", "viewer"))
+    (connect,) = connected.call_args.args
+    if fails:
+        with pytest.raises(OSError, match="no room"):
+            connect(client)
+        site.free_number.assert_called_once_with(site.take_number())
+        site.view.contents.leave.assert_called_once_with(7)
+        assert not site.browsers
+    else:
+        connect(client)
+        site.workers.submit.assert_called_once_with(site.leave, 7)
 
 
 @pytest.mark.parametrize(

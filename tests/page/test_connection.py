@@ -3,12 +3,13 @@
 import json
 import socket
 from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
 
 import pytest
 import viser
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.typing import Subprotocol
+from websockets.sync.client import ClientConnection, connect
 
 from children import until
 from hapticdb.page.connection import (
@@ -20,27 +21,46 @@ from hapticdb.page.connection import (
     Visitor,
     announcement,
 )
-from serving import CAMERA, close_code, sent
+from serving import CAMERA, PROTOCOL, close_code, sent
 
-PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
+
+class Page(NamedTuple):
+    """Our end of the page's socket, the page's end, and viser's server."""
+
+    ours: socket.socket
+    link: PageConnection
+    server: viser.ViserServer
+
+    @property
+    def address(self) -> str:
+        return f"ws://127.0.0.1:{self.server.get_port()}"
 
 
 @pytest.fixture
-def page() -> Iterator[tuple[socket.socket, PageConnection, viser.ViserServer]]:
+def page() -> Iterator[Page]:
     ours, theirs = socket.socketpair()
     ours.settimeout(20.0)
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     link = PageConnection(theirs.detach())
     link.guard(server)
-    yield ours, link, server
+    yield Page(ours, link, server)
     server.stop()
     ours.close()
 
 
-def bound() -> socket.socket:
-    found = socket.socket()
-    found.bind(("127.0.0.1", 0))
-    return found
+@contextmanager
+def entered(page: Page, role: str) -> Iterator[ClientConnection]:
+    """A browser that was announced and is connected."""
+    sock = socket.socket()
+    sock.bind(("127.0.0.1", 0))
+    port = sock.getsockname()[1]
+    page.ours.sendall(announcement(port, "Guest 1", role))
+    assert said(page.ours) == {"word": "expected", "port": port}
+    sock.connect(("127.0.0.1", page.server.get_port()))
+    with connect(page.address, sock=sock, subprotocols=PROTOCOL) as browser:
+        assert said(page.ours) == {"word": "connected", "port": port}
+        yield browser
+    assert said(page.ours)["word"] == "closed"
 
 
 def said(ours: socket.socket) -> dict[str, object]:
@@ -51,23 +71,11 @@ def said(ours: socket.socket) -> dict[str, object]:
     return found
 
 
-def test_an_announced_browser_is_let_in_under_its_name(
-    page: tuple[socket.socket, PageConnection, viser.ViserServer],
-) -> None:
-    ours, link, server = page
-    sock = bound()
-    port = sock.getsockname()[1]
-    ours.sendall(announcement(port, "Guest 1", "toucher"))
-    assert said(ours) == {"word": "expected", "port": port}
-    sock.connect(("127.0.0.1", server.get_port()))
-    with connect(
-        f"ws://127.0.0.1:{server.get_port()}", sock=sock, subprotocols=PROTOCOL
-    ) as socket_:
-        assert said(ours) == {"word": "connected", "port": port}
-        assert socket_.recv(timeout=20.0)
-        assert link.announced(0) == Visitor("Guest 1", "toucher")
-    assert said(ours)["word"] == "closed"
-    until(lambda: _is_gone(link))
+def test_an_announced_browser_is_let_in_under_its_name(page: Page) -> None:
+    with entered(page, "toucher") as browser:
+        assert browser.recv(timeout=20.0)
+        assert page.link.announced(0) == Visitor("Guest 1", "toucher")
+    until(lambda: _is_gone(page.link))
 
 
 def _is_gone(link: PageConnection) -> bool:
@@ -78,47 +86,34 @@ def _is_gone(link: PageConnection) -> bool:
     return False
 
 
-def test_whoever_was_not_announced_is_sent_away_with_nothing(
-    page: tuple[socket.socket, PageConnection, viser.ViserServer],
-) -> None:
-    ours, _, server = page
-    server.scene.add_label("/secret", "secret")
-    ours.sendall(announcement(1, "Guest 1", "editor"))
-    assert said(ours)["word"] == "expected"
+def test_whoever_was_not_announced_is_sent_away_with_nothing(page: Page) -> None:
+    page.server.scene.add_label("/secret", "secret")
+    page.ours.sendall(announcement(1, "Guest 1", "editor"))
+    assert said(page.ours)["word"] == "expected"
     for _ in range(3):
-        address = f"ws://127.0.0.1:{server.get_port()}"
-        with connect(address, subprotocols=PROTOCOL) as browser:
+        with connect(page.address, subprotocols=PROTOCOL) as browser:
             with pytest.raises(ConnectionClosed) as closed:
                 browser.recv(timeout=20.0)
             assert closed.value.rcvd is not None
             assert closed.value.rcvd.code == LATE
-        assert said(ours)["word"] == "refused"
-    assert server.get_clients() == {}
+        assert said(page.ours)["word"] == "refused"
+    assert page.server.get_clients() == {}
 
 
-def test_a_port_is_good_for_one_connection(
-    page: tuple[socket.socket, PageConnection, viser.ViserServer],
-) -> None:
-    ours, _, server = page
-    sock = bound()
-    port = sock.getsockname()[1]
-    ours.sendall(announcement(port, "Guest 1", "viewer"))
-    said(ours)
-    address = f"ws://127.0.0.1:{server.get_port()}"
-    sock.connect(("127.0.0.1", server.get_port()))
-    with connect(address, sock=sock, subprotocols=PROTOCOL) as first:
+def test_a_port_is_good_for_one_connection(page: Page) -> None:
+    with entered(page, "viewer") as first:
         assert first.recv(timeout=20.0)
-        with connect(address, subprotocols=PROTOCOL) as second, pytest.raises(ConnectionClosed):
+        second = connect(page.address, subprotocols=PROTOCOL)
+        with second, pytest.raises(ConnectionClosed):
             second.recv(timeout=20.0)
+        assert said(page.ours)["word"] == "refused"
 
 
 def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
-    page: tuple[socket.socket, PageConnection, viser.ViserServer],
-    caplog: pytest.LogCaptureFixture,
-    capfd: pytest.CaptureFixture[str],
+    page: Page, caplog: pytest.LogCaptureFixture, capfd: pytest.CaptureFixture[str]
 ) -> None:
     """Asyncio would write a traceback for each of them."""
-    ours, _, server = page
+    server = page.server
     slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
     vector = server.gui.add_vector3("vector", (0.0, 0.0, 0.0))
     server.scene.on_click()(lambda _: None)
@@ -135,22 +130,14 @@ def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
         update | {"uuid": vector._impl.uuid, "updates": {"value": ["a", "b", "c"]}},
     ]
     for _ in range(2):
-        sock = bound()
-        port = sock.getsockname()[1]
-        ours.sendall(announcement(port, "Guest 1", "viewer"))
-        assert said(ours)["word"] == "expected"
-        address = f"ws://127.0.0.1:{server.get_port()}"
-        sock.connect(("127.0.0.1", server.get_port()))
         caplog.clear()
-        with connect(address, sock=sock, subprotocols=PROTOCOL) as browser:
-            assert said(ours)["word"] == "connected"
+        with entered(page, "viewer") as browser:
             sent(browser, CAMERA)
             until(lambda: bool(server.get_clients()))
             for number in range(MOST_FAILED):
                 sent(browser, wrong[number % len(wrong)])
             sent(browser, update | {"updates": {"value": 0.7}})
             assert close_code(browser) == BREAKS_RULES
-        assert said(ours)["word"] == "closed"
         until(lambda: not server.get_clients())
         lines = [record.getMessage() for record in caplog.records if record.name != "websockets"]
         assert len(lines) == MOST_FAILED

@@ -1,8 +1,6 @@
 """People edit on the page: who comes second is told, and nothing is lost."""
 
 import threading
-from dataclasses import replace
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -70,9 +68,7 @@ def test_two_people_who_move_one_part(sample: str) -> None:
         edits.close()
 
 
-@pytest.mark.parametrize("tries_again", [False, True])
-def test_an_undo_after_another_persons_move_leaves_it(sample: str, tries_again: bool) -> None:
-    """Whether the first is told of the conflict, or sees the other's move and goes on from it."""
+def test_an_undo_after_another_persons_move_leaves_it(sample: str) -> None:
     edits = Edits(sample, EVERYWHERE)
     up = np.eye(4)
     up[2, 3] = 0.002
@@ -81,13 +77,8 @@ def test_an_undo_after_another_persons_move_leaves_it(sample: str, tries_again: 
             before = env.objects()[0]
             mine = done(edits, 0, lambda own: own.move(before, up))
             theirs = done(edits, 1, lambda own: own.move(mine, up))
-            seen = theirs if tries_again else mine
-            found = done(edits, 0, lambda own: own.move(seen, up))
-            assert isinstance(found, Object if tries_again else ConflictError)
-            if tries_again:
-                done(edits, 0, lambda own: own.undo())
-            refused = done(edits, 0, lambda own: own.undo())
-            assert str(refused).startswith("there is nothing" if tries_again else "cannot undo")
+            assert isinstance(done(edits, 0, lambda own: own.move(mine, up)), ConflictError)
+            assert "cannot undo" in str(done(edits, 0, lambda own: own.undo()))
             now = env.object(before.id)
             assert np.array_equal(now.transform, theirs.transform)
             done(edits, 1, lambda own: own.move(now, np.linalg.inv(up @ up)))
@@ -123,18 +114,3 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
     assert [str(answer) for answer in answers[1:]] == ["there is nothing to undo"] * 2
     assert len(opened) == 2
     assert len(set(opened)) == 1
-
-
-def test_an_error_does_not_tell_where_the_environment_is(sample: str, tmp_path: Path) -> None:
-    edits = Edits(sample, EVERYWHERE)
-    try:
-        with hapticdb.open(sample, read_only=True) as env:
-            gone = replace(env.objects()[0], id=999)
-        found = done(edits, 0, lambda own: own.take_out(gone))
-    finally:
-        edits.close()
-    nowhere = done(Edits(str(tmp_path / "none.db"), EVERYWHERE), 0, lambda own: own.undo())
-    for error in (found, nowhere):
-        assert isinstance(error, HapticDBError)
-        assert str(Path(sample).parent) not in str(error)
-        assert str(tmp_path) not in str(error)

@@ -6,7 +6,7 @@ import trimesh
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb.page.scene.facets import Blocks, Facets, block_facets, coarsened, cube, sharpened
+from hapticdb.page.scene.facets import Blocks, Facets, block_facets, coarsened, sharpened
 
 
 def facets_of(mesh: trimesh.Trimesh) -> Facets:
@@ -21,18 +21,6 @@ def test_splitting_keeps_every_triangle_in_its_place(seed: int, n_faces: int) ->
     after = sharpened(before)
     assert np.array_equal(after.triangles, before.triangles)
     assert len(after.vertices) <= 3 * n_faces
-
-
-def test_a_cube_has_only_sharp_edges_and_a_ball_has_none() -> None:
-    ball = facets_of(trimesh.creation.icosphere(3))
-    assert len(sharpened(cube()).vertices) == 24
-    assert len(sharpened(ball).vertices) == len(ball.vertices)
-
-
-def test_a_file_without_shared_vertices_is_smooth_as_well() -> None:
-    ball = facets_of(trimesh.creation.icosphere(3))
-    loose = Facets(ball.triangles.reshape(-1, 3), np.arange(3 * len(ball.faces)).reshape(-1, 3))
-    assert len(sharpened(loose).vertices) == len(ball.vertices)
 
 
 def test_a_cylinder_is_sharp_at_its_rims_alone() -> None:

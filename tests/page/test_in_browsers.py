@@ -217,36 +217,6 @@ def test_one_feels_a_part_until_another_moves_it_away(
         picture(ben, "6-ben-sweeps", tmp_path)
 
 
-def test_a_page_that_is_closed_in_a_drag_moves_nothing(
-    server: Running, aim: Aim, car: Path, tmp_path: Path
-) -> None:
-    facts = aim.facts
-    links = {role: f"{server.address}?token={token}" for token, role in TOKENS.items()}
-    with chromium() as browser, hapticdb.open(car, read_only=True) as env:
-        revision = env.store.revision()
-        ada = opened(new_page(browser, links[Role.TOUCHER]))
-        ben = opened(new_page(browser, links[Role.EDITOR]))
-        eye = Eye(ada, aim.framing, aim.up)
-        ben.get_by_role("tab", name="Parts").click()
-        ben.mouse.click(*eye.pixel(aim.seen))
-        ben.get_by_text(str(aim.id), exact=True).wait_for()
-        ben.get_by_text("Move", exact=True).click()
-        ben.get_by_label("Move the chosen part").check()
-        ben.wait_for_timeout(1000)
-        spot, before = eye.pixel(aim.seen), picture(ada, "10-ada-before", tmp_path)
-
-        def change() -> float:
-            now = picture(ada, "11-ada-sees", tmp_path)
-            return float(np.abs(around(now, spot) - around(before, spot)).mean())
-
-        arrow = facts.up * (GRABBED * MOVING_GIZMO * facts.diagonal)
-        drag(ben, eye, aim.middle + arrow, facts.up * (0.2 * facts.diagonal), lets_go=False)
-        until(lambda: change() > 8.0, "the part is seen on its way", ada)
-        ben.close()
-        until(lambda: change() < 2.0, "the part is back", ada)
-        assert env.store.revision() == revision
-
-
 def type_place(page: Page, place: Floats) -> None:
     """Type the hand's place into its opened folder."""
     for entry, value in zip(hand_fields(page), place, strict=True):

@@ -1,11 +1,9 @@
-import re
-
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
 from hapticdb.errors import ProtocolError
-from hapticdb.protocol.header import CloseCode, Kind, MessageHeader, header_of
+from hapticdb.protocol.header import Kind, MessageHeader, header_of
 from sources import ROOT
 
 PAGE = (ROOT / "docs/protocol.md").read_text()
@@ -35,10 +33,3 @@ def test_a_header_has_the_bytes_that_the_page_gives() -> None:
 def test_what_is_no_header_is_refused(message: bytes, words: str) -> None:
     with pytest.raises(ProtocolError, match=words):
         header_of(message)
-
-
-def test_the_page_lists_all_kinds_and_close_codes() -> None:
-    for kind in Kind:
-        assert f"{kind.name} (kind {kind.value})" in PAGE
-    for code in CloseCode:
-        assert re.search(rf"^\| {code.value} \| ", PAGE, re.MULTILINE)

@@ -30,7 +30,7 @@ def distance_to_triangle(points: Array, triangle: Array) -> Array:
         [distance_to_segments(points, *edge) for edge in ((a, b), (b, c), (c, a))]
     )
     normal = np.cross(b - a, c - a)
-    if normal @ normal == 0.0:
+    if np.linalg.norm(normal) <= 1e-9 * max((b - a) @ (b - a), (c - a) @ (c - a)):
         return found
     normal = normal / np.linalg.norm(normal)
     sides = [np.cross(q - p, points - p) @ normal for p, q in ((a, b), (b, c), (c, a))]

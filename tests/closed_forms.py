@@ -55,12 +55,6 @@ def plate(normal: ArrayLike, thickness: float) -> Distance:
     return lambda p: np.abs(np.abs(p @ unit) - thickness / 2.0)
 
 
-def box(half: ArrayLike) -> Distance:
-    """Distance to a full box about the origin with those half sides."""
-    sides = np.asarray(half, float)
-    return lambda p: np.linalg.norm(np.maximum(np.abs(p) - sides, 0.0), axis=1)
-
-
 def wedge(angle: float) -> Distance:
     """Distance to a full convex edge along y: its faces fall by `angle` / 2 from the top, radians.
 
@@ -86,11 +80,6 @@ def corner() -> Distance:
 def cylinder(radius: float) -> Distance:
     """Distance to a full cylinder along y."""
     return lambda p: np.maximum(np.hypot(p[:, 0], p[:, 2]) - radius, 0.0)
-
-
-def sphere(radius: float) -> Distance:
-    """Distance to a full sphere about the origin."""
-    return lambda p: np.maximum(np.linalg.norm(p, axis=1) - radius, 0.0)
 
 
 def hole(radius: float) -> Distance:

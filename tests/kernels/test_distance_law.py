@@ -264,21 +264,6 @@ def test_nothing_is_felt_beyond_the_proved_distance() -> None:
     assert close < field.REACH
 
 
-@few
-@given(seed=st.integers(0, 2**32 - 1))
-def test_a_point_that_counts_is_near_a_voxel(seed: int) -> None:
-    scene = merged()
-    rng = np.random.default_rng(seed)
-    voxels = np.array(list(scene.ids_in))
-    for _ in range(20):
-        where = voxels[rng.integers(len(voxels))] + rng.uniform(-5, 6, 3)
-        x, y, z = where.tolist()
-        gaps = np.maximum(np.maximum(voxels - where, where - voxels - 1), 0.0)
-        away = float(np.linalg.norm(gaps, axis=1).min())
-        if away >= field.FELT_WITHIN:
-            assert distance_at((x, y, z), scene.fields.values()) > field.REACH
-
-
 # --- closed forms (physics.md) -------------------------------------------------------------------
 
 PLANE_AT = 20.0

@@ -7,7 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from bands import band_of
+from bands import band_of, distance_to_triangle
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, VOXELS_A_STEP
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.surfaces import distances
@@ -44,31 +44,6 @@ def random_triangles(seed: int, kind: str, n: int, edge: float) -> Floats:
     return corners[:, rng.permutation(3)]
 
 
-def segment_distances(points: Floats, a: Floats, b: Floats) -> Floats:
-    """Distance of points (P, 3) to the segment from a to b."""
-    along = b - a
-    square = along @ along
-    t = np.clip((points - a) @ along / square, 0.0, 1.0) if square > 0 else np.zeros(len(points))
-    return np.asarray(np.linalg.norm(points - a - t[:, None] * along, axis=1))
-
-
-def brute_force(points: Floats, triangles: Floats) -> Floats:
-    """Distance of points (P, 3) to the nearest triangle: its edges, or its plane where over it."""
-    best = np.full(len(points), np.inf)
-    for a, b, c in triangles:
-        for p, q in ((a, b), (b, c), (c, a)):
-            best = np.minimum(best, segment_distances(points, p, q))
-        normal = np.cross(b - a, c - a)
-        length = np.linalg.norm(normal)
-        if length <= 1e-9 * max((b - a) @ (b - a), (c - a) @ (c - a)):
-            continue
-        normal /= length
-        sides = [np.cross(normal, q - p) @ (points - p).T for p, q in ((a, b), (b, c), (c, a))]
-        height = np.abs((points - a) @ normal)
-        best = np.where(np.min(sides, axis=0) >= 0, np.minimum(best, height), best)
-    return np.asarray(best)
-
-
 def centres_of(brick: tuple[int, int, int]) -> Floats:
     """Centres (1000, 3) of a brick's row, voxels from the grid's origin."""
     axis = np.arange(-1, 9) + 0.5
@@ -78,14 +53,15 @@ def centres_of(brick: tuple[int, int, int]) -> Floats:
 
 def check_against_brute_force(triangles: Floats, bits: int) -> None:
     """Every brick of the grid: right to half a step, and a row where there is a distance."""
-    corners = np.broadcast_to(triangles, (len(triangles), 3, 3))
+    corners = np.broadcast_to(triangles, (len(triangles), 3, 3))  # points become triangles, too
     keys, data, ends = band_of(triangles, bits)
     rows = dict(zip(keys.tolist(), unpack(data, ends), strict=True))
     assert keys.tolist() == sorted(rows)
     side = max(1 << bits >> 3, 1)
     n_found = 0
     for brick in np.ndindex(side, side, side):
-        truth = brute_force(centres_of(brick), corners)
+        centres = centres_of(brick)
+        truth = np.min([distance_to_triangle(centres, one) for one in corners], axis=0)
         row = rows.get(z_order(*brick))
         if row is None:
             assert truth.min() > HALF_WIDTH - 1e-7

@@ -1,18 +1,14 @@
-"""The hand of a hosted session between arrivals, and memory at addresses."""
+"""The hand of a hosted session between arrivals."""
 
 import math
-import time
 
 import numpy as np
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
-from numpy.typing import NDArray
 
-from hapticdb.kernels.hosting.clock import now_ns, sleep_ns
 from hapticdb.kernels.hosting.following import LONGEST_GAP_NS, STRETCH, follow_hand
-from hapticdb.kernels.hosting.memory import array_at
-from hapticdb.kernels.records import HAND, PACE, SEAT, STATION
+from hapticdb.kernels.records import HAND, SEAT, STATION
 
 MS = 1_000_000
 """Nanoseconds of a millisecond."""
@@ -93,23 +89,3 @@ def test_a_pose_that_is_being_written_is_taken_later() -> None:
     hand.seat.hand_sequence += 1
     hand.at(1100 * MS)
     assert hand.at(1200 * MS) == pytest.approx(0.01)
-
-
-def test_an_array_at_an_address_is_the_same_memory() -> None:
-    numbers: NDArray[np.float64] = np.arange(12.0)
-    view = array_at(numbers.ctypes.data, (3, 4), np.float64)  # type: ignore[no-untyped-call]
-    view[2, 3] = 100.0
-    assert numbers[-1] == 100.0
-    pace = np.zeros((), PACE)
-    array_at(pace.ctypes.data, (), PACE)["periods"] = 7  # type: ignore[no-untyped-call]
-    assert pace["periods"] == 7
-
-
-def test_the_clock_is_the_systems_and_a_sleep_takes_its_time() -> None:
-    moment = np.zeros(4, dtype=np.int64)
-    before = time.monotonic_ns()
-    begun = now_ns(moment)  # type: ignore[no-untyped-call]
-    sleep_ns(moment, 2 * MS)  # type: ignore[no-untyped-call]
-    ended = now_ns(moment)  # type: ignore[no-untyped-call]
-    assert before <= begun <= ended - 2 * MS
-    assert ended <= time.monotonic_ns()

@@ -16,7 +16,7 @@ from hapticdb.kernels.surfaces.voxelize import (
     voxelize,
     voxelize_pieces,
 )
-from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles, z_order
+from naive import Voxel, bricks_of_voxels, voxels_of_points, voxels_of_triangles
 
 JIT = not numba.config.DISABLE_JIT
 few = settings(max_examples=150 if JIT else 20, deadline=None)
@@ -207,16 +207,6 @@ def test_order_and_split_of_the_triangles_do_not_matter() -> None:
 
 
 @few
-@given(triangles, st.tuples(*[st.integers(0, 2**21 - 24)] * 3))
-def test_a_shift_by_whole_voxels_shifts_the_voxels(
-    tris: Triangles, shift: tuple[int, int, int]
-) -> None:
-    tris = tris + 4  # away from the lower border
-    shifted = voxels(tris + np.array(shift, np.float64), 21)
-    assert shifted == {(i + shift[0], j + shift[1], k + shift[2]) for i, j, k in voxels(tris, 5)}
-
-
-@few
 @given(st.integers(0, 2**32 - 1), st.sampled_from([0.01, 0.4, 3.0]))
 def test_random_triangles_at_the_far_end_of_the_largest_grid_equal_the_oracle(
     seed: int, size: float
@@ -228,14 +218,6 @@ def test_random_triangles_at_the_far_end_of_the_largest_grid_equal_the_oracle(
 
 
 # --- sizes --------------------------------------------------------------------------------------
-
-
-def test_memory_follows_the_surface_and_not_the_grid() -> None:
-    far = 2.0**21 - 2
-    tris = np.array([np.full((3, 3), 1.5), np.full((3, 3), far + 0.5)])
-    keys, occupancy = voxelize(tris, 21)
-    assert keys.tolist() == [0, z_order(2**18 - 1, 2**18 - 1, 2**18 - 1)]
-    assert count_voxels(occupancy) == 2
 
 
 @pytest.mark.parametrize("axis", range(3))

@@ -15,7 +15,6 @@ import hapticdb
 from extraction_scenes import box, imported, joined
 from hapticdb import Grid, PointShell
 from hapticdb.cli.csv_files import rows_of_sweep
-from hapticdb.kernels.surfaces import nearest, sides
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.sweeps.depths import MOST_LOOKS, DepthSearch
 from hapticdb.sweeps.path import SweepPath
@@ -228,23 +227,3 @@ def depth_of(shell: PointShell, path: SweepPath, made: trimesh.Trimesh) -> Conta
     search = DepthSearch(path, len(path), SIZE, 0.005)
     named = voxel_object(Grid(SIZE, (0.0, 0.0, 0.0), 7), np.zeros((1, 3), dtype=np.int64))
     return search.along(named, Solid(shell.surface, SIZE), other, MOST_LOOKS)
-
-
-@given(corners=st.tuples(vectors, vectors, vectors), place=vectors)
-def test_the_distance_to_a_triangle_is_that_to_its_nearest_place(
-    corners: tuple[Floats, Floats, Floats], place: Floats
-) -> None:
-    triangle = np.stack(corners)
-    tree = sides.triangle_tree(triangle[None], np.zeros(1, dtype=np.int64))
-    exact = float(nearest.distances_to(tree, place[None])[0])
-    u, v = (x.ravel() for x in np.meshgrid(np.linspace(0, 1, 60), np.linspace(0, 1, 60)))
-    kept = u + v <= 1.0 + 1e-12
-    places = (
-        corners[0]
-        + u[kept, None] * (corners[1] - corners[0])
-        + v[kept, None] * (corners[2] - corners[0])
-    )
-    sampled = float(np.linalg.norm(places - place, axis=1).min())
-    longest = max(float(np.linalg.norm(a - b)) for a in corners for b in corners)
-    assert exact <= sampled + 1e-9
-    assert sampled <= exact + longest / 59.0 + 1e-9

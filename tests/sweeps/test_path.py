@@ -181,13 +181,3 @@ def test_reaches_bound_the_way_to_a_place_and_around_it(
     closest = path.motion[m] / counts[m] * half / SIZE
     assert around[0] >= closest
     assert spent[0] * SIZE <= path.motion.sum() + (path.slack * len(path)) * SIZE + 1e-6
-
-
-def test_straight_and_turning_motion_is_bounded_without_slack() -> None:
-    for move in ((0.2, (1, 2, 0), 0.0, (0, 0, 1)), (0.0, (1, 0, 0), 2.0, (0, 0, 1))):
-        path = SweepPath.of(path_poses([move], 3, np.zeros(3)), BALL, SIZE)
-        place = 0.5 * (len(path) - 1)
-        spent, around = path.reaches(np.array([place]), np.array([0.5]))
-        assert spent[0] * SIZE == pytest.approx(0.5 * path.motion[0], rel=1e-3)
-        assert around[0] * SIZE == pytest.approx(0.5 * path.motion[0] / (len(path) - 1), rel=1e-3)
-        assert around[0] > 0.24 * (1.0 - 1.0 / len(path))

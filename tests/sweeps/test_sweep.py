@@ -169,13 +169,6 @@ def test_fractions_go_by_the_way_and_not_by_the_number_of_poses() -> None:
     assert path.segments([0, int(path.starts[1]), len(path) - 1]).tolist() == [0, 1, 1]
 
 
-def test_a_path_of_one_pose_is_one_sample(env: Environment) -> None:
-    found = sweep(env, ball(), line((0, 0, 0)))
-    assert (found.samples, found.hits) == (1, 0)
-    assert found.clearance is not None
-    assert found.clearance.distance == pytest.approx(naive_clearance(ball(), line((0, 0, 0))))
-
-
 # --- hits ----------------------------------------------------------------------------------------
 
 PATHS = st.lists(
@@ -223,22 +216,6 @@ def test_hits_contacts_and_objects_are_those_of_every_sample(
         assert one.deepest == max(depths)
         points = [sum(j == i for _, j in frame.pairs) for frame in frames]
         assert one.points == max(points)
-
-
-def test_a_voxel_of_two_objects_is_hit_for_both(env: Environment) -> None:
-    shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3))
-    shared = env.grid.centers([[81, 51, 51]])[0]
-    found = sweep(env, shell, [pose_of(shared)])
-    assert [one.object.name for one in found.objects] == ["wall", "post"]
-    assert found.first_hit is not None
-    assert [obj.name for obj in found.first_hit.objects] == ["wall", "post"]
-
-
-def test_an_object_in_the_same_brick_is_not_hit(env: Environment) -> None:
-    shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3))
-    wall_only = env.grid.centers([[81, 49, 51]])[0]
-    found = sweep(env, shell, [pose_of(wall_only)])
-    assert [one.object.name for one in found.objects] == ["wall"]
 
 
 def test_hits_near_one_another_are_one_interval(env: Environment) -> None:

@@ -7,6 +7,7 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
+from hapticdb import Extraction, extract
 
 Floats = NDArray[np.float64]
 
@@ -33,6 +34,22 @@ def imported(folder: Path, size: float = SIZE, **parts: trimesh.Trimesh) -> Path
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(voxel_size=size))
     hapticdb.import_files(folder / "parts.db", [folder / "parts.glb"], options)
     return folder / "parts.db"
+
+
+def found_in(url: Path, part: str, **options: float) -> Extraction:
+    """The way out of a part."""
+    with hapticdb.open(url, read_only=True) as env:
+        return extract(env, part, **{"seconds": 500.0, **options})  # type: ignore[arg-type]
+
+
+def is_out(found: Extraction, url: Path) -> bool:
+    """Whether the part's box has left the box of all else at the end of the path."""
+    assert found.way is not None
+    with hapticdb.open(url, read_only=True) as env:
+        others = np.array([o.bounds for o in env.objects() if o.id != found.parts[0].id])
+    placed = found.shell.points @ found.way.poses[-1][:3, :3].T + found.way.poses[-1][:3, 3]
+    low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
+    return bool((placed.min(axis=0) > high).any() or (placed.max(axis=0) < low).any())
 
 
 def walls(

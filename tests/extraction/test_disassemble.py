@@ -5,8 +5,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 import hapticdb
 from disassembly_scenes import (
@@ -20,13 +18,8 @@ from disassembly_scenes import (
 )
 from extraction_scenes import corner, lid
 from hapticdb import Disassembly, disassemble
-from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
-from hapticdb.extraction.directions import AGAINST
-from hapticdb.extraction.disassembly.run import opposed
+from hapticdb.errors import MissingExtraError
 from hapticdb.extraction.verdict import disassembly_line, failed_line
-
-numbers = st.floats(-1.0, 1.0)
-vectors = st.tuples(numbers, numbers, numbers).filter(lambda v: sum(x * x for x in v) > 0.01)
 
 
 def found_in(url: Path, *parts: str, motions: int = 0, **options: Any) -> Disassembly:  # noqa: ANN401
@@ -136,17 +129,6 @@ def test_without_a_planner_straight_orders_are_found(
         found_in(made(tmp_path / "chain", CHAIN), "left", motions=100)
 
 
-def test_wrong_arguments_are_refused(tmp_path: Path) -> None:
-    url = made(tmp_path, CHAIN)
-    with pytest.raises(ObjectNotFoundError, match="no object 'nut'"):
-        found_in(url, "nut")
-    for options in ({"seconds": 0.0}, {"depth": -1}, {"seed": -1}, {"out": 0.0}):
-        with pytest.raises(UsageError, match="give"):
-            found_in(url, "left", **options)
-    with pytest.raises(UsageError, match="nothing stands"):
-        found_in(url, "*")
-
-
 @pytest.mark.long
 def test_a_path_through_what_holds_is_no_step(tmp_path: Path) -> None:
     """A small bolt's head is a tenth of the contacts: the pull alone would cut through it."""
@@ -154,18 +136,3 @@ def test_a_path_through_what_holds_is_no_step(tmp_path: Path) -> None:
     assert order(found) == ["bolt", "plate"]
     assert (found.verdict, len(found.failed)) == ("comes out", 1)
     assert [one.object.name for one in found.failed[0].blockers][:1] == ["bolt"]
-
-
-@given(vectors, vectors, vectors)
-def test_a_contact_presses_if_it_moves_into_what_it_touches(
-    point: tuple[float, float, float],
-    normal: tuple[float, float, float],
-    move: tuple[float, float, float],
-) -> None:
-    n, m = np.array(normal), np.array(move)
-    n /= np.linalg.norm(n)
-    pose = np.eye(4)
-    pose[:3, 3] = m
-    cosine = float(n @ m) / float(np.linalg.norm(m))
-    if abs(cosine - AGAINST) > 1e-6:
-        assert bool(opposed(np.array([point]), n[None], pose)[0]) == (cosine < AGAINST)

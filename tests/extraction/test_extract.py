@@ -15,35 +15,22 @@ from extraction_scenes import (
     corner,
     drawer,
     enclosed,
+    found_in,
     imported,
+    is_out,
     lid,
+    room_with_a_door,
     studded,
     walls,
 )
-from hapticdb import Extraction, extract
+from hapticdb import extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
-from hapticdb.extraction.directions import candidate_directions, opposed_shares
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
+from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import problem_of
 from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
-
-
-def found_in(url: Path, part: str, **options: float) -> Extraction:
-    with hapticdb.open(url, read_only=True) as env:
-        return extract(env, part, **options)  # type: ignore[arg-type]
-
-
-def is_out(found: Extraction, url: Path) -> bool:
-    """Whether the part's box has left the box of all else at the end of the path."""
-    assert found.way is not None
-    with hapticdb.open(url, read_only=True) as env:
-        others = np.array([o.bounds for o in env.objects() if o.id != found.parts[0].id])
-    placed = found.shell.points @ found.way.poses[-1][:3, :3].T + found.way.poses[-1][:3, 3]
-    low, high = others[:, 0].min(axis=0), others[:, 1].max(axis=0)
-    return bool((placed.min(axis=0) > high).any() or (placed.max(axis=0) < low).any())
-
 
 # --- straight pulls ------------------------------------------------------------------------------
 
@@ -113,6 +100,21 @@ def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:
     assert way[1] > 0.9 * np.linalg.norm(way)
     assert is_out(found, url)
     assert [(one.object.name, one.pulls > 0) for one in found.blockers] == [("shaft", True)]
+
+
+def test_a_block_leaves_a_room_by_its_door_without_a_planner(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """By straight legs along the axes."""
+    monkeypatch.delattr(Planner, "_ask")
+    found = found_in(room_with_a_door(tmp_path), "block")
+    assert (found.verdict, found.is_planned) == ("comes out", True)
+    assert found.way is not None
+    up, along, out = np.diff(found.way.poses[:, :3, 3], axis=0)
+    assert up[2] > 0.02
+    assert (along != 0.0).tolist() == [True, False, False]
+    assert 0.27 < up[0] + along[0] < 0.37  # the block is 0.06 m wide, the door 0.14 m
+    assert out[1] > 0.1
 
 
 # --- the planner ---------------------------------------------------------------------------------
@@ -223,19 +225,3 @@ def test_a_part_is_out_at_the_given_distance_and_not_before(
         gap = float((np.abs(middle) - 1.0).max())
         assert (gap >= radius - 1e-9) == is_out_there
         assert bool(leaving.is_out(share * length * direction[None])[0]) == is_out_there
-
-
-@given(st.lists(units, max_size=12), st.integers(0, 100))
-def test_directions_are_unit_distinct_and_the_free_ones_come_first(
-    normals: list[tuple[float, float, float]], seed: int
-) -> None:
-    given_normals = np.array(normals).reshape(-1, 3)
-    given_normals /= np.linalg.norm(given_normals, axis=1, keepdims=True)
-    found = candidate_directions(given_normals, seed)
-    assert np.allclose(np.linalg.norm(found, axis=1), 1.0)
-    assert (found @ found.T - 2.0 * np.eye(len(found)) < 0.999).all()
-    shares = np.round(opposed_shares(found, given_normals), 2)
-    assert (np.diff(shares) >= 0.0).all()
-    assert np.array_equal(found, candidate_directions(given_normals, seed))
-    for axis in np.concatenate([np.eye(3), -np.eye(3)]):
-        assert (found @ axis).max() > 0.99

@@ -79,6 +79,21 @@ MESH_3MF = (
     "</triangles></mesh>"
 )
 
+COLLADA = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
+version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset><library_geometries>
+<geometry id="g" name="leaf"><mesh><source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 1 1 0
+0 1 0</float_array><technique_common><accessor source="#pa" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+<vcount>4 3</vcount><p>0 1 2 3 0 1 2</p></polylist><triangles count="1">
+<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node id="a" name="tree">
+<translate>100 0 0</translate><node id="b" name="branch"><scale>2 2 2</scale>
+<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
+"""A quadrilateral and two triangles in the nodes tree/branch; hundredths of a metre, z up."""
+
 
 def text(path: Path, content: str) -> Path:
     path.write_text(content)

@@ -17,19 +17,10 @@ from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
 from command_line import tool as stl
 from hapticdb.mesh import parse_in_process, read_file
 from hapticdb.store.base import scene_bounds
+from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
 PROJECTED = 'PROJCS["somewhere",GEOGCS["g",UNIT["degree",0.0174532925199433]],UNIT["{}",{}]]'
-COLLADA = """<COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema" version="1.4.1">
-<asset><unit name="metre" meter="1"/><up_axis>{}</up_axis></asset>
-<library_geometries><geometry id="g"><mesh><source id="p"><float_array id="a" count="9">
-0 0 0 1 0 0 0 1 0</float_array><technique_common><accessor source="#a" count="3" stride="3">
-<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
-</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
-</vertices><triangles count="1"><input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p>
-</triangles></mesh></geometry></library_geometries><library_visual_scenes><visual_scene id="s">
-<node name="n"><instance_geometry url="#g"/></node></visual_scene></library_visual_scenes>
-<scene><instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 
 def cloud(path: Path, wkt: str = "") -> Path:
@@ -119,7 +110,7 @@ def test_which_axis_points_up_comes_from_the_file(
     file = tmp_path / name
     mesh = trimesh.creation.box()
     if name.endswith(".dae"):
-        file.write_text(COLLADA.format(said))
+        file.write_text(COLLADA.replace("Z_UP", str(said)))
     elif said is None:
         mesh.export(file)
     else:

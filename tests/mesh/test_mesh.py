@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hapticdb.mesh import UNITS, Defects, parse_in_process
 from hapticdb.mesh.clean import clean
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan
-from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
+from mesh_files import COLLADA, MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
 
 # --- names and placements -------------------------------------------------------------------
 
@@ -133,25 +133,10 @@ def test_nested_components_of_a_3mf_keep_every_instance(tmp_path: Path) -> None:
 
 
 def test_collada_nodes_name_and_place_their_geometry(tmp_path: Path) -> None:
-    path = text(
-        tmp_path / "nodes.dae",
-        """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
-        version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset>
-        <library_geometries><geometry id="g" name="leaf"><mesh><source id="p">
-        <float_array id="pa" count="12">0 0 0 1 0 0 1 1 0 0 1 0</float_array><technique_common>
-        <accessor source="#pa" count="4" stride="3"><param name="X" type="float"/>
-        <param name="Y" type="float"/><param name="Z" type="float"/></accessor></technique_common>
-        </source><vertices id="v"><input semantic="POSITION" source="#p"/></vertices>
-        <polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/>
-        <vcount>4 3</vcount><p>0 1 2 3 0 1 2</p></polylist></mesh></geometry></library_geometries>
-        <library_visual_scenes><visual_scene id="s"><node id="a" name="tree">
-        <translate>100 0 0</translate><node id="b" name="branch"><scale>2 2 2</scale>
-        <instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes>
-        <scene><instance_visual_scene url="#s"/></scene></COLLADA>""",
-    )
+    path = text(tmp_path / "nodes.dae", COLLADA)
     file = parse_in_process(path)
     assert names(file) == ["tree/branch"]
-    assert len(file.parts[0].triangles()) == 3
+    assert len(file.parts[0].triangles()) == 4
     np.testing.assert_allclose(
         file.parts[0].bounds, np.array([[1, 0, 0], [1.02, 0.02, 0]]), rtol=1e-6
     )

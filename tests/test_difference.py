@@ -17,7 +17,6 @@ from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Band, Layout
-from hapticdb.store.sqlite.tables.reading import SQLiteReader
 from hapticdb.testing import KINDS, blob, voxel_object, with_distances
 
 Kind = tuple[Layout, CurveName]
@@ -75,32 +74,6 @@ def test_every_voxel_that_differs_is_counted(
         assert found.compared == 2
 
     counted()
-
-
-@pytest.mark.parametrize("kind", KINDS, ids=str)
-def test_a_large_object_is_compared_in_batches(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, kind: Kind
-) -> None:
-    """One voxel of 80,000 differs, and no statement returns many of them."""
-    span = np.arange(20, 220)
-    sheet = np.stack(np.meshgrid(span, span, [99, 100], indexing="ij"), axis=-1).reshape(-1, 3)
-    for name, ijk in (("a", sheet), ("b", np.delete(sheet, 33_333, axis=0))):
-        with make(tmp_path / f"{name}.db", kind, bits=8) as env:
-            write(env, ijk, "sheet")
-    monkeypatch.setattr(transfer, "MOST_ROWS", 4000)
-    brought: list[int] = []
-    rows_of_object = SQLiteReader.rows_of
-
-    def counting(*asked: object) -> object:
-        rows = rows_of_object(*asked)  # type: ignore[arg-type]
-        brought.append(len(rows))
-        return rows
-
-    monkeypatch.setattr(SQLiteReader, "rows_of", counting)
-    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
-    assert [(v.only_in_a, v.only_in_b) for v in found.voxels] == [(1, 0)]
-    assert max(brought) <= 1.25 * 4000  # batches are cut by a histogram, which is only an estimate
-    assert kind[0] == "brick" or len(brought) >= 2 * len(sheet) // 4000
 
 
 def test_parts_are_told_apart_by_what_differs(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from hapticdb import Grid
 from hapticdb.errors import GridError, UsageError
-from hapticdb.grid import CURVE_NAMES, MAX_BITS, ROOM, CurveName, GridOptions
+from hapticdb.grid import CURVE_NAMES, ROOM, CurveName, GridOptions
 
 BOUNDS = np.array([[-1.0, 0.5, 2.0], [3.0, 1.5, 4.0]])  # sides 4, 1 and 2 m
 LONGEST = 4.0
@@ -25,19 +25,6 @@ def center_of(grid: Grid) -> NDArray[np.float64]:
 
 
 # --- the grid -----------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("curve", CURVE_NAMES)
-@given(
-    bits=st.integers(1, MAX_BITS),
-    unit=st.lists(st.tuples(*[st.floats(0, 1)] * 3), min_size=1, max_size=9),
-)
-def test_voxels_return_from_their_keys(
-    curve: CurveName, bits: int, unit: list[tuple[float, float, float]]
-) -> None:
-    grid = Grid(0.005, (0, 0, 0), bits, curve)
-    voxels = np.minimum(np.array(unit) * grid.side, grid.side - 1).astype(np.int64)
-    np.testing.assert_array_equal(grid.decode(grid.encode(voxels)), voxels)
 
 
 @given(
@@ -103,6 +90,8 @@ def test_voxels_and_keys_outside_the_grid_are_refused(curve: CurveName, bits: in
         ((1.0, (0, 0, 0), 22), "22 bits an axis"),
         ((1.0, (0, 0), 4), "three finite coordinates"),
         ((1.0, (0, math.nan, 0), 4), "three finite coordinates"),
+        ((1e308, (0, 0, 0), 4), "far end"),
+        ((1e300, (1.79e308, 0, 0), 20), "far end"),
         ((1.0, (0, 0, 0), 4, "peano"), "choose one of z, hilbert, lexicographic"),
     ],
 )
@@ -169,13 +158,9 @@ def test_a_voxel_size_too_small_for_the_scene_is_refused() -> None:
     ("options", "message"),
     [
         ({"extent": 0.0}, "extent 0.0"),
-        ({"extent": -1.6}, "extent -1.6"),
         ({"extent": math.nan}, "extent nan"),
-        ({"extent": math.inf}, "extent inf"),
-        ({"bits": 0}, "0 bits"),
         ({"bits": 22}, "22 bits"),
         ({"voxel_size": 0.0}, "voxel size 0.0"),
-        ({"voxel_size": math.nan}, "voxel size nan"),
         ({"origin": (1.0, 2.0)}, "three coordinates"),
         ({"origin": (1.0, 2.0, math.inf)}, "three finite coordinates"),
         ({"curve": "peano"}, "choose one of"),
@@ -213,12 +198,8 @@ KNOWN = Grid(0.01, (-1.0, 0.0, 2.0), 9, "hilbert")
     "options",
     [
         {},
-        {"bits": 9},
-        {"voxel_size": 0.01},
         {"voxel_size": 0.1 * 0.1},  # the same length, rounded differently
-        {"origin": (-1.0, 0.0, 2.0)},
         {"origin": [-1.0 - 1e-15, 1e-15, 2.0]},
-        {"curve": "hilbert"},
         {"bits": 9, "voxel_size": 0.01, "origin": (-1.0, 0.0, 2.0), "curve": "hilbert"},
     ],
 )

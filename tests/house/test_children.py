@@ -10,7 +10,6 @@ import pytest
 from children import RUN, child, finished, until
 from hapticdb.resident.table import is_alive
 
-HERE = Path(__file__).parent.parent
 PATHS = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
 
 HEARING = """

@@ -3,11 +3,12 @@
 import ast
 import re
 from collections.abc import Iterator
-from pathlib import Path
 
 import pytest
 
-PACKAGE = Path(__file__).parents[2] / "src" / "hapticdb"
+from house.test_house import imported
+from sources import PACKAGE, modules
+
 DRIVERS = {"apsw", "sqlite3", "psycopg"}
 ASKS_OF_TEXT = {"startswith", "endswith", "partition", "removeprefix", "match", "search"}
 
@@ -16,22 +17,13 @@ def test_only_the_stores_know_their_engine() -> None:
     """No other module imports an engine's driver or modules, or branches on an engine's name."""
     folders = {f"hapticdb.store.{path.parent.name}" for path in PACKAGE.glob("store/*/store.py")}
     assert len(folders) == 2
-    for path in sorted(PACKAGE.rglob("*.py")):
+    for path in modules():
         if path.is_relative_to(PACKAGE / "store"):
             continue
         names = set(imported(path))
         assert not {name.split(".")[0] for name in names} & DRIVERS, path
         assert not {".".join(name.split(".")[:3]) for name in names} & folders, path
         assert list(branches_on_engines(path.read_text())) == [], path
-
-
-def imported(path: Path) -> Iterator[str]:
-    """Dotted names that a source imports, at its top or inside a function."""
-    for node in ast.walk(ast.parse(path.read_text())):
-        if isinstance(node, ast.Import):
-            yield from (alias.name for alias in node.names)
-        elif isinstance(node, ast.ImportFrom):
-            yield from (f"{node.module}.{alias.name}" for alias in node.names)
 
 
 def branches_on_engines(source: str) -> Iterator[str]:

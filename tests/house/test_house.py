@@ -87,6 +87,18 @@ def test_every_module_stands_on_a_floor() -> None:
     assert {domain(path) for path in modules()} - {"__init__"} <= set(LEVELS)
 
 
+def drawn_floors() -> list[set[str]]:
+    """Names of rooms on each line of the drawing, from the top."""
+    page = (ROOT / "ARCHITECTURE.md").read_text()
+    block = page.partition("## Rooms and floors")[2].split("```")[1]
+    lines = [{word.rstrip("/") for word in line.split()} for line in block.splitlines()]
+    return [found for words in lines if (found := words & set(LEVELS))]
+
+
+def test_the_floors_are_drawn_as_they_are_tested() -> None:
+    assert drawn_floors() == FLOORS
+
+
 def test_imports_point_one_way() -> None:
     for path in modules():
         if domain(path) == "__init__":

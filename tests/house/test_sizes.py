@@ -39,11 +39,6 @@ def test_no_function_is_longer_than_60_lines() -> None:
     assert {name: n for name, n in long.items() if name not in LONG_FUNCTIONS} == {}
 
 
-def test_the_lines_of_a_function_are_counted() -> None:
-    source = "def first():\n    def second():\n        return 1\n    return second\n"
-    assert dict(lengths(source)) == {"first": 4, "second": 2}
-
-
 MOST_FILES = 15
 """Most Python files in a folder, without ``__init__``."""
 SHARED = 4

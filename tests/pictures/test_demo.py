@@ -15,7 +15,6 @@ from hapticdb.cli import main
 from hapticdb.errors import UsageError
 from hapticdb.pictures import demo as demo_picture
 from hapticdb.pictures.splat import Camera, empty_depths, shade, splat
-from hapticdb.poses import read_poses
 
 
 @pytest.fixture(scope="session")
@@ -67,17 +66,6 @@ def test_the_path_touches_the_sample(comparison: demo.Comparison) -> None:
     assert trace.force.max() > 0
 
 
-def test_hits_of_the_trace_lie_in_voxels_of_their_objects(
-    scene: demo.DemoScene, comparison: demo.Comparison
-) -> None:
-    trace = comparison.trace
-    with hapticdb.open(scene.imported[0].url, read_only=True) as env:
-        for object_id in np.unique(trace.ids).tolist():
-            mine = env.grid.encode(env.voxels(object_id))
-            hit = env.grid.encode(env.grid.voxels_of(trace.points[trace.ids == object_id]))
-            assert np.isin(hit, mine).all()
-
-
 @pytest.mark.long
 def test_the_picture_shows_the_scene(
     scene: demo.DemoScene, comparison: demo.Comparison, tmp_path: Path
@@ -110,15 +98,6 @@ def test_another_grid_in_the_same_folder_is_refused(scene: demo.DemoScene) -> No
         demo.prepare(scene.folder, bits=6, frames=20)
 
 
-def test_sample_writes_three_files(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    folder = tmp_path / "new" / "sample"
-    assert main(["sample", str(folder), "--frames", "10"]) == 0
-    written = capsys.readouterr().out.splitlines()
-    assert [Path(line).name for line in written] == ["car.glb", "wrench.stl", "path.csv"]
-    assert all(Path(line).parent == folder for line in written)
-    assert len(read_poses(folder / "path.csv")) == 10
-
-
 # -- voxels to pixels ------------------------------------------------------------------------------
 
 
@@ -126,15 +105,6 @@ def camera_above(size: tuple[int, int] = (80, 60)) -> Camera:
     box = np.array([[[-1.0, -1.0, -0.1], [1.0, 1.0, 0.1]]])
     window = np.array([[8.0, 6.0], [72.0, 54.0]])
     return Camera.looking_at(box, np.array([0.2, 0.3, 0.9]), size, window)
-
-
-def test_a_camera_has_its_boxes_in_the_window() -> None:
-    camera = camera_above()
-    corners = np.array([[x, y, z] for x in (-1, 1) for y in (-1, 1) for z in (-0.1, 0.1)])
-    seen = camera.project(corners)
-    assert np.all(seen[:, :2] >= [7.999, 5.999])
-    assert np.all(seen[:, :2] <= [72.001, 54.001])
-    assert np.all((seen[:, 2] > camera.near) & (seen[:, 2] < camera.far))
 
 
 def test_the_nearer_voxel_is_seen_whatever_the_order() -> None:

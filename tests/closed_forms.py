@@ -26,6 +26,7 @@ from hapticdb.kernels.resident.cells import (
     spread_key,
 )
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
+from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -252,14 +253,7 @@ class Hand:
     @property
     def placed(self) -> Floats:
         """Points of the tool (N, 3), world frame."""
-        w, x, y, z = self.tool.quaternion
-        turn = np.array(
-            [
-                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-            ]
-        )
+        turn = rotation_of(self.tool.quaternion)[0]
         placed: Floats = self.shell.points[:, :3] @ turn.T + self.tool.position
         return placed
 

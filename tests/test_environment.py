@@ -69,19 +69,6 @@ def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- objects ------------------------------------------------------------------------------------
 
 
-def test_objects_are_ordered_by_id_and_say_what_they_are(env: Environment, file: Path) -> None:
-    objects = env.objects()
-    assert [o.id for o in objects] == [1, 2, 3, 4]
-    assert [o.name for o in objects] == ["ball 0", "box 1", "ball 2", "ball 3"]
-    for obj, part in zip(objects, parse_in_process(file).parts, strict=True):
-        assert obj.link == str(file.resolve())
-        assert (obj.digest, obj.revision) == (part.digest, obj.id)
-        assert obj.voxels == len(env.voxels(obj.id))
-        np.testing.assert_array_equal(obj.transform, np.eye(4))
-        np.testing.assert_array_equal(obj.bounds, part.bounds)
-        assert env.object(obj.id).name == obj.name
-
-
 # --- moving -------------------------------------------------------------------------------------
 
 

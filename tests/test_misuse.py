@@ -1,7 +1,6 @@
 """Wrong uses of the Python API raise an error of one clear line; no wrong answer is returned."""
 
 import os
-import sys
 import threading
 from collections.abc import Callable
 from pathlib import Path
@@ -11,7 +10,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import PATIENCE, child, exit_code, joined
+from children import exit_code, joined
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.testing import floor_voxels, write_voxels
 
@@ -89,26 +88,6 @@ def test_what_is_no_file_is_refused_before_anything_is_made(
     with pytest.raises(hapticdb.errors.UsageError):
         hapticdb.create(url, Grid(0.01, (0, 0, 0), 4))
     assert not list(tmp_path.iterdir())
-
-
-BOXES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0 0 1\n" + "".join(
-    f"o part{n}\nf 1 2 3\nf 1 2 4\nf 2 3 4\n" for n in range(40)
-)
-
-
-def test_two_imports_of_one_file_at_once_end_as_one(tmp_path: Path) -> None:
-    """Neither import fails because of the other, and each part is in the environment once."""
-    (tmp_path / "parts.obj").write_text(BOXES)
-    command = [sys.executable, "-m", "hapticdb", "import", "e.db", "parts.obj", "--bits", "7"]
-    with child(command, cwd=tmp_path) as one, child(command, cwd=tmp_path) as other:
-        for process in (one, other):
-            _, said = process.communicate(timeout=PATIENCE)
-            assert process.returncode == 0, said
-    with hapticdb.open(tmp_path / "e.db") as env:
-        names = [obj.name for obj in env.objects()]
-        assert sorted(names) == sorted(set(names))
-        assert len(names) == 40
-        assert sum(obj.voxels for obj in env.objects()) == 40 * env.objects()[0].voxels
 
 
 @pytest.mark.parametrize(

@@ -1,6 +1,5 @@
 """A pool lends opened environments to threads, one at a time."""
 
-import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -11,7 +10,7 @@ import psycopg
 import pytest
 
 import hapticdb
-from children import PATIENCE, joined
+from children import PATIENCE
 from hapticdb import Environment, Grid, PointShell, Pool
 from hapticdb.store.postgres.address import parse
 from hapticdb.testing import floor_voxels, write_voxels
@@ -81,23 +80,6 @@ def test_who_waits_too_long_is_told(pool: Pool) -> None:
     assert "\n" not in str(told.value)
     with pool.environment() as env:
         assert len(env.objects()) == 1
-
-
-def test_who_waits_gets_what_another_gives_back(pool: Pool) -> None:
-    found: list[int] = []
-
-    def borrow() -> None:
-        with pool.environment() as env:
-            found.append(len(env.objects()))
-
-    with pool.environment():
-        with pool.environment():
-            waiting = threading.Thread(target=borrow, daemon=True)
-            waiting.start()
-            time.sleep(0.05)
-            assert not found
-        joined(waiting)
-    assert found == [1]
 
 
 def test_what_was_given_back_is_no_longer_ones_own(pool: Pool, sphere: PointShell) -> None:

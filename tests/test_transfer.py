@@ -140,15 +140,6 @@ def test_no_statement_brings_more_than_a_batch(
 # --- a target that is not empty -----------------------------------------------------------------
 
 
-def test_a_second_copy_writes_nothing(tmp_path: Path) -> None:
-    source = make_blobs(tmp_path / "a.db")
-    copy_environment(source, tmp_path / "b.db")
-    before = rows_of(tmp_path / "b.db")
-    report = copy_environment(source, tmp_path / "b.db")
-    assert (report.copied, report.present, report.voxels) == (0, 4, 0)
-    assert rows_of(tmp_path / "b.db") == before
-
-
 def test_an_id_that_is_taken_is_exchanged(tmp_path: Path) -> None:
     source = make_blobs(tmp_path / "a.db")
     with make(tmp_path / "b.db", ("voxel", "hilbert")) as env:

@@ -161,11 +161,6 @@ def test_kernels_import_numpy_numba_and_their_own_folder() -> None:
         assert foreign == [], named(path)
 
 
-def test_nothing_imports_the_command_line() -> None:
-    importers = {domain(path) for path in modules() if "cli" in own(path)}
-    assert importers <= {"__main__"}
-
-
 def test_only_the_command_line_draws_on_terminals() -> None:
     for path in modules():
         if domain(path) not in {"cli", "__main__"}:

@@ -214,11 +214,3 @@ def test_the_clock_passes_over_what_is_wanted_and_gives_used_slots_a_second_roun
     count, hand = kernels.slots_to_free(cells, wanted_at, used, 3, hand, 6, out)
     assert out[:count].tolist() == [2]
     assert kernels.slots_to_free(cells, wanted_at, used, 3, hand, 6, out)[0] == 0
-
-
-def test_the_oldest_version_read_is_that_of_readers_in_a_frame() -> None:
-    readers = np.zeros(16 * 8, dtype=np.int64)
-    nobody = kernels.oldest_version_read(readers)
-    assert nobody > 1 << 60
-    readers[8], readers[24] = 7, 5
-    assert kernels.oldest_version_read(readers) == 5

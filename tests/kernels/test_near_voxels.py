@@ -9,16 +9,12 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from banded import steps_to
-from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.field.corners import interpolated
 from hapticdb.kernels.field.lattice import (
     BEYOND,
     CELL_SIDE,
     CELL_VALUES,
     STEPS,
     VOXELS_A_STEP,
-    cell_place,
-    trilinear,
 )
 from hapticdb.kernels.field.law import REACH
 from hapticdb.kernels.resident.near_voxels import MOST_EIGHTHS, mark_near_voxels
@@ -117,32 +113,3 @@ def test_occupied_voxels_are_near_and_a_cell_without_a_mask_has_none() -> None:
 def test_rounding_cannot_move_a_voxel_over_the_reach() -> None:
     assert MOST_EIGHTHS * VOXELS_A_STEP / 8 < REACH - 1e-4
     assert (MOST_EIGHTHS + 1) * VOXELS_A_STEP / 8 > REACH + 1e-4
-
-
-@leaf
-def interpolate(payload, at, x, y, z):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201
-    """`interpolated`, for a call from Python."""
-    return interpolated(payload, np.uint64(at), x, y, z)  # type: ignore[no-untyped-call]
-
-
-@given(
-    seed=st.integers(0, 2**32 - 1),
-    slot=st.integers(0, 2),
-    corner=st.tuples(*[st.integers(-1, 31)] * 3),
-    part=st.tuples(*[st.floats(0.0, 1.0)] * 3),
-)
-@settings(deadline=None, max_examples=200)
-def test_vectors_interpolate_as_plain_numbers_do(
-    seed: int, slot: int, corner: tuple[int, int, int], part: tuple[float, float, float]
-) -> None:
-    """Bit for bit."""
-    payload = np.random.default_rng(seed).integers(0, 256, (3, CELL_VALUES), dtype=np.uint8)
-    corners = [
-        min(
-            int(payload[slot, cell_place(*(c + s for c, s in zip(corner, step, strict=True)))]),
-            STEPS,
-        )
-        for step in product((0, 1), repeat=3)
-    ]
-    at = slot * CELL_VALUES + cell_place(*corner)
-    assert interpolate(payload, at, *part) == trilinear(*corners, *part)

@@ -12,7 +12,7 @@ from subprocess import Popen
 import numpy as np
 import pytest
 
-from children import child, finished, until
+from children import child, until
 from hapticdb.errors import MissingExtraError
 from hapticdb.mesh import Defects, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
@@ -162,10 +162,3 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'hapticdb\[step\]'"):
         read_file(text(tmp_path / "a.STEP", "ISO-10303-21;"))
-
-
-def test_importing_the_module_loads_no_parser() -> None:
-    heavy = ("trimesh", "collada", "laspy", "cascadio")
-    script = f"import sys, hapticdb.mesh; print([m for m in {heavy} if m in sys.modules])"
-    found = finished([sys.executable, "-c", script], check=True)
-    assert found.stdout.strip() == "[]"

@@ -12,9 +12,8 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.sweeps.run import sweep
-from hapticdb.testing import voxel_object
+from hapticdb.testing import write_voxels
 
 SIZE = 0.01
 GRID = Grid(SIZE, (0.0, 0.0, 0.0), 7)
@@ -25,9 +24,7 @@ EDGES = np.array([0.2, 0.12, 0.08])
 def scene(url: Path, **objects: list[Any]) -> Environment:
     env = hapticdb.create(url, GRID)
     for name, voxels in objects.items():
-        ijk = np.array(voxels, dtype=np.int64).reshape(-1, 3)
-        rows = rows_of_voxels(ijk, GRID, "brick")
-        env.store.add(voxel_object(GRID, ijk, name), rows)
+        write_voxels(env.store, np.array(voxels, dtype=np.int64), name)
     return env
 
 

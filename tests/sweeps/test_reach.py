@@ -15,13 +15,12 @@ from scipy.spatial.transform import Rotation
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.sweeps.deciding import Decider
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import Decision
-from hapticdb.testing import voxel_object
+from hapticdb.testing import write_voxels
 from naive_motion import middle_of, placed, poses_at
 
 Floats = NDArray[np.float64]
@@ -39,8 +38,7 @@ EDGE = SIZE * np.array([64.0, 64.0, 64.5])
 
 def scene(folder: Path, *voxels: tuple[int, int, int]) -> Environment:
     env = hapticdb.create(folder / "s.db", GRID)
-    ijk = np.array(voxels, dtype=np.int64)
-    env.store.add(voxel_object(GRID, ijk, "dots"), rows_of_voxels(ijk, GRID, "brick"))
+    write_voxels(env.store, np.array(voxels, dtype=np.int64))
     return env
 
 

@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import GeometryChangedError, ObjectNotFoundError, UsageError
-from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.pointshell.shell import fibonacci_sphere
 from hapticdb.poses import rotation_of
 from hapticdb.resident.table import LEAST_BUDGET, slots_within
@@ -25,7 +24,7 @@ from hapticdb.sweeps import run as sweeping
 from hapticdb.sweeps.path import SweepPath
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import sweep
-from hapticdb.testing import voxel_object
+from hapticdb.testing import write_voxels
 from naive_frame import NaiveTouch, touch
 
 Floats = NDArray[np.float64]
@@ -56,9 +55,9 @@ def line(*places: Any) -> Floats:  # noqa: ANN401
     return np.array([pose_of(MIDDLE + np.asarray(place)) for place in places])
 
 
-def ball(n_points: int = 24, radius: float = 0.024, center: Any = (0, 0, 0)) -> PointShell:  # noqa: ANN401
+def ball(n_points: int = 24, radius: float = 0.024) -> PointShell:
     out = fibonacci_sphere(n_points)
-    return PointShell(out * radius + np.asarray(center), -out, np.asarray(center, dtype=float))
+    return PointShell(out * radius, -out, np.zeros(3))
 
 
 def block(low: Any, high: Any) -> Voxels:  # noqa: ANN401
@@ -75,12 +74,6 @@ PLATE = block((20, 50, 90), (60, 80, 91))
 POST = block((81, 50, 50), (84, 54, 54))
 
 
-def write(env: Environment, ijk: Voxels, name: str) -> int:
-    return env.store.add(
-        voxel_object(env.grid, ijk, name), rows_of_voxels(ijk, env.grid, env.layout)
-    )
-
-
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
 def env(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
@@ -89,7 +82,7 @@ def env(
     url = tmp_path_factory.mktemp("swept") / "scene.db"
     with hapticdb.create(url, replace(GRID, curve=curve), layout=layout) as made:
         for ijk, name in ((WALL, "wall"), (PLATE, "plate"), (POST, "post")):
-            write(made, ijk, name)
+            write_voxels(made.store, ijk, name)
         yield made
 
 
@@ -149,18 +142,6 @@ def test_no_point_moves_more_than_half_a_voxel_between_samples(
     assert np.array_equal(samples[path.starts], given_poses)
     travels = np.diff(path.travels(0, len(path))) * size
     assert (moved.max(axis=1, initial=0.0) <= travels + 1e-12).all()
-
-
-def test_a_tool_far_from_its_origin_turns_about_its_middle() -> None:
-    """The file's origin does not matter: half a turn does not move the tool along a wide arc."""
-    near, far = ball(), ball(center=(5.0, 0.0, 0.0))
-    start, end = pose_of((0, 0, 0)), pose_of((0, 0, 0), (0, 0, 0, 1))
-    shift = pose_of((-5.0, 0.0, 0.0))
-    one = SweepPath.of([start, end], near, SIZE)
-    other = SweepPath.of([start @ shift, end @ shift], far, SIZE)
-    assert len(one) == len(other)
-    samples = other.sample(0, len(other))
-    assert np.allclose(samples @ np.linalg.inv(shift), one.sample(0, len(one)), atol=1e-12)
 
 
 def test_fractions_go_by_the_way_and_not_by_the_number_of_poses() -> None:
@@ -314,7 +295,7 @@ def test_the_least_budget_finds_the_same(tmp_path: Path) -> None:
     shell = ball(60, 0.05)
     poses = [pose_of((0.3, 0.3, 0.3)), pose_of((1.7, 1.5, 1.2), (1, 1, 0, 0))]
     with hapticdb.create(tmp_path / "spots.db", grid) as env:
-        write(env, np.unique(spots, axis=0), "spots")
+        write_voxels(env.store, np.unique(spots, axis=0), "spots")
         large = sweep(env, shell, poses, clearance_limit=0.05, profile=True)
         small = sweep(
             env, shell, poses, clearance_limit=0.05, profile=True, budget_bytes=LEAST_BUDGET
@@ -333,12 +314,14 @@ def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path, monkeypatc
     poses = line((-0.3, 0, 0), (0.3, 0, 0))
     url = tmp_path / "scene.db"
     with hapticdb.create(url, GRID) as env, hapticdb.open(url) as other:
-        write(env, PLATE, "plate")
+        write_voxels(env.store, PLATE, "plate")
         before = sweep(env, ball(), poses)
 
         def obstruct(done: int, total: int) -> None:
             if done < total:
-                write(other, block((90, 50, 50), (92, 80, 80 + done % 2)), f"wall{done}")
+                write_voxels(
+                    other.store, block((90, 50, 50), (92, 80, 80 + done % 2)), f"wall{done}"
+                )
 
         meanwhile = sweep(env, ball(), poses, progress=obstruct)
         after = sweep(env, ball(), poses)

@@ -9,14 +9,20 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+import hapticdb
 from hapticdb import Environment, Grid, GridOptions, ImportOptions
 from hapticdb.grid import CurveName
 from hapticdb.mesh import Part
 from hapticdb.store.base import Layout
+from hapticdb.testing import KINDS
 from naive import Voxel, voxels_of_triangles
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 Rows = dict[str, list[tuple[Any, ...]]]
+Kind = tuple[Layout, CurveName]
+
+PAIRS = [*zip(KINDS, [*KINDS[1:], KINDS[0]], strict=True), (KINDS[3], KINDS[3])]
+"""Kinds of environments that are copied or compared: each kind takes both parts."""
 
 SIZE = 0.01
 ORIGIN = (-0.16, -0.16, -0.16)
@@ -26,6 +32,12 @@ BITS = 5
 
 def small_grid(curve: CurveName = "z") -> Grid:
     return Grid(SIZE, ORIGIN, BITS, curve)
+
+
+def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
+    """An empty environment of a kind."""
+    layout, curve = kind
+    return hapticdb.create(path, Grid(0.01, (-0.1, 0.2, -0.3), bits, curve), layout=layout)
 
 
 def small_options(

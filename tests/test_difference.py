@@ -11,22 +11,15 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from assemblies import placement, voxel_set
+from assemblies import PAIRS, Kind, make, placement, voxel_set
 from hapticdb import Environment, Grid, diff_environments, transfer
 from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.store.base import Band, Layout
-from hapticdb.testing import KINDS, blob, voxel_object, with_distances
+from hapticdb.store.base import Band
+from hapticdb.testing import blob, voxel_object, with_distances
 
-Kind = tuple[Layout, CurveName]
 PLACE = (12, 12, 12)
-PAIRS = [*zip(KINDS, [*KINDS[1:], KINDS[0]], strict=True), (KINDS[3], KINDS[3])]
-
-
-def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
-    layout, curve = kind
-    return hapticdb.create(path, Grid(0.01, (-0.1, 0.2, -0.3), bits, curve), layout=layout)
 
 
 def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object) -> int:

@@ -115,7 +115,7 @@ def check(suffix: str, folder: Path, most: int) -> None:
     @given(seed=st.integers(0, 2**32 - 1))
     def has_no_fault(seed: int) -> None:
         random = Random(seed)  # noqa: S311 - damages, no secrets
-        path.write_bytes(mutated(random, suffix, random.choice(known), random.choice(known)))
+        path.write_bytes(mutated(random, suffix, random.choice(known)))
         assert fault_in_fork(path) == ""
 
     has_no_fault()

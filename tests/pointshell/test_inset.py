@@ -12,9 +12,9 @@ from scipy.spatial import ConvexHull, cKDTree
 
 from hapticdb.errors import UsageError
 from hapticdb.pointshell.shell import PointShell
+from pointshell.test_pointshell import Mesh, sphere, together
 
 Floats = NDArray[np.float64]
-Mesh = tuple[Floats, NDArray[np.int64]]
 
 INSET = 0.1
 NEAR = 0.98 * INSET
@@ -28,21 +28,6 @@ def hull_of(corners: Floats) -> Mesh:
 def box(sides: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)) -> Mesh:
     unit = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
     return hull_of(unit * sides + at)
-
-
-def together(*meshes: Mesh) -> Mesh:
-    starts = np.cumsum([0] + [len(corners) for corners, _ in meshes])
-    return (
-        np.concatenate([corners for corners, _ in meshes]),
-        np.concatenate([faces + n for (_, faces), n in zip(meshes, starts, strict=False)]),
-    )
-
-
-def ball(n: int = 3000) -> Mesh:
-    k = np.arange(n) + 0.5
-    z, angle = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
-    ring = np.sqrt(1.0 - z * z)
-    return hull_of(np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1))
 
 
 def cylinder(radius: float, length: float, n: int = 96) -> Mesh:
@@ -128,7 +113,7 @@ def test_an_open_sheet_stays_where_it_is() -> None:
 
 
 def test_a_solid_with_a_hole_in_its_surface_is_drawn_in_like_a_whole_one() -> None:
-    corners, faces = ball(800)
+    corners, faces = sphere(n=800)
     torn = faces[3:]
     shell = PointShell.from_mesh(corners, torn, 300, inset=INSET)
     assert not shell.is_closed

@@ -54,10 +54,14 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
     assert (table.cells.payload[0] == BEYOND).all()
     cells, slots = residency.writer.directory.entries()
     points = np.concatenate([np.empty((0, 3)), *objects.values()])
+    # in a grid smaller than a cell, no point needs the centres farther out
+    inside = (slice(min(residency.grid.side, 32) + 2),) * 3
     for key, slot in zip(cells.tolist(), slots.tolist(), strict=True):
         low = np.array([key >> 32, key >> 16 & 0xFFFF, key & 0xFFFF]) << 5
         near = points[(np.abs(points - low - 16.0) < 24.0).all(axis=1)]
-        assert np.array_equal(table.cells.payload[slot], steps_to(near, low - 1, 34))
+        found = table.cells.payload[slot].reshape(34, 34, 34)
+        wanted = steps_to(near, low - 1, 34).reshape(34, 34, 34)
+        assert np.array_equal(found[inside], wanted[inside])
     assert table.cells.near is not None
     near_voxels = np.zeros_like(table.cells.near)
     mark_near_voxels(
@@ -69,7 +73,8 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
 
 
 @pytest.mark.parametrize(
-    ("bits", "curve", "at_once"), [(5, "z", 7), (6, "z", source.ROWS_AT_ONCE), (6, "hilbert", 7)]
+    ("bits", "curve", "at_once"),
+    [(3, "z", 7), (4, "hilbert", 7), (5, "z", 7), (6, "z", source.ROWS_AT_ONCE), (6, "hilbert", 7)],
 )
 def test_cells_hold_the_least_distances_of_all_objects(
     tmp_path: Path, bits: int, curve: CurveName, at_once: int, monkeypatch: pytest.MonkeyPatch

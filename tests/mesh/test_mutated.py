@@ -116,7 +116,8 @@ def check(suffix: str, folder: Path, most: int) -> None:
     def has_no_fault(seed: int) -> None:
         random = Random(seed)  # noqa: S311 - damages, no secrets
         path.write_bytes(mutated(random, suffix, random.choice(known)))
-        assert fault_in_fork(path) == ""
+        fault = fault_in_fork(path)
+        assert not fault, fault
 
     has_no_fault()
 

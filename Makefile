@@ -5,7 +5,8 @@ BIN := .venv/bin
 USER := .venv/user
 READY := .venv/ready
 PIP := $(BIN)/pip install --quiet --disable-pip-version-check
-PYTEST := $(BIN)/pytest tests --numprocesses=auto --dist=worksteal
+# Three tests run on each two processors: most of them wait for servers half of their time.
+PYTEST := $(BIN)/pytest tests --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) --dist=worksteal
 
 .PHONY: demo test test-long test-browser test-all test-plain lint types figures peers realtime feel scale paths wheel pins clean
 
@@ -17,9 +18,8 @@ test: $(READY)
 	$(PYTEST) -m "not long and not browser" $(ARGS)
 
 # Kills, rights, recovery and every page's commands; of each long loop a dozen steps drawn at random.
-# Three tests run on each two processors: most of them wait for servers half of their time.
 test-long: $(READY)
-	$(PYTEST) --numprocesses=$$(( ($$(nproc) * 3 + 1) / 2 )) -m long $(ARGS)
+	$(PYTEST) -m long $(ARGS)
 
 # Chromium draws with all processors: beside other tests its pages would be too slow.
 test-browser: $(READY)

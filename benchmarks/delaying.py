@@ -11,6 +11,7 @@ import subprocess
 import sys
 import threading
 from collections.abc import Iterator
+from functools import partial
 
 READY_WITHIN = 30.0
 """Seconds in which a process must print its port, and end when it is asked to."""
@@ -49,7 +50,7 @@ async def _carry(reader: asyncio.StreamReader, writer: asyncio.StreamWriter, wai
             data = await reader.read(65536)
         except OSError:
             data = b""
-        loop.call_later(wait, writer.write if data else writer.close, *([data] if data else []))
+        loop.call_later(wait, partial(writer.write, data) if data else writer.close)
 
 
 async def relay(port: int, seconds: float) -> None:

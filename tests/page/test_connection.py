@@ -9,7 +9,8 @@ from typing import NamedTuple
 import pytest
 import viser
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import ClientConnection, connect
+from websockets.sync.client import connect
+from websockets.sync.connection import Connection
 
 from children import until
 from hapticdb.page.connection import (
@@ -49,7 +50,7 @@ def page() -> Iterator[Page]:
 
 
 @contextmanager
-def entered(page: Page, role: str) -> Iterator[ClientConnection]:
+def entered(page: Page, role: str) -> Iterator[Connection]:
     """A browser that was announced and is connected."""
     sock = socket.socket()
     sock.bind(("127.0.0.1", 0))

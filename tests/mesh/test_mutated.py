@@ -127,7 +127,7 @@ def check(suffix: str, folder: Path, most: int) -> None:
 @pytest.mark.parametrize("suffix", [*SUFFIXES, *OTHERS])
 def test_damaged_files_are_read_or_refused_in_one_line(tmp_path: Path, suffix: str) -> None:
     """Each format has a process of its own, because a fork copies all that is loaded."""
-    command = [sys.executable, __file__, suffix, str(tmp_path), "400" if is_every() else "100"]
+    command = [sys.executable, __file__, suffix, str(tmp_path), "400" if is_every() else "40"]
     paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = finished(command, cwd=tmp_path, env=paths)
     assert done.returncode == 0, done.stderr

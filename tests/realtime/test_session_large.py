@@ -9,7 +9,7 @@ import pytest
 
 from banded import write_points
 from children import PATIENCE
-from hapticdb import Environment, PointShell
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import UsageError
 from hapticdb.query.law import LawName
@@ -17,6 +17,7 @@ from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
+from hapticdb.recording.header import Header
 from hapticdb.recording.replay import replay
 from realtime.hands import at, still
 from realtime.sessions import NEVER_STALE, felt_at, floor_points, floored, recorded, standing_plate
@@ -110,3 +111,12 @@ def test_a_budget_that_is_no_number_of_points_is_refused(budget: object) -> None
     """Before the environment is looked for."""
     with pytest.raises(UsageError, match=f"a budget of {budget} points"):
         Session("none.db", PointShell.sphere(0.01, 10), still(0.03), budget_points=budget)  # type: ignore[arg-type]
+
+
+def test_headers_with_another_budget_differ() -> None:
+    shell = PointShell.sphere(0.01, 10)
+    grid = Grid(SIZE, (0.0, 0.0, 0.0), 6)
+    with_one, other, without = (
+        Header("a.db", grid, 1, shell, 100.0, budget_points=n) for n in (5, 6, None)
+    )
+    assert with_one.differing(other) == with_one.differing(without) == ["budget_points"]

@@ -186,6 +186,7 @@ def test_wrong_paths_and_units_are_refused() -> None:
 # -- the command line ------------------------------------------------------------------------------
 
 
+@pytest.mark.long
 def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: Path) -> None:
     trimesh.creation.box((20.0, 20.0, 20.0)).export(scene.parent / "mm.stl")
     for args in (("touch", scene, "--poses"), ("sweep", scene, "--path")):

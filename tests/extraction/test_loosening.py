@@ -64,6 +64,7 @@ def test_a_block_in_a_pocket_is_lifted_and_then_pulled(tmp_path: Path) -> None:
     assert places_in_boxes(found, url, "block", 0.5 * SIZE) == 0
 
 
+@pytest.mark.long
 def test_a_plate_under_a_ledge_slides_in_contact_and_then_lifts(tmp_path: Path) -> None:
     url = ledge(tmp_path)
     found = found_in(url, "plate")

@@ -86,6 +86,7 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
     )  # fmt: skip
 
 
+@pytest.mark.long
 def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) -> None:
     shell = shell_of(300)
     n_felt = 0

@@ -60,6 +60,7 @@ def peg(folder: Path) -> Path:
     )
 
 
+@pytest.mark.long
 def test_a_peg_pulled_along_its_hole_gets_no_deeper(tmp_path: Path) -> None:
     found = swept(peg(tmp_path), "peg", moved((0.0, 0.0, 0.2)))
     (depth,) = found.depths
@@ -127,6 +128,7 @@ def test_what_is_open_on_both_sides_has_no_depth(tmp_path: Path) -> None:
     assert {row[9] for row in rows_of_sweep(found)} == {"not decided"}
 
 
+@pytest.mark.long
 def test_a_depth_that_its_bounds_leave_open_is_not_decided(tmp_path: Path) -> None:
     """The peg moves by what is allowed: no finer look tells whether it cuts."""
     url = peg(tmp_path)

@@ -46,6 +46,7 @@ def at(*places: Any) -> NDArray[np.float64]:  # noqa: ANN401 - triples
 voxels = st.lists(st.tuples(*[st.integers(40, 90)] * 3), min_size=1, max_size=4)
 
 
+@pytest.mark.long
 @settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
 @given(
     placed=voxels,

@@ -104,6 +104,7 @@ voxels = st.lists(st.tuples(*[st.integers(60, 68)] * 3), min_size=1, max_size=3,
 places = st.tuples(*[st.floats(-1.0, 1.0)] * 3).map(np.array)
 
 
+@pytest.mark.long
 @settings(
     suppress_health_check=[HealthCheck.function_scoped_fixture], max_examples=40, deadline=None
 )

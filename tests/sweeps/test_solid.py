@@ -53,6 +53,7 @@ corners = st.tuples(*[st.integers(0, 6)] * 3).map(lambda one: np.array(one, dtyp
 edges = st.tuples(*[st.integers(1, 4)] * 3).map(lambda one: np.array(one, dtype=float))
 
 
+@pytest.mark.long
 @settings(max_examples=6, deadline=None)
 @given(
     boxes=st.lists(st.tuples(corners, edges), min_size=1, max_size=4),

@@ -1,12 +1,16 @@
 """Of a browser's messages only what our page uses passes, checked and encoded anew."""
 
+from dataclasses import fields
+from typing import get_args
+
 import msgspec
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
+from viser import _messages as viser_messages
 
 from hapticdb.server.access import Role
-from hapticdb.server.messages import LARGEST, Verdict, judged
+from hapticdb.server.messages import LARGEST, Known, Verdict, judged
 from serving import CAMERA
 
 encode = msgspec.msgpack.encode
@@ -34,6 +38,12 @@ def test_what_viser_sends_passes_with_the_same_content(message: dict[str, object
     passed = judged(encode(message), Role.EDITOR).passed
     assert passed is not None
     assert message.items() <= msgspec.msgpack.decode(passed).items()
+
+
+@pytest.mark.parametrize("kind", get_args(Known))
+def test_each_type_is_a_message_of_viser(kind: type[msgspec.Struct]) -> None:
+    theirs = getattr(viser_messages, kind.__name__)
+    assert set(kind.__struct_fields__) <= {field.name for field in fields(theirs)}
 
 
 @pytest.mark.parametrize("content", [True, 0.5, "word", [1, 2.5], ["a", "b"], None])

@@ -31,7 +31,7 @@ Value = bool | Whole | Real | Text | Some | None
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """A message of a browser; the names of its fields are viser's."""
+    """A message of a browser; its name and those of its fields are viser's."""
 
 
 class ViewerCameraMessage(_Message, tag=True):
@@ -58,7 +58,7 @@ class ScenePointerMessage(_Message, tag=True):
     modifier: Modifier = None
 
 
-class _SceneNodeClickMessage(_Message, tag=True):
+class SceneNodeClickMessage(_Message, tag=True):
     """A click on a part."""
 
     name: Name
@@ -79,14 +79,14 @@ class TransformControlsUpdateMessage(_Message, tag=True):
     owner: Name = ""
 
 
-class _TransformControlsDragStartMessage(_Message, tag=True):
+class TransformControlsDragStartMessage(_Message, tag=True):
     """A gizmo is taken."""
 
     name: Name
     owner: Name = ""
 
 
-class _TransformControlsDragEndMessage(_TransformControlsDragStartMessage, tag=True):
+class TransformControlsDragEndMessage(TransformControlsDragStartMessage, tag=True):
     """A gizmo is let go."""
 
 
@@ -118,17 +118,17 @@ class _Tag(msgspec.Struct):
 Known = (
     ViewerCameraMessage
     | ScenePointerMessage
-    | _SceneNodeClickMessage
+    | SceneNodeClickMessage
     | TransformControlsUpdateMessage
-    | _TransformControlsDragStartMessage
-    | _TransformControlsDragEndMessage
+    | TransformControlsDragStartMessage
+    | TransformControlsDragEndMessage
     | GuiUpdateMessage
     | CommandTriggerMessage
 )
 FOR_HANDS = (
     TransformControlsUpdateMessage,
-    _TransformControlsDragStartMessage,
-    _TransformControlsDragEndMessage,
+    TransformControlsDragStartMessage,
+    TransformControlsDragEndMessage,
 )
 """Messages of someone who holds a tool; a viewer holds none."""
 

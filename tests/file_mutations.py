@@ -29,8 +29,8 @@ _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
 _ELEMENT = re.compile(rb"<(\w+)[^<>]*(?:/>|>[^<]*</\1>)")
 
 
-def mutated(random: Random, suffix: str, content: bytes) -> bytes:
-    """Content with one to three damages."""
+def mutated(random: Random, suffix: str, content: bytes, other: bytes) -> bytes:
+    """Content with one to three damages. `other` is a file of the same format."""
     for _ in range(random.choice((1, 1, 1, 2, 3))):
         choices: list[Callable[[Random, bytes], bytes]] = [_bytes_changed, _cut_or_grown]
         if suffix in TEXTS:
@@ -43,7 +43,10 @@ def mutated(random: Random, suffix: str, content: bytes) -> bytes:
             choices += [_archive_changed] * 5
         if suffix in {".las", ".laz", ".stl", ".hdbrec", ".glb"}:
             choices += [_header_changed] * 2
-        content = random.choice(choices)(random, content)
+        chosen = random.choice(choices)
+        if random.random() < 0.04:
+            content = _spliced(random, content, other)
+        content = chosen(random, content)
     return content
 
 
@@ -76,6 +79,10 @@ def _cut_or_grown(random: Random, content: bytes) -> bytes:
     if kind == 2:
         return content[:last] + content[first:]
     return content[:first] + random.randbytes(random.choice((1, 4, 100))) + content[first:]
+
+
+def _spliced(random: Random, content: bytes, other: bytes) -> bytes:
+    return content[: random.randrange(len(content) + 1)] + other[random.randrange(len(other) + 1) :]
 
 
 def _numbers_changed(random: Random, content: bytes) -> bytes:

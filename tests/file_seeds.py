@@ -1,4 +1,7 @@
-"""Small sound files of every format, of which damaged ones are made."""
+"""Small sound files of every format: `mutate_files` damages them.
+
+Libraries are imported where they are used, because each fork copies what its process has loaded.
+"""
 
 import io
 import json
@@ -7,18 +10,28 @@ import struct
 import zipfile
 from pathlib import Path
 
-import laspy
 import numpy as np
 
-from hapticdb import PointShell
-from hapticdb.poses import write_poses
-from mesh_files import COLLADA, MESH_3MF, TRIANGLE, glb_of, gltf, threemf
-from recordings import motion, write
+from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, threemf
 
 MOST_BYTES = 20_000
 """Size in bytes of the largest file of HAPTICDB_TEST_DATA that becomes a seed. Larger: slower."""
 OTHERS = (".npz", ".csv", ".hdbrec")
-"""Suffixes of saved shells, paths and recordings."""
+"""Suffixes of saved shells, paths and recordings. They are read in the caller's own process."""
+
+_DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
+version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset><library_geometries>
+<geometry id="g" name="leaf"><mesh><source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 1 1 0
+0 1 0</float_array><technique_common><accessor source="#pa" count="4" stride="3">
+<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
+</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
+</vertices><polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/>
+<vcount>4 3</vcount><p>0 1 2 3 0 1 2</p></polylist><triangles count="1">
+<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry>
+</library_geometries><library_visual_scenes><visual_scene id="s"><node id="a" name="tree">
+<translate>100 0 0</translate><node id="b" name="branch"><scale>2 2 2</scale>
+<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes><scene>
+<instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 _STEP = """ISO-10303-21;
 HEADER;
@@ -119,7 +132,7 @@ def _texts() -> list[tuple[str, bytes]]:
             (".off", f"COFF 5 1 0\n{rows}3 0 1 4\n"),
             (".stl", solid + solid.replace(" a\n", " b\n")),
             (".ply", f"{ply}{coloured}4 0 1 2 3\n3 0 1 4\n"),
-            (".dae", COLLADA),
+            (".dae", _DAE),
             (".step", _STEP),
         )
     ]
@@ -166,6 +179,8 @@ def _binaries(folder: Path) -> list[tuple[str, bytes]]:
 
 
 def _clouds(folder: Path) -> list[tuple[str, bytes]]:
+    import laspy  # noqa: PLC0415
+
     found = []
     for version, point_format in (("1.2", 1), ("1.4", 6)):
         header = laspy.LasHeader(version=version, point_format=point_format)
@@ -179,6 +194,10 @@ def _clouds(folder: Path) -> list[tuple[str, bytes]]:
 
 
 def _ours(folder: Path) -> list[tuple[str, bytes]]:
+    from hapticdb import PointShell  # noqa: PLC0415
+    from hapticdb.poses import write_poses  # noqa: PLC0415
+    from recordings import motion, write  # noqa: PLC0415
+
     shell, poses, recording = (folder / f"seed{suffix}" for suffix in OTHERS)
     PointShell.sphere(0.1, 20).save(shell)
     write_poses(poses, np.tile(np.eye(4), (5, 1, 1)))

@@ -4,6 +4,7 @@ import itertools
 import os
 import sys
 import threading
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -93,3 +94,18 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
     assert not is_alive(gone.pid)
     assert is_alive(os.getpid())
     assert is_alive(1)
+
+
+def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    with child([sys.executable, "-c", "pass"]) as gone:
+        until(lambda: not is_alive(gone.pid))
+
+        def read_text(path: Path) -> str:
+            gone.wait()
+            raise FileNotFoundError(path)
+
+        with monkeypatch.context() as patched:
+            patched.setattr(Path, "read_text", read_text)
+            assert not is_alive(gone.pid)

@@ -260,17 +260,24 @@ class CellTable:
 
 def is_alive(pid: int) -> bool:
     """Whether a process runs; a zombie (ended, but not yet waited for) does not."""
+    if not _exists(pid):
+        return False
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:  # no such folder on this system, or another has just waited for a zombie
+        return _exists(pid)
+    return status.rpartition(")")[2].split()[0] not in {"Z", "X"}
+
+
+def _exists(pid: int) -> bool:
+    """Whether the system knows a process, be it a zombie."""
     try:
         os.kill(pid, 0)
     except ProcessLookupError:
         return False
     except PermissionError:
-        return True
-    try:
-        status = Path(f"/proc/{pid}/stat").read_text()
-    except OSError:  # no such folder on this system, or the process ended just now
-        return True
-    return status.rpartition(")")[2].split()[0] not in {"Z", "X"}
+        pass
+    return True
 
 
 def anonymous_memory(name: str, size: int) -> int:

@@ -12,7 +12,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from children import child, joined, until
+from children import PATIENCE, child, joined, until
 from hapticdb.errors import UsageError
 from hapticdb.kernels.resident.cells import READER_STRIDE
 from hapticdb.resident.table import (
@@ -103,7 +103,7 @@ def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
         until(lambda: not is_alive(gone.pid))
 
         def read_text(path: Path) -> str:
-            gone.wait()
+            gone.wait(PATIENCE)
             raise FileNotFoundError(path)
 
         with monkeypatch.context() as patched:

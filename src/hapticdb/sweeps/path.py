@@ -86,12 +86,12 @@ class SweepPath:
         UsageError
             If there is no pose, a pose is not rigid, or the path is too long for its voxels.
         """
-        given = _checked(poses)
+        given = checked_poses(poses)
         center, radius = shell if isinstance(shell, Extent) else Extent.of(shell)
         rotations = given[:, :3, :3]
         quaternions = quaternion_of(rotations)
         centers = rotations @ center + given[:, :3, 3]
-        turns = _turns_between(quaternions)
+        turns = turns_between(quaternions)
         with np.errstate(over="ignore"):
             motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
         motion += radius * np.linalg.norm(turns, axis=1)
@@ -185,7 +185,7 @@ class SweepPath:
         return np.asarray(self._travels[0, at] + (samples - self.starts[at]) * self._travels[1, at])
 
 
-def _checked(poses: ArrayLike) -> Floats:
+def checked_poses(poses: ArrayLike) -> Floats:
     """Check that poses (M, 4, 4) are rigid transforms, and return them."""
     given = as_floats(poses, "a path")
     if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
@@ -205,7 +205,7 @@ def _checked(poses: ArrayLike) -> Floats:
     return given
 
 
-def _turns_between(quaternions: Floats) -> Floats:
+def turns_between(quaternions: Floats) -> Floats:
     """Rotation vectors (M - 1, 3), world frame: smallest turn from each quaternion to the next."""
     aw, a = quaternions[1:, :1], quaternions[1:, 1:]
     bw, b = quaternions[:-1, :1], -quaternions[:-1, 1:]

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.proportions import Proportions
 from hapticdb.store.base import Object
-from hapticdb.sweeps.path import SweepPath
+from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 
@@ -75,8 +75,9 @@ class Swept:
 
     Attributes
     ----------
-    path : SweepPath
-        The poses given, and the motion between them.
+    path : Way
+        The poses given, and the motion between them: `path.at(fractions * path.length)` gives poses,
+        and no place of the tool moves more than `path.length` metres.
     gap : Gap
         Of all objects while they do not touch; 0 if anything is hit.
     hits : tuple of Place
@@ -105,7 +106,7 @@ class Swept:
         Whether the time ended the sweep before all was decided.
     """
 
-    path: SweepPath
+    path: Way
     gap: Gap
     hits: tuple[Place, ...]
     touching: tuple[Touching, ...]

@@ -1,0 +1,221 @@
+"""Distance of two surfaces: a walk through both of their trees of boxes.
+
+The trees are those of `surfaces.sides`. A pair of nodes whose boxes are farther apart than the
+nearest triangles so far is not entered. The distance told from below is proved for each pair of
+triangles (`pairs`), and boxes are never told farther apart than they are, so it is never too large.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
+from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+WAITING = 256
+"""Pairs of nodes that wait to be visited: more than the height of two trees over 2^31 leaves."""
+
+
+@leaf
+def place_corners(corners, first, last, pose, out):
+    """Write triangles first .. last - 1, moved by a pose (4, 4), into out (.., 3, 3)."""
+    for n in range(first, last):
+        for i in range(3):
+            x, y, z = corners[n, i, 0], corners[n, i, 1], corners[n, i, 2]
+            for axis in range(3):
+                out[n - first, i, axis] = (
+                    pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
+                )
+
+
+@leaf
+def box_gap(boxes, node, others, other, pose, slack):
+    """Squared distance, at most, of a node's box and that of another tree, moved by a pose."""
+    if boxes[node, 0, 0] > boxes[node, 1, 0] or others[other, 0, 0] > others[other, 1, 0]:
+        return math.inf
+    square = 0.0
+    cx = 0.5 * (others[other, 0, 0] + others[other, 1, 0])
+    cy = 0.5 * (others[other, 0, 1] + others[other, 1, 1])
+    cz = 0.5 * (others[other, 0, 2] + others[other, 1, 2])
+    hx = others[other, 1, 0] - cx
+    hy = others[other, 1, 1] - cy
+    hz = others[other, 1, 2] - cz
+    for axis in range(3):
+        middle = pose[axis, 0] * cx + pose[axis, 1] * cy + pose[axis, 2] * cz + pose[axis, 3]
+        half = abs(pose[axis, 0]) * hx + abs(pose[axis, 1]) * hy + abs(pose[axis, 2]) * hz + slack
+        gap = max(boxes[node, 0, axis] - middle - half, middle - half - boxes[node, 1, axis], 0.0)
+        square += gap * gap
+    return square
+
+
+@leaf
+def _extent(boxes, node):
+    """Sum of a box's edges."""
+    return (
+        (boxes[node, 1, 0] - boxes[node, 0, 0])
+        + (boxes[node, 1, 1] - boxes[node, 0, 1])
+        + (boxes[node, 1, 2] - boxes[node, 0, 2])
+    )
+
+
+@leaf
+def largest(boxes):
+    """Largest coordinate of the box of all."""
+    found = 0.0
+    for axis in range(3):
+        found = max(found, abs(boxes[0, 0, axis]), abs(boxes[0, 1, axis]))
+    return found
+
+
+@leaf
+def triangle_gap(one, n, other, m):
+    """Squared distance of the boxes of two triangles."""
+    square = 0.0
+    for axis in range(3):
+        low = min(one[n, 0, axis], one[n, 1, axis], one[n, 2, axis])
+        high = max(one[n, 0, axis], one[n, 1, axis], one[n, 2, axis])
+        below = min(other[m, 0, axis], other[m, 1, axis], other[m, 2, axis])
+        above = max(other[m, 0, axis], other[m, 1, axis], other[m, 2, axis])
+        gap = max(low - above, below - high, 0.0)
+        square += gap * gap
+    return square
+
+
+@leaf
+def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
+    """Measure the triangles of two leaves; notes what is nearer than out[0] from below.
+
+    The nearest pair from above has its triangles in pair (2,) and its places in out[2:8].
+    """
+    begin = (other - b.boxes.shape[0] // 2) * LEAF_SIZE
+    end = min(begin + LEAF_SIZE, b.corners.shape[0])
+    place_corners(b.corners, begin, end, pose, placed)
+    first = (node - a.boxes.shape[0] // 2) * LEAF_SIZE
+    for n in range(first, min(first + LEAF_SIZE, a.corners.shape[0])):
+        for m in range(begin, end):
+            if triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]:
+                below, above = measure_pair(a.corners, n, placed, m - begin, size, found)
+                _keep(below, above, n, m, found, pair, out)
+
+
+@leaf
+def _keep(below, above, n, m, found, pair, out):
+    """Note a pair of triangles where it is nearer than what is known."""
+    out[0] = min(out[0], below)
+    if above < out[1]:
+        out[1] = above
+        pair[0], pair[1] = n, m
+        for k in range(6):
+            out[2 + k] = found[1 + k]
+
+
+@leaf
+def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
+    """Find the nearest triangles of tree a and of tree b, moved by a pose (4, 4) into a's frame.
+
+    out (8,): bounds of the distance from below and from above, which begin as the greatest distance
+    that is looked for, then the place on each. pair (2,): triangles that are tried first, -1 where
+    none is known; afterwards the nearest ones, or -1. Ends at once where the bound above is
+    `enough` or less. nodes (.., 2), squares, placed, found are scratch.
+    """
+    size = largest(a.boxes)
+    reach = largest(b.boxes)
+    for axis in range(3):
+        size = max(size, abs(pose[axis, 3]) + 2.0 * reach)
+    slack = ROUNDING * size
+    first, second = pair[0], pair[1]
+    pair[0], pair[1] = -1, -1
+    if first >= 0:
+        place_corners(b.corners, second, second + 1, pose, placed)
+        below, above = measure_pair(a.corners, first, placed, 0, size, found)
+        _keep(below, above, first, second, found, pair, out)
+    leaves_a, leaves_b = a.boxes.shape[0] // 2, b.boxes.shape[0] // 2
+    nodes[0, 0], nodes[0, 1] = 0, 0
+    squares[0] = box_gap(a.boxes, np.int64(0), b.boxes, np.int64(0), pose, slack)
+    top = 1
+    while top > 0 and out[1] > enough:
+        top -= 1
+        if not squares[top] < out[0] * out[0]:
+            continue
+        node, other = nodes[top, 0], nodes[top, 1]
+        if node >= leaves_a and other >= leaves_b:
+            _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out)
+            continue
+        if other >= leaves_b or (
+            node < leaves_a and _extent(a.boxes, node) >= _extent(b.boxes, other)
+        ):
+            near, far, near_other, far_other = 2 * node + 1, 2 * node + 2, other, other
+        else:
+            near, far, near_other, far_other = node, node, 2 * other + 1, 2 * other + 2
+        here = box_gap(a.boxes, near, b.boxes, near_other, pose, slack)
+        there = box_gap(a.boxes, far, b.boxes, far_other, pose, slack)
+        if there < here:
+            near, far, near_other, far_other = far, near, far_other, near_other
+            here, there = there, here
+        nodes[top, 0], nodes[top, 1], squares[top] = far, far_other, there
+        top += 1
+        nodes[top, 0], nodes[top, 1], squares[top] = near, near_other, here
+        top += 1
+
+
+@entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, INTS2, FLOATS2)
+def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
+    """Find the nearest triangles at poses (N, 4, 4), which lead b into a's frame.
+
+    farthest (N,): the greatest distance that is looked for; pairs (N, 2), out (N, 8): as for
+    `nearest_pair`. The pair of a pose is tried first at the next one that has none.
+    """
+    nodes = np.empty((WAITING, 2), dtype=np.int64)
+    squares = np.empty(WAITING)
+    placed = np.empty((LEAF_SIZE, 3, 3))
+    found = np.empty(7)
+    for n in range(poses.shape[0]):
+        if n and pairs[n, 0] < 0:
+            pairs[n, 0], pairs[n, 1] = pairs[n - 1, 0], pairs[n - 1, 1]
+        out[n, 0] = out[n, 1] = farthest[n]
+        nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
+
+
+class Nearest(NamedTuple):
+    """Distances of two surfaces at N poses, metres, in the frame of the first.
+
+    at_least, at_most (N,): bounds; the greatest distance that was looked for where nothing is
+    nearer; on_a, on_b (N, 3): the nearest places, whose distance is `at_most`; pairs (N, 2):
+    numbers of the triangles in the trees, -1 where nothing is nearer.
+    """
+
+    at_least: Floats
+    at_most: Floats
+    on_a: Floats
+    on_b: Floats
+    pairs: Ints
+
+
+def nearest(
+    a: TriangleTree,
+    b: TriangleTree,
+    poses: Floats,
+    farthest: Floats,
+    *,
+    enough: float = 0.0,
+    first: Ints | None = None,
+) -> Nearest:
+    """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
+
+    farthest (N,): the greatest distance that is looked for; a distance of `enough` or less ends the
+    search at a pose, and is then that of some triangles; first (2,): triangles that are tried first.
+    """
+    pairs = np.full((len(poses), 2), -1, dtype=np.int64)
+    if first is not None and len(poses):
+        pairs[0] = first
+    out = np.zeros((len(poses), 8))
+    nearest_kernel(
+        a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out
+    )
+    return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)

@@ -1,0 +1,124 @@
+"""Least distance of two surfaces along a path, and where they meet first: branch and bound.
+
+A place of the path is told by its way: the metres that the tool's farthest-moving place has moved
+at most. So the distance of two surfaces changes by no more than the way does, and one measurement
+in the middle of a stretch bounds the distance on all of it. A stretch is halved until its bound is
+as good as the nearest place that is known.
+"""
+
+import time
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels.surfaces.sides import TriangleTree
+from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.sweeps.way import Way
+
+Floats = NDArray[np.float64]
+
+FINE = 9e-6
+"""Metres to which a least distance is found, if that is more than `SHARE` of it."""
+SHARE = 0.009
+"""Share of a least distance to which it is found. Larger: fewer measurements."""
+MEETING = 1e-5
+"""Metres: surfaces that come so near have met."""
+AT_ONCE = 2048
+"""Measurements after which the time is looked at. Larger: a limit of time is overrun by more."""
+
+
+class OverTimeError(Exception):
+    """The time of a sweep is over."""
+
+
+class Least(NamedTuple):
+    """Bounds of a least distance, metres, and the way of its place with the places found there."""
+
+    at_least: float
+    at_most: float
+    way: float
+    on_object: Floats
+    on_tool: Floats
+
+
+class Pair:
+    """The tool and one object along a path.
+
+    tree, tool : triangles of the object, world frame, and of the tool; way : the path; until : time
+    of `time.monotonic` at which it ends by OverTimeError.
+    """
+
+    def __init__(self, tree: TriangleTree, tool: TriangleTree, way: Way, until: float) -> None:
+        self.tree, self.tool, self.way, self.until = tree, tool, way, until
+        self.looks = 0
+
+    def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
+        """Measure at ways (n,); farthest (n,), enough : as for `kernels.triangles.nearest`."""
+        found = []
+        for at in range(0, max(len(ways), 1), AT_ONCE):
+            some = slice(at, at + AT_ONCE)
+            poses = self.way.at(ways[some])
+            found.append(nearest(self.tree, self.tool, poses, farthest[some], enough=enough))
+            self.looks += len(poses)
+            if time.monotonic() > self.until:
+                raise OverTimeError
+        return Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+
+    def least(self, lows: Floats, highs: Floats, best: float) -> Least | None:
+        """Least distance on stretches of the path (n,), if it is less than `best`; else None.
+
+        Ends as soon as the surfaces have met.
+        """
+        found: Least | None = None
+        closed = best
+        while len(lows):
+            middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
+            near = self.measure(middles, best + halves, MEETING)
+            n = int(np.argmin(near.at_most))
+            if near.at_most[n] < best:
+                best = float(near.at_most[n])
+                found = Least(0.0, best, float(middles[n]), near.on_a[n], near.on_b[n])
+            if best <= MEETING:
+                return found
+            bounds = near.at_least - halves
+            is_open = bounds < best - error_of(best)
+            closed = min(closed, float(bounds[~is_open].min(initial=np.inf)))
+            lows, highs = halved(lows, highs, is_open)
+        return None if found is None else found._replace(at_least=max(min(closed, best), 0.0))
+
+    def first(self, lows: Floats, highs: Floats, known: float) -> Least:
+        """Where on stretches of the path (n,) the surfaces meet first; known : a way where they do.
+
+        Before it they keep half of `MEETING` apart.
+        """
+        found = self._at(known)
+        while len(lows):
+            middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
+            near = self.measure(middles, MEETING + halves, 0.0)
+            met = np.flatnonzero((near.at_most <= MEETING) & (middles < found.way))
+            if len(met):
+                n = int(met[np.argmin(middles[met])])
+                found = Least(
+                    0.0, float(near.at_most[n]), float(middles[n]), near.on_a[n], near.on_b[n]
+                )
+            is_open = (near.at_least - halves < 0.5 * MEETING) & (lows < found.way)
+            is_open &= halves > 0.25 * MEETING
+            lows, highs = halved(lows, highs, is_open)
+        return found
+
+    def _at(self, way: float) -> Least:
+        near = self.measure(np.array([way]), np.array([2.0 * MEETING]))
+        return Least(0.0, float(near.at_most[0]), way, near.on_a[0], near.on_b[0])
+
+
+def error_of(distance: float) -> float:
+    """Metres to which a least distance is found."""
+    return max(FINE, SHARE * distance)
+
+
+def halved(lows: Floats, highs: Floats, is_open: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+    """Both halves of the stretches that are open, in order."""
+    low, high = lows[is_open], highs[is_open]
+    middle = 0.5 * (low + high)
+    return np.stack([low, middle], axis=1).ravel(), np.stack([middle, high], axis=1).ravel()

@@ -1,0 +1,120 @@
+"""The motion along a path, told by the metres that no place of the tool exceeds."""
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.poses import quaternion_of, rotation_of
+from hapticdb.sweeps.path import Floats, checked_poses, turns_between
+
+Ints = NDArray[np.int64]
+
+AT_ONCE = 64
+"""Segments whose turns are bounded together. Larger: more memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class Way:
+    """M given poses and the motion between them.
+
+    The tool's `center` moves on straight lines, and the tool turns about it evenly, about one axis
+    (slerp). Rotations are made orthonormal first; a given one may deviate by 1e-6.
+
+    Attributes
+    ----------
+    poses : (M, 4, 4)
+        As given, `world_from_tool`.
+    ways : (M,)
+        Metres at each given pose: from one to the next, no place of the tool moves more than the
+        difference.
+    """
+
+    poses: Floats
+    ways: Floats
+    _center: Floats
+    _centers: Floats
+    _quaternions: Floats
+    _turns: Floats
+
+    @classmethod
+    def of(cls, poses: ArrayLike, corners: Floats, center: Floats) -> "Way":
+        """Motion of a tool with corners (V, 3) through poses (M, 4, 4); center (3,), its frame.
+
+        Raises
+        ------
+        UsageError
+            If there is no pose, a pose is not rigid, or the path is too long for numbers.
+        """
+        given = checked_poses(poses)
+        quaternions = quaternion_of(given[:, :3, :3])
+        centers = given[:, :3, :3] @ center + given[:, :3, 3]
+        turns = turns_between(quaternions)
+        with np.errstate(over="ignore"):
+            motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
+        motion += _turned(corners - center, turns, rotation_of(quaternions[:-1]))
+        ways = np.concatenate([[0.0], np.cumsum(motion)])
+        if not np.isfinite(ways[-1]):
+            raise UsageError("the path is longer than numbers go: check its unit")
+        return cls(given, ways, center, centers, quaternions, turns)
+
+    @property
+    def length(self) -> float:
+        """Metres at the last pose."""
+        return float(self.ways[-1])
+
+    def segments(self, ways: Floats) -> Ints:
+        """Segments (n,) of ways (n,), 0 .. M - 2: index of the last given pose before each."""
+        found = np.searchsorted(self.ways, ways, side="right") - 1
+        return np.asarray(np.clip(found, 0, max(len(self.ways) - 2, 0)))
+
+    def fraction(self, way: float) -> float:
+        """Share of the path's motion before a way, 0 .. 1."""
+        return min(way / self.length, 1.0) if self.length > 0.0 else 0.0
+
+    def at(self, ways: ArrayLike) -> Floats:
+        """Poses (n, 4, 4) at ways (n,); the first and the last one where a way is beyond them."""
+        ways = np.asarray(ways, dtype=np.float64)
+        at = self.segments(ways)
+        out = np.tile(np.eye(4), (len(ways), 1, 1))
+        if len(self.ways) == 1:
+            out[:, :3, :3] = rotation_of(self._quaternions)
+            centers = self._centers[at]
+        else:
+            length = self.ways[at + 1] - self.ways[at]
+            share = np.where(length > 0.0, (ways - self.ways[at]) / np.where(length, length, 1), 0)
+            share = np.clip(share, 0.0, 1.0)[:, None]
+            out[:, :3, :3] = rotation_of(_by(share * self._turns[at], self._quaternions[at]))
+            centers = self._centers[at] + share * (self._centers[at + 1] - self._centers[at])
+        out[:, :3, 3] = centers - out[:, :3, :3] @ self._center
+        return out
+
+
+def _turned(corners: Floats, turns: Floats, rotations: Floats) -> Floats:
+    """Metres (M - 1,) that the farthest of corners (V, 3) about the centre moves in each turn."""
+    angles = np.linalg.norm(turns, axis=1)
+    out = np.zeros(len(turns))
+    turning = np.flatnonzero(angles > 0.0)
+    if not len(turning):
+        return out
+    corners = np.unique(corners, axis=0)
+    squares = (corners**2).sum(axis=1)
+    axes = np.einsum("nij,ni->nj", rotations[turning], turns[turning] / angles[turning, None])
+    for at in range(0, len(turning), AT_ONCE):
+        along = corners @ axes[at : at + AT_ONCE].T
+        beside = np.sqrt(np.maximum(squares[:, None] - along**2, 0.0).max(axis=0))
+        out[turning[at : at + AT_ONCE]] = angles[turning[at : at + AT_ONCE]] * beside
+    return out * (1.0 + 1e-9)
+
+
+def _by(turns: Floats, quaternions: Floats) -> Floats:
+    """Quaternions (n, 4) after turns (n, 3), rotation vectors in the world frame."""
+    angle = np.linalg.norm(turns, axis=1, keepdims=True)
+    w = np.cos(0.5 * angle)
+    v = turns * np.where(angle < 1e-12, 0.5, np.sin(0.5 * angle) / np.maximum(angle, 1e-300))
+    bw, b = quaternions[:, :1], quaternions[:, 1:]
+    product = np.hstack(
+        [w * bw - (v * b).sum(axis=1, keepdims=True), w * b + bw * v + np.cross(v, b)]
+    )
+    return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))

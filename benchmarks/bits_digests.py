@@ -169,5 +169,5 @@ def swept(place: Place, tool: Tool, results: Results) -> None:
     del verdict["elapsed"]
     (digest := Digest()).feed(json.dumps(verdict, sort_keys=True))
     results[f"{place.name}/sweep"] = digest.entry(
-        verdict["hits"], f"of {verdict['samples']} samples hit"
+        len(verdict["hits"]), f"objects hit: {verdict['line']}"
     )

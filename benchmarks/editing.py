@@ -8,6 +8,7 @@ import subprocess
 import sys
 import threading
 import time
+from collections import Counter
 from pathlib import Path as FilePath
 from typing import Any
 
@@ -31,10 +32,10 @@ PATIENCE = 60.0
 
 
 def touched_object(url: str, shell: PointShell, path: FilePath) -> int:
-    """Id of the object that the tool hits for most of the path."""
+    """Id of the object that the tool hits at most poses of the path."""
     with hapticdb.open(url, read_only=True) as env:
-        met = hapticdb.sweep(env, shell, read_poses(path), clearance_limit=0.0).objects
-    return max(met, key=lambda one: one.samples).object.id
+        met = [obj.id for pose in read_poses(path) for obj in env.touch(shell, pose).objects]
+    return Counter(met).most_common(1)[0][0]
 
 
 def write(url: str, object_id: int, n_edits: int) -> None:

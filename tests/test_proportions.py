@@ -17,7 +17,7 @@ from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F4
 from hapticdb import Object, PointShell, Proportions, compare_proportions
 from hapticdb.errors import UsageError
 from hapticdb.poses import rotation_of
-from hapticdb.sweeps.path import SweepPath
+from hapticdb.sweeps.way import Way
 from hapticdb.units import UNITS
 
 TOOL = ("--tool", "tool.stl")
@@ -168,8 +168,9 @@ def test_no_point_of_the_tool_comes_nearer_than_the_gap(seed: int, pairs: int) -
         patch.setattr("hapticdb.proportions.PAIRS", pairs)
         gap = compare_proportions(scene, 0.01, shell, path).gap
     assert gap is not None
-    way = SweepPath.of(path, shell, 0.3)
-    for pose in way.sample(0, len(way)):
+    middle = 0.5 * (shell.points.min(axis=0) + shell.points.max(axis=0))
+    way = Way.of(path, shell.points, middle)
+    for pose in way.at(np.append(way.ways, np.arange(0.0, way.length, 0.15))):
         points = shell.points @ pose[:3, :3].T + pose[:3, 3]
         for low, high in boxes:
             apart = np.maximum(np.maximum(low - points, points - high), 0)
@@ -201,9 +202,9 @@ def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: Path) -> None:
 
 def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
     poses(scene.parent / "mm.csv", (0, 0, 55), (200, 0, 300))
-    args = ("sweep", scene, *TOOL, "--path", "mm.csv", "--clearance", 0)
+    args = ("sweep", scene, *TOOL, "--path", "mm.csv")
     code, out, err = run(*args)
-    assert (code, out.startswith("comes out: ")) == (3, True)
+    assert (code, out.startswith("clear ")) == (3, True)
     assert err.endswith("millimetres, not metres (factor 1000); give --path-unit mm if so\n")
     assert len(err.splitlines()) == 1
     code, out, _ = run(*args, "--json")

@@ -30,10 +30,10 @@ def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
     assert hits("--where", "box1", "--exclude", "box1") == [0, 0, 0]
     each = [hits("--where", f"box{n}") for n in range(3)]
     assert [max(column) for column in zip(*each, strict=True)] == everything
-    path = ("--tool", "tool.npz", "--path", "path.csv", "--json")
+    path = ("--tool", "tool.stl", "--path", "path.csv", "--json")
     for n in range(3):
         found = json.loads(run("sweep", scene, *path, "--where", f"box{n}")[1])
-        assert {one["id"] for one in found["objects"]} == ({n + 1} if any(each[n]) else set())
+        assert [one["name"] for one in found["hits"]] == ["box1"] * (n == 1)
         assert found["tool"]["excluded"] == sorted({1, 2, 3} - {n + 1})
     hand = ("--tool", "tool.npz", "--device", "path.csv", "--policy", "wait", "--rate", 200)
     code, out, err = run("feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?")
@@ -52,7 +52,7 @@ def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...
     assert (code, err) == (0, "")
     assert (found["tool"]["parts"], found["tool"]["excluded"]) == ([1, 3], [1, 3])
     code, out, _ = run("sweep", scene, "--part", *parts, "--path", aside, "--json")
-    assert (code, [one["id"] for one in json.loads(out)["objects"]]) == (1, [2])
+    assert (code, [one["id"] for one in json.loads(out)["hits"]]) == (1, [2])
     # box 2 alone has a free path, so the result above does not come from it alone
     assert run("sweep", scene, "--part", "3", "--path", aside)[0] == 0
 

@@ -12,7 +12,7 @@ import pytest
 
 import hapticdb
 from children import finished
-from command_line import Run, boxes, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping
 
@@ -21,7 +21,7 @@ TOOL = ("--tool", "tool.stl")
 
 @pytest.fixture
 def free(scene: Path) -> Path:
-    """A path above the boxes."""
+    """A path 40 mm above the boxes."""
     return poses(scene.parent / "free.csv", (0.0, 0.0, 0.1), (0.4, 0.0, 0.1))
 
 
@@ -33,134 +33,60 @@ def through(scene: Path) -> Path:
     )
 
 
+@pytest.fixture
+def along(scene: Path) -> Path:
+    """A path on which the tool lies on the first box, slides, and goes up."""
+    return poses(scene.parent / "along.csv", (0.0, 0.0, 0.06), (0.02, 0.0, 0.06), (0.02, 0.0, 0.2))
+
+
 @pytest.mark.usefixtures("free")
-def test_what_comes_out_is_said_with_its_clearance(run: Run, scene: Path) -> None:
+def test_what_is_clear_is_said_with_its_gap(run: Run, scene: Path) -> None:
     code, out, err = run("sweep", scene, *TOOL, "--path", "free.csv")
     assert (code, err) == (0, "")
-    lines = out.splitlines()
-    assert lines[0].startswith("comes out: no hit in ")
-    # voxels of 12.5 mm: a box's voxels end at 62.5 mm, the tool begins at 90 mm
-    assert lines[0].endswith(", least clearance 27.5 mm from box0")
-    assert any(line.startswith("clearance") and "the surfaces are" in line for line in lines)
-    assert any(
-        line.startswith("tool") and "none of its surface more than" in line for line in lines
-    )
+    assert out.startswith("clear by 40 mm: nearest box")
+    found = json.loads(run("sweep", scene, *TOOL, "--path", "free.csv", "--json")[1])
+    assert found["verdict"] == "clear"
+    assert found["gap"] <= 0.04 <= found["gap_at_most"] <= 0.0404
+    assert (found["moved"], found["path"], found["poses"]) == ("tool.stl", "free.csv", 2)
 
 
 @pytest.mark.usefixtures("through")
-def test_what_is_caught_is_said_with_where_and_by_what(run: Run, scene: Path) -> None:
+def test_what_is_hit_is_said_with_where(run: Run, scene: Path) -> None:
     code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv")
     assert (code, err) == (1, "")
     first, *rest = out.splitlines()
-    assert first.startswith("is caught: first contact at ")
-    assert "(segment 0) with box0" in first
+    assert first.startswith("hits box0 at ")
+    assert "(segment 0)" in first
     assert [name for name in ("box0", "box1", "box2") if any(name in line for line in rest)] == [
         "box0", "box1", "box2",
     ]  # fmt: skip
 
 
-def test_what_is_not_decided_has_a_code_of_its_own(run: Run, scene: Path) -> None:
-    """The tool ends 5 mm above a box's voxels, and its 40 points are more than 5 mm apart."""
-    poses(scene.parent / "near.csv", (0.0, 0.0, 0.0775), (0.005, 0.0, 0.0775))
-    few = ("--points", 40)
-    code, out, err = run("sweep", scene, *TOOL, "--path", "near.csv", *few)
-    assert (code, err) == (3, "")
-    verdict = out.splitlines()[0]
-    assert verdict.startswith("not decided: no hit in ")
-    assert "a voxel of box0 comes within 5 mm of a point" in verdict
-    n_points = verdict.rpartition("--points ")[2].rstrip(")")
-    code, out, _ = run("sweep", scene, *TOOL, "--path", "near.csv", "--points", n_points)
-    assert (code, out[:9]) == (0, "comes out")
-    found = json.loads(run("sweep", scene, *TOOL, "--path", "near.csv", *few, "--json")[1])
-    assert (found["verdict"], found["comes_out"]) == ("not decided", False)
-    assert found["proof"]["cover"] > found["proof"]["nearest"] > found["proof"]["cover_needed"]
+@pytest.mark.usefixtures("along")
+def test_what_slides_at_its_start_is_no_hit(run: Run, scene: Path) -> None:
+    sweep = ("sweep", scene, *TOOL, "--path", "along.csv")
+    code, out, err = run(*sweep)
+    assert (code, err) == (0, "")
+    assert out.startswith("slides along box0 until 12.5 % of the path, otherwise clear by ")
+    assert run(*sweep, "--contact", 0)[0] == 1
+    refused(run(*sweep, "--contact", -1), "contact")
 
 
-def test_a_saved_shell_is_told_what_it_lacks(run: Run, scene: Path) -> None:
-    poses(scene.parent / "free.csv", (0.0, 0.0, 0.1), (0.4, 0.0, 0.1))
-    hapticdb.PointShell.from_file(scene.parent / "tool.stl", 2000).save(scene.parent / "tool.npz")
-    code, out, _ = run("sweep", scene, "--tool", "tool.npz", "--path", "free.csv")
-    assert code == 3
-    assert "how well the points cover the tool is not known: give its mesh" in out.splitlines()[0]
+def test_a_path_may_turn_about_another_centre(run: Run, scene: Path) -> None:
+    """Half a turn takes the tool through the first box, or about the box's middle round it."""
+    text = "x,y,z,qw,qx,qy,qz\n0,0,0.1,1,0,0,0\n0,0,-0.1,0,0,1,0\n"
+    (scene.parent / "turn.csv").write_text(text)
+    sweep = ("sweep", scene, *TOOL, "--path", "turn.csv")
+    assert run(*sweep)[0] == 1
+    code, out, _ = run(*sweep, "--about", "0,0,-100", "--json")
+    assert (code, json.loads(out)["nearest"]["name"]) == (0, "box0")
+    # the tool's inner side is 90 mm from the box's middle, the box's edges are 70.7 mm from it
+    assert json.loads(out)["gap"] == pytest.approx(0.09 - 0.1 / 2**0.5, rel=0.01)
+    refused(run(*sweep, "--about", "0,-100"), "--about", "millimetres")
 
 
-@pytest.mark.usefixtures("through")
-def test_sweep_json_has_the_documented_keys(run: Run, scene: Path) -> None:
-    code, out, err = run("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--points", 50)
-    assert (code, err) == (1, "")
-    found = json.loads(out)
-    assert set(found) == {
-        "verdict", "comes_out", "line", "proof", "poses", "samples", "hits", "contacts",
-        "first_hit", "first_contact", "deepest", "objects", "enclosed", "hit_intervals",
-        "contact_intervals", "clearance", "tool", "revision", "elapsed", "cells", "proportions",
-        "at_least", "looked", "left_at_start", "decision", "depths",
-    }  # fmt: skip
-    assert set(found["first_contact"]) == {"sample", "fraction", "segment", "pose", "objects"}
-    assert set(found["deepest"]) == {"depth", "point", "moment"}
-    assert set(found["clearance"]) == {
-        "distance", "at_least", "at_most", "is_beyond", "point", "voxel", "moment",
-    }  # fmt: skip
-    assert set(found["objects"][0]) == {
-        "id", "name", "first", "last", "intervals", "first_contact", "length", "samples",
-        "contacts", "points", "deepest",
-    }  # fmt: skip
-    assert (found["comes_out"], found["poses"], found["tool"]["points"]) == (False, 3, 50)
-    assert found["clearance"]["distance"] == 0.0
-
-
-@pytest.mark.usefixtures("scene")
-def test_what_the_tool_touches_at_its_start_is_left_out_and_named(run: Run, scene: Path) -> None:
-    poses(scene.parent / "up.csv", (0.0, 0.0, 0.055), (0.0, 0.0, 0.2))
-    up = ("sweep", scene, *TOOL, "--path", "up.csv", "--leave-start")
-    code, out, _ = run(*up)
-    assert code == 0
-    assert "; left out, since touched at the start: box0; in box0 " in out.splitlines()[0]
-    found = json.loads(run(*up, "--json")[1])
-    assert [one["name"] for one in found["depths"]] == ["box0"]
-    assert [one["name"] for one in found["left_at_start"]] == ["box0"]
-    assert found["tool"]["excluded"] == []
-
-
-def test_nothing_comes_out_of_what_it_may_cut(run: Run, scene: Path) -> None:
-    """The file of what the tool touches at its start is gone: it is not known how deep it goes."""
-    file = boxes(scene.parent / "own.glb")
-    assert run("import", "own.db", file, "--bits", 6)[0] == 0
-    file.unlink()
-    poses(scene.parent / "up.csv", (0.0, 0.0, 0.055), (0.0, 0.0, 0.2))
-    up = ("sweep", "own.db", *TOOL, "--path", "up.csv", "--leave-start")
-    code, out, _ = run(*up)
-    assert code == 3
-    assert "comes out" not in out
-    line = out.splitlines()[0]
-    assert line.startswith("not decided: meets nothing else, but how deep it goes into box0 ")
-    code, out, _ = run(*up, "--json")
-    assert (code, json.loads(out)["verdict"], json.loads(out)["line"]) == (3, "not decided", line)
-
-
-@pytest.mark.usefixtures("through")
-def test_a_hit_is_told_only_within_the_tolerance(run: Run, scene: Path) -> None:
-    sweep = ("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--tolerance")
-    code, out, _ = run(*sweep, 10)
-    decision = json.loads(out)["decision"]
-    assert (code, decision["is_near"]) == (1, True)
-    assert decision["within"] <= decision["tolerance"] == 0.01
-    code, out, _ = run(*sweep, 1e-6)
-    found = json.loads(out)
-    assert (code, found["verdict"], found["decision"]["is_near"]) == (3, "not decided", False)
-    assert found["line"].startswith("not decided below ")
-    assert "grazes box0" in found["line"]
-
-
-def test_a_finer_shell_decides_by_itself(run: Run, scene: Path) -> None:
-    """Few points at first, and the tool starts 5 mm above a box's voxels."""
-    poses(scene.parent / "near.csv", (0.0, 0.0, 0.0775), (0.0, 0.0, 0.2))
-    near = ("sweep", scene, *TOOL, "--path", "near.csv", "--points", 6)
-    assert run(*near)[0] == 3
-    code, out, _ = run(*near, "--refine")
-    assert (code, out[:24]) == (0, "comes out with at least ")
-    decision = json.loads(run(*near, "--refine", "--json")[1])["decision"]
-    assert decision["is_clear"]
-    assert 0.0 < decision["at_least"] <= 0.0175 + 1e-9  # the boxes' surfaces are so far apart
+def test_a_saved_shell_has_no_surface(run: Run, scene: Path) -> None:
+    refused(run("sweep", scene, "--tool", "tool.npz", "--path", "path.csv"), "surface")
 
 
 @pytest.mark.usefixtures("through")
@@ -171,14 +97,53 @@ def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
     text = scene.with_name("hit.csv").read_text()
     header, *rows = [line.split(",") for line in text.splitlines()]
     assert tuple(header) == SWEPT
-    assert [(row[1], float(row[2]), float(row[3])) for row in rows] == [
-        (one["name"], *interval) for one in found["objects"] for interval in one["intervals"]
+    assert [(row[1], row[2], float(row[3])) for row in rows] == [
+        (one["name"], "hit", one["fraction"]) for one in found["hits"]
     ]
     code, out, err = run(*sweep, "--csv", "-")
     assert (code, out, err) == (1, text, "")
     refused(run(*sweep, "--csv", "-", "--json"), "only one")
     refused(run(*sweep, "--csv", "hit.csv"), "--csv")
-    refused(run(*sweep, "--tolerance", 0), "tolerance")
+
+
+@pytest.mark.usefixtures("free", "through", "along")
+def test_many_sweeps_are_one_command(run: Run, scene: Path) -> None:
+    many = scene.with_name("many.csv")
+    many.write_text(
+        "tool,part,path,exclude,contact\n"
+        "tool.stl,,free.csv,,\n"
+        "tool.stl,,through.csv,box0; box[12],\n"
+        ",box2,free.csv,,0.1\n"
+    )
+    code, out, err = run("sweep", scene, "--batch", "many.csv")
+    assert (code, err) == (0, "")
+    assert [line.split()[0] for line in out.splitlines()[1:]] == ["tool.stl", "tool.stl", "box2"]
+    many.write_text(many.read_text() + "tool.stl,,through.csv,,\n")
+    code, out, err = run("sweep", scene, "--batch", "many.csv", "--json")
+    assert (code, err) == (1, "")
+    found = [json.loads(line) for line in out.splitlines()]
+    assert [one["verdict"] for one in found] == ["clear", "clear", "clear", "hits"]
+    assert [one["contact"] for one in found] == pytest.approx([5e-5, 5e-5, 1e-4, 5e-5])
+    assert found[1]["tool"]["excluded"] == [1, 2, 3]
+    assert found[2]["tool"]["parts"] == [3]
+
+
+@pytest.mark.parametrize(
+    ("text", "told"),
+    [
+        ("", "--batch"), ("part,way\n1,a.csv\n", "'way'"), ("part\n1\n", "path"),
+        ("part,path\n", "no sweep"), ("part,path\n1\n", "line 2"), ("part,path\n1,,\n", "line 2"),
+        ("part,tool,path\n1,tool.stl,path.csv\n", "line 2"),
+        ("part,path\n\n1,path.csv\n9,path.csv\n", "line 4: --part: no object 9"),
+        ("part,path\n1,none.csv\n", "line 2: no file of poses"),
+        ("tool,path\nnone.stl,path.csv\n", "line 2: cannot read none.stl"),
+        ("part,path,contact\n1,path.csv,wide\n", "line 2: contact"),
+        ('part,path\n"1,path.csv\n', "line 2"), ("\0", "--batch"),
+    ],
+)  # fmt: skip
+def test_a_wrong_file_of_sweeps_is_one_line(run: Run, scene: Path, text: str, told: str) -> None:
+    scene.with_name("many.csv").write_text(text)
+    refused(run("sweep", scene, "--batch", "many.csv"), told)
 
 
 @pytest.mark.long
@@ -229,22 +194,23 @@ def test_a_path_beside_the_environment_is_told(
 ) -> None:
     poses(scene.parent / "mm.csv", place, (place[0] + 0.1, *place[1:]))
     code, out, err = run("sweep", scene, *TOOL, "--path", "mm.csv")
-    assert (code, out.startswith("comes out: ")) == (3, True)
+    assert (code, out.startswith("clear ")) == (3, True)
     (line,) = err.splitlines()
     assert line.startswith("hapticdb: the path never comes within ")
+    assert run("sweep", scene, *TOOL, "--path", "mm.csv", "--as-given")[0] == 0
 
 
 def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     path = ("--path", "path.csv")
     refused(run("sweep", scene, *path), "--tool and --part")
+    refused(run("sweep", scene, *TOOL), "--path", "--batch")
+    refused(run("sweep", scene, *path, "--batch", "many.csv"), "--batch and --path")
     refused(run("sweep", scene, *path, *TOOL, "--part", 1), "--tool and --part")
     refused(run("sweep", scene, *path, "--part", 1, "--tool-unit", "mm"), "--tool-unit")
     refused(run("sweep", scene, *path, "--part", 9), "no object 9")
     refused(run("sweep", scene, *path, *TOOL, "--exclude", "9"), "no object 9")
     refused(run("sweep", scene, *path, *TOOL, "--exclude", "x"), "--exclude")
-    refused(run("sweep", scene, *path, *TOOL, "--budget", 0.5), "--budget")
-    refused(run("sweep", scene, *path, *TOOL, "--clearance", -1), "clearance")
+    refused(run("sweep", scene, *path, *TOOL, "--seconds", -1), "second")
     refused(run("sweep", scene, *path, *TOOL, "--picture", "no/folder.png"), "cannot write")
-    refused(run("sweep", scene, *path, *TOOL, "--clearance", 1e300), "up to 1e+300 m needs more")
     refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
     refused(run("sweep", "none.db", *path, *TOOL), "none.db")

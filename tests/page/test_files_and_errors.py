@@ -22,6 +22,9 @@ from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
 from hapticdb.recording.file import Recorder
+from hapticdb.sweeps.result import Gap
+from hapticdb.sweeps.way import Way
+from made_sweeps import place_at, swept
 from page_person import PagePerson
 from recordings import HEADER
 from serving import PROTOCOL
@@ -237,3 +240,23 @@ def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
         person.choose("Tool", "peg")
         until(lambda: browser.tool is site.tools[1])
         assert person.told == []
+
+
+@pytest.mark.parametrize(("hits", "told"), [(True, "hits ball at 50 %"), (False, "clear by 3 mm")])
+def test_a_sweep_is_told_and_shown(
+    scene: Path, monkeypatch: pytest.MonkeyPatch, hits: bool, told: str
+) -> None:
+    with page_of(scene) as (site, person, browser):
+        choose(browser, "box.stl")
+        (ball,) = (obj for obj in site.objects.values() if obj.link.endswith("/ball.stl"))
+
+        def found(_: object, shell: hapticdb.PointShell, poses: Any, **__: object) -> Any:  # noqa: ANN401 - as `sweep`
+            path = Way.of(poses, shell.points, np.zeros(3))
+            place = place_at(ball, 0.5, path, 0.003)
+            gap = Gap(0.003, 0.003, place)
+            return swept(path, hits=(place,)) if hits else swept(path, gap=gap)
+
+        monkeypatch.setattr("hapticdb.page.panels.sweeps.sweep", found)
+        person.press("Run the sweep")
+        said_of_sweep(person, told)
+        assert not any("sweep failed" in text for text in person.received)

@@ -14,7 +14,10 @@ from hapticdb.pictures.demo import PAPER, SCENE, SIZE, TOWARDS, mixed
 from hapticdb.pictures.splat import Camera, faded, turned
 from hapticdb.pictures.sweep import compose_sweep, extent_of
 from hapticdb.store.attributes import AXES, up_axis
+from hapticdb.sweeps.result import Profile
+from hapticdb.sweeps.way import Way
 from hapticdb.units import length_text, readable_unit
+from made_sweeps import place_at, swept
 
 LONG = "assembly > sub-assembly 0123456789 > " * 4
 
@@ -72,7 +75,7 @@ def test_lengths_are_in_the_unit_that_reads_best(length: float, text: str) -> No
 
 
 def swept_figure(folder: Path, scale: float, names: list[str], reach: float = 1.0) -> Figure:
-    """Figure of a sweep over plates with the given names; the tool hits some of the plates."""
+    """Figure of a sweep over plates with the given names; the tool hits all of the plates."""
     assembly = trimesh.Scene()
     for n, name in enumerate(names):
         box = trimesh.creation.box((scale, scale, 0.05 * scale))
@@ -86,9 +89,13 @@ def swept_figure(folder: Path, scale: float, names: list[str], reach: float = 1.
         poses = np.tile(np.eye(4), (2, 1, 1))
         poses[:, 1, 3] = reach * scale, -reach * scale
         shell = PointShell.sphere(0.1 * scale, 60)
-        found = hapticdb.sweep(env, shell, poses, profile=True)
-        assert found.hits
-        return compose_sweep(env, shell, found, verdict=f"is caught: {', '.join(names)}")
+        path = Way.of(poses, shell.points, np.zeros(3))
+        hits = tuple(
+            place_at(obj, 0.1 * n, path, 0.1 * scale) for n, obj in enumerate(env.objects())
+        )
+        profile = Profile(np.array([0.0, 0.2, 1.0]), scale * np.array([0.3, 0.0, 0.1]))
+        found = swept(path, hits=hits, profile=profile)
+        return compose_sweep(env, shell, found, verdict=f"hits {', '.join(names)}")
 
 
 @pytest.mark.parametrize("scale", [0.02, 2000.0])
@@ -104,8 +111,8 @@ def test_no_words_run_over_others_or_the_edge(tmp_path: Path, scale: float) -> N
         assert box.x1 <= SIZE[0]
         assert box.y1 <= SIZE[1]
     words = " ".join(text.get_text() for text in figure.texts)
-    assert "voxels of 62.5 m" in words if scale > 1 else "voxels of 0.625 mm" in words
-    assert figure.axes[1].get_ylabel() == ("clear, m" if scale > 1 else "clear, mm")
+    assert "692.8 m across" in words if scale > 1 else "6.928 mm across" in words
+    assert figure.axes[1].get_ylabel() == ("gap, m" if scale > 1 else "gap, mm")
 
 
 @pytest.mark.parametrize("reach", [0.15, 1.0])

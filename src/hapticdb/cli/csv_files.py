@@ -22,7 +22,8 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.query.touches import Touch
     from hapticdb.recording.frame import Frames
-    from hapticdb.sweeps.result import Swept
+    from hapticdb.store.base import Object
+    from hapticdb.sweeps.result import Place, Swept
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")
@@ -36,13 +37,12 @@ TOUCHED = ("pose", *WRENCH, "hits", "contacts", "deepest_m", "object_ids", "obje
 CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "object_name")
 """Columns of `touch --contacts-csv`: a row for each contact with each object that it touches."""
 SWEPT = (
-    "object_id", "object_name", "from_fraction", "to_fraction", "enclosed", "samples",
-    "contact_samples", "points", "tangent_depth_m", "verdict", "start_depth_at_most_m",
-    "depth_at_least_m", "depth_at_most_m",
+    "object_id", "object_name", "what", "fraction", "segment", "tool_x_m", "tool_y_m", "tool_z_m",
+    "object_x_m", "object_y_m", "object_z_m", "until_fraction", "start_depth_m", "deepest_m",
+    "allowed_m", "gap_m", "verdict",
 )  # fmt: skip
-"""Columns of `sweep --csv`: a row for each interval in which an object is hit; counts and depth are
-those of all intervals of the object. Objects that are left out at the start have a row each, with
-bounds of depths; other rows have none."""
+"""Columns of `sweep --csv`: a row for each object that is hit, enclosed or touched at the start,
+and one for the nearest object; `what` says which. A cell that does not belong to it is empty."""
 _PLACE = (*(f"{axis}_m" for axis in AXES), "qw", "qx", "qy", "qz")
 _SPEED = (*(f"v{axis}_m_per_s" for axis in AXES), *(f"w{axis}_rad_per_s" for axis in AXES))
 FRAME_COLUMNS: dict[str, tuple[str, ...]] = {
@@ -152,21 +152,30 @@ def rows_of_contacts(
 
 
 def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
-    """Rows of `SWEPT`, in the order in which the tool meets the objects; those inside it last."""
-    inside, none = {obj.id for obj in found.enclosed}, ["", "", ""]
-    for one in found.objects:
-        who = [one.object.id, text_cell(one.object.name)]
-        counts = [one.samples, one.contacts, one.points, one.deepest, found.verdict, *none]
-        for begin, end in one.intervals.tolist():
-            yield [*who, begin, end, int(one.object.id in inside), *counts]
-    met = {one.object.id for one in found.objects}
+    """Rows of `SWEPT`: what is hit, along the path; enclosed; touched at the start; the nearest."""
+
+    def row(
+        what: str,
+        obj: "Object",
+        place: "Place | None" = None,
+        depths: Sequence[float | str] = ("",) * 4,
+        gap: float | str = "",
+    ) -> list[object]:
+        where: list[object] = [""] * 8
+        if place is not None:
+            on_both = [*place.on_tool.tolist(), *place.on_object.tolist()]
+            where = [place.fraction, place.segment, *on_both]
+        return [obj.id, text_cell(obj.name), what, *where, *depths, gap, found.verdict]
+
+    for place in found.hits:
+        yield row("hit", place.object, place)
     for obj in found.enclosed:
-        if obj.id not in met:
-            yield [obj.id, text_cell(obj.name), 0.0, 1.0, 1, 0, 0, 0, 0.0, found.verdict, *none]
-    for left in found.depths:
-        who = [left.object.id, text_cell(left.object.name)]
-        depths = none if left.why else [left.at_start_most, left.deepest, left.deepest_most]
-        yield [*who, 0.0, "", 0, "", "", "", "", found.verdict, *depths]
+        yield row("enclosed", obj)
+    for one in found.touching:
+        depths = one.until, one.start, one.deepest, one.allowed
+        yield row("touched", one.object, one.cut, depths)
+    if found.gap.place is not None and found.is_free:
+        yield row("nearest", found.gap.place.object, found.gap.place, gap=found.gap.at_least)
 
 
 def rows_of_frames(frames: "Frames") -> Iterator[list[object]]:

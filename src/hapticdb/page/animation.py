@@ -179,8 +179,7 @@ def _shown_poses(found: Extraction) -> Floats:
     """Displacements (n, 4, 4) evenly along a path; the last one is its end."""
     assert found.way is not None  # noqa: S101 - each step has a path
     path = found.way.swept.path
-    samples = np.linspace(0, len(path) - 1, min(PLACES, len(path))).round().astype(np.int64)
-    return np.concatenate([path.sample(n, n + 1) for n in samples.tolist()])
+    return path.at(np.linspace(0.0, path.length, PLACES))
 
 
 def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:

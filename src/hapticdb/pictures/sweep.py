@@ -1,4 +1,4 @@
-"""The picture of a sweep: the tool's path through the voxels, its hits, the clearance along it."""
+"""The picture of a sweep: the tool's path through the scene, what it hits, the gap along it."""
 
 import textwrap
 from collections.abc import Iterable
@@ -10,7 +10,6 @@ from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from matplotlib.text import Text
-from matplotlib.ticker import MaxNLocator
 from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
@@ -35,7 +34,7 @@ from hapticdb.pictures.splat import Camera, empty_depths, faded, shade, splat
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Moment, Swept
+from hapticdb.sweeps.result import Profile, Swept
 from hapticdb.units import length_text, readable_unit
 
 WINDOW = ((60, 105), (1540, 690))
@@ -58,8 +57,6 @@ GHOSTS = 7
 """Poses at which the tool is shown."""
 GHOST_POINTS = 1500
 """Points of the shell drawn at each of these poses, at most about twice as many."""
-MOST_TOUCHED = 300
-"""Samples whose hits are shown."""
 LIFTS = (-9.0, 12.0, -26.0, 28.0, -44.0, 46.0)
 BESIDE: list[tuple[float, float, Literal["left", "right"]]] = [
     *((9.0, lift, "left") for lift in LIFTS),
@@ -68,7 +65,7 @@ BESIDE: list[tuple[float, float, Literal["left", "right"]]] = [
 """Where the words of a mark may stand: typographic points to the right and up, and the end of the
 words that stands there."""
 WAY = 400
-"""Samples of the path that are drawn at most. More follow a curved path better."""
+"""Places of the path that are drawn. More follow a curved path better."""
 FREE, CAUGHT = "#ffffff", "#ff5d73"
 BEHIND = {"facecolor": PAPER, "alpha": 0.55, "linewidth": 0, "pad": 1.5}
 """What is behind words, so that they are readable over the scene."""
@@ -85,25 +82,35 @@ def compose_sweep(
     verdict: str = "",
     up: str | None = None,
 ) -> Figure:
-    """Lay out the figure of a sweep: words, the scene, the clearance along the path.
+    """Lay out the figure of a sweep: words, the scene, the gap along the path.
 
-    env, shell, exclude : what was swept; excluded objects are not drawn; found : with its profile
-    of clearances; verdict : one line of words; up : axis that points up, x, y or z; what most of
-    the objects' files say unless given.
+    env, shell, exclude : what was swept; excluded objects are not drawn; found : the gap along the
+    path is drawn if it has a profile; verdict : one line of words; up : axis that points up, x, y
+    or z; what most of the objects' files say unless given.
     """
     left_out = set(exclude)
     figure, above = new_figure()
-    colors = dict(zip((one.object.id for one in found.objects), COLORS, strict=False))
-    legend = _draw_legend(figure, found, colors)
-    _write_verdict(figure, verdict, _words(env, shell, found))
+    shown = _shown_objects(found)
+    colors = dict(zip((obj.id for obj in shown), COLORS, strict=False))
+    legend = _draw_legend(figure, shown, colors)
+    _write_verdict(figure, verdict, _words(shell, found))
     axis = up_axis(env.objects()) if up is None else AXES.index(up)
     camera = _camera(env, shell, found, left_out, axis, legend)
     _draw_scene(above, env, camera, colors, left_out)
     _draw_tool(above, camera, shell, found)
-    _draw_hits(above, camera, env, shell, found, colors, left_out)
+    _draw_hits(above, camera, found, colors)
     _draw_way(above, camera, shell, found)
-    _draw_profile(figure, found)
+    _draw_gap(figure, found)
     return figure
+
+
+def _shown_objects(found: Swept) -> list[Object]:
+    """What is hit, in the order along the path, encloses or is touched; else what is nearest."""
+    met = [place.object for place in found.hits]
+    met += [*found.enclosed, *(one.object for one in found.touching)]
+    if not met and found.gap.place is not None:
+        met = [found.gap.place.object]
+    return list({obj.id: obj for obj in met}.values())
 
 
 def _write_verdict(figure: Figure, verdict: str, words: str) -> None:
@@ -122,26 +129,21 @@ def _write(figure: Figure, down: float, words: str, **style: Any) -> None:  # no
     figure.text(LEFT / SIZE[0], 1.0 - down / SIZE[1], words, va="center", bbox=BEHIND, **style)
 
 
-def _words(env: Environment, shell: PointShell, found: Swept) -> str:
-    return (
-        f"{len(shell):,} points, {found.samples:,} samples along {len(found.path.poses):,} poses, "
-        f"voxels of {length_text(env.grid.voxel_size)}"
-    )
+def _words(shell: PointShell, found: Swept) -> str:
+    length = length_text(float(np.linalg.norm(np.ptp(shell.outline, axis=0))))
+    near = f"{found.objects:,} object{'s' * (found.objects != 1)} near it"
+    way = length_text(found.path.length)
+    return f"{length} across, {way} along {len(found.path.poses):,} poses, {near}"
 
 
 def _placed(points: Floats, pose: Floats) -> Floats:
     return np.asarray(points @ pose[:3, :3].T + pose[:3, 3])
 
 
-def _some_samples(found: Swept, count: int) -> NDArray[np.int64]:
-    """Samples, at most so many, evenly along the path."""
-    count = min(count, found.samples)
-    return np.unique(np.linspace(0, found.samples - 1, count).round().astype(np.int64))
-
-
-def _poses_at(found: Swept, samples: NDArray[np.int64]) -> Floats:
-    """Poses (n, 4, 4) of samples (n,)."""
-    return np.concatenate([found.path.sample(n, n + 1) for n in samples.tolist()])
+def _along(found: Swept, count: int) -> tuple[Floats, Floats]:
+    """Fractions (n,) and poses (n, 4, 4), at most so many, evenly along the path."""
+    fractions = np.linspace(0.0, 1.0, count if found.path.length > 0.0 else 1)
+    return fractions, found.path.at(fractions * found.path.length)
 
 
 def _camera(
@@ -151,8 +153,7 @@ def _camera(
     low, high = shell.points.min(axis=0), shell.points.max(axis=0)
     which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
     corners = np.stack([low, high])[which, np.arange(3)]
-    poses = _poses_at(found, _some_samples(found, WAY))
-    swept = np.stack([_placed(corners, pose) for pose in poses])
+    swept = np.stack([_placed(corners, pose) for pose in _along(found, WAY)[1]])
     low, high = swept.min(axis=1), swept.max(axis=1)
     length = float((high.max(axis=0) - low.min(axis=0)).max())
     boxes = np.stack([low - ROOM * length, high + ROOM * length], axis=1)
@@ -173,7 +174,7 @@ def _camera(
 def _draw_scene(
     axes: Axes, env: Environment, camera: Camera, colors: dict[int, str], exclude: set[int]
 ) -> None:
-    """Shade the voxels in view, objects that are hit in their colours."""
+    """Shade the voxels in view, objects that the legend names in their colours."""
     depths = empty_depths(camera)
     tints = [mixed(BODY, BODY, 0.0)]
     for obj in _in_view(env, camera, exclude):
@@ -209,48 +210,44 @@ def _in_view(env: Environment, camera: Camera, exclude: set[int]) -> list[Object
 def _draw_tool(axes: Axes, camera: Camera, shell: PointShell, found: Swept) -> None:
     """Shell at a few poses, the first and the last brightest."""
     points = shell.points[:: max(1, len(shell) // GHOST_POINTS)]
-    samples = _some_samples(found, GHOSTS)
-    for sample, pose in zip(samples.tolist(), _poses_at(found, samples), strict=True):
+    for fraction, pose in zip(*_along(found, GHOSTS), strict=True):
         seen = camera.project(_placed(points, pose)) / SAMPLES
-        is_end = sample in {0, found.samples - 1}
-        axes.scatter(
-            seen[:, 0], seen[:, 1], s=3.0, c=INK, linewidths=0, alpha=0.8 if is_end else 0.3
-        )
+        alpha = 0.8 if fraction in {0.0, 1.0} else 0.3
+        axes.scatter(seen[:, 0], seen[:, 1], s=3.0, c=INK, linewidths=0, alpha=alpha)
 
 
 def _draw_way(axes: Axes, camera: Camera, shell: PointShell, found: Swept) -> None:
-    """Way of the tool's middle, other where it hits something; start, and what matters on it."""
+    """Way of the tool's middle, other from its first hit on; start, and what matters on it."""
     middle = 0.5 * (shell.points.min(axis=0) + shell.points.max(axis=0))[None]
-    samples = _some_samples(found, WAY)
-    places = np.concatenate([_placed(middle, pose) for pose in _poses_at(found, samples)])
+    fractions, poses = _along(found, WAY)
+    places = np.concatenate([_placed(middle, pose) for pose in poses])
     seen = camera.project(places)[:, :2] / SAMPLES
-    fractions = found.path.fractions(samples)
     segments = np.stack([seen[:-1], seen[1:]], axis=1)
-    halfway = 0.5 * (fractions[:-1] + fractions[1:])
-    low, high = found.hit_intervals[:, :1], found.hit_intervals[:, 1:]
-    is_hit = np.any((halfway >= low) & (halfway <= high), axis=0)
+    first = found.hits[0] if found.hits else None
+    until = np.inf if first is None else first.fraction
+    is_past = 0.5 * (fractions[:-1] + fractions[1:]) >= until
     for width, alpha, colors in (
         (4.5, 0.6, [PAPER] * len(segments)),
-        (2.0, 1.0, [CAUGHT if caught else FREE for caught in is_hit.tolist()]),
+        (2.0, 1.0, [CAUGHT if past else FREE for past in is_past.tolist()]),
     ):
         axes.add_collection(
             LineCollection(segments.tolist(), colors=colors, linewidths=width, alpha=alpha)
         )
-    first_contact = found.caught or found.first_contact
-    if first_contact is None or first_contact.sample > 0:
+    if until > 0.0:
         _mark(axes, seen[0], "start", FREE)
-    if found.samples > 1:
+    if len(fractions) > 1:
         _mark(axes, seen[-1], "end", FREE)
-    clearance = found.clearance
-    if first_contact is not None:
-        _mark(axes, _middle_at(camera, middle, first_contact), "first contact", CAUGHT)
-    elif clearance is not None and clearance.point is not None:
-        at = camera.project(clearance.point[None])[0, :2] / SAMPLES
-        _mark(axes, at, f"nearest: {length_text(clearance.distance)}", COLORS[1])
+    nearest = found.gap.place
+    if first is not None:
+        _mark(axes, _seen(camera, first.on_object), "first hit", CAUGHT)
+    elif nearest is not None:
+        words = f"nearest: {length_text(found.gap.at_least)}"
+        _mark(axes, _seen(camera, nearest.on_object), words, COLORS[1])
 
 
-def _middle_at(camera: Camera, middle: Floats, moment: Moment) -> Floats:
-    return np.asarray(camera.project(_placed(middle, moment.pose))[0, :2] / SAMPLES)
+def _seen(camera: Camera, place: Floats) -> Floats:
+    """Where a place (3,) is in the picture."""
+    return np.asarray(camera.project(place[None])[0, :2] / SAMPLES)
 
 
 def extent_of(text: Text) -> Bbox:
@@ -279,39 +276,22 @@ def _mark(axes: Axes, at: Floats, text: str, color: str) -> None:
             return
 
 
-def _draw_hits(
-    axes: Axes,
-    camera: Camera,
-    env: Environment,
-    shell: PointShell,
-    found: Swept,
-    colors: dict[int, str],
-    exclude: set[int],
-) -> None:
-    """Hits of some samples as points in the colour of their object."""
-    samples = np.arange(found.samples) if found.samples < WAY else _some_samples(found, 20 * WAY)
-    at = found.path.fractions(samples)
-    low, high = found.hit_intervals[:, :1], found.hit_intervals[:, 1:]
-    samples = samples[np.any((at >= low) & (at <= high), axis=0)]
-    samples = samples[:: max(1, len(samples) // MOST_TOUCHED)]
-    if not len(samples):
-        return
-    for pose in _poses_at(found, samples):
-        pairs = env.touch(shell, pose, exclude=exclude, law="plane").pairs
-        seen = camera.project(_placed(shell.points[pairs[:, 0]], pose)) / SAMPLES
-        tints = [colors.get(i, FAINT) for i in pairs[:, 1].tolist()]
-        axes.scatter(seen[:, 0], seen[:, 1], s=5.0, c=tints, linewidths=0, alpha=0.8, zorder=4)
+def _draw_hits(axes: Axes, camera: Camera, found: Swept, colors: dict[int, str]) -> None:
+    """The first place where each object is hit, in the object's colour."""
+    for place in found.hits:
+        at = _seen(camera, place.on_object)
+        tint = colors.get(place.object.id, FAINT)
+        axes.scatter([at[0]], [at[1]], s=30, c=tint, edgecolors=PAPER, linewidths=1.0, zorder=4)
 
 
-def _draw_legend(figure: Figure, found: Swept, colors: dict[int, str]) -> float:
-    """Names of the objects that are hit, in their colours; pixels from the left where they begin.
+def _draw_legend(figure: Figure, shown: list[Object], colors: dict[int, str]) -> float:
+    """Names of objects in their colours; pixels from the left where they begin.
 
-    Where nothing is hit, that is the right edge of the words.
+    Where none is shown, that is the right edge of the words.
     """
-    names = {one.object.id: one.object.name for one in found.objects}
-    lines = [(shortened(names[i], LEGEND), color) for i, color in colors.items()]
-    if len(names) > len(colors):
-        lines.append((f"and {len(names) - len(colors)} more", FAINT))
+    lines = [(shortened(obj.name, LEGEND), colors[obj.id]) for obj in shown if obj.id in colors]
+    if len(shown) > len(colors):
+        lines.append((f"and {len(shown) - len(colors)} more", FAINT))
     begins = float(RIGHT + LEFT)
     for number, (words, color) in enumerate(lines):
         x, y = RIGHT / SIZE[0], 1.0 - (TOP + LINE * number) / SIZE[1]
@@ -322,26 +302,28 @@ def _draw_legend(figure: Figure, found: Swept, colors: dict[int, str]) -> float:
     return begins
 
 
-def _draw_profile(figure: Figure, found: Swept) -> None:
-    """Clearance and points hit along the path."""
-    profile = found.profile
-    share = 100 * np.append(profile.fractions, 1.0)
-    top = figure.add_axes((0.055, 0.165, 0.925, 0.085))
-    farthest = float(np.nanmax(profile.clearances, initial=0.0)) or found.voxel_size
-    size, unit = readable_unit(farthest)
-    near = np.append(profile.clearances, profile.clearances[-1:]) / size
-    top.step(share, near, where="post", color=COLORS[1], linewidth=1.2)
-    if found.clearance is not None and np.isfinite(near).all():
-        top.fill_between(share, 0, near, step="post", color=COLORS[1], alpha=0.2, linewidth=0)
-        top.set_ylim(0, 1.08 * farthest / size)
-    bottom = figure.add_axes((0.055, 0.06, 0.925, 0.085))
-    hits = np.append(profile.hits, profile.hits[-1:])
-    bottom.fill_between(share, 0, hits, step="post", color=CAUGHT, alpha=0.75, linewidth=0)
-    bottom.set_ylim(0, 1.08 * max(int(hits.max(initial=0)), 1))
-    bottom.yaxis.set_major_locator(MaxNLocator(3, integer=True))
-    bottom.set_xlabel("per cent of the path", color=FAINT, fontsize=11, labelpad=1)
-    for axes, label in ((top, f"clear, {unit}"), (bottom, "points hit")):
-        style(axes, 9)
-        axes.set_xlim(0, 100)
-        axes.set_ylabel(label, color=FAINT, fontsize=10)
-    top.tick_params(labelbottom=False)
+def _draw_gap(figure: Figure, found: Swept) -> None:
+    """The gap along the path; where something is hit or touched."""
+    axes = figure.add_axes((0.055, 0.06, 0.925, 0.19))
+    style(axes, 9)
+    unit = "m" if found.profile is None else _draw_profile(axes, found.profile)
+    for one in found.touching:
+        axes.axvspan(0.0, 100.0 * one.until, color=COLORS[0], alpha=0.15, linewidth=0)
+    for place in found.hits:
+        axes.axvline(100.0 * place.fraction, color=CAUGHT, linewidth=1.2)
+    axes.set_xlim(0, 100)
+    axes.set_ylim(bottom=0.0)
+    axes.set_ylabel(f"gap, {unit}", color=FAINT, fontsize=10)
+    axes.set_xlabel("per cent of the path", color=FAINT, fontsize=11, labelpad=1)
+
+
+def _draw_profile(axes: Axes, profile: Profile) -> str:
+    """Draw the gap where it is known; returns the unit."""
+    is_known = np.isfinite(profile.gaps)
+    farthest = float(profile.gaps[is_known].max(initial=0.0))
+    size, unit = readable_unit(farthest or 1.0)
+    gaps = np.where(is_known, profile.gaps / size, np.nan)
+    share = 100.0 * profile.fractions
+    axes.plot(share, gaps, color=COLORS[1], linewidth=1.2)
+    axes.fill_between(share, 0.0, gaps, color=COLORS[1], alpha=0.2, linewidth=0)
+    return unit

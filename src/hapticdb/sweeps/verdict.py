@@ -1,13 +1,12 @@
 """The verdict of a sweep in one line."""
 
-import math
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 
-from hapticdb.pointshell.coverage import COVER_OF_SPACING, points_for
-from hapticdb.pointshell.orientation import Surface
-from hapticdb.pointshell.shell import MAX_POINTS, PointShell
+import numpy as np
+
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Clearance, ContactDepth, MetObject, Moment, Swept
+from hapticdb.sweeps.result import Place, Swept, Touching
 from hapticdb.units import length_text
 
 MOST_NAMED = 3
@@ -27,196 +26,106 @@ def names_of(objects: Sequence[Object]) -> str:
 
 
 def verdict_line(found: Swept, shell: PointShell) -> str:
-    """Say in one line whether the tool comes out, the first obstacle, or what would decide it.
+    """Say in one line what the sweep has found.
 
-    shell : the tool of the sweep, with its covering radius if that is known.
+    shell : the tool; its size tells whether it lies inside an object, or the object inside it.
     """
-    line = _line(found, shell)
-    if found.left_at_start:
-        line += f"; left out, since touched at the start: {names_of(found.left_at_start)}"
-        line += "".join(f"; in {one.object.name} {depth_text(one)}" for one in _told(found.depths))
-    if found.is_clear_beside and found.verdict == "not decided":
-        line += f"; {_next_for_depths(found.undecided)}"
-    return line
-
-
-def _next_for_depths(undecided: Sequence[ContactDepth]) -> str:
-    """Say what may decide depths, or how to do without them."""
-    deeper = max(one.deepest_most - one.at_start for one in undecided)
-    if math.isfinite(deeper) and not any(one.why for one in undecided):
-        return f"--tolerance {math.ceil(1e4 * deeper) / 10:g} may decide it"
-    who = names_of([one.object for one in undecided])
-    return f"let the path begin where the tool is free of {who}, or leave that out by --exclude"
-
-
-def _told(depths: Sequence[ContactDepth]) -> Sequence[ContactDepth]:
-    """Those that a line tells: cuts first, `MOST_NAMED` at most."""
-    return sorted(depths, key=lambda one: (not one.is_cut, one.is_bounded))[:MOST_NAMED]
-
-
-def depth_text(one: ContactDepth) -> str:
-    """Say how deep a tool gets into an object that it touches at its start."""
-    start, most = length_text(one.at_start_most), length_text(one.deepest_most)
-    if one.is_cut:
-        least = length_text(one.deepest)
-        return f"it cuts {least} deep or more (at the start {start} at most)"
-    if one.is_bounded:
-        return f"no deeper than {most} (at the start {start} at most)"
-    if one.why:
-        return f"the depth is not decided: {one.why}"
-    return (
-        f"the depth is not decided: between {length_text(one.deepest)} and {most} (at the start "
-        f"{start} at most)"
-    )
-
-
-def _line(found: Swept, shell: PointShell) -> str:
-    """`verdict_line` without what was left out."""
-    samples = f"{found.samples:,} sample{'s' * (found.samples > 1)}"
-    if found.verdict == "comes out":
-        if found.decision is not None:
-            return f"comes out with at least {length_text(found.at_least)}{_closer_clause(found)}"
-        return f"comes out: no hit in {samples}{_clearance_clause(found.clearance)}"
+    if found.verdict == "hits":
+        return "; ".join([*_enclosed_clauses(found, shell), *_hit_clauses(found)])
     if found.verdict == "not decided":
-        if found.is_clear_beside:
-            who = names_of([one.object for one in found.undecided])
-            return f"not decided: meets nothing else, but how deep it goes into {who} is not proved"
-        if found.hits:
-            return _graze(found)
-        return f"not decided: no hit in {samples}{_near_clause(found)}, but {_doubt(found, shell)}"
-    if found.cuts and not found.objects and not found.enclosed:
-        return f"cuts into {names_of([one.object for one in found.cuts])}"
-    if not found.hits and not found.enclosed:
-        return _near(found)
-    left = [one for one in found.objects if one.is_left_at_once]
-    obstacles = [one for one in found.objects if not one.is_left_at_once]
-    within = [
-        obj for obj in found.enclosed if obj.id not in {one.object.id for one in found.objects}
-    ]
-    said = [_obstacle_clause(found, obstacles)] if obstacles else []
-    if left:
-        until = percent(max(one.last for one in left))
-        said.append(
-            f"touches {names_of([one.object for one in left])} where it starts"
-            + (
-                f", until {until} of the path"
-                if obstacles
-                else f"; no hit after {until} of the path"
-            )
-        )
-    if within:
-        said.append(f"{names_of(within)} inside the closed tool where it starts")
-        if len(said) == 1:
-            said = [f"hits {said[0]}"]
-    return "; ".join(said)
-
-
-def _closer_clause(found: Swept) -> str:
-    """Say that the samples alone would not show it."""
-    if not found.hits:
-        return ": proved between samples and points"
-    return ", although points are in voxels of " + names_of([one.object for one in found.objects])
-
-
-def _near_clause(found: Swept) -> str:
-    """Say below which distance nothing is decided, as a clause of a line."""
-    below = _below(found)
-    return f", not decided{below}" if below else ""
-
-
-def _below(found: Swept) -> str:
-    """Say below which distance it is open how far surfaces are apart, if it is known."""
-    decision = found.decision
-    if decision is None or decision.is_clear or not math.isfinite(decision.within):
-        return ""
-    return f" below {length_text(decision.within)}"
-
-
-def _graze(found: Swept) -> str:
-    """Say that points are in voxels, but that surfaces are not proved near enough for a hit."""
-    who = names_of([one.object for one in found.objects])
-    size = length_text(0.5 * found.voxel_size)
-    return (
-        f"not decided{_below(found)}: grazes {who}, points are in voxels there, but no surface is "
-        f"proved to come within the tolerance; voxels of {size} may decide it"
-    )
-
-
-def _near(found: Swept) -> str:
-    """Say where surfaces are proved to be within the tolerance, though no point is in a voxel."""
-    decision = found.decision
-    if decision is None or decision.near is None:
-        return "hits"
-    who = names_of(decision.near.objects) or "an object"
-    where = percent(decision.near.fraction)
-    return f"hits {who} at {where} of the path: within {length_text(decision.within)}"
-
-
-def _obstacle_clause(found: Swept, obstacles: Sequence[MetObject]) -> str:
-    """Name the first of the obstacles: objects that the tool does not only leave at the start."""
-    first_contact = found.caught
-    if first_contact is None:
-        first = min(one.first for one in obstacles)
-        grazed = [one.object for one in obstacles if one.first == first]
-        where = f"{percent(first)} of the path"
-        return f"grazes {names_of(grazed)} at {where}: within a voxel, without contact"
-    caught = [
-        one.object
-        for one in obstacles
-        if one.first_contact is not None and one.first_contact.sample == first_contact.sample
-    ]
-    return f"is caught: first contact at {_where(found, first_contact)} with {names_of(caught)}"
-
-
-def _doubt(found: Swept, shell: PointShell) -> str:
-    """Say why neither verdict is proved, and what would decide it."""
-    proof = found.proof
-    if proof.cover is None:
         return (
-            "how well the points cover the tool is not known: give its mesh, or save the shell "
-            "with its covering radius (PointShell.with_cover)"
+            "not decided: the time was over before the surfaces of all objects near the path were "
+            "measured; give more --seconds"
         )
-    if proof.is_clear:
-        return (
-            "it is not known what lies inside the closed tool where it starts: give its mesh"
-            if shell.surface is None
-            else "its closed tool is too large to see what lies inside it where it starts"
-        )
-    if found.decision is not None and found.decision.is_clear and proof.cover_needed == 0.0:
-        return (
-            "the tool is closed and near voxels on its whole path, so it is not known what lies "
-            "inside it: let the path end where the tool is free"
-        )
-    moment = None if found.clearance is None else found.clearance.moment
-    who = "a voxel" if moment is None else f"a voxel of {names_of(moment.objects)}"
-    text = (
-        f"{who} comes within {length_text(proof.nearest)} of a point, and the tool's surface "
-        f"lies up to {length_text(proof.cover)} beside its points"
-    )
-    n_points, spacing = 0, 0.0
-    if isinstance(shell.surface, Surface) and proof.cover_needed > 0.0:
-        spacing = proof.cover_needed / COVER_OF_SPACING
-        n_points = points_for(float(shell.surface.areas.sum()), spacing)
-    if not 0 < n_points <= MAX_POINTS:
-        return f"{text}: voxels of {length_text(0.5 * found.voxel_size)} may decide it"
-    return (
-        f"{text}: points {length_text(spacing)} apart would decide it, if none of them comes "
-        f"nearer (--points {n_points})"
-    )
+    return "; ".join([_free_clause(found), *_touching_clauses(found)])
 
 
-def _clearance_clause(clearance: Clearance | None) -> str:
-    if clearance is None:
-        return ""
-    if clearance.moment is None:
-        return f", nothing nearer than {length_text(clearance.distance)}"
-    return (
-        f", least clearance {length_text(clearance.distance)} "
-        f"from {names_of(clearance.moment.objects)}"
-    )
+def gap_text(found: Swept) -> str:
+    """Write the proved gap: ``0.4 mm``, ``more than 0.5 m``, or ``-`` if it has no bound."""
+    gap = found.gap
+    if gap.place is not None:
+        return length_text(gap.at_least)
+    return f"more than {length_text(gap.at_least)}" if np.isfinite(gap.at_least) else "-"
 
 
-def _where(found: Swept, moment: Moment) -> str:
-    """Write a moment's place on the path: ``31 % of the path (segment 4)``."""
-    segment = f" (segment {moment.segment})" if len(found.path.poses) > 2 else ""
-    return f"{percent(moment.fraction)} of the path{segment}"
+def where_text(found: Swept, place: Place) -> str:
+    """Write a place on the path: ``31.2 % of the path (segment 4)``."""
+    segment = f" (segment {place.segment})" if len(found.path.poses) > 2 else ""
+    return f"{percent(place.fraction)} of the path{segment}"
+
+
+def until_text(fraction: float) -> str:
+    """Write until when something lasts: ``until 12 % of the path``."""
+    return f"until {percent(fraction)} of the path" if fraction < 1.0 else "to the end of the path"
+
+
+def hit_text(found: Swept, place: Place) -> str:
+    """Say how and where an object is hit."""
+    where = f"at {where_text(found, place)}"
+    for one in found.touching:
+        if one.object.id != place.object.id:
+            continue
+        if one.cut is None or one.cut.fraction != place.fraction:
+            return f"leaves {place.object.name} and hits it again {where}"
+        depth, allowed = length_text(one.deepest), length_text(one.allowed)
+        return f"cuts into {place.object.name} {where}: {depth} deep, {allowed} is allowed"
+    return f"hits {place.object.name} {where}"
+
+
+def is_around(obj: Object, found: Swept, shell: PointShell) -> bool:
+    """Whether an enclosed object is around the tool; else it is inside the tool."""
+    pose = found.path.poses[0]
+    outline = shell.outline @ pose[:3, :3].T + pose[:3, 3]
+    tool = float(np.linalg.norm(np.ptp(outline, axis=0)))
+    return float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) > tool
+
+
+def _enclosed_clauses(found: Swept, shell: PointShell) -> Iterable[str]:
+    is_outer = [is_around(obj, found, shell) for obj in found.enclosed]
+    around = [obj for obj, outer in zip(found.enclosed, is_outer, strict=True) if outer]
+    inside = [obj for obj, outer in zip(found.enclosed, is_outer, strict=True) if not outer]
+    if around:
+        yield f"lies inside {names_of(around)}"
+    if inside:
+        verb = "lies" if len(inside) == 1 else "lie"
+        yield f"{names_of(inside)} {verb} inside the tool"
+
+
+def _hit_clauses(found: Swept) -> Iterable[str]:
+    if found.hits:
+        yield hit_text(found, found.hits[0])
+    if len(found.hits) > 1:
+        yield f"then {names_of([place.object for place in found.hits[1:]])}"
+
+
+def _free_clause(found: Swept) -> str:
+    """Say that the tool slides, if it does, and how far it keeps from all that it does not touch.
+
+    The gap is that of the whole path, so also of other objects while the tool slides.
+    """
+    sliding = [one for one in found.touching if one.is_sliding]
+    clear = _clear_clause(found)
+    if not sliding:
+        return clear
+    return f"slides along {_touched_text(sliding)}, otherwise {clear}"
+
+
+def _clear_clause(found: Swept) -> str:
+    gap, place = found.gap, found.gap.place
+    if place is not None:
+        nearest = f"nearest {place.object.name} at {where_text(found, place)}"
+        return f"clear by {length_text(gap.at_least)}: {nearest}"
+    if np.isfinite(gap.at_least):
+        return f"clear: nothing nearer than {length_text(gap.at_least)}"
+    return "clear: nothing else is there"
+
+
+def _touching_clauses(found: Swept) -> Iterable[str]:
+    resting = [one for one in found.touching if not one.is_sliding]
+    if resting:
+        yield f"touches {_touched_text(resting)}"
+
+
+def _touched_text(touched: Sequence[Touching]) -> str:
+    last = max(one.until for one in touched)
+    return f"{names_of([one.object for one in touched])} {until_text(last)}"

@@ -1,7 +1,8 @@
 """The verb sweep."""
 
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
 
@@ -9,36 +10,41 @@ from hapticdb.cli import fitting, render
 from hapticdb.cli.choosing import felt_objects, ids_of
 from hapticdb.cli.csv_files import STDOUT, SWEPT, open_csv, rows_of_sweep
 from hapticdb.cli.options import (
-    BudgetOption,
     CsvOption,
     ExcludeOption,
     JsonOption,
     OptionalToolOption,
     PathUnitOption,
-    PosesOption,
-    SeedOption,
     ToolUnitOption,
     UrlArgument,
     WhereOption,
 )
+from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
 from hapticdb.cli.tools import shell_of
-from hapticdb.cli.values import budget_bytes
+from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hapticdb.cli.choosing import Felt
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.sweeps.result import Clearance, Swept
+    from hapticdb.sweeps.result import Swept
 
-EXIT_CODES = {"comes out": 0, "hits": 1, "not decided": 3}
+EXIT_CODES = {"clear": 0, "slides": 0, "hits": 1, "not decided": 3}
 DOUBTFUL = 3
-"""Exit code of "comes out", too, where tool, path and scene do not fit."""
-DENSE = 0.5
-"""Voxels from point to point of the tool, unless --points are given."""
-
+"""Exit code where nothing is hit, too, but tool, path and scene do not fit."""
+WORST = (1, 3, 0)
+"""Exit codes, the worst first: the code of a batch is the first that a sweep of it has."""
+MM = 1e-3
+"""Metres of a millimetre: all lengths among the options are in millimetres."""
+DRAWN_POINTS = 3000
+"""Points of the tool in a picture. More: a denser tool."""
 MOST_OBJECTS = 20
-"""Rows of the table of what is hit; the other objects are counted below it."""
+"""Rows of the table of what is hit or touched; the other objects are counted below it."""
 
 UpName = Literal["x", "y", "z"]
 PartsOption = Annotated[
@@ -49,79 +55,103 @@ PartsOption = Annotated[
         help="Instead of --tool: objects that move, all together; chosen as for --exclude.",
     ),
 ]
-ClearanceOption = Annotated[
-    float | None,
+PathOption = Annotated[
+    str | None, typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header.")
+]
+ContactOption = Annotated[
+    float,
     typer.Option(
-        metavar="M",
-        help="Distance up to which clearance is looked for; 0: not at all.",
-        show_default="32 voxels",
+        metavar="MM",
+        help="Millimetres: what is so near where the path starts may be touched; the tool may go "
+        "so much deeper into it.",
     ),
 ]
-DensePointsOption = Annotated[
-    int | None,
-    typer.Option(metavar="N", help="Points of the shell.", show_default="half a voxel apart"),
+AboutOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Millimetres, tool's frame: the centre of the path's turns.",
+        show_default="middle of the tool's box",
+    ),
+]
+SweepSecondsOption = Annotated[
+    float | None,
+    typer.Option(metavar="S", help="Time of a sweep.", show_default="no limit"),
+]
+BatchOption = Annotated[
+    str | None,
+    typer.Option(metavar="CSV", help="Many sweeps, one a line; see above."),
 ]
 AsGivenOption = Annotated[
     bool,
     typer.Option(
-        "--as-given", help="The sizes and places are right: exit code 0 when it comes out."
+        "--as-given", help="The sizes and places are right: exit code 0 when nothing is hit."
     ),
-]
-LeaveStartOption = Annotated[
-    bool,
-    typer.Option(
-        "--leave-start",
-        help="Leave out the objects that are hit at the first pose, if it is proved that the tool "
-        "goes no deeper into them.",
-    ),
-]
-ToleranceOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="MM",
-        help="Say hits only where surfaces are proved to come so near; other hits are grazes.",
-        show_default="a voxel's diagonal",
-    ),
-]
-RefineOption = Annotated[
-    bool,
-    typer.Option("--refine", help="Where it is not decided, look at finer points by itself."),
 ]
 PictureOption = Annotated[
-    str | None, typer.Option(metavar="PNG", help="Draw the path, its hits and clearance.")
+    str | None, typer.Option(metavar="PNG", help="Draw the path, what it hits, and the gap.")
 ]
 UpOption = Annotated[
     UpName | None,
     typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
 ]
 
-HELP = """Say whether a tool or part comes out along a path: what it hits, where, how near it comes.
+HELP = """Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
-Hits: a point of the tool is in a voxel of an object, or something lies inside
-a closed body of the tool. Comes out: proved for the whole surface and the whole
-path. Not decided: neither; a line says what would decide it.
+Clear by a gap: no surface meets the tool's. Slides: it moves along what it
+touches where the path starts, and hits nothing. Hits: a surface is met, or what
+is touched is cut; or one lies inside the other. Not decided: --seconds were over.
+The triangles decide, between the poses, too; the gap is right to 0.01 mm or 1 %.
 
-Between two poses the tool's middle moves straight while the tool turns about
-it, in steps in which no point moves more than half a voxel. Segment 0 leads
-from pose 0 to pose 1.
+Between two poses the centre moves straight while the tool turns about it.
+Segment 0 leads from pose 0 to pose 1.
 
-With --part, objects of the environment are the tool: all of them together are
-one rigid body, which is not felt. The poses are displacements from where the
-objects are: x,y,z 0 and qw 1 is their present place. A sub-assembly's name means
-all that is below it; 'hapticdb objects --help' says how names choose objects.
+With --part, objects of the environment are the tool, one rigid body; the poses
+are displacements from their place: x,y,z 0 and qw 1 leaves them there. 'hapticdb
+objects --help' says how names choose objects.
 
-Where distances are stored, they decide what voxels leave open. A proved verdict
-says how far the surfaces keep apart (docs/paths.md).
+What is touched at the start may not get deeper than there, or than --contact,
+by more than --contact; once it is farther than that, to meet it again is a hit.
 
-The points are half a voxel apart, 200,000 at most, unless --points are given.
+--batch reads a CSV file with the columns part or tool, and path; and if wanted
+where, exclude and contact (mm). Several words in a cell stand with ; between.
 
-The exit code is 0 when it comes out, 1 when it hits, 3 when it is not decided.
-It is 3, too, when it comes out but the sizes or places of tool, path and scene do
-not fit together; a line then says so. With --as-given they are taken as right.
+The exit code is 0 when it is clear or slides, 1 when it hits, 3 when it is not
+decided or, without --as-given, when the sizes or places of tool, path and scene do
+not fit together; a line then says so. A batch has the worst: 1 before 3 before 0.
 
 Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
 """
 """The verb's help text: longer than a function of this house may be."""
+
+
+class _Options(NamedTuple):
+    """Options that all sweeps of a command share; about : metres."""
+
+    tool_unit: str | None
+    path_unit: str | None
+    about: "list[float] | None"
+    seconds: float | None
+    is_drawn: bool
+    as_given: bool
+
+
+class _Job(NamedTuple):
+    """A sweep whose words and path are read; parts : ids of what moves."""
+
+    asked: Asked
+    poses: "NDArray[np.float64]"
+    parts: list[int]
+    felt: "Felt"
+
+
+class _Told(NamedTuple):
+    """A sweep's result with its tool, and the exit code."""
+
+    job: _Job
+    shell: "PointShell"
+    found: "Swept"
+    code: int
 
 
 def sweep(
@@ -129,19 +159,16 @@ def sweep(
     *,
     tool: OptionalToolOption = None,
     part: PartsOption = None,
-    path: PosesOption,
+    path: PathOption = None,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
-    clearance: ClearanceOption = None,
-    budget: BudgetOption = 256.0,
+    contact: ContactOption = 0.05,
+    about: AboutOption = None,
     tool_unit: ToolUnitOption = None,
     path_unit: PathUnitOption = None,
-    points: DensePointsOption = None,
-    seed: SeedOption = None,
+    batch: BatchOption = None,
+    seconds: SweepSecondsOption = None,
     as_given: AsGivenOption = False,
-    leave_start: LeaveStartOption = False,
-    tolerance: ToleranceOption = None,
-    refine: RefineOption = False,
     csv: CsvOption = None,
     picture: PictureOption = None,
     up: UpOption = None,
@@ -149,71 +176,57 @@ def sweep(
 ) -> None:
     """Sweep a tool or parts along a path; the help text is `HELP`."""
     import hapticdb
-    from hapticdb.poses import read_poses
-    from hapticdb.sweeps.record import sweep_record
-    from hapticdb.sweeps.run import sweep as sweep_path
 
-    _check(tool, part, tool_unit, picture, csv if json else None)
-    poses = read_poses(path, unit=path_unit or "m")
+    one = Asked(tool, part or [], path or "", where or [], exclude or [], contact, "")
+    _check(one, tool_unit, batch, csv, picture)
+    if csv == STDOUT and json:
+        raise UsageError("--csv - and --json: only one may be standard output")
+    center = None if about is None else numbers_of(about, 3, "--about", "X,Y,Z in millimetres")
+    options = _Options(
+        tool_unit, path_unit, center and [MM * x for x in center], seconds, picture is not None,
+        as_given,
+    )  # fmt: skip
+    asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
-        parts = ids_of(env, part, "--part")
-        felt = felt_objects(env, where, exclude, parts)
-        render.compile_kernels("sweep", files=[tool] if tool else [])
-        shell = _shell(env, tool, parts, tool_unit, points, seed)
-        fit = fitting.compare(
-            env, shell, poses, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
-            path_unit=path_unit, is_moving=True,
-        )  # fmt: skip
-        with render.bar("sweeping", "samples", lambda *now: now) as progress:
-            found = sweep_path(
-                env, shell, poses, where=felt.where, exclude=felt.exclude, proportions=fit,
-                budget_bytes=budget_bytes(budget), clearance_limit=clearance, refine=refine,
-                profile=picture is not None, progress=progress, leave_start=leave_start,
-                tolerance=None if tolerance is None else 1e-3 * tolerance,
-            )  # fmt: skip
-        _note_writes(env, found)
+        jobs = [_job(env, each, path_unit) for each in asked]
+        tools = [each.tool for each in asked if each.tool]
+        render.compile_kernels("sweep", files=tools if len(tools) == len(asked) else [])
+        if batch is not None:
+            raise typer.Exit(_run_batch(env, jobs, options, json=json))
+        told = _swept(env, jobs[0], options)
         if table:
-            table.write(rows_of_sweep(found))
+            table.write(rows_of_sweep(told.found))
         try:
             if json:
-                render.say_json(sweep_record(found, shell, parts, felt.left_out))
+                _say_json(told)
             elif csv != STDOUT:
-                _show(env, found, shell)
+                _show(told)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
-                _draw(picture, env, shell, found, felt.left_out, up)
-    _exit(found, None if json or csv == STDOUT else picture, bool(fit.misfits) and not as_given)
-
-
-def _exit(found: "Swept", picture: str | None, is_doubtful: bool) -> None:  # noqa: FBT001
-    """Name the picture, if any, and end with the verdict's exit code."""
-    if picture is not None:
+                _draw(picture, env, told, up)
+    if picture is not None and not json and csv != STDOUT:
         render.say(f"picture: {picture}")
-    if found.verdict != "comes out":
-        raise typer.Exit(EXIT_CODES[found.verdict])
-    if is_doubtful:
-        raise typer.Exit(DOUBTFUL)
-
-
-def _note_writes(env: "Environment", found: "Swept") -> None:
-    """Say that others have written since the sweep began, if they have."""
-    if env.store.revision() != found.revision:
-        render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+    raise typer.Exit(told.code)
 
 
 def _check(
-    tool: str | None,
-    part: list[str] | None,
-    tool_unit: str | None,
-    picture: str | None,
-    csv_beside_json: str | None,
+    one: Asked, tool_unit: str | None, batch: str | None, csv: str | None, picture: str | None
 ) -> None:
     """Refuse options that contradict one another."""
-    if csv_beside_json == STDOUT:
-        raise UsageError("--csv - and --json: only one may be standard output")
-    if (tool is None) == (not part):
+    if batch is not None:
+        given = {
+            "--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv,
+            "--picture": picture,
+        }  # fmt: skip
+        for name, value in given.items():
+            if value:
+                raise UsageError(f"--batch and {name}: give only one of them")
+        return
+    if (one.tool is None) == (not one.part):
         raise UsageError("give one of --tool and --part")
-    if part and tool_unit is not None:
+    if not one.path:
+        raise UsageError("give --path, a file of poses, or --batch")
+    if one.part and tool_unit is not None:
         raise UsageError(
             "--tool-unit belongs to --tool: a part has the unit that it was imported in"
         )
@@ -226,93 +239,121 @@ def check_picture(picture: str | None) -> None:
         raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
 
 
-def _shell(
-    env: "Environment",
-    tool: str | None,
-    parts: list[int],
-    tool_unit: str | None,
-    points: int | None,
-    seed: int | None,
-) -> "PointShell":
-    """Shell of the tool's file, or of the parts, with its covering radius."""
-    spacing = DENSE * env.grid.voxel_size if points is None else None
-    if tool is not None:
-        return shell_of(tool, tool_unit, points, seed, spacing).with_cover()
-    return env.shell(*parts, points=points, spacing=spacing, seed=seed or 0).with_cover()
+def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
+    from hapticdb.poses import read_poses
+
+    with naming(asked.line):
+        poses = read_poses(asked.path, unit=path_unit or "m")
+        parts = ids_of(env, asked.part, "--part")
+        return _Job(asked, poses, parts, felt_objects(env, asked.where, asked.exclude, parts))
 
 
-def _draw(
-    picture: str,
-    env: "Environment",
-    shell: "PointShell",
-    found: "Swept",
-    excluded: list[int],
-    up: UpName | None,
-) -> None:
+def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
+    """Make the tool, and move it along the path."""
+    from hapticdb.sweeps.run import sweep as sweep_path
+
+    asked, felt = job.asked, job.felt
+    points = DRAWN_POINTS if options.is_drawn else None
+    with naming(asked.line):
+        if asked.tool is None:
+            shell = env.shell(*job.parts, points=points)
+        else:
+            shell = shell_of(asked.tool, options.tool_unit, points, None)
+        fit = fitting.compare(
+            env, shell, job.poses, exclude=felt.left_out, tool=asked.tool,
+            tool_unit=options.tool_unit, path_unit=options.path_unit, is_moving=True,
+        )  # fmt: skip
+        with render.bar("sweeping", "objects", lambda *now: now) as progress:
+            found = sweep_path(
+                env, shell, job.poses, where=felt.where, exclude=felt.exclude, proportions=fit,
+                contact=MM * asked.contact, about=options.about, seconds=options.seconds,
+                profile=options.is_drawn, progress=progress,
+            )  # fmt: skip
+    if env.store.revision() != found.revision:
+        render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
+    is_doubtful = bool(fit.misfits) and not options.as_given
+    code = DOUBTFUL if found.is_free and is_doubtful else EXIT_CODES[found.verdict]
+    return _Told(job, shell, found, code)
+
+
+def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, json: bool) -> int:
+    """Run all sweeps, print a line or a row for each; returns the worst exit code."""
+    from hapticdb.sweeps.verdict import gap_text, percent
+
+    rows, codes = [], set()
+    for job in jobs:
+        told = _swept(env, job, options)
+        codes.add(told.code)
+        if json:
+            _say_json(told)
+            continue
+        found = told.found
+        place = found.hits[0] if found.hits else found.gap.place
+        name, at = ("", "") if place is None else (place.object.name, percent(place.fraction))
+        doubt = ", but sizes do not fit" if told.code == DOUBTFUL and found.is_free else ""
+        gap = gap_text(found) if found.is_free else "-"
+        rows.append((job.asked.name, job.asked.path, found.verdict + doubt, gap, name, at))
+    if rows:
+        render.table(("part or tool", "path", "verdict", "gap>", "nearest or hit", "at>"), rows)
+    return next(code for code in WORST if code in codes)
+
+
+def _say_json(told: _Told) -> None:
+    from hapticdb.sweeps.record import sweep_record
+
+    job = told.job
+    record = sweep_record(told.found, told.shell, job.parts, job.felt.left_out)
+    render.say_json({"moved": job.asked.name, "path": job.asked.path} | record)
+
+
+def _draw(picture: str, env: "Environment", told: _Told, up: UpName | None) -> None:
     from hapticdb.pictures.demo import save
     from hapticdb.pictures.sweep import compose_sweep
     from hapticdb.sweeps.verdict import verdict_line
 
-    verdict = verdict_line(found, shell)
-    figure = compose_sweep(env, shell, found, exclude=excluded, verdict=verdict, up=up)
+    verdict = verdict_line(told.found, told.shell)
+    figure = compose_sweep(
+        env, told.shell, told.found, exclude=told.job.felt.left_out, verdict=verdict, up=up
+    )
     save(figure, picture)
 
 
-def _show(env: "Environment", found: "Swept", shell: "PointShell") -> None:
-    """Print the verdict, a table of what is hit, and the figures that it stands on."""
-    from hapticdb.sweeps.verdict import percent, verdict_line
+def _show(told: _Told) -> None:
+    """Print the verdict, a table of what is hit or touched, and the figures that it stands on."""
+    from hapticdb.sweeps.verdict import gap_text, percent, until_text, verdict_line
 
-    render.say(verdict_line(found, shell))
-    if found.objects:
-        rows = [
-            (
-                str(one.object.id),
-                one.object.name,
-                f"{percent(one.first)} to {percent(one.last)}",
-                length_text(one.length),
-                f"{one.samples:,}",
-                f"{one.contacts:,}",
-                f"{one.points:,}",
-            )
-            for one in found.objects[:MOST_OBJECTS]
-        ]
-        columns = ("id>", "hit", "of the path>", "length>", "samples>", "in contact>", "points>")
-        render.table(columns, rows)
-        if len(found.objects) > MOST_OBJECTS:
-            render.say(f"{len(found.objects)} objects, {MOST_OBJECTS} of them shown")
-    render.facts(_facts(env, found, shell))
-
-
-def _facts(env: "Environment", found: "Swept", shell: "PointShell") -> list[tuple[str, str]]:
-    from hapticdb.sweeps.record import median_spacing
-    from hapticdb.sweeps.verdict import depth_text
-
-    size = env.grid.voxel_size
-    way = f"{len(found.path.poses):,} poses given, {found.samples:,} samples"
-    tool = f"{len(shell):,} points, {length_text(median_spacing(shell))} apart (median)"
-    if found.proof.cover is not None:
-        tool += f", none of its surface more than {length_text(found.proof.cover)} from one"
+    found = told.found
+    render.say(verdict_line(found, told.shell))
     rows = [
-        ("path", f"{way}, no point moves more than {length_text(0.5 * size)} between two"),
-        ("tool", tool),
-        ("hits", f"{found.hits:,} samples hit, {found.contacts:,} in contact"),
+        (str(place.object.id), place.object.name, "hit", f"at {percent(place.fraction)}", "", "")
+        for place in found.hits
     ]
-    if found.clearance is not None and not found.hits:
-        rows.append(("clearance", _clearance_text(found.clearance)))
-    rows += [(f"in {one.object.name}", depth_text(one)) for one in found.depths[:MOST_OBJECTS]]
-    rate = f"{found.samples / max(found.elapsed, 1e-9):,.0f} poses a second"
-    rows.append(("took", f"{found.elapsed:.2f} s, {rate}, {found.cells:,} cells fetched"))
-    return rows
+    rows += [
+        (
+            str(one.object.id),
+            one.object.name,
+            "touched",
+            until_text(one.until).removesuffix(" of the path"),
+            length_text(one.start),
+            length_text(one.deepest),
+        )
+        for one in found.touching
+    ]
+    if rows:
+        columns = ("id>", "object", "is", "where", "deep at start>", "deepest>")
+        render.table(columns, rows[:MOST_OBJECTS])
+        if len(rows) > MOST_OBJECTS:
+            render.say(f"{len(rows)} rows, {MOST_OBJECTS} of them shown")
+    facts = [("path", f"{len(found.path.poses):,} poses, {length_text(found.path.length)}")]
+    if found.is_free:
+        facts.append(("gap", _gap_range(found, gap_text(found))))
+    looked = f"{render.counted(found.objects, 'object')} near the path, {found.looks:,} looks"
+    facts += [("looked at", looked), ("took", f"{found.elapsed:.2f} s")]
+    render.facts(facts)
 
 
-def _clearance_text(clearance: "Clearance") -> str:
-    """What the number means: a surface lies somewhere in its voxel, and beside the points."""
-    from hapticdb.sweeps.verdict import names_of, percent
-
-    if clearance.moment is None:
-        return f"no voxel nearer than {length_text(clearance.distance)}; farther is not looked"
-    return (
-        f"{length_text(clearance.distance)} from a voxel of {names_of(clearance.moment.objects)} "
-        f"at {percent(clearance.moment.fraction)}: the surfaces are "
-        f"{length_text(clearance.at_least)} to {length_text(clearance.at_most)} apart"
-    )
+def _gap_range(found: "Swept", text: str) -> str:
+    """The gap's bounds."""
+    if found.gap.place is None:
+        return text
+    return f"{text} proved, {length_text(found.gap.at_most)} measured at the nearest place"

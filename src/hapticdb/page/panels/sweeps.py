@@ -1,7 +1,8 @@
-"""The tab Sweep: whether a tool, or a part, comes out along a way, and where it hits."""
+"""The tab Sweep: whether a tool, or a part, is free along a way, and what it hits or nears."""
 
 import logging
 import math
+from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -16,9 +17,9 @@ from hapticdb.page.widgets import put
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
-from hapticdb.sweeps import run as sweeps
-from hapticdb.sweeps.result import Moment, Swept
-from hapticdb.sweeps.verdict import percent, verdict_line
+from hapticdb.sweeps.result import Place, Swept
+from hapticdb.sweeps.run import sweep
+from hapticdb.sweeps.verdict import gap_text, percent, verdict_line
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -26,10 +27,11 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
-MOST_POINTS = 20_000
-"""Points of a swept part. Larger: "comes out" is proved for larger parts, in more time."""
 MOST_NAMED = 8
 """Objects that the answer names, with where each is hit."""
+VERDICTS = {"hits": "#c62838", "not decided": "#a8730f"}
+FREE = "#1f8a4c"
+"""Colours of verdicts; FREE: of all others."""
 WAYS = {
     "to the hand": None, "+x": (0, 1.0), "-x": (0, -1.0), "+y": (1, 1.0), "-y": (1, -1.0),
     "+z": (2, 1.0), "-z": (2, -1.0),
@@ -38,16 +40,15 @@ WAYS = {
 
 
 class _SweepAnswer(NamedTuple):
-    """A sweep's answer, to be drawn.
-
-    shell : what was swept; swept : the result; moment : where it is caught, or else where it hits
-    first, or None; marks (H, 3) : its points in voxels there, metres.
-    """
+    """A sweep's answer, to be drawn; shell : what was swept."""
 
     shell: PointShell
     swept: Swept
-    moment: Moment | None
-    marks: Floats
+
+    @property
+    def place(self) -> Place | None:
+        """Where something is hit first, or else where the tool comes nearest to anything."""
+        return self.swept.hits[0] if self.swept.hits else self.swept.gap.place
 
 
 class SweepPanel:
@@ -115,47 +116,47 @@ class SweepPanel:
         put(self._bar, 100.0 * done / max(total, 1))
 
     def _show(self, found: _SweepAnswer, name: str) -> None:
-        swept, scene = found.swept, self._browser.client.scene
+        swept = found.swept
+        if found.place is not None:
+            self._draw(found, found.place, name)
         line = verdict_line(swept, found.shell)
-        colour = {"hits": "#c62838", "comes out": "#1f8a4c"}.get(swept.verdict, "#a8730f")
         hit = "".join(
-            f"<div>{swatch(colours.of_object(met.object.id))}"
-            f"{escaped(short_name(met.object.name))} · at {percent(met.first)}</div>"
-            for met in swept.objects[:MOST_NAMED]
+            f"<div>{swatch(colours.of_object(place.object.id))}"
+            f"{escaped(short_name(place.object.name))} · at {percent(place.fraction)}</div>"
+            for place in swept.hits[:MOST_NAMED]
         )
-        more = len(swept.objects) - MOST_NAMED
+        more = len(swept.hits) - MOST_NAMED
         self._said.content = (
-            f'<div style="margin:2px 12px;font-size:0.85em"><b style="color:{colour}">'
+            '<div style="margin:2px 12px;font-size:0.85em">'
+            f'<b style="color:{VERDICTS.get(swept.verdict, FREE)}">'
             f"{escaped(name)}: {escaped(swept.verdict)}</b>"
             f'<div style="margin:3px 0">{escaped(plain_name(line))}</div>{hit}'
             f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"
         )
         self._clear.visible = True
-        moment = found.moment
-        if moment is None:
-            return
+
+    def _draw(self, found: _SweepAnswer, place: Place, name: str) -> None:
+        """Show the tool where it hits first or comes nearest, and the two places there."""
+        scene, swept = self._browser.client.scene, found.swept
         ghost = tools.from_shell(name, found.shell)
-        middle = tools.middle_of(found.shell)
-        pose = moment.pose.copy()
-        pose[:3, 3] += pose[:3, :3] @ middle
-        node = add_tool(scene, "/swept", ghost, colours.MARK, 0.4)
+        pose = place.pose.copy()
+        pose[:3, 3] += pose[:3, :3] @ tools.middle_of(found.shell)
+        colour = colours.MARK if swept.hits else self._browser.colour
+        node = add_tool(scene, "/swept", ghost, colour, 0.4)
         put_at(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
-        self._drawn = [node]
-        if len(found.marks):
-            word = "first hit" if swept.caught is None else "caught"
-            size = self._browser.site.facts.diagonal
-            self._drawn.append(
-                scene.add_point_cloud(
-                    "/swept_hits", found.marks, (255, 214, 0), point_size=0.007 * size,
-                    point_shape="circle", precision="float32",
-                )
-            )  # fmt: skip
-            self._drawn.append(
-                scene.add_label(
-                    "/swept_label", f"{word} at {percent(moment.fraction)}",
-                    position=found.marks.mean(axis=0), anchor="bottom-left",
-                )
-            )  # fmt: skip
+        words = "hit" if swept.hits else f"nearest, {gap_text(swept)},"
+        self._drawn = [
+            node,
+            scene.add_point_cloud(
+                "/swept_places", np.stack([place.on_tool, place.on_object]), (255, 214, 0),
+                point_size=0.007 * self._browser.site.facts.diagonal, point_shape="circle",
+                precision="float32",
+            ),
+            scene.add_label(
+                "/swept_label", f"{words} at {percent(place.fraction)}",
+                position=tuple(place.on_object), anchor="bottom-left",
+            ),
+        ]  # fmt: skip
 
     def _erase(self) -> None:
         for node in self._drawn:
@@ -183,23 +184,13 @@ class _SweepJob:
         obj = None if part is None else browser.site.objects[part]
         self.name = self._tool.name if obj is None else short_name(obj.name)
 
-    def run(self, progress: sweeps.SampleCallback) -> _SweepAnswer:
+    def run(self, progress: Callable[[int, int], None]) -> _SweepAnswer:
         """Sweep on a connection of its own."""
         with opened(self._site.url, self._site.folders) as env:
-            if self._part is None:
-                shell = self._tool.shell
-            else:
-                spacing = 0.5 * env.grid.voxel_size
-                shell = env.shell(self._part, points=MOST_POINTS, spacing=spacing)
+            shell = self._tool.shell if self._part is None else env.shell(self._part)
             present = [i for i in self._exclude if i in self._site.objects]
-            swept = sweeps.sweep(env, shell, self._path(shell), exclude=present, progress=progress)
-            marks = np.empty((0, 3))
-            moment = swept.caught or swept.first_hit
-            if moment is not None:
-                pose = moment.pose
-                touch = env.touch(shell, pose, exclude=present, law="plane")
-                marks = shell.points[touch.hits] @ pose[:3, :3].T + pose[:3, 3]
-        return _SweepAnswer(shell, swept, moment, marks)
+            swept = sweep(env, shell, self._path(shell), exclude=present, progress=progress)
+        return _SweepAnswer(shell, swept)
 
     def _path(self, shell: PointShell) -> Floats:
         """Poses of the sweep: of the tool, or displacements of the part from its place."""

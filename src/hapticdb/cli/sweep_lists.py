@@ -1,0 +1,100 @@
+"""Sweeps as they are asked for, and files that list many of them."""
+
+import csv
+import io
+import math
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+from typing import NamedTuple
+
+from hapticdb.errors import FileError, ObjectNotFoundError, UsageError
+
+COLUMNS = ("part", "tool", "path", "where", "exclude", "contact")
+BETWEEN = ";"
+"""Between several words in a cell."""
+_HINT = "give a header with part or tool, and path; and if wanted where, exclude, contact"
+
+
+class Asked(NamedTuple):
+    """One sweep: files and words as they are given; contact : millimetres.
+
+    line : where it stands in a file of sweeps, or empty.
+    """
+
+    tool: str | None
+    part: list[str]
+    path: str
+    where: list[str]
+    exclude: list[str]
+    contact: float
+    line: str
+
+    @property
+    def name(self) -> str:
+        """What moves, as it was asked for."""
+        return self.tool or f"{BETWEEN} ".join(self.part)
+
+
+@contextmanager
+def naming(line: str) -> Iterator[None]:
+    """Put a line's place before what is wrong with it."""
+    try:
+        yield
+    except (FileError, ObjectNotFoundError, UsageError) as error:
+        if not line:
+            raise
+        raise UsageError(f"{line}: {error}") from error
+
+
+def read_sweeps(path: str, given: Asked) -> list[Asked]:
+    """Sweeps of a CSV file, at least one; what a line does not say is as `given`."""
+    try:
+        text = Path(path).read_text(encoding="utf-8-sig")
+    except (OSError, UnicodeDecodeError) as error:
+        why = error.strerror if isinstance(error, OSError) else "it is no text"
+        raise FileError(f"--batch: cannot read {path}: {why}") from error
+    reader = csv.DictReader(io.StringIO(text, newline=""), skipinitialspace=True, strict=True)
+    try:
+        unknown = [name for name in reader.fieldnames or () if name not in COLUMNS]
+        if unknown or "path" not in (reader.fieldnames or ()):
+            raise FileError(f"--batch {path}: {_unknown(unknown)}{_HINT}")
+        asked = [_asked(row, given, f"{path}, line {reader.line_num}") for row in reader]
+    except csv.Error as error:
+        raise FileError(f"--batch {path}, line {reader.line_num}: {error}; {_HINT}") from error
+    if not asked:
+        raise FileError(f"--batch {path}: no sweep after its header; {_HINT}")
+    return asked
+
+
+def _unknown(names: list[str]) -> str:
+    return f"no column {names[0][:40]!r} is known; " if names else ""
+
+
+def _asked(row: dict[str, str | None], given: Asked, line: str) -> Asked:
+    """The sweep of a row."""
+    if None in row or None in row.values():
+        raise FileError(f"--batch {line}: it has more or fewer cells than the header")
+    cells = {name: (text or "").strip() for name, text in row.items()}
+    tool, part, path = (cells.get(name, "") for name in ("tool", "part", "path"))
+    if not path or bool(tool) == bool(part):
+        raise FileError(f"--batch {line}: give a path, and one of tool and part")
+    return Asked(
+        tool or None, _words(part), path, _words(cells.get("where")) or given.where,
+        _words(cells.get("exclude")) or given.exclude,
+        _contact(cells.get("contact"), given.contact, line), line,
+    )  # fmt: skip
+
+
+def _words(cell: str | None) -> list[str]:
+    return [word.strip() for word in (cell or "").split(BETWEEN) if word.strip()]
+
+
+def _contact(cell: str | None, given: float, line: str) -> float:
+    try:
+        contact = float(cell) if cell else given
+    except ValueError:
+        contact = math.nan
+    if not math.isfinite(contact):
+        raise FileError(f"--batch {line}: contact is {cell!r}: give millimetres")
+    return contact

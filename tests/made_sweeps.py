@@ -1,0 +1,67 @@
+"""Results of sweeps that are made by hand, for tests of what tells and draws them."""
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb import Object
+from hapticdb.proportions import Proportions
+from hapticdb.sweeps.result import Gap, Place, Profile, Swept, Touching
+from hapticdb.sweeps.way import Way
+
+Floats = NDArray[np.float64]
+
+CORNERS = 0.01 * np.array(
+    [[x, y, z] for x in (-1.0, 1.0) for y in (-1.0, 1.0) for z in (-1.0, 1.0)]
+)
+"""Of the tool, a cube of 2 cm."""
+
+
+def thing(name: str, number: int = 1, side: float = 0.1) -> Object:
+    """An object about the origin."""
+    half = np.full(3, 0.5 * side)
+    return Object(name, "a.glb", "", np.eye(4), 1, np.stack([-half, half]), id=number)
+
+
+def place_at(found: Object, fraction: float, path: Way, apart: float = 0.0) -> Place:
+    """Where the tool is at a share of the path; apart : metres between the two surfaces."""
+    way = np.array([fraction * path.length])
+    pose = path.at(way)[0]
+    on_tool = pose[:3, 3] - (0.0, 0.0, 0.01)
+    on_object = on_tool - (0.0, 0.0, apart)
+    return Place(found, fraction, int(path.segments(way)[0]), pose, on_tool, on_object)
+
+
+def line(*places: tuple[float, float, float]) -> Way:
+    """A path of the tool through places; 1 m along x unless they are given."""
+    places = places or ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return Way.of(poses, CORNERS, np.zeros(3))
+
+
+def touching(found: Object, until: float, **changed: Any) -> Touching:  # noqa: ANN401 - its fields
+    """An object that the tool touches without overlap."""
+    one = Touching(found, 0.0, 0.0, 1e-4, until, is_sliding=False, cut=None)
+    return one._replace(**changed)
+
+
+def swept(path: Way | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - fields of a result
+    """A sweep that meets nothing, with some fields changed."""
+    path = path or line()
+    fields: dict[str, Any] = {
+        "path": path,
+        "gap": Gap(np.inf, np.inf, None),
+        "hits": (),
+        "touching": (),
+        "enclosed": (),
+        "contact": 5e-5,
+        "objects": 3,
+        "looks": 40,
+        "revision": 1,
+        "elapsed": 0.1,
+        "proportions": Proportions(None, 0.02, None, None, ()),
+        "profile": Profile(np.linspace(0.0, 1.0, 5), np.array([0.4, 0.3, 0.1, 0.0, np.inf])),
+    }
+    return Swept(**(fields | changed))

@@ -1,0 +1,108 @@
+"""What is told of a sweep: the verdict's line, JSON, rows of CSV."""
+
+import json
+
+import numpy as np
+import pytest
+
+from hapticdb import PointShell
+from hapticdb.cli.csv_files import SWEPT, rows_of_sweep
+from hapticdb.sweeps.record import sweep_record
+from hapticdb.sweeps.result import Gap, Swept
+from hapticdb.sweeps.verdict import gap_text, verdict_line
+from made_sweeps import CORNERS, line, place_at, swept, thing, touching
+
+PATH = line()
+BENT = line((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 0.5, 0.0))
+TOOL = PointShell(CORNERS, CORNERS / np.linalg.norm(CORNERS, axis=1)[:, None], np.zeros(3))
+BOLT, SEAT, LID = thing("bolt", 1), thing("seat", 2), thing("lid", 3)
+GAP = Gap(4e-4, 4.01e-4, place_at(BOLT, 0.312, PATH, 4e-4))
+CUT = place_at(SEAT, 0.25, PATH)
+
+
+@pytest.mark.parametrize(
+    ("found", "verdict", "told"),
+    [
+        (swept(gap=GAP), "clear", "clear by 0.4 mm: nearest bolt at 31.2 % of the path"),
+        (swept(BENT, gap=Gap(4e-4, 4e-4, place_at(BOLT, 0.75, BENT))), "clear",
+         "clear by 0.4 mm: nearest bolt at 75 % of the path (segment 1)"),
+        (swept(gap=Gap(0.5, 0.5, None)), "clear", "clear: nothing nearer than 0.5 m"),
+        (swept(), "clear", "clear: nothing else is there"),
+        (swept(gap=GAP, touching=(touching(SEAT, 0.12),)), "clear",
+         ("clear by 0.4 mm: nearest bolt at 31.2 % of the path; "
+         "touches seat until 12 % of the path")),
+        (swept(gap=GAP, touching=(touching(SEAT, 0.12, is_sliding=True), touching(LID, 1.0))),
+         "slides",
+         ("slides along seat until 12 % of the path, otherwise clear by 0.4 mm: nearest bolt at "
+         "31.2 % of the path; touches lid to the end of the path")),
+        (swept(hits=tuple(place_at(one, 0.312, PATH) for one in (BOLT, SEAT, LID))), "hits",
+         "hits bolt at 31.2 % of the path; then seat, lid"),
+        (swept(hits=(CUT,), touching=(touching(SEAT, 0.6, deepest=2e-3, allowed=1e-4, cut=CUT),)),
+         "hits", "cuts into seat at 25 % of the path: 2 mm deep, 0.1 mm is allowed"),
+        (swept(hits=(place_at(SEAT, 0.8, PATH),), touching=(touching(SEAT, 0.1),)), "hits",
+         "leaves seat and hits it again at 80 % of the path"),
+        (swept(enclosed=(thing("tank", 4, 1.0), thing("pea", 5, 1e-3))), "hits",
+         "lies inside tank; pea lies inside the tool"),
+        (swept(enclosed=(thing("tank", 4, 1.0),), hits=(place_at(BOLT, 0.5, PATH),)), "hits",
+         "lies inside tank; hits bolt at 50 % of the path"),
+    ],
+)  # fmt: skip
+def test_the_verdict_is_told_in_a_line(found: Swept, verdict: str, told: str) -> None:
+    assert found.verdict == verdict
+    assert verdict_line(found, TOOL) == told
+
+
+def test_what_time_has_ended_is_not_decided_unless_something_is_hit() -> None:
+    stopped = swept(is_stopped=True)
+    assert stopped.verdict == "not decided"
+    assert verdict_line(stopped, TOOL).startswith("not decided: the time was over")
+    hits = (place_at(BOLT, 0.5, PATH),)
+    assert verdict_line(swept(is_stopped=True, hits=hits), TOOL).startswith("hits bolt")
+
+
+def test_a_gap_without_a_place_is_a_bound() -> None:
+    assert [gap_text(swept(gap=gap)) for gap in (GAP, Gap(0.5, 0.5, None), swept().gap)] == [
+        "0.4 mm", "more than 0.5 m", "-",
+    ]  # fmt: skip
+
+
+def test_json_has_the_documented_keys_and_no_infinity() -> None:
+    both = touching(SEAT, 0.6, cut=CUT)
+    found = swept(gap=GAP, hits=(CUT,), touching=(both,), enclosed=(LID,))
+    record = json.loads(json.dumps(sweep_record(found, TOOL, [7], [7, 8]), allow_nan=False))
+    assert set(record) == {
+        "verdict", "gap", "gap_at_most", "nearest", "line", "comes_out", "hits", "touching",
+        "enclosed", "contact", "objects", "looks", "revision", "elapsed", "is_stopped", "poses",
+        "profile", "tool", "proportions",
+    }  # fmt: skip
+    assert set(record["hits"][0]) == {
+        "id", "name", "fraction", "segment", "pose", "on_tool", "on_object",
+    }  # fmt: skip
+    assert set(record["touching"][0]) == {
+        "id", "name", "start", "deepest", "allowed", "until", "is_sliding", "cut",
+    }  # fmt: skip
+    assert record["touching"][0]["cut"] == record["hits"][0]
+    assert (record["verdict"], record["gap"], record["nearest"]["name"]) == ("hits", 4e-4, "bolt")
+    assert record["tool"] == {"parts": [7], "excluded": [7, 8]}
+    assert record["profile"]["gaps"][-1] is None
+    nothing = sweep_record(swept(), TOOL, [], [])
+    assert (nothing["verdict"], nothing["gap"], nothing["nearest"]) == ("clear", None, None)
+
+
+def test_csv_has_a_row_for_each_object_that_is_met() -> None:
+    hit = place_at(BOLT, 0.5, PATH)
+    found = swept(hits=(hit, CUT), touching=(touching(SEAT, 0.6, cut=CUT),), enclosed=(LID,))
+    rows = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(found)]
+    told = [(row["object_name"], row["what"], row["fraction"]) for row in rows]
+    assert told == [
+        ("bolt", "hit", 0.5), ("seat", "hit", 0.25), ("lid", "enclosed", ""),
+        ("seat", "touched", 0.25),
+    ]  # fmt: skip
+    assert [rows[0][f"object_{axis}_m"] for axis in "xyz"] == hit.on_object.tolist()
+    assert (rows[3]["until_fraction"], rows[3]["allowed_m"], rows[0]["allowed_m"]) == (
+        0.6,
+        1e-4,
+        "",
+    )
+    (nearest,) = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(swept(gap=GAP))]
+    assert (nearest["what"], nearest["gap_m"], nearest["verdict"]) == ("nearest", 4e-4, "clear")

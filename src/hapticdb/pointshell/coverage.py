@@ -19,9 +19,6 @@ CLOSE = 0.1
 """Tolerance of a computed covering radius: it exceeds the least one by at most this share, or comes
 from triangles with sides of at most this share of the points' spacing. A smaller value cuts more
 triangles."""
-COVER_OF_SPACING = 1.45
-"""Expected covering radius of a mesh's shell, in spacings of its points. Measured on a cube: 0.98
-at 300 points, 1.37 at 400,000. Larger: an undecided sweep recommends more points."""
 LINES = 32
 """Lines that vote at most whether a body encloses a place. Larger: slower; one decides, if it meets
 no edge."""

@@ -15,7 +15,14 @@ def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
     keys (n,) int64: of voxels on the environment's curve, distinct and ascending; exclude (E,) ids
     that are left out.
     """
-    return np.unique(pairs_of_voxels(store, keys, exclude)[:, 1])
+    if store.layout == "voxel":
+        ids = np.unique(store.lookup(keys).ids)
+    else:
+        bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
+        rows = store.lookup(bricks)
+        voxel, row = _rows_of_bricks(rows, bricks[inverse])
+        ids = np.unique(rows.ids[row[_is_in_voxel(store, rows, row, keys[voxel])]])
+    return ids[~np.isin(ids, exclude)]
 
 
 def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
@@ -39,28 +46,6 @@ def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> N
     is_near |= _is_in_voxel(store, rows, row, keys[voxel])
     ids = np.unique(rows.ids[row[is_near]])
     return ids[~np.isin(ids, exclude)]
-
-
-def pairs_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
-    """Every voxel with every object in it, (P, 2): index in `keys`, and object id; ordered by both.
-
-    The arguments are those of `ids_of_voxels`.
-    """
-    if store.layout == "voxel":
-        rows = store.lookup(keys)
-        pairs = np.stack([np.searchsorted(keys, rows.keys), rows.ids], axis=1)
-    else:
-        pairs = _pairs_in_bricks(store, keys)
-    pairs = pairs[~np.isin(pairs[:, 1], exclude)]
-    return pairs[np.lexsort((pairs[:, 1], pairs[:, 0]))]
-
-
-def _pairs_in_bricks(store: Store, keys: Keys) -> NDArray[np.int64]:
-    bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
-    rows = store.lookup(bricks)
-    voxel, row = _rows_of_bricks(rows, bricks[inverse])
-    is_set = _is_in_voxel(store, rows, row, keys[voxel])
-    return np.stack([voxel[is_set], rows.ids[row[is_set]]], axis=1)
 
 
 def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArray[np.int64]]:

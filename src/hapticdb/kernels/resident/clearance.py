@@ -1,74 +1,24 @@
-"""Clearance of a swept shell from occupied voxels, by bounds that are kept from pose to pose.
+"""Nearest occupied voxels of resident cells, and the cells that a search for them needs.
 
-The search stops at the first cell that is not resident and returns where it stopped. The caller
-fetches that cell and continues the search; no distance is guessed.
+A search stops at the first cell that is not resident. The caller fetches that cell and goes on; no
+distance is guessed.
 """
 
 import math
-from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import (
-    FLOAT,
-    FLOATS,
-    FLOATS2,
-    FLOATS3,
-    INT,
-    INTS,
-    entry,
-    fields_of,
-    inlined,
-    leaf,
-)
+from hapticdb.kernels._jit import FLOAT, FLOATS2, FLOATS3, INT, INTS, entry, inlined, leaf
 from hapticdb.kernels.bits import highest_bit, lowest_bit
 from hapticdb.kernels.resident.cells import (
-    CELLS,
-    CLUSTERS,
     EMPTY_SLOT,
     PLACE,
-    begin_frame,
-    end_frame,
     key_of_cell,
     place_in_set,
     slot_of,
 )
-from hapticdb.kernels.resident.sweep import CAUTION, packed, unpacked
+from hapticdb.kernels.resident.sweep import packed, unpacked
 from hapticdb.kernels.rigid import moved, transform_of
-
-MARGIN = 4.0
-"""Voxels that a search reaches beyond the distance that matters now. Larger: longer searches, fewer
-repeated ones."""
-
-
-class Bounds(NamedTuple):
-    """Bounds on the clearance, in voxels, kept from sample to sample.
-
-    expiry (N,): for each point, the earliest travel at which it can reach an occupied voxel, if it
-    went straight there: its distance now is at least expiry - travel; of_runs (C,): the earliest
-    expiry of the points of each run; nearest (N,) int64: the voxel, packed, that was nearest to
-    each point in its last search, or -1; least (W,): least distance so far in each window of the
-    path; state (2,): indices `SOONEST`, `LEAST`; where (6,) int64: indices `SAMPLE` to `LOOKED`.
-    """
-
-    expiry: NDArray[np.float64]
-    of_runs: NDArray[np.float64]
-    nearest: NDArray[np.int64]
-    least: NDArray[np.float64]
-    state: NDArray[np.float64]
-    where: NDArray[np.int64]
-
-
-BOUNDS = fields_of(Bounds, FLOATS, FLOATS, INTS, FLOATS, FLOATS, INTS)
-
-
-SOONEST, LEAST = 0, 1
-"""Indices into `Bounds.state`: the least expiry of all points, and the least distance, voxels."""
-SAMPLE, POINT, VOXEL, NEAREST, STOPPED, LOOKED = 0, 1, 2, 3, 4, 5
-"""Indices into `Bounds.where`: sample, point and voxel of the least distance; the point that was
-nearest last; the point, or first point of a run, at which the search stopped; the number of poses
-at which any point was looked at, because bounds of earlier poses did not reach so far."""
 
 
 @leaf
@@ -189,133 +139,6 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
                     words, slot, masks[slot], ci, cj, ck, x, y, z, square, voxel
                 )
     return square, voxel
-
-
-@inlined
-def nearest_to(keys, slots, words, masks, used, which, x, y, z, cap, near, side):
-    """Squared distance from (x, y, z) to the nearest occupied voxel, and that voxel; all in voxels.
-
-    The search reaches as far as `cap` + `MARGIN`, or as the voxel `near` (packed, or -1 for none)
-    if that is nearer. The voxel is -1 when there is none, and -2 when a cell in reach is unknown.
-    """
-    square, voxel = (cap + MARGIN) ** 2, np.int64(-1)
-    if near >= 0 and square_to(x, y, z, near) < square:
-        square, voxel = square_to(x, y, z, near), near
-    return nearest_voxel(
-        keys, slots, words, masks, used, which, x, y, z, square, voxel, side
-    )  # fmt: skip
-
-
-@inlined
-def _far_run(
-    keys, slots, words, masks, used, which, spheres, at, near, cap, transform, place
-):  # fmt: skip
-    """Lower bound, voxels, of the distance from a placed run's points to any occupied voxel.
-
-    It comes from the run's sphere, looked for as far as `cap`; -1 when a cell in reach is unknown.
-    near: a voxel, packed, with which the search begins, or -1.
-    """
-    size = place.size
-    x, y, z = moved(transform, spheres[at, 0], spheres[at, 1], spheres[at, 2])
-    radius = spheres[at, 3] / size
-    square, voxel = nearest_to(
-        keys, slots, words, masks, used, which, (x - place.x) / size, (y - place.y) / size,
-        (z - place.z) / size, cap + radius, near, place.side,
-    )  # fmt: skip
-    return -1.0 if voxel == -2 else max(math.sqrt(square) - radius, 0.0)
-
-
-@inlined
-def near_points(
-    keys, slots, words, masks, used, which, points, run, at, transform, place, travel, cap, sample,
-    expiry, nearest, state, where,
-):  # fmt: skip
-    """Distances of the points of run `at` that may be nearer than `cap`, into arrays of `Bounds`.
-
-    Returns the least of `cap` and these distances, and the run's earliest expiry, all in voxels; -1
-    and 0 when a cell is unknown. sample: number of the pose on the path.
-    """
-    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
-    soonest = np.inf
-    start = at * run
-    for p in range(start, min(start + run, points.shape[0])):
-        if expiry[p] - travel < cap:
-            x, y, z = moved(transform, points[p, 0], points[p, 1], points[p, 2])
-            square, voxel = nearest_to(
-                keys, slots, words, masks, used, which,
-                (x - ox) / size, (y - oy) / size, (z - oz) / size, cap, nearest[p], side,
-            )  # fmt: skip
-            if voxel == -2:
-                where[STOPPED] = p
-                return -1.0, 0.0
-            distance = math.sqrt(square)
-            nearest[p] = voxel
-            expiry[p] = travel + distance - CAUTION
-            if voxel >= 0 and distance < cap:
-                cap = distance
-                where[NEAREST] = p
-                if distance < state[LEAST]:
-                    state[LEAST] = distance
-                    where[SAMPLE] = sample
-                    where[POINT] = p
-                    where[VOXEL] = voxel
-        soonest = min(soonest, expiry[p])
-    return cap, soonest
-
-
-@entry(CELLS, INT, CLUSTERS, FLOATS3, INT, INT, FLOATS, INTS, PLACE, FLOAT, BOUNDS)
-def find_clearance(
-    cells, reader, shell, poses, first, base, travels, windows, place, small, bounds
-):  # fmt: skip
-    """Least distance from the points to an occupied voxel's box at poses[first:], in `bounds`.
-
-    travels (B,): largest way of any point from the path's start to each pose, voxels; windows (B,)
-    int64: the entry of `bounds.least` that each pose counts for; base: number of poses[0] as a
-    sample of the path; small: runs with a radius of at most so many voxels are searched as a whole
-    before their points. Returns the number of poses done. It is less than B when a cell was not
-    resident; then `bounds.where[STOPPED]` has the point, or the first point of the run.
-    """
-    _, _, keys, slots, words, masks, used, _, _ = cells
-    points, _, spheres, _, run, _, _ = shell
-    expiry, of_runs, nearest, least, state, where = bounds
-    which = begin_frame(cells, reader)
-    for n in range(first, poses.shape[0]):
-        travel, window = travels[n], windows[n]
-        cap = least[window]
-        if state[SOONEST] - travel >= cap:
-            continue
-        transform = transform_of(poses[n])
-        soonest = np.inf
-        # first the run of the point that was nearest last: it bounds the search for all others
-        for turn_of in range(-1, of_runs.shape[0]):
-            at = where[NEAREST] // run if turn_of < 0 else turn_of
-            is_expired = of_runs[at] - travel < cap and turn_of >= 0
-            if is_expired and spheres.shape[0] > 0 and spheres[at, 3] <= small * place.size:
-                bound = _far_run(
-                    keys, slots, words, masks, used, which, spheres, at, nearest[at * run], cap,
-                    transform, place,
-                )  # fmt: skip
-                if bound < 0.0:
-                    where[STOPPED] = at * run
-                    end_frame(cells, reader)
-                    return n
-                of_runs[at] = max(of_runs[at], travel + bound - CAUTION)
-            if of_runs[at] - travel < cap:
-                cap, soonest_of_run = near_points(
-                    keys, slots, words, masks, used, which, points, run, at, transform, place,
-                    travel, cap, base + n, expiry, nearest, state, where,
-                )  # fmt: skip
-                if cap < 0.0:
-                    end_frame(cells, reader)
-                    return n
-                of_runs[at] = soonest_of_run
-            if turn_of >= 0:
-                soonest = min(soonest, of_runs[at])
-        least[window] = cap
-        state[SOONEST] = soonest
-        where[LOOKED] += 1
-    end_frame(cells, reader)
-    return poses.shape[0]
 
 
 @entry(FLOATS2, FLOATS3, PLACE, INT, INT, FLOAT, INTS, INT)

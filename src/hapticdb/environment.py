@@ -12,9 +12,9 @@ from hapticdb.batches.queries import Queries
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
+from hapticdb.ingest.geometry import shell_of_objects
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.ingest.moving import move_object, restore_object, shift_objects
-from hapticdb.ingest.originals import shell_of_objects
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel
@@ -144,7 +144,7 @@ class Environment(Queries):
         seed: int = 0,
         inset: float = 0.0,
     ) -> PointShell:
-        """Make one rigid tool from objects at their places; reads their files again.
+        """Make one rigid tool from objects at their places.
 
         The shell is in the world's frame, metres. So its present pose is the identity, and the
         poses of a path are displacements. Exclude the objects from the force:
@@ -161,12 +161,12 @@ class Environment(Queries):
         ------
         ObjectNotFoundError
             If a word chooses nothing.
-        GeometryChangedError
-            If an object's file is missing or has another geometry now.
+        NoSurfaceError
+            If an object was imported by a version that kept no surfaces.
         UsageError
             If no word is given, or an object is a point cloud, which has no surface.
         """
-        return shell_of_objects(self.find(*words), points, spacing, seed, inset)
+        return shell_of_objects(self._store, self.find(*words), points, spacing, seed, inset)
 
     def add(
         self,
@@ -216,6 +216,8 @@ class Environment(Queries):
     def remove(self, object_id: int, *, revision: int | None = None) -> Object:
         """Remove an object and its rows, in one transaction; returns the object as it was.
 
+        The returned object has its surface, so that `restore` can put it back.
+
         Parameters
         ----------
         revision : int or None
@@ -232,7 +234,8 @@ class Environment(Queries):
         def covering(known: Object) -> Iterable[tuple[int, int]]:
             if revision is not None:  # inside the transaction
                 check_unwritten(replace(known, revision=revision), known, self.url)
-            removed.append(known)
+            surface = self._store.surfaces([known.digest]).get(known.digest)
+            removed.append(replace(known, surface=surface))
             return self._covering(known)
 
         self._store.remove(as_id(object_id), covering)
@@ -240,7 +243,7 @@ class Environment(Queries):
         return removed[-1]
 
     def restore(self, removed: Object) -> Object:
-        """Put a removed object back, in one transaction; reads its file again.
+        """Put a removed object back, in one transaction.
 
         Parameters
         ----------
@@ -251,8 +254,8 @@ class Environment(Queries):
         ------
         EnvironmentExistsError
             If the part is in the environment.
-        GeometryChangedError
-            If the object's file is missing or has another geometry now.
+        NoSurfaceError
+            If neither `removed` nor the environment has its surface.
         """
         self._check_writable()
         object_id = restore_object(self._store, removed)
@@ -260,7 +263,7 @@ class Environment(Queries):
         return self.object(object_id)
 
     def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
-        """Move an object to a new placement, in one transaction; reads its file again.
+        """Move an object to a new placement, in one transaction.
 
         Parameters
         ----------
@@ -275,8 +278,8 @@ class Environment(Queries):
         ------
         ConflictError
             If `revision` is given and the object has been written since.
-        GeometryChangedError
-            If the object's file is missing or has another geometry now.
+        NoSurfaceError
+            If the object was imported by a version that kept no surfaces.
         OutsideGridError
             If the object would leave the grid.
         """
@@ -287,7 +290,7 @@ class Environment(Queries):
         return self.object(object_id)
 
     def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift all objects by the same vector, one transaction an object; reads each file once.
+        """Shift all objects by the same vector, one transaction an object.
 
         Parameters
         ----------
@@ -299,7 +302,7 @@ class Environment(Queries):
 
         Raises
         ------
-        GeometryChangedError, OutsideGridError
+        NoSurfaceError, OutsideGridError
             As for `move`; then no object is shifted.
         """
         self._check_writable()

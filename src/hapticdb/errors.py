@@ -7,7 +7,7 @@
     │   └── GridError                         a grid that is not possible, or does not match
     ├── FileError (ValueError)                an input file that cannot be used
     │   ├── OutsideGridError                  a part that does not fit the grid
-    │   └── GeometryChangedError              an object's file is gone or has changed
+    │   └── GeometryChangedError              a part has changed since it was imported
     ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
@@ -18,6 +18,7 @@
         ├── NotAnEnvironmentError             a file of another kind
         ├── NewerVersionError                 written by a newer hapticdb
         ├── DamagedError                      an environment whose contents are broken
+        ├── NoSurfaceError                    an object that an earlier version has imported
         ├── ReadOnlyError (PermissionError)   a write where only reading is possible
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
@@ -51,7 +52,7 @@ class OutsideGridError(FileError):
 
 
 class GeometryChangedError(FileError):
-    """The file behind an object is gone, or no longer holds the same geometry."""
+    """A part of a file has another geometry than the object that was imported from it."""
 
 
 class MissingExtraError(HapticDBError, ImportError):
@@ -92,6 +93,10 @@ class NewerVersionError(DatabaseError):
 
 class DamagedError(DatabaseError):
     """An environment whose contents are broken."""
+
+
+class NoSurfaceError(DatabaseError):
+    """An object whose surface is not in the database; an upgrade puts it there."""
 
 
 class ReadOnlyError(DatabaseError, PermissionError):

@@ -85,7 +85,8 @@ def copy_environment(
     target already are left alone: an interrupted copy goes on when it is started again. Everything
     is read at one revision of the source, so later edits are not copied. The memory needed is
     proportional to the largest object. Distances to surfaces are copied as they are, if the target
-    wants them; a new target of bricks wants them if the source does.
+    wants them; a new target of bricks wants them if the source does. Surfaces are copied with the
+    first object that has them.
 
     Parameters
     ----------
@@ -184,8 +185,9 @@ def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -
             loading.enter_context(target.loading())
         for done, obj in enumerate(missing, start=len(objects) - len(missing) + 1):
             rows = _rows_for(target, source, obj, quantiles)
+            surface = source.surfaces([obj.digest]).get(obj.digest)
             try:
-                renumbered += target.add(obj, rows) != obj.id
+                renumbered += target.add(obj, rows, surface) != obj.id
             except EnvironmentExistsError:
                 if _missing([obj], source, target):
                     raise

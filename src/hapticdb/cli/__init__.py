@@ -55,7 +55,7 @@ VERBS: dict[Callable[..., None], str] = {
     check: "Say whether an environment is sound.",
     backup: "Copy an SQLite environment into a file, whole.",
     restore: "Put such a copy in an environment's place.",
-    upgrade: "Give distances to objects imported without.",
+    upgrade: "Give objects surfaces and distances that they lack.",
     grant: "Say what a role may do, on PostgreSQL.",
     demo: "Make, import, touch and draw the sample.",
     sample: "Write a sample: a car, a wrench and its path.",

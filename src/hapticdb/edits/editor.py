@@ -146,7 +146,7 @@ class Editor:
         ------
         ConflictError
             If somebody else has moved the object or taken it out since this editor has seen it.
-        GeometryChangedError, OutsideGridError, UsageError
+        NoSurfaceError, OutsideGridError, UsageError
             As for `Environment.move`.
         """
         before, place = self._present(object_id), as_floats(transform, "a transform").copy()
@@ -173,8 +173,6 @@ class Editor:
             If this editor has not taken it out.
         ConflictError
             If somebody else has put the part back, or has imported it again.
-        GeometryChangedError
-            If the object's file is missing or has another geometry now.
         """
         if object_id not in self._out:
             raise UsageError(f"object {object_id} was not taken out by this editor")

@@ -1,4 +1,4 @@
-"""Imports files as objects and their rows: one transaction an object, in the order of the file.
+"""Imports files as objects, rows and surfaces: one transaction an object, in the file's order.
 
 Objects are written in the order of the files and of their parts, whatever the number of jobs. So an
 import that was interrupted and is run again ends with the same rows and ids as an undisturbed one.
@@ -337,9 +337,10 @@ def _add_missing(
 
     parts = voxelize_parts(still_missing(), mesh_file, store, *unit_and_jobs, report_share)
     with contextlib.closing(parts):
-        for obj, rows in parts:
+        for obj, rows, surface in parts:
             n_done += 1
-            if (new_id := added_or_present(store, obj, rows, plan.known)) is not None:
+            new_id = added_or_present(store, obj, rows, surface, plan.known)
+            if new_id is not None:
                 added.add(new_id)
             voxels += obj.voxels
             report_share(0.0)

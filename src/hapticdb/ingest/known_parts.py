@@ -69,14 +69,16 @@ class KnownParts:
             self._digest_of[obj.name] = obj.digest
 
 
-def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) -> int | None:
+def added_or_present(
+    store: Store, part: Object, rows: Rows, surface: bytes, known: KnownParts
+) -> int | None:
     """Add a part; returns its id, or None if another process has added the same part meanwhile.
 
     Raises `EnvironmentExistsError` if there is a part of that name with another geometry.
     """
     for attempt in range(MOST_ATTEMPTS):
         try:
-            return store.add(part, rows)
+            return store.add(part, rows, surface)
         except EnvironmentExistsError:
             known.refresh()
             digest = known.digest_of(part.name)
@@ -89,13 +91,14 @@ def added_or_present(store: Store, part: Object, rows: Rows, known: KnownParts) 
 
 
 def replace_changed(
-    store: Store, anew: Iterable[tuple[Object, Rows]], id_of: dict[str, int]
+    store: Store, anew: Iterable[tuple[Object, Rows, bytes]], id_of: dict[str, int]
 ) -> int:
     """Replace the objects with the parts' names, one transaction each; returns their number."""
     n_replaced = 0
-    for part, rows in anew:
+    for part, rows, surface in anew:
+        new = dataclasses.replace(part, id=id_of[part.name])
         with contextlib.suppress(ObjectNotFoundError):  # another process has removed it
-            store.replace(dataclasses.replace(part, id=id_of[part.name]), rows, covering(store))
+            store.replace(new, rows, covering(store), surface)
             n_replaced += 1
     return n_replaced
 

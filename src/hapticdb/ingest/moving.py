@@ -1,4 +1,4 @@
-"""Moves objects: reads their geometry again, voxelizes it, and replaces their rows."""
+"""Moves objects: voxelizes their surfaces at the new place, and replaces their rows."""
 
 from collections.abc import Iterable
 from dataclasses import replace
@@ -6,16 +6,14 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import ConflictError, UsageError
+from hapticdb.errors import ConflictError, NoSurfaceError, UsageError
 from hapticdb.ingest.checking import bounds_inside
-from hapticdb.ingest.originals import parts_of
+from hapticdb.ingest.geometry import parts_of, unpacked_part
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
 from hapticdb.store.base import Covering, Object, Store
-
-_RESTORE = "restore the file, or remove the object and import it again"
 
 Floats = NDArray[np.float64]
 
@@ -25,21 +23,33 @@ def move_object(
 ) -> None:
     """Move an object; see `Environment.move`."""
     placed = _as_transform(transform)
-    ((_, part),) = parts_of([old], "moved", _RESTORE)
+    ((_, part),) = parts_of(store, [old])
     _write_moved(store, old, part, placed, revision or 0, covering)
 
 
 def restore_object(store: Store, record: Object) -> int:
     """Write an object that was removed, at its place and with its id; see `Environment.restore`."""
-    ((_, part),) = parts_of([record], "put back", "import the file again")
+    surface = record.surface or store.surfaces([record.digest]).get(record.digest)
+    if surface is None:
+        raise NoSurfaceError(
+            f"object {record.id} ({record.name}) cannot be put back, its surface is not in "
+            f"{store.url}: import {record.link} again"
+        )
+    part = unpacked_part(store.url, record, surface)
     bounds = bounds_inside(part, record.link, store.grid, record.transform)
     rows, n_voxels = rows_of_part(
         part, store.grid, store.layout, record.transform, distances=record.has_distances
     )
     new = replace(
-        record, voxels=n_voxels, bounds=bounds, revision=0, rows_crc=None, distances_crc=None
+        record,
+        voxels=n_voxels,
+        bounds=bounds,
+        revision=0,
+        rows_crc=None,
+        distances_crc=None,
+        surface=None,
     )
-    return store.add(new, rows)
+    return store.add(new, rows, surface)
 
 
 def shift_objects(
@@ -48,7 +58,7 @@ def shift_objects(
     """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
-    pairs = list(parts_of([store.object(int(i)) for i in as_ids(ids)], "moved", _RESTORE))
+    pairs = list(parts_of(store, [store.object(int(i)) for i in as_ids(ids)]))
     for obj, part in pairs:
         bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
     for known, part in pairs:
@@ -61,7 +71,7 @@ def shift_objects(
                 obj = store.object(obj.id)
                 if obj.digest != part.digest:
                     raise
-    return [store.object(obj.id) for obj, _ in sorted(pairs, key=lambda pair: pair[0].id)]
+    return [store.object(obj.id) for obj, _ in pairs]
 
 
 def _write_moved(

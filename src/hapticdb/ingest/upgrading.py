@@ -1,7 +1,7 @@
-"""Gives distances to objects that were imported without: one transaction an object.
+"""Gives surfaces and distances to objects that were imported without: one transaction each.
 
-Each object's file is read again. An upgrade that was interrupted, or left objects out, is run again
-and goes on with the objects that have no distances yet.
+Surfaces come from the objects' files, distances from the surfaces. An upgrade that was interrupted,
+or left objects out, is run again and goes on with what is missing.
 """
 
 import os
@@ -14,10 +14,10 @@ import numpy as np
 
 from hapticdb.errors import ConflictError, FileError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.files import ImportCallback, ImportProgress
+from hapticdb.ingest.geometry import found_parts, packed_surface
 from hapticdb.ingest.known_parts import covering
-from hapticdb.ingest.originals import found_parts
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
-from hapticdb.mesh import Part
+from hapticdb.mesh import Part, read_file
 from hapticdb.query.grouping import object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Object, Rows, Store
@@ -30,7 +30,7 @@ KEY_END = (1 << 63) - 1
 
 
 class LeftOut(NamedTuple):
-    """Objects that stay without distances for the same reason."""
+    """Objects that stay without surface or distances for the same reason."""
 
     objects: tuple[Object, ...]
     error: HapticDBError
@@ -38,69 +38,71 @@ class LeftOut(NamedTuple):
 
 @dataclass(frozen=True)
 class UpgradeReport:
-    """Result of `upgrade_environment`: numbers of objects, and of the upgraded ones' voxels."""
+    """Result of `upgrade_environment`: numbers of objects, and of voxels."""
 
     url: str
+    surfaces: int
+    """Objects that had no surface and have one now."""
     upgraded: int
+    """Objects that had no distances and have some now."""
     present: int
-    """Objects that had distances already."""
+    """Objects that lacked nothing."""
     voxels: int
+    """Voxels of the objects that were given distances."""
     left_out: tuple[LeftOut, ...]
-    """Objects that stay without, and why."""
+    """Objects that still lack something, and why."""
 
     @property
     def is_complete(self) -> bool:
-        """Whether every object has distances."""
+        """Whether no object lacks anything now."""
         return not self.left_out
 
 
 def upgrade_environment(
     url: str | os.PathLike[str], *, jobs: int | None = None, progress: ImportCallback | None = None
 ) -> UpgradeReport:
-    """Give distances to each object that has none; parts that are imported later get them, too.
+    """Give each object its surface and, in the layout brick, distances to it.
 
-    The file of each object is read again, at the object's place. Its voxels stay as they are. An
-    object is left out if its file is gone or has another geometry, or if its voxels are not those
-    that this version makes of the file. Run again, an upgrade goes on with what is left.
+    A missing surface is read from the object's file. Voxels stay as they are. An object is left out
+    if its file is gone or has another geometry, or if its voxels are not those that this version
+    makes of its surface. Run again, an upgrade goes on with what is left. Parts that are imported
+    later get distances, too.
 
     Parameters
     ----------
     url : str or path
-        An environment with the layout brick, which is opened to write.
+        An environment, which is opened to write.
     jobs : int or None
         Threads that compute distances; one for each processor unless given.
     progress : callable or None
-        Called with an `ImportProgress`.
+        Called with an `ImportProgress`, which counts each surface and each object's distances.
 
     Raises
     ------
-    UsageError
-        If the layout is voxel, which has no distances.
     DatabaseError
         If the environment cannot be opened or written.
     """
     if jobs is not None and jobs < 1:
         raise UsageError(f"{jobs} jobs: give 1 or more")
     with closing(open_store(url)) as store:
-        if store.layout == "voxel":
-            raise UsageError(
-                f"{store.url} has the layout voxel, which has no distances: "
-                "'hapticdb copy URL NEW --layout brick', then upgrade that"
-            )
-        if not store.wants_distances:
+        is_brick = store.layout == "brick"
+        if is_brick and not store.wants_distances:
             store.want_distances()
-        objects = store.objects()
-        missing = [obj for obj in objects if not obj.has_distances]
-        run = _Run(store, len(missing), progress)
-        if missing:
+        objects, there = store.objects(), store.surface_digests()
+        bare = [obj for obj in objects if obj.digest not in there]
+        flat = [obj for obj in objects if is_brick and not obj.has_distances]
+        run = _Run(store, len(bare) + len(flat), progress)
+        run.give_surfaces(bare)
+        if flat:
             with store.loading():
-                run.upgrade(missing, jobs or os.cpu_count() or 1)
+                run.give_distances(flat, jobs or os.cpu_count() or 1)
         if run.n_upgraded:
             store.analyze(DEFAULT_RESOLUTION)
         return UpgradeReport(
             store.url,
+            run.n_surfaces,
             run.n_upgraded,
-            len(objects) - len(missing),
+            len(objects) - len({obj.id for obj in bare + flat}),
             run.voxels,
             tuple(run.left_out),
         )
@@ -109,14 +111,32 @@ def upgrade_environment(
 class _Run:
     """An upgrade under way: what was done, and what was left out."""
 
-    def __init__(self, store: Store, n_objects: int, progress: ImportCallback | None) -> None:
-        self._store, self._n_objects, self._progress = store, n_objects, progress
+    def __init__(self, store: Store, n_steps: int, progress: ImportCallback | None) -> None:
+        self._store, self._n_steps, self._progress = store, n_steps, progress
         self._link = ""
-        self.n_upgraded = self.voxels = self._n_done = 0
+        self.n_surfaces = self.n_upgraded = self.voxels = self._n_done = 0
         self.left_out: list[LeftOut] = []
 
-    def upgrade(self, objects: Sequence[Object], jobs: int) -> None:
-        """Give distances to objects, in the order of their files."""
+    def give_surfaces(self, objects: Sequence[Object]) -> None:
+        """Write the surfaces of objects from their files."""
+        written: set[str] = set()
+        for some, part in _parts_in_files(objects):
+            self._link = some[0].link
+            if not isinstance(part, Part):
+                self._leave_out(some, part)
+                continue
+            if part.digest not in written:
+                try:
+                    self._store.add_surface(part.digest, packed_surface(part))
+                except FileError as error:  # too large
+                    self._leave_out(some, error)
+                    continue
+                written.add(part.digest)
+            self.n_surfaces += 1
+            self._advance(1)
+
+    def give_distances(self, objects: Sequence[Object], jobs: int) -> None:
+        """Write the distances of objects."""
         grid = self._store.grid
 
         def measured(
@@ -142,12 +162,12 @@ class _Run:
                 self._advance(1)
 
     def _found(self, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
-        """Objects with their parts; objects whose part is not found are left out."""
-        for some, part in found_parts(objects, "upgraded", "restore the file, and run this again"):
-            if isinstance(part, Part):
-                yield some[0], part
+        """Objects with their parts; those without a surface are left out already."""
+        for obj, part in found_parts(self._store, objects):
+            if part is None:
+                self._advance(1)
             else:
-                self._leave_out(some, part)
+                yield obj, part
 
     def _write(self, obj: Object, rows: Rows) -> HapticDBError | None:
         """Write the distances of an object, unless its voxels are not those that are stored."""
@@ -155,7 +175,7 @@ class _Run:
             if not is_as_stored(self._store, obj, rows):
                 return FileError(
                     f"object {obj.id} ({obj.name}) cannot be upgraded: its voxels are not those "
-                    f"that its file gives now; 'hapticdb remove' it and import {obj.link} again"
+                    f"that its surface gives now; 'hapticdb remove' it and import {obj.link} again"
                 )
             self._store.replace(obj, rows, covering(self._store))
         except (ConflictError, ObjectNotFoundError) as error:
@@ -166,14 +186,47 @@ class _Run:
         self.left_out.append(LeftOut(objects, error))
         self._advance(len(objects))
 
-    def _advance(self, n_objects: int) -> None:
-        self._n_done += n_objects
+    def _advance(self, n_steps: int) -> None:
+        self._n_done += n_steps
         self._tell(0.0)
 
     def _tell(self, share: float) -> None:
         if self._progress is not None:
-            done = ImportProgress(self._link, self._n_done, self._n_objects, self.voxels, share)
+            done = ImportProgress(self._link, self._n_done, self._n_steps, self.voxels, share)
             self._progress(done)
+
+
+def _parts_in_files(
+    objects: Sequence[Object],
+) -> Iterator[tuple[tuple[Object, ...], Part | HapticDBError]]:
+    """Yield objects with the geometry that was imported, ordered by file, or with an error.
+
+    Reads each file once. A geometry comes with one object, an error with all objects that it means.
+    """
+    of_file: dict[tuple[str, str | None], list[Object]] = {}
+    for obj in objects:
+        unit = obj.attributes.get("unit")
+        of_file.setdefault((obj.link, unit if isinstance(unit, str) else None), []).append(obj)
+    for (link, unit), some in of_file.items():
+        first = f"object {some[0].id} ({some[0].name})"
+        if len(some) > 1:
+            first += f" and {len(some) - 1} of the same file"
+        try:
+            parts = {(part.name, part.digest): part for part in read_file(link, unit=unit).parts}
+        except HapticDBError as error:
+            unread = FileError(f"{first} cannot be upgraded, its file cannot be read: {error}")
+            yield tuple(some), unread
+            continue
+        for obj in some:
+            part = parts.get((obj.name, obj.digest))
+            yield (
+                (obj,),
+                part
+                or FileError(
+                    f"object {obj.id} ({obj.name}) cannot be upgraded: {link} no longer holds the "
+                    "geometry that was imported; restore the file, and run this again"
+                ),
+            )
 
 
 def is_as_stored(store: Store, obj: Object, rows: Rows) -> bool:

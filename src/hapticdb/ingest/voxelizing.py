@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
+from hapticdb.ingest.geometry import packed_surface
 from hapticdb.ingest.layout import Bricks, rows_of_bricks
 from hapticdb.kernels.surfaces import distances as kernels
 from hapticdb.kernels.surfaces import voxelize
@@ -187,17 +188,18 @@ def voxelize_parts(
     unit: str | None,
     jobs: int,
     progress: ShareCallback = lambda _share: None,
-) -> Generator[tuple[Object, Rows], None, None]:
-    """Yield objects and rows of parts, in order; `jobs` threads voxelize a few parts in advance.
+) -> Generator[tuple[Object, Rows, bytes], None, None]:
+    """Yield objects, rows and packed surfaces of parts, in order; threads work a few in advance.
 
     Threads suffice because the voxelizer runs without the interpreter lock. unit : in which the
     file was read, stored with the objects; progress : as for `in_threads`.
     """
     given = {"unit": unit, "up": file.up}
     attributes = {name: value for name, value in given.items() if value}
+    surfaces: dict[str, bytes] = {}
 
-    def voxelize_part(part: Part, share: ShareCallback) -> tuple[Object, Rows]:
-        return _object_of(part, file, store, attributes, share)
+    def voxelize_part(part: Part, share: ShareCallback) -> tuple[Object, Rows, bytes]:
+        return _object_of(part, file, store, attributes, surfaces, share)
 
     yield from in_threads(parts, voxelize_part, jobs, progress)
 
@@ -252,13 +254,19 @@ def _object_of(
     file: MeshFile,
     store: Store,
     attributes: Mapping[str, object],
+    surfaces: dict[str, bytes],
     progress: ShareCallback,
-) -> tuple[Object, Rows]:
-    """Object and rows of a part at its placement in the file."""
+) -> tuple[Object, Rows, bytes]:
+    """Object, rows and surface of a part at its placement in the file.
+
+    surfaces : those that are packed already, by their digests: instances share one.
+    """
     try:
         rows, n_voxels = rows_of_part(
             part, store.grid, store.layout, progress=progress, distances=store.wants_distances
         )
+        if part.digest not in surfaces:
+            surfaces[part.digest] = packed_surface(part)
     except FileError as error:
         raise FileError(f"{file.link}: {error}") from None
     return (
@@ -272,4 +280,5 @@ def _object_of(
             attributes=attributes,
         ),
         rows,
+        surfaces[part.digest],
     )

@@ -179,6 +179,8 @@ class Object:
         checksums has written.
     distances_crc : int or None
         Checksum of its rows of distances as they were written. None for an object without any.
+    surface : bytes or None
+        Its packed surface. Only `Environment.remove` gives it, so that the object can be restored.
     """
 
     name: str
@@ -192,6 +194,7 @@ class Object:
     revision: int = 0
     rows_crc: int | None = None
     distances_crc: int | None = None
+    surface: bytes | None = field(default=None, repr=False)
 
     @property
     def has_distances(self) -> bool:
@@ -246,13 +249,18 @@ class Freshness(NamedTuple):
 
 
 class Size(NamedTuple):
-    """How large the tables are; bytes of the whole database, its write-ahead log included."""
+    """How large the tables are; bytes of the whole database, its write-ahead log included.
+
+    surface_bytes : of the packed surfaces alone.
+    """
 
     rows: int
     bytes: int
     leaf_blocks: int
     band_rows: int = 0
     band_bytes: int = 0
+    surfaces: int = 0
+    surface_bytes: int = 0
 
 
 class _ReadsRows(Protocol):
@@ -300,10 +308,18 @@ class _ReadsObjects(Protocol):
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
 
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        """Packed surfaces of the digests that have one, in one statement."""
+
+    def surface_digests(self) -> set[str]:
+        """Digests of all surfaces."""
+
 
 class _WritesObjects(Protocol):
     """Writes objects, each in one transaction: its rows, its record and its `Change`.
 
+    A given surface, packed, is stored under the record's digest, unless there is one already. The
+    last object of a digest takes the surface along when it is removed or gets another digest.
     Rows with distances are written into both tables, and the object has distances from then on.
     Rows without are written into the index table alone, and the object has none.
     Raises ReadOnlyError when the store was opened to read, or the user may not write.
@@ -316,13 +332,15 @@ class _WritesObjects(Protocol):
         does this work, after an error, too. Writes that were committed inside are safe.
         """
 
-    def add(self, record: Object, rows: Rows) -> int:
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
         """Write an object and its rows (any ids in them) in one transaction; returns its id.
 
         The record's own id is kept when it is above 0 and no object has it.
         """
 
-    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+    def replace(
+        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+    ) -> None:
         """Exchange an object's rows in one transaction; `covering` says where the old ones are.
 
         A record with a revision above 0 was derived from the object of that revision. Raises
@@ -331,6 +349,9 @@ class _WritesObjects(Protocol):
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+    def add_surface(self, digest: str, surface: bytes) -> None:
+        """Write the surface of objects that lack it; nothing if no object has the digest."""
 
     def want_distances(self) -> None:
         """Make `Store.wants_distances` true from now on, for all who open the environment."""

@@ -40,8 +40,8 @@ ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
 TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
 """Tables that every environment has, in every format."""
-BAND = "band"
-"""Table of distances, which an environment has since format 4."""
+BAND, SURFACE = "band", "surface"
+"""Tables of distances and of surfaces, which an environment has since formats 4 and 6."""
 Floats = NDArray[np.float64]
 
 
@@ -150,8 +150,9 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
             raise damaged(url, f"no such table: {name}")
         if kind != "table":
             raise damaged(url, f"{name} is a {kind} and no table")
-    if kinds.get(BAND, "table") != "table":
-        raise damaged(url, f"{BAND} is a {kinds[BAND]} and no table")
+    for name in (BAND, SURFACE):
+        if kinds.get(name, "table") != "table":
+            raise damaged(url, f"{name} is a {kinds[name]} and no table")
 
 
 def object_of(url: str, row: Sequence[Any]) -> Object:
@@ -204,6 +205,16 @@ def change_of(url: str, row: Sequence[Any]) -> Change:
     if pairs is None or len(pairs) % 2 or (np.diff(pairs) < 0).any() or (pairs < 0).any():
         raise damaged(url, f"{place}: its ranges are no ascending pairs of keys")
     return Change(revision, action, object_id, pairs.reshape(-1, 2))
+
+
+def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
+    """Read packed surfaces (digest, geometry); `hapticdb.mesh.packing` judges what they hold."""
+    found = {}
+    for digest, geometry in rows:
+        if not (isinstance(digest, str) and isinstance(geometry, bytes)):
+            raise damaged(url, f"surface {digest!s:.40}: its digest is no text, or it is no bytes")
+        found[digest] = geometry
+    return found
 
 
 def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:

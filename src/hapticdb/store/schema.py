@@ -29,6 +29,8 @@ STEPS = (
     Step("distances", readers_need_it=False),
     # changes no table; earlier versions could place rows on several servers
     Step("shards", readers_need_it=False),
+    # without it no object has a surface
+    Step("surfaces", readers_need_it=False),
 )
 FORMAT_VERSION = len(STEPS)
 Dialect = Mapping[str, tuple[str, ...]]

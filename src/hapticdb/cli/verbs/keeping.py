@@ -125,13 +125,14 @@ def _say_copied(report: "BackupReport", *, json: bool) -> None:
 
 
 def upgrade(url: UrlArgument, *, jobs: JobsOption = None, json: JsonOption = False) -> None:
-    """Give distances to the objects of an environment, from which smooth forces are computed.
+    """Give objects what an earlier version has not stored: surfaces, and distances to them.
 
-    The file of each object is read again; its voxels stay as they are. Every
-    object is written in a transaction of its own: run the same command again
-    to go on with what was interrupted. An object whose file is gone or has
-    changed is named and stays without, and the exit code is 1. Parts that are
-    imported later get distances, too. The layout voxel has none.
+    A surface that is missing is read from the object's file; moves, tools and
+    views need it. Smooth forces need distances; the layout voxel has none.
+    Voxels stay as they are. Every object is written in a transaction of its
+    own: run the same command again to go on with what was interrupted. An
+    object whose file is gone or has changed is named and stays as it is, and
+    the exit code is 1. Parts that are imported later get distances, too.
 
     Example: hapticdb upgrade car.db
     """
@@ -158,6 +159,7 @@ def upgrade(url: UrlArgument, *, jobs: JobsOption = None, json: JsonOption = Fal
 def _upgrade_record(report: "UpgradeReport") -> dict[str, object]:
     return {
         "url": report.url,
+        "surfaces": report.surfaces,
         "upgraded": report.upgraded,
         "present": report.present,
         "voxels": report.voxels,
@@ -171,14 +173,16 @@ def _upgrade_record(report: "UpgradeReport") -> dict[str, object]:
 
 def _upgraded(report: "UpgradeReport") -> str:
     there = render.counted(report.present, "object")
-    if not report.upgraded and report.is_complete:
+    if not (report.surfaces or report.upgraded) and report.is_complete:
         return f"{report.url}: complete already ({there}), nothing to do"
     line = f"{report.url}: distances for {render.counted(report.upgraded, 'object')}"
+    if report.surfaces:
+        line += f", surfaces for {report.surfaces:,}"
     if report.present:
-        line += f"; {report.present} had them already"
+        line += f"; {there} had all already"
     if not report.is_complete:
         n_left = sum(len(left.objects) for left in report.left_out)
-        line += f"; {render.counted(n_left, 'object')} without; the same command tries again"
+        line += f"; {render.counted(n_left, 'object')} left out; the same command tries again"
     return line
 
 

@@ -121,12 +121,15 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         "rows": size.rows,
         "bytes": size.bytes,
         "distances": {"objects": n_banded, "rows": size.band_rows, "bytes": size.band_bytes},
+        "surfaces": {"shapes": size.surfaces, "bytes": size.surface_bytes},
         "standby": None if lag is None else lag._asdict(),
         "statistics": {"source": source, **freshness._asdict()},
     }
     origin = ", ".join(f"{x:.6g}" for x in grid.origin)
     a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
     distances = f"of {n_banded:,} objects, {render.bytes_text(size.band_bytes)}"
+    n_shapes = render.counted(size.surfaces, "shape")
+    surfaces = f"{n_shapes}, {render.bytes_text(size.surface_bytes)}" if size.surfaces else "none"
     words = [
         ("environment", store.url),
         ("name", store.name),
@@ -143,6 +146,7 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         ("rows", f"{size.rows:,}"),
         ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
         ("distances", distances if n_banded else "none"),
+        ("surfaces", surfaces),
         ("statistics", f"{SOURCES[source]}; {_age(freshness)}"),
     ]
     return record, words

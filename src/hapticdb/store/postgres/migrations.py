@@ -178,9 +178,28 @@ LANGUAGE sql STABLE SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
 $$""",
 )
 
+def _granted_as_on_brick(table: str, also: str = "") -> str:
+    """Statement that gives roles on a new table what they may do with `brick`.
+
+    So nobody's right has to be granted anew. also : done for each right, `given`.
+    """
+    return f"""
+DO $$
+DECLARE given record;
+BEGIN
+  FOR given IN
+    SELECT CASE grantee WHEN 0 THEN 'PUBLIC' ELSE grantee::regrole::text END AS role,
+           privilege_type AS privilege
+      FROM pg_class, aclexplode(relacl)
+     WHERE pg_class.oid = 'brick'::regclass AND grantee <> relowner
+  LOOP
+    EXECUTE format('GRANT %s ON {table} TO %s', given.privilege, given.role);{also}
+  END LOOP;
+END $$"""
+
+
 # a row has 30 to 1,000 bytes, packed already: EXTERNAL compresses nothing, and spares the three
-# bytes of padding and length that PLAIN takes. Roles keep on `band` what they may do with `brick`,
-# so that nobody's right has to be granted anew
+# bytes of padding and length that PLAIN takes
 DISTANCES = (
     f"""
 CREATE TABLE band (
@@ -192,22 +211,21 @@ CREATE TABLE band (
     "ALTER TABLE band ALTER id SET STATISTICS 0, ALTER distances SET STATISTICS 0",
     "CREATE UNIQUE INDEX band_key ON band (z_val, id)",
     "ALTER TABLE environment ADD COLUMN wants_distances boolean NOT NULL DEFAULT false",
-    """
-DO $$
-DECLARE given record;
-BEGIN
-  FOR given IN
-    SELECT CASE grantee WHEN 0 THEN 'PUBLIC' ELSE grantee::regrole::text END AS role,
-           privilege_type AS privilege
-      FROM pg_class, aclexplode(relacl)
-     WHERE pg_class.oid = 'brick'::regclass AND grantee <> relowner
-  LOOP
-    EXECUTE format('GRANT %s ON band TO %s', given.privilege, given.role);
+    _granted_as_on_brick(
+        "band",
+        """
     IF given.privilege = 'INSERT' THEN
       EXECUTE format('GRANT UPDATE (wants_distances) ON environment TO %s', given.role);
-    END IF;
-  END LOOP;
-END $$""",
+    END IF;""",
+    ),
+)
+
+# packed already: EXTERNAL compresses nothing. A hash index has no longest digest
+SURFACES = (
+    "CREATE TABLE surface (digest text PRIMARY KEY, geometry bytea NOT NULL)",
+    "ALTER TABLE surface ALTER geometry SET STORAGE EXTERNAL",
+    "CREATE INDEX object_digest ON object USING hash (digest)",
+    _granted_as_on_brick("surface"),
 )
 
 MIGRATIONS: Dialect = {
@@ -227,4 +245,5 @@ MIGRATIONS: Dialect = {
     "removed parts": REMOVED,
     "distances": DISTANCES,
     "shards": (),
+    "surfaces": SURFACES,
 }

@@ -55,12 +55,13 @@ class PostgresStore:
         self.version, self.revision = reader.version, reader.revision
         self.objects, self.object = reader.objects, reader.object
         self.removed, self.changes = reader.removed, reader.changes
+        self.surfaces, self.surface_digests = reader.surfaces, reader.surface_digests
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
         loading = self._loading = Loading(connection, self.layout)
         writer = PostgresWriter(connection, self.grid, self.layout, reader, loading)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
-        self._write_wish = writer.want_distances
+        self.add_surface, self._write_wish = writer.add_surface, writer.want_distances
         known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

@@ -112,10 +112,20 @@ ALTER TABLE environment
   ADD COLUMN wants_distances INTEGER NOT NULL DEFAULT 0 CHECK (wants_distances IN (0, 1))""",
 )
 
+SURFACES = (
+    """
+CREATE TABLE surface (
+  digest   TEXT PRIMARY KEY,
+  geometry BLOB NOT NULL
+) STRICT""",
+    "CREATE INDEX object_digest ON object (digest)",
+)
+
 MIGRATIONS: Dialect = {
     "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, CHANGE, QUANTILE, COST),
     "lineage": LINEAGE,
     "removed parts": REMOVED,
     "distances": DISTANCES,
     "shards": (),
+    "surfaces": SURFACES,
 }

@@ -41,9 +41,10 @@ class SQLiteStore:
         self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.objects, self.object = reader.objects, reader.object
         self.removed, self.changes = reader.removed, reader.changes
+        self.surfaces, self.surface_digests = reader.surfaces, reader.surface_digests
         writer = SQLiteWriter(connection, self.grid, self.layout, reader)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
-        self._write_wish = writer.want_distances
+        self.add_surface, self._write_wish = writer.add_surface, writer.want_distances
         known = SQLiteStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

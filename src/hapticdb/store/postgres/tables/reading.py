@@ -1,6 +1,6 @@
 """Reads on a server: rows by key and by range, the paper's Figure 3, objects, changes."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -32,7 +32,7 @@ OBJECTS = (
     "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
     " FROM object"
 )
-HAS_BAND = "SELECT to_regclass('band') IS NOT NULL"
+HAS_TABLE = "SELECT to_regclass(%s) IS NOT NULL"
 
 
 class PostgresReader:
@@ -44,7 +44,7 @@ class PostgresReader:
         self._layout = layout
         self._shift = row_shift(layout)
         self._seen = -1
-        self._has_band = False
+        self._found: set[str] = set()
         self._excluded = NO_KEYS
         self._excluded_parameters: list[wire.Parameter] = []
 
@@ -74,11 +74,11 @@ class PostgresReader:
             rows = rows.having(believed.band_of(self._url, found[3] or b"", lengths))
         return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
-    def has_band(self) -> bool:
-        """Whether there is a table of distances; another may make it while a reader has it open."""
-        if not self._has_band:
-            self._has_band = self._connection.rows(HAS_BAND) == [(True,)]
-        return self._has_band
+    def has_table(self, name: str) -> bool:
+        """Whether a table of a later format is there; another may make it at any time."""
+        if name not in self._found and self._connection.rows(HAS_TABLE, (name,)) == [(True,)]:
+            self._found.add(name)
+        return name in self._found
 
     def _read(
         self,
@@ -88,7 +88,7 @@ class PostgresReader:
         is_nothing: bool = False,
     ) -> Rows:
         """Rows by the statement of the table that answers; none if that table is not there."""
-        if is_nothing or (distances and not self.has_band()):
+        if is_nothing or (distances and not self.has_table(believed.BAND)):
             return no_rows(distances=distances)
         text = texts["band" if distances else self._layout]
         return self.unpacked(self._connection.fetch(text, *parameters), distances=distances)
@@ -192,6 +192,23 @@ class PostgresReader:
             (since,),
         ):
             yield believed.change_of(self._url, row)
+
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        """Packed surfaces of the digests that have one, in one statement."""
+        if not self.has_table(believed.SURFACE):
+            return {}
+        text = "SELECT digest, geometry FROM surface WHERE digest = ANY (%s)"
+
+        def read() -> list[tuple[object, ...]]:
+            return self._connection.driver.execute(text, (list(digests),), binary=True).fetchall()
+
+        return believed.surfaces_of(self._url, self._connection.again(read))
+
+    def surface_digests(self) -> set[str]:
+        """Digests of all surfaces."""
+        if not self.has_table(believed.SURFACE):
+            return set()
+        return {row[0] for row in self._connection.rows("SELECT digest FROM surface")}
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:

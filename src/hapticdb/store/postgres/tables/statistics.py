@@ -16,6 +16,7 @@ from hapticdb.store.postgres.tables.histogram import (
 from hapticdb.store.postgres.tables.reading import PostgresReader
 
 SIZE_OF_BAND = "SELECT count(*), pg_total_relation_size('band') FROM band"
+SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 
 
 class PostgresStatistics:
@@ -29,10 +30,10 @@ class PostgresStatistics:
         self._reader = reader
 
     def size(self) -> Size:
-        """Rows, bytes of all tables and indexes, leaf blocks of the index; rows of distances."""
+        """Rows, bytes of all tables and indexes, leaf blocks; rows of distances; surfaces."""
         with self._connection.snapshot(), self._connection.without_limit():
             self._reader.revision()
-            band = (0, 0)
+            band = surfaces = (0, 0)
             counted = (
                 "SELECT count(*) FROM brick"
                 if self._layout == "brick"
@@ -40,9 +41,11 @@ class PostgresStatistics:
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
-            if self._reader.has_band():
+            if self._reader.has_table(believed.BAND):
                 (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
-            return Size(int(rows), total, max(index, 1), *map(int, band))
+            if self._reader.has_table(believed.SURFACE):
+                (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
+            return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
 
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets.

@@ -37,6 +37,13 @@ UPDATE_OBJECT = """
 UPDATE object SET digest = %(digest)s, transform = %(transform)s, voxels = %(voxels)s,
        bounds = %(bounds)s, attributes = %(attributes)s, revision = %(revision)s
  WHERE id = %(id)s"""
+DROP_SURFACE = """
+DELETE FROM surface
+ WHERE digest = %(digest)s AND NOT EXISTS (SELECT 1 FROM object WHERE digest = %(digest)s)"""
+# asked before the bytes are sent
+LACKS_SURFACE = """
+SELECT EXISTS (SELECT 1 FROM object WHERE digest = %(digest)s)
+       AND NOT EXISTS (SELECT 1 FROM surface WHERE digest = %(digest)s)"""
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
@@ -63,8 +70,8 @@ class PostgresWriter:
         self._written: tuple[int, str, int, str] = (0, "", 0, "")
         self._highest_id = (0, 0)  # at which revision
 
-    def add(self, record: Object, rows: Rows) -> int:
-        """Write an object and its rows in one transaction; returns its id."""
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
+        """Write an object, its rows and its surface in one transaction; returns its id."""
 
         def work() -> int:
             revision = self._next_revision()
@@ -74,12 +81,15 @@ class PostgresWriter:
             except errors.UniqueViolation as error:
                 raise present_already(record, self._connection.shown) from error
             self._put(rows, object_id)
+            self._put_surface(record.digest, surface)
             self._log(revision, "add", object_id, rows.keys)
             return int(object_id)
 
         return self._commit(work)
 
-    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+    def replace(
+        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+    ) -> None:
         """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
 
         def work() -> None:
@@ -89,6 +99,8 @@ class PostgresWriter:
             gone = self._take(known, covering)
             self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
             self._put(rows, record.id)
+            self._execute(DROP_SURFACE, {"digest": known.digest})
+            self._put_surface(record.digest, surface)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
         self._commit(work)
@@ -98,11 +110,22 @@ class PostgresWriter:
 
         def work() -> None:
             revision = self._next_revision()
-            gone = self._take(self._reader.object(object_id), covering)
+            known = self._reader.object(object_id)
+            gone = self._take(known, covering)
             self._execute("DELETE FROM object WHERE id = %s", (object_id,))
+            self._execute(DROP_SURFACE, {"digest": known.digest})
             self._log(revision, "remove", object_id, gone)
 
         self._commit(work)
+
+    def add_surface(self, digest: str, surface: bytes) -> None:
+        """Write the surface of objects that lack it; nothing if no object has the digest."""
+
+        def work() -> None:
+            self._execute("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")  # the write lock
+            self._put_surface(digest, surface)
+
+        self._connection.write(work)
 
     def want_distances(self) -> None:
         """Note in the environment that its parts get distances."""
@@ -153,6 +176,10 @@ class PostgresWriter:
         self._copy_into(self._layout, rows.occupied(), object_id)
         if rows.distances is not None:
             self._copy_into("band", rows, object_id)
+
+    def _put_surface(self, digest: str, surface: bytes | None) -> None:
+        if surface is not None and self._execute(LACKS_SURFACE, {"digest": digest}) == [(True,)]:
+            self._execute("INSERT INTO surface VALUES (%s, %b)", (digest, surface))
 
     def _take(self, known: Object, covering: Covering) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys."""

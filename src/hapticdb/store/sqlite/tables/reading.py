@@ -6,7 +6,8 @@ So keys are passed as ``apsw.carray`` of contiguous, non-empty int64 arrays, and
 Python's own.
 """
 
-from collections.abc import Iterator
+import json
+from collections.abc import Iterator, Sequence
 from typing import Any
 
 import apsw
@@ -32,7 +33,7 @@ from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.ranges import COLUMNS, RangeStatements
 
-HAS_BAND = "SELECT count(*) FROM sqlite_master WHERE name = 'band' AND type = 'table'"
+HAS_TABLE = "SELECT count(*) FROM sqlite_master WHERE name = ? AND type = 'table'"
 LOOKUP: dict[Table, str] = {
     table: f"SELECT {columns} FROM carray(?1) AS asked CROSS JOIN {table} ON z_val = asked.value"
     for table, columns in COLUMNS.items()
@@ -69,7 +70,7 @@ class SQLiteReader:
         self._connection = connection
         self._layout = layout
         self._has_bricks = row_shift(layout) > 0
-        self._has_band = False
+        self._found: set[str] = set()
         self._ranges = RangeStatements(connection.driver, layout, grid.bits)
         sqlite_force.register(connection.driver, grid, layout)
 
@@ -88,16 +89,15 @@ class SQLiteReader:
             return sqlite_rows.rows_with_distances(url, found)
         return sqlite_rows.rows_of(url, found, has_bricks=self._has_bricks)
 
-    def has_band(self) -> bool:
-        """Whether there is a table of distances; another may make it while a reader has it open."""
-        if not self._has_band:
-            found = self._connection.fetch(HAS_BAND)
-            self._has_band = bool(found[0][0])
-        return self._has_band
+    def has_table(self, name: str) -> bool:
+        """Whether a table of a later format is there; another may make it at any time."""
+        if name not in self._found and self._connection.fetch(HAS_TABLE, (name,))[0][0]:
+            self._found.add(name)
+        return name in self._found
 
     def _table(self, *, distances: bool, is_nothing: bool = False) -> Table | None:
         """Table that answers a read; None if it is not there, or nothing is asked for."""
-        if is_nothing or (distances and not self.has_band()):
+        if is_nothing or (distances and not self.has_table(believed.BAND)):
             return None
         return "band" if distances else self._layout
 
@@ -200,3 +200,19 @@ class SQLiteReader:
             (since,),
         ):
             yield believed.change_of(self._connection.url, row)
+
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        """Packed surfaces of the digests that have one, in one statement."""
+        if not self.has_table(believed.SURFACE):
+            return {}
+        found = self._connection.fetch(
+            "SELECT digest, geometry FROM surface WHERE digest IN (SELECT value FROM json_each(?))",
+            (json.dumps(list(digests)),),
+        )
+        return believed.surfaces_of(self._connection.url, found)
+
+    def surface_digests(self) -> set[str]:
+        """Digests of all surfaces."""
+        if not self.has_table(believed.SURFACE):
+            return set()
+        return {row[0] for row in self._connection.fetch("SELECT digest FROM surface")}

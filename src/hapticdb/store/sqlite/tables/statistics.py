@@ -14,6 +14,7 @@ from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
 SIZE_OF_BAND = "SELECT ncell, pgsize FROM dbstat WHERE name = 'band' AND aggregate = TRUE"
 """Rows and bytes by one pass: in a table WITHOUT ROWID each cell is a row."""
+SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(length(geometry)), 0) FROM surface"
 
 
 class SQLiteStatistics:
@@ -25,18 +26,21 @@ class SQLiteStatistics:
         self._reader = reader
 
     def size(self) -> Size:
-        """Rows, bytes of the file and its write-ahead log, leaf blocks; rows of distances."""
-        band = (0, 0)
+        """Rows, bytes of the file and its log, leaf blocks; rows of distances; surfaces."""
+        band = surfaces = (0, 0)
         with self._connection.snapshot():
             rows = self._connection.fetch(f"SELECT count(*) FROM {self._layout}")[0][0]
             blocks = self._connection.fetch(
                 "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self._layout,)
             )
-            if self._reader.has_band():
+            if self._reader.has_table(believed.BAND):
                 (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
+            if self._reader.has_table(believed.SURFACE):
+                (surfaces,) = self._connection.fetch(SIZE_OF_SURFACES)
         wal = Path(f"{self._connection.path}-wal")
         total = self._connection.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
-        return Size(int(rows), total, int(blocks[0][0]) if blocks else 1, *map(int, band))
+        n_blocks = int(blocks[0][0]) if blocks else 1
+        return Size(int(rows), total, n_blocks, *map(int, (*band, *surfaces)))
 
     def quantiles(self, resolution: int) -> Histogram:
         """Equi-count histogram of all row keys, of R buckets.

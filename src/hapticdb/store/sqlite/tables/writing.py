@@ -42,6 +42,14 @@ SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN
 UPDATE_OBJECT = """
 UPDATE object SET digest = ?, transform = ?, voxels = ?, bounds = ?, attributes = ?, revision = ?
  WHERE id = ?"""
+PUT_SURFACE = """
+INSERT INTO surface
+SELECT ?1, ?2
+ WHERE EXISTS (SELECT 1 FROM object WHERE digest = ?1)
+   AND NOT EXISTS (SELECT 1 FROM surface WHERE digest = ?1)"""
+DROP_SURFACE = """
+DELETE FROM surface
+ WHERE digest = ?1 AND NOT EXISTS (SELECT 1 FROM object WHERE digest = ?1)"""
 
 DELETE: dict[Table, str] = {
     table: f"DELETE FROM {table} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
@@ -60,8 +68,8 @@ class SQLiteWriter:
         self._layout = layout
         self._reader = reader
 
-    def add(self, record: Object, rows: Rows) -> int:
-        """Write an object and its rows in one transaction; returns its id."""
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
+        """Write an object, its rows and its surface in one transaction; returns its id."""
         with self._connection.writing():
             revision = self._reader.revision() + 1
             try:
@@ -79,27 +87,40 @@ class SQLiteWriter:
                 raise present_already(record, self._connection.url) from error
             object_id = self._connection.driver.last_insert_rowid()
             self._insert(rows, object_id)
+            self._put_surface(record.digest, surface)
             self._log(revision, "add", object_id, rows.keys)
         return object_id
 
-    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+    def replace(
+        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+    ) -> None:
         """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
         with self._connection.writing():
             revision = self._reader.revision() + 1
-            check_unwritten(record, self._reader.object(record.id), self._connection.url)
-            gone = self._delete(record.id, covering)
+            known = self._reader.object(record.id)
+            check_unwritten(record, known, self._connection.url)
+            gone = self._delete(known, covering)
             contents = sqlite_rows.contents(record, rows)
             self._connection.execute(UPDATE_OBJECT, (*contents, revision, record.id))
             self._insert(rows, record.id)
+            self._connection.execute(DROP_SURFACE, (known.digest,))
+            self._put_surface(record.digest, surface)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
         with self._connection.writing():
             revision = self._reader.revision() + 1
-            gone = self._delete(object_id, covering)
+            known = self._reader.object(object_id)
+            gone = self._delete(known, covering)
             self._connection.execute("DELETE FROM object WHERE id = ?", (object_id,))
+            self._connection.execute(DROP_SURFACE, (known.digest,))
             self._log(revision, "remove", object_id, gone)
+
+    def add_surface(self, digest: str, surface: bytes) -> None:
+        """Write the surface of objects that lack it; nothing if no object has the digest."""
+        with self._connection.writing():
+            self._put_surface(digest, surface)
 
     def want_distances(self) -> None:
         """Note in the environment that its parts get distances."""
@@ -125,16 +146,19 @@ class SQLiteWriter:
             keys = apsw.carray(np.ascontiguousarray(band.keys))
             self._connection.execute(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
 
-    def _delete(self, object_id: int, covering: Covering) -> Keys:
+    def _put_surface(self, digest: str, surface: bytes | None) -> None:
+        if surface is not None:
+            self._connection.execute(PUT_SURFACE, (digest, surface))
+
+    def _delete(self, known: Object, covering: Covering) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys."""
-        known = self._reader.object(object_id)
         tables: list[Table] = [self._layout]
         if known.has_distances:
             tables.append("band")
         gone: list[int] = []
         for low, high in covering(known):
             for table in tables:
-                deleted = self._connection.execute(DELETE[table], (low, high, object_id))
+                deleted = self._connection.execute(DELETE[table], (low, high, known.id))
                 gone += [row[0] for row in deleted]
         return np.array(gone, dtype=np.int64)
 

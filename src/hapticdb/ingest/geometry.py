@@ -1,0 +1,107 @@
+"""Geometry of stored objects, read from the surfaces in the database."""
+
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+
+from hapticdb.errors import FileError, NoSurfaceError, UsageError
+from hapticdb.mesh import Part, packing
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.store.base import Object, Store
+from hapticdb.store.believed import damaged
+
+AT_ONCE = 16
+"""Surfaces that one statement reads. A larger value needs fewer statements and more memory."""
+MOST_BYTES = 1_000_000_000
+"""Bytes of a packed surface that each engine can store in a row."""
+
+
+def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
+    """Yield objects in the order of their ids with their geometry; reads each surface once.
+
+    Raises `NoSurfaceError` if the surface of an object is not in the database.
+    """
+    for obj, part in found_parts(store, objects):
+        if part is None:
+            raise NoSurfaceError(
+                f"object {obj.id} ({obj.name}) has no surface in {store.url}: run "
+                f"'hapticdb upgrade {store.url}', which reads it from {obj.link}"
+            )
+        yield obj, part
+
+
+def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part | None]]:
+    """Yield objects with their geometry, as `parts_of`; None without a surface in the database."""
+    ordered = sorted(objects, key=lambda obj: obj.id)
+    uses = Counter(obj.digest for obj in ordered)
+    asked: set[str] = set()
+    packed: dict[str, bytes] = {}
+    shapes: dict[str, Part] = {}
+    for at, obj in enumerate(ordered):
+        digest = obj.digest
+        if digest not in asked:
+            ahead = {later.digest for later in ordered[at : at + AT_ONCE]} - asked
+            packed |= store.surfaces(sorted(ahead))
+            asked |= ahead
+        if digest in packed:
+            shapes[digest] = unpacked_part(store.url, obj, packed.pop(digest))
+        shape = shapes.get(digest)
+        uses[digest] -= 1
+        if not uses[digest]:
+            shapes.pop(digest, None)
+        yield obj, None if shape is None else _placed(shape, obj)
+
+
+def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
+    """Geometry of an object from its packed surface; DamagedError if it is not that of its digest.
+
+    The digest is a checksum of all positions and corners, so no other geometry is ever returned.
+    """
+    try:
+        vertices, faces = packing.unpack(surface)
+    except ValueError as error:
+        raise damaged(url, f"object {obj.id}: {error}") from None
+    part = Part(obj.name, vertices, faces, obj.transform)
+    if part.digest != obj.digest:
+        raise damaged(url, f"object {obj.id}: its surface is not the one that was written")
+    return part
+
+
+def packed_surface(part: Part) -> bytes:
+    """Pack the geometry of a part; FileError if it is more than a database holds in a row."""
+    surface = packing.pack(part.vertices, part.faces)
+    if len(surface) > MOST_BYTES:
+        raise FileError(
+            f"part {part.name!r}: its surface takes {len(surface) / 1e9:.1f} GB packed, and at "
+            "most 1 can be stored: divide it into several parts"
+        )
+    return surface
+
+
+def shell_of_objects(
+    store: Store,
+    objects: Sequence[Object],
+    points: int | None,
+    spacing: float | None,
+    seed: int,
+    inset: float = 0.0,
+) -> PointShell:
+    """Make one shell of several objects at their places; see `Environment.shell`."""
+    if not objects:
+        raise UsageError("a shell of no objects: name at least one")
+    triangles = []
+    for obj, part in parts_of(store, objects):
+        if part.is_cloud:
+            raise UsageError(
+                f"object {obj.id} ({obj.name}) is a point cloud, which has no surface: leave it out"
+            )
+        triangles.append(part.triangles(obj.transform))
+    corners = np.concatenate(triangles).reshape(-1, 3)
+    faces = np.arange(len(corners)).reshape(-1, 3)
+    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed, inset=inset)
+
+
+def _placed(shape: Part, obj: Object) -> Part:
+    """A shape as the part of an object; objects of one shape share its arrays."""
+    return Part(obj.name, shape.vertices, shape.faces, obj.transform, shared=shape.shared)

@@ -25,7 +25,7 @@ import page_tables
 import records
 from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
-from hapticdb.ingest.originals import parts_of
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import write_sample
 from hapticdb.sweeps.record import plain
@@ -125,7 +125,7 @@ def _record(env: Environment, question: Question, found: Extraction) -> dict[str
         }
         if found.way.clearance is not None:
             standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))
-            row |= by_meshes(found, standing)
+            row |= by_meshes(env, found, standing)
     return row
 
 
@@ -144,7 +144,7 @@ def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str,
                 "clearance_m": way.clearance,
                 "proved_from_m": way.rest_from,
             }
-            steps.append(row | by_meshes(step.found, env.felt((), step.excluded)))
+            steps.append(row | by_meshes(env, step.found, env.felt((), step.excluded)))
     return {
         "parts": ", ".join(words),
         "verdict": found.verdict,
@@ -154,7 +154,9 @@ def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str,
     }
 
 
-def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[str, Any]:
+def by_meshes(
+    env: hapticdb.Environment, found: Extraction, standing: Sequence[hapticdb.Object]
+) -> dict[str, Any]:
     """Least distance of the exact meshes on the proved part of the path, at half the steps."""
     way, surface = found.way, found.shell.surface
     assert way is not None
@@ -162,9 +164,7 @@ def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[st
     path = (way.rest or way.swept).path
     places = np.arange(0.0, len(path) - 0.75, 0.5)
     places = places[:: max(1, -(-len(places) // MOST_POSES))]
-    others = [
-        part.triangles(obj.transform) for obj, part in parts_of(standing, "compared", "import it")
-    ]
+    others = [part.triangles(obj.transform) for obj, part in parts_of(env.store, standing)]
     tool = tree_of_boxes(*mesh_of(surface.triangles))
     scene = tree_of_boxes(*mesh_of(np.concatenate(others)))
     here, request = coal.Transform3s(), coal.DistanceRequest()

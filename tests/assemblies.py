@@ -4,7 +4,7 @@ import sqlite3
 from collections.abc import Iterable, Mapping
 from contextlib import closing
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from hapticdb import Environment, Grid, GridOptions, ImportOptions
 from hapticdb.grid import CurveName
 from hapticdb.mesh import Part
 from hapticdb.store.base import Layout
+from hapticdb.store.connect import open_store
 from hapticdb.testing import KINDS
 from naive import Voxel, voxels_of_triangles
 
@@ -125,7 +126,7 @@ def voxel_set(ijk: NDArray[np.int64]) -> set[Voxel]:
     return found
 
 
-TABLES = ("environment", "object", "voxel", "brick", "band", "change", "quantile")
+TABLES = ("environment", "object", "voxel", "brick", "band", "surface", "change", "quantile")
 
 
 def rows_of(database: Path, *tables: str) -> Rows:
@@ -139,6 +140,14 @@ def rows_of(database: Path, *tables: str) -> Rows:
         if "environment" in found:  # without the column `lineage`, which is random
             found["environment"] = [row[:8] for row in found["environment"]]
         return found
+
+
+def drop_surfaces(url: str | Path, *digests: str) -> None:
+    """Take surfaces, all unless digests are given, out of an environment, as if it were older."""
+    with closing(open_store(url)) as store:
+        driver = cast("Any", store)._connection.driver
+        for digest in digests or sorted(store.surface_digests()):
+            driver.execute(f"DELETE FROM surface WHERE digest = '{digest}'")
 
 
 def index_rows(env: Environment) -> set[tuple[int, int, bytes]]:

@@ -1,7 +1,6 @@
 """An opened environment: its objects, moving and removing them, and what other readers see."""
 
 import sys
-from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -10,9 +9,9 @@ from numpy.typing import NDArray
 
 import hapticdb
 from assemblies import (
-    Mesh,
     assembly,
     ball,
+    drop_surfaces,
     index_rows,
     oracle_voxels,
     placement,
@@ -24,6 +23,7 @@ from assemblies import (
 )
 from children import PIPE, child
 from hapticdb import Environment, PointShell, environment
+from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
@@ -139,38 +139,39 @@ def test_a_move_reads_the_file_in_the_unit_that_it_was_imported_in(tmp_path: Pat
         assert voxel_set(env.voxels(1)) == oracle_voxels(part, env.grid)
 
 
-def vanish(file: Path) -> None:
+def test_an_imported_environment_needs_its_files_no_more(env: Environment, file: Path) -> None:
+    """Tools of parts, moves and removals, of the last object of a shape, too; damage is told."""
+    shell, before = env.shell(1, 3, points=200), index_rows(env)
     file.unlink()
+    np.testing.assert_array_equal(env.shell(1, 3, points=200).points, shell.points)
+    home = env.object(2).transform
+    env.move(2, ELSEWHERE)
+    assert index_rows(env) != before
+    env.move(2, home)
+    env.shift([1, 3], (0.01, 0, 0))
+    env.shift([1, 3], (-0.01, 0, 0))
+    removed = env.remove(2)
+    assert removed.digest not in env.store.surface_digests()
+    assert env.restore(removed).id == 2
+    assert index_rows(env) == before
+    assert check_environment(env.url).findings == []
 
 
-def become_another(file: Path) -> None:
-    write_obj(file, {**assembly(4), "box 1": ball((0, 0, 0), 0.03)})
-
-
-def lose_the_part(file: Path) -> None:
-    parts: dict[str, Mesh] = assembly(4)
-    del parts["box 1"]
-    write_obj(file, parts)
-
-
-def become_rubbish(file: Path) -> None:
-    file.write_text("v 1 2\n")
-
-
-@pytest.mark.parametrize("spoil", [vanish, become_another, lose_the_part, become_rubbish])
-def test_an_object_whose_file_is_gone_or_another_cannot_be_moved(
-    env: Environment, file: Path, spoil: Callable[[Path], None]
-) -> None:
+def test_an_object_without_a_surface_is_told_in_one_line(env: Environment) -> None:
+    drop_surfaces(env.url)
     before = rows_of(Path(env.url))
-    spoil(file)
-    with pytest.raises(hapticdb.errors.GeometryChangedError) as raised:
-        env.move(2, ELSEWHERE)
-    for words in ("object 2 (box 1) cannot be moved", str(file)):
-        assert words in str(raised.value)
-    assert "\n" not in str(raised.value)
+    for edit in (env.shell, lambda number: env.move(number, ELSEWHERE)):
+        with pytest.raises(hapticdb.errors.NoSurfaceError) as raised:
+            edit(2)
+        for words in ("object 2 (box 1) has no surface", f"'hapticdb upgrade {env.url}'"):
+            assert words in str(raised.value)
+        assert "\n" not in str(raised.value)
     assert rows_of(Path(env.url)) == before
-    env.remove(2)  # removing needs no file
-    assert [o.id for o in env.objects()] == [1, 3, 4]
+    removed = env.remove(2)
+    with pytest.raises(hapticdb.errors.NoSurfaceError, match="cannot be put back"):
+        env.restore(removed)
+    report = check_environment(env.url)
+    assert (report.findings, report.surfaces, report.without_surfaces) == ([], 0, 3)
 
 
 def test_no_object_is_moved_out_of_the_grid(env: Environment) -> None:

@@ -8,7 +8,7 @@ engines have.
 # ruff: noqa: ARG002 - a store takes what the protocol gives, needed or not
 
 import contextlib
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from threading import Lock
@@ -56,10 +56,13 @@ class State:
         objects: Mapping[int, tuple[Object, Rows]],
         changes: tuple[Change, ...] = (),
         removed: frozenset[tuple[str, str]] = frozenset(),
+        surfaces: Mapping[str, bytes] | None = None,
     ) -> None:
         self.objects = objects
         self.changes = changes
         self.removed = removed
+        held = {obj.digest for obj, _ in objects.values()}
+        self.surfaces = {name: one for name, one in (surfaces or {}).items() if name in held}
 
     @property
     def revision(self) -> int:
@@ -208,10 +211,17 @@ class MemoryStore:
     def changes(self, since: int = 0) -> Iterator[Change]:
         yield from self._state().changes[since:]
 
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        held = self._state().surfaces
+        return {digest: held[digest] for digest in digests if digest in held}
+
+    def surface_digests(self) -> set[str]:
+        return set(self._state().surfaces)
+
     def loading(self) -> contextlib.AbstractContextManager[None]:
         return contextlib.nullcontext()
 
-    def add(self, record: Object, rows: Rows) -> int:
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
         with self._contents.write_lock:
             state = self._newest()
             part = (record.link, record.name)
@@ -220,20 +230,29 @@ class MemoryStore:
             is_free = record.id > 0 and record.id not in state.objects
             object_id = record.id if is_free else self._contents.n_ids + 1
             self._contents.n_ids = max(self._contents.n_ids, object_id)
-            self._commit("add", object_id, rows.keys, replace(record, id=object_id), rows)
+            new = replace(record, id=object_id)
+            self._commit("add", object_id, rows.keys, new, rows, surface)
         return object_id
 
-    def replace(self, record: Object, rows: Rows, covering: Covering) -> None:
+    def replace(
+        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+    ) -> None:
         with self._contents.write_lock:
             known, old = self._known(record.id)
             check_unwritten(record, known, self.url)
             touched = np.concatenate([old.keys, rows.keys])
-            self._commit("move", record.id, touched, record, rows)
+            self._commit("move", record.id, touched, record, rows, surface)
 
     def remove(self, object_id: int, covering: Covering) -> None:
         with self._contents.write_lock:
             _, old = self._known(object_id)
             self._commit("remove", object_id, old.keys, None, NO_ROWS)
+
+    def add_surface(self, digest: str, surface: bytes) -> None:
+        with self._contents.write_lock:
+            state = self._newest()
+            held = {digest: surface} | state.surfaces
+            self._contents.state = State(state.objects, state.changes, state.removed, held)
 
     def want_distances(self) -> None:
         self._check_writable()
@@ -267,11 +286,13 @@ class MemoryStore:
         touched: Keys,
         record: Object | None,
         rows: Rows,
+        surface: bytes | None = None,
     ) -> None:
         """Replace the newest state by the next one. The caller holds the write lock."""
         state = self._contents.state
         revision = state.revision + 1
         objects, removed = dict(state.objects), set(state.removed)
+        surfaces = dict(state.surfaces)
         if record is None:
             gone = objects.pop(object_id)[0]
             removed.add((gone.link, gone.name))
@@ -285,9 +306,13 @@ class MemoryStore:
             ids = np.full(len(rows), object_id, np.int64)
             objects[object_id] = (written, Rows(rows.keys, ids, rows.occupancy, rows.distances))
             removed.discard((record.link, record.name))
+            if surface is not None:
+                surfaces.setdefault(record.digest, surface)
         ranges = touched_ranges(self.grid, self.layout, touched)
         change = Change(revision, action, object_id, ranges)
-        self._contents.state = State(objects, (*state.changes, change), frozenset(removed))
+        self._contents.state = State(
+            objects, (*state.changes, change), frozenset(removed), surfaces
+        )
 
     # -- statistics --------------------------------------------------------------------------
 
@@ -297,7 +322,11 @@ class MemoryStore:
         if band.distances is not None:
             of_band = band.keys.nbytes + band.ids.nbytes + band.distances.data.nbytes
         n_bytes += of_band
-        return Size(len(rows), n_bytes, 1 + n_bytes // 8192, len(band), of_band)
+        held = self._state().surfaces
+        of_surfaces = sum(map(len, held.values()))
+        n_bytes += of_surfaces
+        blocks = 1 + n_bytes // 8192
+        return Size(len(rows), n_bytes, blocks, len(band), of_band, len(held), of_surfaces)
 
     def quantiles(self, resolution: int) -> Histogram:
         state = self._state()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
+from hapticdb.ingest.geometry import AT_ONCE, unpacked_part
 from hapticdb.kernels import curves
 from hapticdb.kernels.field import packing
 from hapticdb.store.base import (
@@ -57,10 +58,12 @@ class CheckReport:
         One line for each fault, at most the first `MOST_FINDINGS`.
     n_findings : int
         Number of all faults.
-    objects, voxels, rows : int
-        Numbers of objects, voxels and rows that were read.
+    objects, voxels, rows, surfaces : int
+        Numbers of objects, voxels, rows and surfaces that were read.
     without_row_checksums : int
         Objects that were written before there were checksums of their rows.
+    without_surfaces : int
+        Objects that were written before there were surfaces; 'hapticdb upgrade' reads them.
     """
 
     url: str
@@ -69,7 +72,9 @@ class CheckReport:
     objects: int = 0
     voxels: int = 0
     rows: int = 0
+    surfaces: int = 0
     without_row_checksums: int = 0
+    without_surfaces: int = 0
 
     @property
     def is_sound(self) -> bool:
@@ -94,8 +99,9 @@ def check_environment(
     in order, and lie in the grid and in its object's bounds. A brick must hold a voxel, and none
     outside the grid. Every object must have its number of voxels, and its rows the checksum that
     was written with them; so must its distances, if it has any, and every brick that holds a voxel
-    of it must have distances. The log of changes must have no gaps and agree with the objects. Rows
-    are read in batches, so memory does not grow with their number.
+    of it must have distances. Every surface must be the one of its digest, and an object must have
+    that digest. The log of changes must have no gaps and agree with the objects. Rows are read in
+    batches, so memory does not grow with their number.
 
     Parameters
     ----------
@@ -135,6 +141,8 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
         for finding in _row_findings(store, objects, report, progress):
             report.add(finding)
         for finding in _band_findings(store, objects):
+            report.add(finding)
+        for finding in _surface_findings(store, objects, report):
             report.add(finding)
 
 
@@ -262,6 +270,28 @@ def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
             yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
         if sums.checksums.get(obj.id, Checksum()).value() != obj.distances_crc:
             yield f"object {obj.id} ({obj.name}): its distances are not those that were written"
+
+
+# -- surfaces -------------------------------------------------------------------------------------
+
+
+def _surface_findings(
+    store: Store, objects: dict[int, Object], report: CheckReport
+) -> Iterator[str]:
+    """Surfaces that are damaged, or of no object; counts objects without one."""
+    of_digest = {obj.digest: obj for obj in objects.values()}
+    there = store.surface_digests()
+    for digest in sorted(there - of_digest.keys()):
+        yield f"surface {digest:.40} of no object"
+    report.without_surfaces = sum(obj.digest not in there for obj in objects.values())
+    digests = sorted(there & of_digest.keys())
+    for at in range(0, len(digests), AT_ONCE):
+        for digest, surface in store.surfaces(digests[at : at + AT_ONCE]).items():
+            report.surfaces += 1
+            try:
+                unpacked_part(store.url, of_digest[digest], surface)
+            except DamagedError as error:
+                yield _cause(error)
 
 
 def _is_ascending(rows: Rows, key: int, object_id: int) -> bool:

@@ -27,7 +27,6 @@ def scene(tmp_path: Path) -> Path:
         (["--host", "192.0.2.1"], "--token"),
         (["--token-file", "none"], "--token-file none"),
         (["--tool", "none.stl"], "no such file"),
-        (["--files", "none"], "no such folder"),
         (["--prefix", "a b"], "--prefix"),
         (["--tls-cert", "cert.pem"], "--tls-key"),
         (["--seconds", "0"], "--seconds"),

@@ -136,13 +136,6 @@ def test_a_move_that_cannot_be_changes_nothing(
     assert rows_of(scene) == before
 
 
-def test_a_move_says_when_the_file_is_gone(run: Run, tmp_path: Path) -> None:
-    file = boxes(tmp_path / "gone.glb")
-    assert run("import", "a.db", file, "--bits", 4)[0] == 0
-    file.unlink()
-    refused(run("move", "a.db", 1, "--translate", "0,0,0.01"), "gone.glb")
-
-
 def test_remove_takes_all_or_nothing(run: Run, scene: Scene) -> None:
     refused(run("remove", scene, 1, 9), "no object 9")
     refused(run("remove", scene, "first"), "first")

@@ -1,4 +1,4 @@
-"""Distances for objects that were imported without: resumable, and equal to those of an import.
+"""Surfaces and distances for objects that lack them: resumable, and equal to those of an import.
 
 An upgrade that is interrupted is a process of its own that says how many objects it has written.
 """
@@ -13,13 +13,14 @@ import numpy as np
 import pytest
 
 import hapticdb
-from assemblies import assembly, index_rows, small_options, write_obj
+from assemblies import assembly, drop_surfaces, index_rows, small_options, write_obj
 from children import child
 from hapticdb import Environment, ImportOptions, upgrade_environment
 from hapticdb.check import check_environment
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import parse_in_process
+from hapticdb.store.base import Layout
 from servers import Place
 
 EVERYWHERE = np.array([0]), np.array([2**62])
@@ -152,19 +153,46 @@ def test_an_interrupted_upgrade_goes_on(
         assert band_of(env) == wanted_band(env, file, set(range(1, N_PARTS + 1)))
 
 
+@pytest.mark.parametrize("layout", ["brick", "voxel"])
+def test_surfaces_come_from_the_files_once(
+    file: Path, place: Place, tmp_path: Path, layout: Layout
+) -> None:
+    """What is there already is not read again; the layout voxel has surfaces and no distances."""
+    hapticdb.import_files(tmp_path / "e.db", [file], small_options(layout=layout))
+    on_a_server = place()
+    hapticdb.copy_environment(tmp_path / "e.db", on_a_server)
+    for url in (str(tmp_path / "e.db"), on_a_server):
+        with hapticdb.open(url) as env:
+            digests = sorted(env.store.surface_digests())
+            wanted = env.store.surfaces(digests)
+            assert len(wanted) == N_PARTS == env.size().surfaces
+            drop_surfaces(url, digests[0])
+            report = upgrade_environment(url)
+            assert (report.surfaces, report.upgraded, report.present) == (1, 0, N_PARTS - 1)
+            assert env.store.surfaces(digests) == wanted
+    drop_surfaces(tmp_path / "e.db")
+    with hapticdb.open(tmp_path / "e.db") as env:
+        env.remove(1)
+        assert upgrade_environment(env.url).surfaces == N_PARTS - 1
+        assert env.store.surface_digests() == {obj.digest for obj in env.objects()}
+        assert check_environment(env.url).findings == []
+
+
 def test_objects_whose_file_is_gone_are_left_out_once(plain: Path, file: Path) -> None:
     """One reason for all of them. When the file is back, the same call goes on."""
+    drop_surfaces(plain)
     hidden = file.rename(file.with_name("hidden.obj"))
     report = upgrade_environment(plain)
     ((objects, error),) = report.left_out
-    assert (len(objects), report.upgraded) == (N_PARTS, 0)
+    assert (len(objects), report.surfaces, report.upgraded) == (N_PARTS, 0, 0)
     assert "object 1 (ball 0) and 6 of the same file cannot be upgraded" in str(error)
     hidden.rename(file)
     assert upgrade_environment(plain).upgraded == N_PARTS
 
 
 def test_an_object_whose_geometry_changed_is_left_out(plain: Path, file: Path) -> None:
-    """The others get distances."""
+    """The others get surfaces and distances."""
+    drop_surfaces(plain)
     changed = assembly(N_PARTS)
     vertices, faces = changed["ball 3"]
     write_obj(file, {**changed, "ball 3": (vertices * 1.01, faces)})
@@ -172,31 +200,29 @@ def test_an_object_whose_geometry_changed_is_left_out(plain: Path, file: Path) -
     ((objects, error),) = report.left_out
     assert [obj.name for obj in objects] == ["ball 3"]
     assert "no longer holds the geometry that was imported" in str(error)
-    assert report.upgraded == N_PARTS - 1
+    assert report.surfaces == report.upgraded == N_PARTS - 1
     with hapticdb.open(plain) as env:
         assert [obj.name for obj in env.objects() if not obj.has_distances] == ["ball 3"]
         assert not env.has_distances
 
 
-def test_an_object_with_other_voxels_than_its_file_gives_is_left_out(plain: Path) -> None:
+def test_distances_need_no_file(plain: Path, file: Path) -> None:
+    with hapticdb.open(plain) as env:
+        hidden = file.rename(file.with_name("hidden.obj"))
+        assert upgrade_environment(plain).upgraded == N_PARTS
+        assert band_of(env) == wanted_band(env, hidden, set(range(1, N_PARTS + 1)))
+
+
+def test_an_object_with_other_voxels_than_its_surface_gives_is_left_out(plain: Path) -> None:
     """Such as one that another version has voxelized otherwise."""
     with hapticdb.open(plain) as env:
-        obj = env.object(2)
-        env.store.remove(2, lambda _: [(0, 2**62)])
+        obj = env.remove(2)
         rows = env.store.rows_of(3, *EVERYWHERE)
-        env.store.add(obj, rows)
+        env.store.add(obj, rows, obj.surface)
     report = upgrade_environment(plain)
     ((objects, error),) = report.left_out
     assert [obj.id for obj in objects] == [2]
-    assert "its voxels are not those that its file gives now" in str(error)
+    assert "its voxels are not those that its surface gives now" in str(error)
     assert report.upgraded == N_PARTS - 1
-
-
-def test_the_layout_voxel_is_refused(file: Path, tmp_path: Path) -> None:
-    hapticdb.import_files(tmp_path / "v.db", [file], small_options(layout="voxel"))
-    with pytest.raises(
-        hapticdb.errors.UsageError, match="has the layout voxel, which has no distances"
-    ):
-        upgrade_environment(tmp_path / "v.db")
     with pytest.raises(hapticdb.errors.UsageError, match="0 jobs"):
-        upgrade_environment(tmp_path / "v.db", jobs=0)
+        upgrade_environment(plain, jobs=0)

@@ -13,7 +13,6 @@ import hapticdb
 from children import until
 from hapticdb.mesh import read_file
 from hapticdb.page.colours import MARKED
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member
@@ -34,7 +33,7 @@ class Shown:
         self.contents = Contents(Audience(cast("Any", self.scene)))
         self.contents.add(self.objects)
         self.n_boxes = len(drawn(self.scene))
-        reader = ShapeReader(AllowedFolders(["/"]), self.contents.shape, lambda _: None)
+        reader = ShapeReader(str(path), self.contents.shape, lambda _: None)
         reader.read(self.objects)
         until(lambda: self.contents.waiting() == 0)
         reader.close()

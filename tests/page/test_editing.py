@@ -11,12 +11,8 @@ from children import until
 from hapticdb.errors import ConflictError, HapticDBError, UsageError
 from hapticdb.page import database
 from hapticdb.page.editing import Edits
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.sample.write import write_sample
 from hapticdb.store.base import Object
-from hapticdb.store.connect import open_store
-
-EVERYWHERE = AllowedFolders(["/"])
 
 
 @pytest.fixture(scope="module")
@@ -43,7 +39,7 @@ def done(edits: Edits, person: int, job: Any) -> Any:  # noqa: ANN401 - a job's 
 
 
 def test_two_people_who_move_one_part(sample: str) -> None:
-    edits = Edits(sample, EVERYWHERE)
+    edits = Edits(sample)
     try:
         with hapticdb.open(sample, read_only=True) as env:
             seen = env.objects()[0]
@@ -69,7 +65,7 @@ def test_two_people_who_move_one_part(sample: str) -> None:
 
 
 def test_an_undo_after_another_persons_move_leaves_it(sample: str) -> None:
-    edits = Edits(sample, EVERYWHERE)
+    edits = Edits(sample)
     up = np.eye(4)
     up[2, 3] = 0.002
     try:
@@ -98,10 +94,10 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
         opened.append(threading.current_thread())
         if len(opened) == 1:
             raise HapticDBError("the server is away")
-        return open_store(*args, **options)
+        return hapticdb.open(*args, **options)
 
-    monkeypatch.setattr(database, "open_store", wait_and_open)
-    edits = Edits(sample, EVERYWHERE)
+    monkeypatch.setattr(database, "open_environment", wait_and_open)
+    edits = Edits(sample)
     try:
         for person in range(3):
             edits.ask(person, lambda own: own.undo(), answers.append, answers.append)

@@ -1,4 +1,4 @@
-"""The page reads objects' files below the operator's folders only, and its errors name no place."""
+"""The page's errors name no place; the part in hand is unseen."""
 
 import shutil
 import socket
@@ -13,6 +13,7 @@ import trimesh
 from websockets.sync.client import connect
 
 import hapticdb
+from assemblies import drop_surfaces
 from children import PATIENCE, until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor, line
@@ -65,14 +66,14 @@ def two_parts(folder: Path) -> Path:
 
 @contextmanager
 def page_of(
-    url: Path, *, folders: tuple[str, ...] | None = None, recordings: Path | None = None
+    url: Path, *, recordings: Path | None = None
 ) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     ours, theirs = socket.socketpair()
     ours.sendall(line({"word": "prepared"}))
     request = PageRequest(
-        dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), folders, 0, 0,
+        dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0,
         None if recordings is None else str(recordings),
     )  # fmt: skip
     try:
@@ -121,30 +122,6 @@ def said_of_sweep(person: PagePerson, words: str) -> None:
     until(lambda: (person.look(0.05), any(words in text for text in person.received))[1])
 
 
-def test_files_outside_the_operators_folders_are_not_read(scene: Path, tmp_path: Path) -> None:
-    (tmp_path / "other").mkdir()
-    with hapticdb.open(scene, read_only=True) as env:
-        before = {obj.id: obj.revision for obj in env.objects()}
-    with page_of(scene, folders=(str(tmp_path / "other"),)) as (site, person, browser):
-        chosen = choose(browser, "box.stl")
-        person.press("Take this part in hand")
-        assert "--files" in told(person, after=0)
-        person.press("Run the sweep")
-        said_of_sweep(person, "--files")
-        assert site.edits is not None
-        seen = site.objects[chosen]
-        site.edits.ask(browser.number, lambda own: own.move(seen, WAY), str, browser.failed)
-        assert "--files" in told(person, after=1)
-        site.edits.ask(browser.number, lambda own: own.take_out(seen), str, browser.failed)
-        site.edits.ask(browser.number, lambda own: own.put_back(), str, browser.failed)
-        assert "--files" in told(person, after=2)
-        assert browser.taken is None
-    with hapticdb.open(scene, read_only=True) as env:
-        assert {obj.id: obj.revision for obj in env.objects()} == {
-            one: revision for one, revision in before.items() if one != chosen
-        }
-
-
 def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) -> None:
     folder = scene.parent
     recordings = folder / "recorded here"
@@ -157,36 +134,26 @@ def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) ->
         def ask(job: Any) -> None:  # noqa: ANN401 - a job of the database
             site.database.ask(job, str, browser.failed)
 
-        (folder / "box.stl").write_bytes(b"solid nonsense")
+        drop_surfaces(scene)
         person.press("Take this part in hand")
         errors.append(told(person, after=0))
-        assert "box.stl" in errors[-1]
+        assert "reads it from box.stl" in errors[-1]
         person.press("Run the sweep")
-        said_of_sweep(person, "cannot be a tool")
-
-        shutil.copy(folder / "ball.stl", folder / "box.stl")
-        person.press("Take this part in hand")
-        errors.append(told(person, after=1))
-        assert "box.stl no longer holds the geometry" in errors[-1]
-
-        (folder / "box.stl").unlink()
-        person.press("Take this part in hand")
-        errors.append(told(person, after=2))
-        assert "not there" in errors[-1]
+        said_of_sweep(person, "has no surface")
 
         ask(lambda env: env.object(999))
-        errors.append(told(person, after=3))
+        errors.append(told(person, after=1))
         assert "no object 999 in the environment" in errors[-1]
         ask(lambda env: env.find("nothing like it"))
-        errors.append(told(person, after=4))
+        errors.append(told(person, after=2))
 
         person.choose("Recording", "bad.hdbrec")
-        errors.append(told(person, after=5))
+        errors.append(told(person, after=3))
         assert "bad.hdbrec" in errors[-1]
         until(lambda: browser.session is not None)
         shutil.rmtree(recordings)
         person.press("Record")
-        errors.append(told(person, after=6))
+        errors.append(told(person, after=4))
         assert ".hdbrec" in errors[-1]
         person.look()
         for text in person.received:

@@ -28,7 +28,6 @@ from chromium import (
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.page import tools
 from hapticdb.page.drawing import HAND_GIZMO
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.panels.moving import MOVING_GIZMO
 from hapticdb.page.process import new_server
 from hapticdb.page.scene.picking import Struck
@@ -127,7 +126,7 @@ def aim(car: Path) -> Iterator[Aim]:
     viser_server = new_server()
     try:
         with (
-            SceneView(viser_server, str(car), AllowedFolders(["/"])) as view,
+            SceneView(viser_server, str(car)) as view,
             hapticdb.open(car, read_only=True) as env,
         ):
             patiently(lambda: view.contents.waiting() == 0)

@@ -1,4 +1,4 @@
-"""A scene follows what others commit, and shows voxels where a file must not be read or is gone."""
+"""A scene follows what others commit, and shows voxels of objects without a surface."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -8,14 +8,12 @@ import pytest
 import viser
 
 import hapticdb
+from assemblies import drop_surfaces
 from children import until
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.picking import Struck
 from hapticdb.page.scene.view import SceneView
 from hapticdb.store.base import Object
 from recorded_scene import write_parts
-
-EVERYWHERE, NOWHERE = AllowedFolders(["/"]), AllowedFolders([])
 
 
 @pytest.fixture(scope="module")
@@ -44,7 +42,7 @@ def from_above(view: SceneView, obj: Object) -> Struck | None:
 def test_moves_removals_and_additions_of_others_are_followed(
     server: viser.ViserServer, place: Path
 ) -> None:
-    with SceneView(server, str(place), EVERYWHERE) as view, hapticdb.open(place) as other:
+    with SceneView(server, str(place)) as view, hapticdb.open(place) as other:
         all_shown(view)
         tree = view.tree()
         assert len(view.objects) == tree.count == 16
@@ -70,22 +68,24 @@ def test_moves_removals_and_additions_of_others_are_followed(
         assert len(view.objects) == view.tree().count == 16
 
 
-@pytest.mark.parametrize("gone", [True, False])
-def test_voxels_stand_for_files_that_are_gone_or_must_not_be_read(
-    server: viser.ViserServer, place: Path, gone: bool
+@pytest.mark.parametrize("has_surfaces", [True, False])
+def test_no_file_is_needed_and_voxels_stand_for_objects_without_a_surface(
+    server: viser.ViserServer, place: Path, has_surfaces: bool
 ) -> None:
-    if gone:
-        place.with_suffix(".glb").unlink()
-    with SceneView(server, str(place), EVERYWHERE if gone else NOWHERE) as view:
+    place.with_suffix(".glb").unlink()
+    if not has_surfaces:
+        drop_surfaces(place)
+    with SceneView(server, str(place)) as view:
         all_shown(view)
         rod = view.objects[view.search("rod")[0]]
         found = from_above(view, rod)
         assert found is not None
-        assert rod.bounds[1, 2] - 1e-9 <= found.point[2] <= rod.bounds[1, 2] + 0.03
+        above = found.point[2] - rod.bounds[1, 2]
+        assert abs(above) < 1e-4 if has_surfaces else -1e-9 <= above <= 0.03
 
 
 def test_an_environment_that_is_not_there_is_an_error(
     server: viser.ViserServer, tmp_path: Path
 ) -> None:
     with pytest.raises(hapticdb.errors.EnvironmentNotFoundError):
-        SceneView(server, str(tmp_path / "none.db"), EVERYWHERE)
+        SceneView(server, str(tmp_path / "none.db"))

@@ -27,7 +27,7 @@ from assemblies import ball, box, placement, small_options, write_obj
 from children import PATIENCE, end_forked, joined, received
 from hapticdb import Environment, PointShell
 from hapticdb.cli import main
-from hapticdb.ingest.originals import parts_of
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Object, Rows
@@ -124,7 +124,7 @@ def processes(
 
 def places_of(env: Environment) -> list[tuple[Object, Rows]]:
     """The shuttle's record and rows at its left place, then at its right place."""
-    ((_, part),) = parts_of([env.object(1)], "moved", "")
+    ((_, part),) = parts_of(env.store, [env.object(1)])
     found: list[tuple[Object, Rows]] = []
     for x in (0.0, 0.18):
         placed = placement(x, 0, 0)

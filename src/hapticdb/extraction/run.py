@@ -84,8 +84,8 @@ def extract(
     ------
     ObjectNotFoundError
         If a word chooses no object.
-    GeometryChangedError
-        If the file of a part is missing or has another geometry now.
+    NoSurfaceError
+        If a part was imported by a version that kept no surfaces.
     MissingExtraError
         If no straight pull leads out, and the planner is not installed.
     UsageError

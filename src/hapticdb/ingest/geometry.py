@@ -22,7 +22,7 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
 
     Raises `NoSurfaceError` if the surface of an object is not in the database.
     """
-    for obj, part in found_parts(store, objects):
+    for obj, part in found_parts(store, sorted(objects, key=lambda obj: obj.id)):
         if part is None:
             raise NoSurfaceError(
                 f"object {obj.id} ({obj.name}) has no surface in {store.url}: run "
@@ -32,16 +32,18 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
 
 
 def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part | None]]:
-    """Yield objects with their geometry, as `parts_of`; None without a surface in the database."""
-    ordered = sorted(objects, key=lambda obj: obj.id)
-    uses = Counter(obj.digest for obj in ordered)
+    """Yield objects, in their order, with their geometry; None without a surface in the database.
+
+    Reads each surface once, and keeps it as long as a later object has it.
+    """
+    uses = Counter(obj.digest for obj in objects)
     asked: set[str] = set()
     packed: dict[str, bytes] = {}
     shapes: dict[str, Part] = {}
-    for at, obj in enumerate(ordered):
+    for at, obj in enumerate(objects):
         digest = obj.digest
         if digest not in asked:
-            ahead = {later.digest for later in ordered[at : at + AT_ONCE]} - asked
+            ahead = {later.digest for later in objects[at : at + AT_ONCE]} - asked
             packed |= store.surfaces(sorted(ahead))
             asked |= ahead
         if digest in packed:

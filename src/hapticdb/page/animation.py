@@ -14,8 +14,7 @@ from numpy.typing import NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError
 from hapticdb.extraction.result import Extraction
-from hapticdb.ingest.originals import found_parts
-from hapticdb.mesh import Part
+from hapticdb.ingest.geometry import found_parts
 from hapticdb.page import colours
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
 from hapticdb.page.scene.surroundings import add_surroundings
@@ -41,7 +40,7 @@ AROUND = 0.6
 MOST_TRIANGLES = 400_000
 """Triangles of all that stands; of more, the largest objects are left out. More: a larger file."""
 MOST_BLOCKS = 20_000
-"""Blocks for an object whose file is gone, at most."""
+"""Blocks for an object without triangles, at most."""
 STANDING: colours.Colour = (186, 193, 201)
 SEEN_THROUGH = 0.45
 """Opacity of what stands: the parts are seen behind it. Larger: solid, and hides more."""
@@ -207,12 +206,11 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> Facets:
         and (obj.bounds[0] < box[1] + reach).all()
     ]
     shapes: dict[int, Facets] = {}
-    for some, part in found_parts(near, "shown", "it is shown by its voxels"):
-        for obj in some:
-            if isinstance(part, Part) and not part.is_cloud:
-                shapes[obj.id] = _of_triangles(part.triangles(obj.transform))
-            else:
-                shapes[obj.id] = _of_voxels(env, obj)
+    for obj, part in found_parts(env.store, near):
+        if part is None or part.is_cloud:
+            shapes[obj.id] = _of_voxels(env, obj)
+        else:
+            shapes[obj.id] = _of_triangles(part.triangles(obj.transform))
     kept, total = [], 0
     for facets in sorted(shapes.values(), key=lambda one: len(one.faces)):
         total += len(facets.faces)

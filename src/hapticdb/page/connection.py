@@ -49,14 +49,12 @@ class PageRequest(NamedTuple):
     """What the page process is started with.
 
     urls : the environment's address for each role: the database decides what each may do; tools :
-    files, the first is chosen at the start; folders : below which objects' files may be read, None:
-    those of the files as imported; server, host : descriptors of the sockets to the server (this
-    module) and to the `SessionHost`; recordings : folder for recordings, None: nobody records.
+    files, the first is chosen at the start; server, host : descriptors of the sockets to the server
+    (this module) and to the `SessionHost`; recordings : folder for recordings, or None.
     """
 
     urls: Mapping[str, str]
     tools: tuple[str, ...]
-    folders: tuple[str, ...] | None
     server: int
     host: int
     recordings: str | None = None

@@ -7,9 +7,8 @@ from collections.abc import Callable
 from typing import Any, TypeVar
 
 from hapticdb.environment import Environment
+from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
-from hapticdb.page.folders import AllowedFolders, FoldersEnvironment
-from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.page")
 MOST_WAITING = 64
@@ -21,20 +20,15 @@ ENDS_WITHIN = 0.2
 Answer = TypeVar("Answer")
 
 
-def opened(url: str, folders: AllowedFolders, *, read_only: bool = True) -> Environment:
-    """Open an environment; objects' files are read below these folders only."""
-    return FoldersEnvironment(open_store(url, read_only=read_only), folders)
-
-
 class DatabaseThread:
     """An environment in a thread of its own, which does the jobs of all browsers in turn.
 
     It is opened for the first job, and for each later one again while it cannot be; such a job
-    fails. Its jobs may read objects' files below the folders.
+    fails.
     """
 
-    def __init__(self, url: str, folders: AllowedFolders, *, read_only: bool = True) -> None:
-        self._url, self._read_only, self._folders = url, read_only, folders
+    def __init__(self, url: str, *, read_only: bool = True) -> None:
+        self._url, self._read_only = url, read_only
         self._env: Environment | None = None
         self._jobs: queue.Queue[Callable[[], None]] = queue.Queue(MOST_WAITING)
         self._is_ending = threading.Event()
@@ -81,5 +75,5 @@ class DatabaseThread:
     def _opened(self) -> Environment:
         """The environment, which is opened if it is not yet open."""
         if self._env is None:
-            self._env = opened(self._url, self._folders, read_only=self._read_only)
+            self._env = open_environment(self._url, read_only=self._read_only)
         return self._env

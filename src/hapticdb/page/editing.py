@@ -10,7 +10,6 @@ from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
 from hapticdb.errors import AccessError, ConflictError, HapticDBError, UsageError
 from hapticdb.page.database import DatabaseThread
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.wording import error_text, short_name
 from hapticdb.store.base import Object
 
@@ -67,9 +66,9 @@ class PersonsEdits:
 class Edits:
     """Edits of all people of a page, at the environment's address for one who may write."""
 
-    def __init__(self, url: str, folders: AllowedFolders) -> None:
+    def __init__(self, url: str) -> None:
         self._url = url
-        self._database = DatabaseThread(url, folders, read_only=False)
+        self._database = DatabaseThread(url, read_only=False)
         self._of: dict[int, PersonsEdits] = {}
 
     def ask(

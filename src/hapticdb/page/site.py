@@ -12,17 +12,14 @@ from typing import TYPE_CHECKING, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.hosting.attached import AttachedHost
 from hapticdb.page import tools
 from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.editing import Edits
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
-from hapticdb.store.connect import open_store
 
 if TYPE_CHECKING:
     from viser import ViserServer
@@ -100,13 +97,12 @@ class Site:
         self.edits: Edits | None = None
         self.workers = ThreadPoolExecutor(WORKERS, thread_name_prefix="page-worker")
         self.sweeping = ThreadPoolExecutor(1, thread_name_prefix="page-sweep")
-        self.folders = self._allowed()
         if "editor" in request.urls:
-            self.edits = Edits(request.urls["editor"], self.folders)
-        self.view = SceneView(self.server, self.url, self.folders)
+            self.edits = Edits(request.urls["editor"])
+        self.view = SceneView(self.server, self.url)
         self.objects = self.view.objects
         self.facts = facts = SceneFacts.of(self.view)
-        self.database = DatabaseThread(self.url, self.folders)
+        self.database = DatabaseThread(self.url)
         self.tools = [
             *tools.from_files(request.tools, facts.voxel_size, smooth=facts.is_smooth),
             *tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth),
@@ -169,17 +165,10 @@ class Site:
         """Words of an error as any browser may read them; see `wording.error_text`."""
         request = self.request
         files = [obj.link for obj in self.objects.values()] + list(request.tools)
-        folders = {file.rpartition("/")[0] for file in files} | {*(request.folders or ())}
+        folders = {file.rpartition("/")[0] for file in files}
         if request.recordings is not None:
             folders.add(request.recordings)
         return error_text(error, request.urls.values(), folders)
-
-    def _allowed(self) -> AllowedFolders:
-        folders = self.request.folders
-        if folders is not None:
-            return AllowedFolders(folders)
-        with Environment(open_store(self.url, read_only=True)) as env:
-            return AllowedFolders.of_links(obj.link for obj in env.objects())
 
     def _learn(self) -> None:
         """Objects have changed: somebody has edited the environment."""

@@ -55,8 +55,7 @@ class Serving:
 
     urls : the environment's address for each role; tools : files; tokens : the role that each
     gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
-    it is reached, such as ``/hapticdb``; folders : below which objects' files may be read, None:
-    those of the files as imported; certificate, key : files of TLS; recordings : folder for
+    it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
     recordings of sessions, None: nobody records; page : function of the page's process;
     awaits_devices : whether what hands call is compiled from the start, for devices on other
     machines, and not when somebody first feels something.
@@ -70,7 +69,6 @@ class Serving:
     port: int = 0
     prefix: str = ""
     host_names: tuple[str, ...] = ()
-    folders: tuple[str, ...] | None = None
     certificate: str | None = None
     key: str | None = None
     title: str = "hapticdb"
@@ -219,9 +217,7 @@ async def run(
 
 def _page_request(serving: Serving, server: int, host: int) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
-    return PageRequest(
-        urls, serving.tools, serving.folders, server, host, serving.recordings, serving.title
-    )
+    return PageRequest(urls, serving.tools, server, host, serving.recordings, serving.title)
 
 
 async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:

@@ -33,6 +33,7 @@ from hapticdb.testing.scenes import (
     write_voxels,
 )
 from hapticdb.testing.statistics import StatisticsContract
+from hapticdb.testing.surfaces import SurfacesContract
 from hapticdb.testing.watching import WatchContract, is_noticed
 
 __all__ = [
@@ -54,6 +55,7 @@ class StoreContract(
     RowsContract,
     ObjectsContract,
     DistancesContract,
+    SurfacesContract,
     LifecycleContract,
     StatisticsContract,
     WatchContract,

@@ -63,6 +63,11 @@ def _checked(report: "CheckReport") -> str:
             f"; {render.counted(report.without_row_checksums, 'object')} without checksums: "
             "'hapticdb copy' makes an environment that has them"
         )
+    if report.without_surfaces:
+        line += (
+            f"; {render.counted(report.without_surfaces, 'object')} without surfaces: "
+            "'hapticdb upgrade' reads them"
+        )
     return line
 
 

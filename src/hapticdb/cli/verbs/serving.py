@@ -26,14 +26,6 @@ ToolsOption = Annotated[
         help="Mesh of a tool to choose from, beside a ball and a peg. Give it again for more.",
     ),
 ]
-FilesOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="FOLDER",
-        help="Folder below which objects' files may be read to show them. Give it again for more.",
-        show_default="the folders of the files as imported",
-    ),
-]
 RecordingsOption = Annotated[
     str | None,
     typer.Option(metavar="FOLDER", help="Folder in which people's sessions may be recorded."),
@@ -92,7 +84,6 @@ def view(
     url: UrlArgument,
     *,
     tool: ToolsOption = None,
-    files: FilesOption = None,
     recordings: RecordingsOption = None,
     seconds: SecondsOption = None,
     no_browser: NoBrowserOption = False,
@@ -105,7 +96,7 @@ def view(
     from hapticdb.server.access import Role, make_token
 
     token = make_token()
-    serving = _serving(url, tool, files, {token: Role.EDITOR}, None, recordings)
+    serving = _serving(url, tool, {token: Role.EDITOR}, None, recordings)
 
     def ready(port: int) -> None:
         address = serving.address(port, token)
@@ -127,7 +118,6 @@ def serve(
     port: PortOption = 0,
     prefix: PrefixOption = "",
     host_name: HostNameOption = None,
-    files: FilesOption = None,
     recordings: RecordingsOption = None,
     tls_cert: CertificateOption = None,
     tls_key: KeyOption = None,
@@ -143,7 +133,7 @@ def serve(
 
     tokens = _tokens(token_file, are_made=token)
     serving = replace(
-        _serving(url, tool, files, tokens, role_url, recordings),
+        _serving(url, tool, tokens, role_url, recordings),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
         certificate=tls_cert, key=tls_key, awaits_devices=True,
     )  # fmt: skip
@@ -173,14 +163,12 @@ def _check_extra() -> None:
 def _serving(
     url: str,
     tools: Sequence[str] | None,
-    files: Sequence[str] | None,
     tokens: "dict[str, Role]",
     role_urls: Sequence[str] | None,
     recordings: str | None,
 ) -> "Serving":
     """What to serve; refuses an environment, a tool or a folder that is not there."""
     import hapticdb
-    from hapticdb.page.folders import AllowedFolders
     from hapticdb.server.access import Role
     from hapticdb.server.running import Serving
 
@@ -194,13 +182,12 @@ def _serving(
     for tool in tools or ():
         if not Path(tool).is_file():
             raise UsageError(f"--tool {tool}: no such file")
-    AllowedFolders(files or ())
     if recordings is not None and not Path(recordings).is_dir():
         raise UsageError(f"--recordings {recordings}: no such folder")
     return Serving(
         urls=urls, tools=tuple(tools or ()), tokens=tokens,
         open_role=None if tokens else Role.EDITOR,
-        folders=None if files is None else tuple(files), title=_title(url),
+        title=_title(url),
         recordings=None if recordings is None else str(Path(recordings).resolve()),
     )  # fmt: skip
 

@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import GeometryChangedError, MissingExtraError, UsageError
+from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
 from hapticdb.extraction.directions import AGAINST
 from hapticdb.extraction.disassembly.result import (
     PROVED,
@@ -87,7 +87,7 @@ def disassemble(
 
     Raises
     ------
-    ObjectNotFoundError, GeometryChangedError, UsageError
+    ObjectNotFoundError, NoSurfaceError, UsageError
         As for `extract`, about the parts. Other objects whose files are gone are not taken off.
     MissingExtraError
         If straight pulls lead to no order, and the planner is not installed.
@@ -230,7 +230,7 @@ class _OrderSearch:
             if not is_wanted:
                 self._check_something_stands({*excluded, *ids})
             found = self._searched(ids, excluded, motions)
-        except (GeometryChangedError, UsageError) as error:
+        except (NoSurfaceError, UsageError) as error:
             if is_wanted:
                 raise
             failed = FailedSearch(parts, n_gone, None, (), str(error))

@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
-from hapticdb.page.database import opened
 from hapticdb.page.drawing import add_tool, put_at
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
@@ -186,7 +186,7 @@ class _SweepJob:
 
     def run(self, progress: Callable[[int, int], None]) -> _SweepAnswer:
         """Sweep on a connection of its own."""
-        with opened(self._site.url, self._site.folders) as env:
+        with open_environment(self._site.url, read_only=True) as env:
             shell = self._tool.shell if self._part is None else env.shell(self._part)
             present = [i for i in self._exclude if i in self._site.objects]
             swept = sweep(env, shell, self._path(shell), exclude=present, progress=progress)

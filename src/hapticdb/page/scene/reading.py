@@ -1,10 +1,7 @@
-"""Reads the shapes of objects again from their files, off the page's thread, a few at a time."""
+"""Reads the shapes of objects from the database, off the page's thread."""
 
-import os
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
-from dataclasses import replace
-from pathlib import Path
+from collections.abc import Callable, Sequence
+from contextlib import closing
 from queue import SimpleQueue
 from threading import Event, Thread
 from time import monotonic
@@ -12,23 +9,20 @@ from time import monotonic
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import FileError
-from hapticdb.ingest.originals import found_parts
+from hapticdb.errors import HapticDBError
+from hapticdb.ingest.geometry import found_parts
 from hapticdb.mesh import Part
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.facets import Facets
 from hapticdb.page.scene.rigid import taken_apart
 from hapticdb.page.scene.shapes import PartShape, draw_each
 from hapticdb.store.base import Object
+from hapticdb.store.connect import open_store
 
 ShapedObject = tuple[Object, PartShape, NDArray[np.float64]]
 """An object, its shape, and the shape's pose (4, 4), world_from_shape."""
-READERS = 2
-"""Files that are read at once, each by a process of its own. More open faster on a machine with
-processors to spare, and take more memory."""
 SHOW_EVERY_S = 0.5
-"""Seconds after which the shapes read so far are shown. A larger value merges more of the parts of
-many small files, and shows them later."""
+"""Seconds after which the shapes read so far are shown. A larger value merges more of them, and
+shows them later."""
 SHOW_TRIANGLES = 1_000_000
 """Triangles after which the shapes read so far are shown."""
 
@@ -37,16 +31,16 @@ class ShapeReader:
     """A thread that reads the shapes of objects which it is given, in order.
 
     show : called from the thread with objects and their shapes, as they become known; lost : with
-    objects whose file is gone, changed or must not be read.
+    objects that have no triangles in the database.
     """
 
     def __init__(
         self,
-        folders: AllowedFolders,
+        url: str,
         show: Callable[[Sequence[ShapedObject]], None],
         lost: Callable[[Sequence[Object]], None],
     ) -> None:
-        self._folders = folders
+        self._url = url
         self._show = show
         self._lost = lost
         self._wanted: SimpleQueue[Sequence[Object] | None] = SimpleQueue()
@@ -60,7 +54,7 @@ class ShapeReader:
         self._wanted.put(objects)
 
     def close(self) -> None:
-        """End the thread; it ends after the file that it reads."""
+        """End the thread; it ends after the surface that it reads."""
         self._ended.set()
         self._wanted.put(None)
 
@@ -69,40 +63,34 @@ class ShapeReader:
         self._thread.join(timeout)
 
     def _run(self) -> None:
-        with ThreadPoolExecutor(READERS, "files") as pool:
-            while (objects := self._wanted.get()) is not None and not self._ended.is_set():
-                self._read(objects, pool)
+        while (objects := self._wanted.get()) is not None and not self._ended.is_set():
+            self._read(objects)
 
-    def _read(self, objects: Sequence[Object], pool: ThreadPoolExecutor) -> None:
-        allowed: list[Object] = []
-        lost: list[Object] = []
-        paths: dict[str, Path | None] = {}
-        for obj in objects:
-            if obj.link not in paths:
-                paths[obj.link] = _readable(obj.link, self._folders)
-            (lost if paths[obj.link] is None else allowed).append(obj)
-        self._lost(lost)
+    def _read(self, objects: Sequence[Object]) -> None:
+        # by digest: a batch of equal parts is complete when it is shown
+        ordered = sorted(objects, key=lambda obj: obj.digest)
+        left = {obj.id: obj for obj in objects}
         ready: list[ShapedObject] = []
-        shown, n_triangles = monotonic(), 0
-        for some, parts in _files(allowed, paths, pool, self._ended):
-            missing, digest = [], ""
-            # by digest: a batch of equal parts is complete when it is shown
-            for obj, part in sorted(zip(some, parts, strict=True), key=lambda both: both[0].digest):
-                if self._ended.is_set():
-                    return
-                if obj.digest != digest and (
-                    n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S
-                ):
-                    self._show_drawn(ready)
-                    ready, shown, n_triangles = [], monotonic(), 0
-                digest = obj.digest
-                if part is None or part.faces is None:
-                    missing.append(obj)
-                    continue
-                ready.append(self._shaped(obj, part))
-                n_triangles += ready[-1][1].n_triangles
-            self._lost(missing)
+        try:
+            with closing(open_store(self._url, read_only=True)) as store:
+                shown, n_triangles, digest = monotonic(), 0, ""
+                for obj, part in found_parts(store, ordered):
+                    if self._ended.is_set():
+                        return
+                    if obj.digest != digest and (
+                        n_triangles > SHOW_TRIANGLES or monotonic() - shown > SHOW_EVERY_S
+                    ):
+                        self._show_drawn(ready)
+                        ready, shown, n_triangles = [], monotonic(), 0
+                    digest = obj.digest
+                    if part is not None and not part.is_cloud:
+                        ready.append(self._shaped(obj, part))
+                        n_triangles += ready[-1][1].n_triangles
+                        del left[obj.id]
+        except HapticDBError:  # the database is away or damaged: the others are shown by voxels
+            pass
         self._show_drawn(ready)
+        self._lost(list(left.values()))
 
     def _show_drawn(self, ready: Sequence[ShapedObject]) -> None:
         draw_each({shape.serial: shape for _, shape, _ in ready}.values())
@@ -127,46 +115,3 @@ def centred(pose: NDArray[np.float64], shape: PartShape) -> NDArray[np.float64]:
     moved = pose.copy()
     moved[:3, 3] += pose[:3, :3] @ shape.center
     return moved
-
-
-def _readable(link: str, folders: AllowedFolders) -> Path | None:
-    """The file behind a link, without symbolic links; None if it is gone or must not be read."""
-    try:
-        path = folders.checked(link)
-    except FileError:
-        return None
-    return path if os.access(path, os.R_OK) else None
-
-
-def _files(
-    objects: Sequence[Object],
-    paths: Mapping[str, Path | None],
-    pool: ThreadPoolExecutor,
-    ended: Event,
-) -> Iterator[tuple[list[Object], list[Part | None]]]:
-    """Objects of a file with their parts, None where there is none, as they are read.
-
-    At most `READERS` files are in memory and not yet taken.
-    """
-    of_file: dict[tuple[str, object], list[Object]] = {}
-    for obj in objects:
-        of_file.setdefault((obj.link, obj.attributes.get("unit")), []).append(obj)
-    waiting = list(of_file.values())[::-1]
-    running: set[Future[tuple[list[Object], list[Part | None]]]] = set()
-    while (waiting or running) and not ended.is_set():
-        while waiting and len(running) < READERS:
-            some = waiting.pop()
-            running.add(pool.submit(_parts, some, str(paths[some[0].link])))
-        done, running = wait(running, return_when=FIRST_COMPLETED)
-        for future in done:
-            yield future.result()
-
-
-def _parts(objects: list[Object], path: str) -> tuple[list[Object], list[Part | None]]:
-    """Objects of one file with their parts; the file is opened by the path that was judged."""
-    found: dict[int, Part] = {}
-    linked = [replace(obj, link=path) for obj in objects]
-    for some, part in found_parts(linked, "shown", "import it again"):
-        if isinstance(part, Part):
-            found[some[0].id] = part
-    return objects, [found.get(obj.id) for obj in objects]

@@ -11,7 +11,6 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
-from hapticdb.page.folders import AllowedFolders
 from hapticdb.page.scene.contents import Contents, is_same_shape
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
@@ -27,7 +26,7 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 MOST_BLOCKS = 6_000
-"""Cubes that stand for an object whose file cannot be read; more voxels are drawn as larger cubes.
+"""Cubes that stand for an object without a surface; more voxels are drawn as larger cubes.
 A larger value shows more detail, and sends about 100 bytes more for each cube."""
 ENDS_WITHIN_S = 10.0
 """Seconds that `SceneView.close` waits for each of its threads."""
@@ -36,15 +35,15 @@ ENDS_WITHIN_S = 10.0
 class SceneView:
     """Shows the objects of an environment in all browsers of a viser server, and follows edits.
 
-    Boxes are shown at once, then shapes from the objects' files as they are read, then the voxels,
-    as blocks, of objects whose file is gone, has changed or must not be read. All methods may be
+    Boxes are shown at once, then the objects' surfaces as they are read, then the voxels, as
+    blocks, of point clouds and of objects without a surface in the database. All methods may be
     called from any thread. It is a context manager, which closes it.
 
     The server's scene below ``/parts``, its ground, light, background and first view are this
     view's. HapticDBError if the environment cannot be opened or read.
     """
 
-    def __init__(self, server: "ViserServer", url: str, folders: AllowedFolders) -> None:
+    def __init__(self, server: "ViserServer", url: str) -> None:
         self._server, self._url = server, url
         self.contents = Contents(Audience(server.scene))
         """The objects, their nodes, and what each browser sees of them."""
@@ -57,7 +56,7 @@ class SceneView:
         """Number of the axis that points up: 0 for x, 1 for y, 2 for z."""
         self.revision = -1
         """Revision of the environment that is shown."""
-        self._reader = ShapeReader(folders, self._show_shapes, self._show_voxels)
+        self._reader = ShapeReader(url, self._show_shapes, self._show_voxels)
         self._follower = Follower(url, self._follow)
         try:
             self._follower.start()
@@ -165,7 +164,7 @@ class SceneView:
             self.contents.shape(found)
 
     def _show_voxels(self, objects: Sequence[Object]) -> None:
-        """Show objects without a readable file as blocks of their voxels."""
+        """Show objects without triangles as blocks of their voxels."""
         if not objects:
             return
         with suppress(HapticDBError), open_environment(self._url, read_only=True) as env:

@@ -178,6 +178,7 @@ LANGUAGE sql STABLE SECURITY DEFINER SET search_path = {schema}, pg_temp AS $$
 $$""",
 )
 
+
 def _granted_as_on_brick(table: str, also: str = "") -> str:
     """Statement that gives roles on a new table what they may do with `brick`.
 

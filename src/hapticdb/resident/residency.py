@@ -95,8 +95,6 @@ class Residency:
         Cells near tools, distinct, most urgent first.
     clock : callable
         Returns seconds, to time loads.
-    may_measure : bool
-        Whether there is time at the start to measure the cost of statements, if no cost is stored.
 
     Attributes
     ----------
@@ -121,7 +119,6 @@ class Residency:
         where: Words = (),
         urgent: Keys = NO_KEYS,
         clock: Callable[[], float] = time.perf_counter,
-        may_measure: bool = True,
     ) -> None:
         check_cells(store)
         self.table = table
@@ -134,9 +131,7 @@ class Residency:
         self._commit_count = NOTHING_KNOWN
         is_first = table.version == FIRST_VERSION
         self._left_out = LeftOutObjects(Filter(where, exclude))
-        self._source = CellSource(
-            store, self._left_out.ids, clock, may_measure=may_measure and is_first
-        )
+        self._source = CellSource(store, self._left_out.ids, clock, may_measure=is_first)
         if not is_first:
             self._take_over(urgent)
         self.refresh()

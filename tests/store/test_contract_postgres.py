@@ -100,7 +100,8 @@ def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_i
     name = parse(url).environment
     for what in ("TABLE {0}.removed", "FUNCTION {0}.note_removed", "FUNCTION {0}.removed_parts"):
         admin.execute(f"DROP {what.format(name)} CASCADE")
-    admin.execute(f"DROP TABLE {name}.band")
+    admin.execute(f"DROP TABLE {name}.band, {name}.surface")
+    admin.execute(f"DROP INDEX {name}.object_digest")
     admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
     admin.execute(f"UPDATE {name}.environment SET format = 2")
     everywhere = np.array([0]), np.array([2**62])
@@ -109,12 +110,14 @@ def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_i
         assert env.store.removed(obj.link) == set()
         assert not env.store.wants_distances
         assert not len(env.store.scan(*everywhere, distances=True))
+        assert env.store.surface_digests() == set(env.store.surfaces([obj.digest])) == set()
         with hapticdb.open(url) as writer:
             writer.remove(obj.id)
             assert writer.store.removed(obj.link) == {obj.name}
             rows = with_distances(blob(1, (20, 20, 20)), GRID, "brick")
-            writer.store.add(obj, rows)
+            writer.store.add(obj, rows, b"surface")
         assert len(env.store.scan(*everywhere, distances=True)) == len(rows)
+        assert env.store.surfaces([obj.digest]) == {obj.digest: b"surface"}
 
 
 def test_a_dropped_table_is_damage(url: str, admin: psycopg.Connection) -> None:

@@ -116,12 +116,14 @@ def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(
         assert not reader.wants_distances
         assert not obj.has_distances
         assert not len(reader.scan(*everywhere, distances=True))
+        assert reader.surface_digests() == set(reader.surfaces([obj.digest])) == set()
         assert path.read_bytes() == before
         rows = with_distances(blob(1, (20, 20, 20)), GRID, "brick")
         with closing(SQLiteStore.open(path)) as writer:
             assert not writer.wants_distances
-            writer.add(replace(obj, name="blob"), rows)
+            writer.add(replace(obj, name="blob"), rows, b"surface")
         assert len(reader.scan(*everywhere, distances=True)) == len(rows)
+        assert reader.surfaces([obj.digest]) == {obj.digest: b"surface"}
     assert version_of(path) == FORMAT_VERSION
 
 

@@ -60,15 +60,16 @@ def test_a_role_name_that_is_too_long_is_not_granted_to_its_beginning(
 
 
 @pytest.mark.parametrize("right", ["viewer", "editor"])
-def test_rights_from_before_the_table_of_distances_hold_for_it(
+def test_rights_from_before_a_table_hold_for_it(
     place: Place, role: str, admin: psycopg.Connection, right: Right
 ) -> None:
-    """The step that makes the table gives a role on it what it may do with the bricks."""
+    """The step that makes a table gives a role on it what it may do with the bricks."""
     url = place()
     create_store(url, GRID).close()
     grant(url, role, right)
     name = parse(url).environment
-    admin.execute(f"DROP TABLE {name}.band")
+    admin.execute(f"DROP TABLE {name}.band, {name}.surface")
+    admin.execute(f"DROP INDEX {name}.object_digest")
     admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
     admin.execute(f"UPDATE {name}.environment SET format = 3")
     open_store(url).close()
@@ -76,10 +77,16 @@ def test_rights_from_before_the_table_of_distances_hold_for_it(
         "SELECT has_table_privilege(%(role)s, %(band)s, 'SELECT'),"
         "       has_table_privilege(%(role)s, %(band)s, 'INSERT'),"
         "       has_table_privilege(%(role)s, %(band)s, 'DELETE'),"
+        "       has_table_privilege(%(role)s, %(surface)s, 'INSERT'),"
         "       has_column_privilege(%(role)s, %(one)s, 'wants_distances', 'UPDATE')",
-        {"role": role, "band": f"{name}.band", "one": f"{name}.environment"},
+        {
+            "role": role,
+            "band": f"{name}.band",
+            "surface": f"{name}.surface",
+            "one": f"{name}.environment",
+        },
     ).fetchone()
-    assert held == (True, *[right == "editor"] * 3)
+    assert held == (True, *[right == "editor"] * 4)
 
 
 @pytest.mark.parametrize(

@@ -27,7 +27,7 @@ def move(
     ] = None,
     json: JsonOption = False,
 ) -> None:
-    """Place objects anew; their geometry is read from their files again.
+    """Place objects anew.
 
     --translate shifts all objects that are chosen, or none of them when one would
     leave the grid; --matrix places one object. 'hapticdb objects --help' says how

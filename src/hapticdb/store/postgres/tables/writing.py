@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from psycopg import errors
 
+from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.store import believed
 from hapticdb.store.base import Covering, Keys, Layout, Object, Rows, Table, touched_ranges
@@ -99,7 +100,7 @@ class PostgresWriter:
             gone = self._take(known, covering)
             self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
             self._put(rows, record.id)
-            self._execute(DROP_SURFACE, {"digest": known.digest})
+            self._drop_surface(known.digest)
             self._put_surface(record.digest, surface)
             self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
@@ -113,7 +114,7 @@ class PostgresWriter:
             known = self._reader.object(object_id)
             gone = self._take(known, covering)
             self._execute("DELETE FROM object WHERE id = %s", (object_id,))
-            self._execute(DROP_SURFACE, {"digest": known.digest})
+            self._drop_surface(known.digest)
             self._log(revision, "remove", object_id, gone)
 
         self._commit(work)
@@ -125,6 +126,11 @@ class PostgresWriter:
             self._execute("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")  # the write lock
             self._put_surface(digest, surface)
 
+        if not self._reader.has_table(believed.SURFACE):
+            raise ReadOnlyError(
+                f"{self._connection.shown} has an older format: its owner has to open it once to "
+                "write, and it is brought up to date"
+            )
         self._connection.write(work)
 
     def want_distances(self) -> None:
@@ -178,8 +184,16 @@ class PostgresWriter:
             self._copy_into("band", rows, object_id)
 
     def _put_surface(self, digest: str, surface: bytes | None) -> None:
-        if surface is not None and self._execute(LACKS_SURFACE, {"digest": digest}) == [(True,)]:
+        """Write a surface; an editor of an older environment, whose owner makes the table, none."""
+        if surface is None or not self._reader.has_table(believed.SURFACE):
+            return
+        if self._execute(LACKS_SURFACE, {"digest": digest}) == [(True,)]:
             self._execute("INSERT INTO surface VALUES (%s, %b)", (digest, surface))
+
+    def _drop_surface(self, digest: str) -> None:
+        """Delete a surface that no object has any more."""
+        if self._reader.has_table(believed.SURFACE):
+            self._execute(DROP_SURFACE, {"digest": digest})
 
     def _take(self, known: Object, covering: Covering) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys."""

@@ -1,0 +1,84 @@
+"""Packed geometry returns bit for bit; damaged bytes end in one line, and take no memory."""
+
+import tracemalloc
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra.numpy import arrays
+from numpy.typing import NDArray
+
+from hapticdb.mesh.packing import HEADER, pack, unpack
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+FINITE = st.floats(allow_nan=False, allow_infinity=False)
+FEW = st.sampled_from([0.0, -0.0, 1.0, 0.001, 5e-324, -1.7e308])
+
+
+@st.composite
+def geometries(draw: st.DrawFn) -> tuple[Floats, Ints | None]:
+    """Vertices, many of them alike, and any triangles of them, or none."""
+    n = draw(st.integers(0, 300))
+    vertices = draw(arrays(np.float64, (n, 3), elements=st.one_of(FINITE, FEW)))
+    if draw(st.booleans()):
+        return vertices, None
+    n_faces = draw(st.integers(0, 40)) if n else 0
+    return vertices, draw(arrays(np.int64, (n_faces, 3), elements=st.integers(0, max(n - 1, 0))))
+
+
+@settings(max_examples=200, deadline=None)
+@given(geometries())
+def test_what_is_packed_returns_bit_for_bit(geometry: tuple[Floats, Ints | None]) -> None:
+    vertices, faces = geometry
+    found, corners = unpack(pack(vertices, faces))
+    assert found.tobytes() == np.ascontiguousarray(vertices).tobytes()
+    assert found.shape == vertices.shape
+    if faces is None:
+        assert corners is None
+    else:
+        np.testing.assert_array_equal(corners, faces)
+
+
+def ball(n: int) -> tuple[Floats, Ints]:
+    """Points of a sphere in n rings of n, and the triangles between them."""
+    u, v = np.meshgrid(np.linspace(0, 2 * np.pi, n), np.linspace(0, np.pi, n), indexing="ij")
+    points = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1)
+    first = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
+    corners = np.concatenate(
+        [np.stack([first, first + 1, first + n]), np.stack([first + 1, first + n + 1, first + n])],
+        axis=1,
+    )
+    return points.reshape(-1, 3), corners.T.copy()
+
+
+@settings(max_examples=300, deadline=None)
+@given(st.data())
+def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObject) -> None:
+    """Never a position that is no number, nor a triangle of a vertex that is not there."""
+    vertices, faces = ball(9)
+    whole = bytearray(pack(vertices, faces if data.draw(st.booleans()) else None))
+    for _ in range(data.draw(st.integers(1, 3))):
+        at = data.draw(st.integers(0, len(whole) - 1))
+        whole[at] ^= data.draw(st.integers(1, 255))
+    damaged = bytes(whole[: data.draw(st.integers(0, len(whole)))])
+    try:
+        found, corners = unpack(damaged)
+    except ValueError:
+        return
+    assert np.isfinite(found).all()
+    assert corners is None or not corners.size or 0 <= corners.min() <= corners.max() < len(found)
+
+
+@pytest.mark.parametrize("n_faces", [0, 1 << 40, (1 << 64) - 1])
+@pytest.mark.parametrize("n_vertices", [1 << 20, 1 << 40, (1 << 64) - 1])
+def test_a_header_takes_no_memory_that_its_bytes_do_not_hold(n_vertices: int, n_faces: int) -> None:
+    packed = pack(*ball(9))
+    tracemalloc.start()
+    try:
+        with pytest.raises(ValueError, match="a surface"):
+            unpack(HEADER.pack(n_vertices, n_faces) + packed[HEADER.size :])
+        assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    finally:
+        tracemalloc.stop()

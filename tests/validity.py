@@ -12,12 +12,13 @@ Contents = tuple[list[tuple[Any, ...]], list[tuple[Any, ...]], set[tuple[int, in
 
 
 def assert_valid(env: Environment) -> None:
-    """Assert that objects have their recorded rows, rows have an object, the log is complete."""
+    """Assert that objects have their recorded rows and surfaces and no others, with a whole log."""
     with env.store.snapshot():
         objects = env.objects()
         rows = env.store.scan(np.array([0]), np.array([2**62]))
         changes = list(env.store.changes())
         revision = env.store.revision()
+        surfaces = env.store.surface_digests()
     if env.layout == "brick":
         bits = np.unpackbits(rows.occupancy.reshape(-1, 64), axis=1).sum(axis=1)
     else:
@@ -27,6 +28,7 @@ def assert_valid(env: Environment) -> None:
     assert {i: n for i, n in enumerate(counted.tolist()) if n} == {
         obj.id: obj.voxels for obj in objects
     }
+    assert surfaces == {obj.digest for obj in objects if len(obj.digest) == 64}  # of files
     assert [change.revision for change in changes] == list(range(1, revision + 1))
     last = {change.id: change for change in changes}
     assert {i for i, change in last.items() if change.action != "remove"} == {

@@ -7,6 +7,7 @@ import apsw
 import numpy as np
 
 from hapticdb import Grid
+from hapticdb.mesh import packing
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import floor_voxels, write_voxels
@@ -15,6 +16,7 @@ GRID = Grid(0.005, (0, 0, 0), 7)
 NANS = np.full(6, np.nan).tobytes().hex()
 UPSIDE_DOWN = np.array([1.0, 1, 1, 0, 0, 0]).tobytes().hex()
 DESCENDING = np.array([9, 3], np.int64).tobytes().hex()
+BALL = packing.pack(np.eye(3), np.array([[0, 1, 2]])).hex()
 VIEW = "ALTER TABLE {0} RENAME TO t; CREATE VIEW {0} AS SELECT * FROM t"
 CRAFTED = {
     "attributes that are no JSON": "UPDATE object SET attributes = '{'",
@@ -38,7 +40,7 @@ CRAFTED = {
     "a view for the rows": VIEW.format("{layout}"),
     "a view for the objects": VIEW.format("object"),
     "a missing table": "DROP TABLE change",
-    "a missing column": "ALTER TABLE object DROP COLUMN digest",
+    "a missing column": "DROP INDEX object_digest; ALTER TABLE object DROP COLUMN digest",
     "changes upside down": f"UPDATE change SET ranges = x'{DESCENDING}'",
     "changes cut short": "UPDATE change SET ranges = x'00'",
     "an unknown action": "UPDATE change SET action = 'paint'",
@@ -61,6 +63,12 @@ CRAFTED = {
     "a log with a gap": "DELETE FROM change WHERE revision = 1",
     "an object of no change": "UPDATE object SET revision = 1 WHERE id = 2",
     "a removal that was none": "UPDATE change SET action = 'remove' WHERE id = 2",
+    "a surface of no object": "INSERT INTO surface VALUES ('x', x'00')",
+    "a surface without a name": "INSERT INTO surface VALUES (x'00', x'00')",
+    "a surface of text": "INSERT INTO surface SELECT digest, 'x' FROM object WHERE id = 2",
+    "a surface cut short": "INSERT INTO surface SELECT digest, x'00' FROM object WHERE id = 2",
+    "another surface": f"INSERT INTO surface SELECT digest, x'{BALL}' FROM object WHERE id = 2",
+    "a view for the surfaces": VIEW.format("surface"),
 }
 OF_BRICKS = {
     "an empty brick": "UPDATE brick SET occupancy = zeroblob(64) WHERE id = 2",

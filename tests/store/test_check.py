@@ -47,6 +47,8 @@ def used(path: Path, sphere: PointShell) -> None:
             lambda: env.touch(sphere, pose).pairs,
             lambda: list(env.store.changes()),
             lambda: env.voxels(2),
+            lambda: env.shell(2),
+            lambda: env.move(2, np.eye(4)),
             lambda: env.store.costs("elsewhere"),
             lambda: env.quantiles(10),
             env.size,

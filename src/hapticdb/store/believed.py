@@ -217,6 +217,14 @@ def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
     return found
 
 
+def digests_of(url: str, rows: Iterable[Sequence[Any]]) -> set[str]:
+    """Read the digests (digest,) of surfaces."""
+    found = {row[0] for row in rows}
+    if not all(isinstance(digest, str) for digest in found):
+        raise damaged(url, "a surface whose digest is no text")
+    return found
+
+
 def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
     """Read a kept histogram; bounds as bytes or as a list."""
     keys = _int64s(bounds)

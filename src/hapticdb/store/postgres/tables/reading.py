@@ -208,7 +208,8 @@ class PostgresReader:
         """Digests of all surfaces."""
         if not self.has_table(believed.SURFACE):
             return set()
-        return {row[0] for row in self._connection.rows("SELECT digest FROM surface")}
+        found = self._connection.rows("SELECT digest FROM surface")
+        return believed.digests_of(self._url, found)
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:

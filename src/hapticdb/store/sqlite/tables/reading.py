@@ -215,4 +215,5 @@ class SQLiteReader:
         """Digests of all surfaces."""
         if not self.has_table(believed.SURFACE):
             return set()
-        return {row[0] for row in self._connection.fetch("SELECT digest FROM surface")}
+        found = self._connection.fetch("SELECT digest FROM surface")
+        return believed.digests_of(self._connection.url, found)

@@ -50,6 +50,7 @@ ENTRIES = {
     "surfaces.sides": "side_votes_kernel nesting_kernel",
     "surfaces.nearest": "distances_kernel",
     "triangles.nearest": "nearest_kernel",
+    "triangles.piercing": "piercing_kernel",
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",

@@ -1,6 +1,6 @@
 """Kernels on pairs of surfaces: how far apart they are, and how deep they overlap.
 
-`pairs` measures two triangles, `nearest` two trees of them.
+`pairs` measures two triangles, `nearest` two trees of them; `piercing` finds edges that go through.
 """
 
 from hapticdb.kernels._later import later_modules

@@ -118,11 +118,12 @@ def _separation(found, one, n, other, m, distance):
 
 
 @leaf
-def edge_goes_through(one, n, i, other, m):
+def edge_goes_through(one, n, i, other, m, beside):
     """Where edge i of triangle n goes through triangle m: share of the edge, or -1.
 
     The edge's ends lie on different sides of the plane, or one in it, and the place between is
-    inside the triangle or on its edge. An edge in the plane does not go through.
+    inside the triangle, on its edge, or beside it by that share of its height at most. An edge in
+    the plane does not go through.
     """
     k = (i + 1) % 3
     ax, ay, az = other[m, 0, 0], other[m, 0, 1], other[m, 0, 2]
@@ -140,7 +141,8 @@ def edge_goes_through(one, n, i, other, m):
     area = nx * nx + ny * ny + nz * nz
     along = (y * vz - z * vy) * nx + (z * vx - x * vz) * ny + (x * vy - y * vx) * nz
     across = (uy * z - uz * y) * nx + (uz * x - ux * z) * ny + (ux * y - uy * x) * nz
-    if along < 0.0 or across < 0.0 or along + across > area:
+    least = -beside * area
+    if along < least or across < least or along + across > area - least:
         return -1.0
     return share
 
@@ -149,7 +151,7 @@ def edge_goes_through(one, n, i, other, m):
 def _goes_through(found, one, n, other, m, is_first):
     """Whether an edge of triangle n goes through triangle m; notes the place."""
     for i in range(3):
-        share = edge_goes_through(one, n, i, other, m)
+        share = edge_goes_through(one, n, i, other, m, 0.0)
         if share >= 0.0:
             k = (i + 1) % 3
             x = one[n, i, 0] + share * (one[n, k, 0] - one[n, i, 0])

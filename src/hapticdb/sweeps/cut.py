@@ -1,0 +1,291 @@
+"""How deep two surfaces overlap, open or closed: what gets through, and how far.
+
+Where a surface goes through another one, the other parts it into pieces. A piece that gets less
+than some metres away from the other surface is pushed through by less than that, on whichever side
+it is: a peg's end in a wall, the patch of a wall in a peg. So where surfaces cross, one gets through
+the other by the lesser of the greatest distances of its two pieces there. Along one curve on which
+two surfaces cross, the cut is the lesser of what either gets through the other: an edge that is
+stuck through a sheet by little cuts by little, though it parts the sheet. The cut of the surfaces
+is the greatest of all curves. No inside is needed.
+
+Pieces are told by edges: those of the mesh, and in each triangle that is gone through, edges from
+there to its corners, so that the inside of a large triangle is seen, too. An edge is parted where it
+goes through the other surface. What is connected by edges without such a place is one piece. Where
+both sides of a place are one piece, as where a sheet is stuck on the border of another, the parts
+of the edge itself count. Beyond a thin piece the next one counts, so that a plate is gone through
+though its inside is near both of its faces.
+
+What this does not see: pieces that lie wholly inside one triangle beside the edges drawn;
+connections of meshes whose triangles do not share corners, whose pieces count as smaller than they
+are; how far a part gets through that is itself thinner than the cut.
+"""
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels.surfaces.nearest import distances_to
+from hapticdb.kernels.surfaces.sides import TriangleTree
+from hapticdb.kernels.triangles.piercing import piercing
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+JOIN = 1e-6
+"""Share of a surface's diagonal up to which corners are one, and places of an edge, too."""
+PLACES = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
+"""Places of a part of an edge whose distance is measured. More: deeper cuts of curved surfaces."""
+SPOTS = 3
+"""Places that each place in a triangle is paired with, to find a spot between them. More: deeper
+cuts of curved surfaces."""
+CHUNK = 256
+"""Corners of a piece that are measured together, until one is far enough."""
+
+
+class Mesh:
+    """A surface with its corners joined.
+
+    tree : its triangles; points (V, 3); edges (E, 2), faces (T, 3) : numbers of points, the faces
+    in the order of the tree; near : length up to which places are one, metres.
+    """
+
+    def __init__(self, tree: TriangleTree) -> None:
+        self.tree = tree
+        corners = tree.corners.reshape(-1, 3)
+        self.near = JOIN * float(np.linalg.norm(np.ptp(corners, axis=0))) or 1.0
+        _, first, inverse = np.unique(
+            np.rint(corners / self.near).astype(np.int64),
+            axis=0, return_index=True, return_inverse=True,
+        )  # fmt: skip
+        self.points = np.ascontiguousarray(corners[first])
+        self.faces = inverse.reshape(-1, 3)
+        sides = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2).reshape(-1, 2)
+        self.edges, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+        which = which.reshape(-1)
+        order = np.argsort(which, kind="stable")
+        self._faces_at = order // 3
+        self._starts = np.searchsorted(which[order], np.arange(len(self.edges) + 1))
+
+    def faces_of(self, edges: Ints) -> tuple[Ints, Ints]:
+        """Faces (F,) at edges (n,), with the index (F,) of the edge that each is at."""
+        counts = self._starts[edges + 1] - self._starts[edges]
+        which = np.repeat(np.arange(len(edges)), counts)
+        within = np.arange(len(which)) - np.repeat(np.cumsum(counts) - counts, counts)
+        return self._faces_at[self._starts[edges][which] + within], which
+
+
+class Cut(NamedTuple):
+    """The deepest cut: metres, and its place (3,) in the frame of the first surface."""
+
+    depth: float
+    place: Floats
+
+
+NONE = Cut(0.0, np.zeros(3))
+
+
+def cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float) -> Cut:
+    """Greatest cut of two surfaces, up to `most` metres: deeper ones are told as `most`.
+
+    one_from_other (4, 4) : rigid.
+    """
+    other_from_one = np.linalg.inv(one_from_other)
+    mine, theirs = _Parted(one, other, other_from_one), _Parted(other, one, one_from_other)
+    if not (len(mine.shares) or len(theirs.shares)):
+        return NONE
+    spots = mine.spots(), theirs.spots()
+    mine.add(*spots[1], one_from_other)
+    theirs.add(*spots[0], other_from_one)
+    return _deepest(mine, theirs, one_from_other, most)
+
+
+def _deepest(mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float) -> Cut:
+    """The deepest of all curves: at each the lesser of what either surface gets through."""
+    from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
+    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
+
+    own, at_own = mine.crossings()
+    other, at_other = theirs.crossings()
+    pairs = np.concatenate([own, other[:, ::-1]])  # triangles that cross: of one, of the other
+    n_own, n_all = len(mine.shares), len(mine.shares) + len(theirs.shares)
+    place = np.concatenate([at_own, n_own + at_other])
+    _, pair = np.unique(pairs, axis=0, return_inverse=True)
+    pair = pair.reshape(-1)
+    size = n_all + (int(pair.max()) + 1 if len(pair) else 0)
+    links = coo_array((np.ones(len(place)), (place, n_all + pair)), shape=(size, size))
+    n_curves, curve = connected_components(links, directed=False)
+    through = [np.full(n_curves, -1.0), np.full(n_curves, -1.0)]
+    depths = mine.depths(most), theirs.depths(most)
+    for deepest, values, curves in zip(
+        through, depths, (curve[:n_own], curve[n_own:n_all]), strict=True
+    ):
+        np.maximum.at(deepest, curves, values)
+    lesser = np.where(
+        through[0] < 0.0, through[1], np.where(through[1] < 0.0, through[0], np.minimum(*through))
+    )
+    best = int(np.argmax(lesser))
+    depth = float(lesser[best])
+    if through[0][best] >= 0.0:
+        return Cut(depth, mine.places()[np.flatnonzero(curve[:n_own] == best)[0]])
+    place_of = theirs.places()[np.flatnonzero(curve[n_own:n_all] == best)[0]]
+    return Cut(depth, one_from_other[:3, :3] @ place_of + one_from_other[:3, 3])
+
+
+class _Parted:
+    """A surface and the places where its edges go through another one.
+
+    edges (P,), triangles (P,), shares (P,) : edge of each place, triangle of the other surface,
+    share of the edge; ascending by edge and share.
+    """
+
+    def __init__(self, mesh: Mesh, other: Mesh, other_from_mesh: Floats) -> None:
+        self._mesh, self._other, self._pose = mesh, other, other_from_mesh
+        self._points, self._edges = mesh.points, mesh.edges
+        self._spotted: Ints = np.empty(0, dtype=np.int64)
+        self.edges, self.triangles, self.shares = self._pierce(mesh.edges)
+
+    def _pierce(self, edges: Ints) -> tuple[Ints, Ints, Floats]:
+        """Places of edges (n, 2); what is at one place of an edge counts once."""
+        ends = np.ascontiguousarray(self._points[edges].reshape(-1, 2, 3))
+        which, triangles, shares = piercing(ends, self._other.tree, self._pose)
+        lengths = np.linalg.norm(ends[which, 1] - ends[which, 0], axis=1)
+        is_next = (np.diff(which, prepend=-1) > 0) | (
+            np.diff(shares, prepend=0.0) * lengths > self._mesh.near
+        )
+        return which[is_next], triangles[is_next], shares[is_next]
+
+    def places(self) -> Floats:
+        """The places (P, 3)."""
+        ends = self._points[self._edges[self.edges]]
+        return np.asarray(ends[:, 0] + self.shares[:, None] * (ends[:, 1] - ends[:, 0]))
+
+    def spots(self) -> tuple[Ints, Floats]:
+        """Triangles (S,) of the other surface that are gone through, and a spot (S, 3) in each.
+
+        It is between places of the triangle, as far from this surface as such places are found.
+        """
+        triangles, which = np.unique(self.triangles, return_inverse=True)
+        order = np.argsort(which, kind="stable")
+        places, which = self.places()[order], which[order]
+        counts = np.bincount(which, minlength=len(triangles))
+        starts = np.cumsum(counts) - counts
+        steps = np.arange(1, SPOTS + 1) * counts[which][:, None] // (SPOTS + 1)
+        within = np.arange(len(which)) - starts[which]
+        others = starts[which][:, None] + (within[:, None] + steps) % counts[which][:, None]
+        middles = 0.5 * (places[:, None] + places[others])
+        far = distances_to(self._mesh.tree, middles.reshape(-1, 3)).reshape(middles.shape[:2])
+        best = np.argmax(far, axis=1)
+        rows = np.arange(len(which))
+        order = np.lexsort((-far[rows, best], which))
+        chosen = order[starts]
+        return triangles, middles[chosen, best[chosen]]
+
+    def add(self, triangles: Ints, spots: Floats, mesh_from_other: Floats) -> None:
+        """Add edges from spots (S, 3), other frame, on triangles (S,) to their corners."""
+        numbers = np.repeat(len(self._points) + np.arange(len(spots)), 3)
+        more = np.stack([numbers, self._mesh.faces[triangles].reshape(-1)], axis=1)
+        spots = spots @ mesh_from_other[:3, :3].T + mesh_from_other[:3, 3]
+        self._points = np.concatenate([self._points, spots])
+        edges, through, shares = self._pierce(more)
+        self.edges = np.concatenate([self.edges, edges + len(self._edges)])
+        self.triangles = np.concatenate([self.triangles, through])
+        self.shares = np.concatenate([self.shares, shares])
+        self._edges = np.concatenate([self._edges, more])
+        self._spotted = np.repeat(triangles, 3)
+
+    def crossings(self) -> tuple[Ints, Ints]:
+        """Triangles that cross (C, 2), own and other, with the number (C,) of the place of each."""
+        n_edges = len(self._mesh.edges)
+        is_own = self.edges < n_edges
+        own = np.flatnonzero(is_own)
+        faces, which = self._mesh.faces_of(self.edges[own])
+        spots = np.flatnonzero(~is_own)
+        place = np.concatenate([own[which], spots])
+        mine = np.concatenate([faces, self._spotted[self.edges[spots] - n_edges]])
+        return np.stack([mine, self.triangles[place]], axis=1), place
+
+    def depths(self, most: float) -> Floats:
+        """How far (P,) the surface gets through at each place."""
+        if not len(self.shares):
+            return self.shares
+        pieces = self._pieces()
+        cut_edges, first = np.unique(self.edges, return_index=True)
+        n_cuts = np.diff(np.append(first, len(self.shares)))
+        # an edge of n places has n + 1 parts; part k of all is before place k - (edges before it)
+        starts = np.concatenate([[0], np.cumsum(n_cuts + 1)])
+        begins, ends = np.insert(self.shares, first, 0.0), np.insert(self.shares, first + n_cuts, 1.0)
+        owner = np.repeat(np.arange(len(cut_edges)), n_cuts + 1)
+        far = self._parts_far(cut_edges[owner], begins, ends, most)
+        is_end = np.zeros((2, len(owner)), dtype=bool)
+        is_end[0, starts[:-1]] = is_end[1, starts[1:] - 1] = True
+        corners = self._edges[cut_edges[owner]]
+        piece = np.where(is_end[0], pieces[corners[:, 0]], pieces[corners[:, 1]])
+        inner = np.flatnonzero(~is_end.any(axis=0))
+        piece[inner] = pieces.max() + 1 + np.arange(len(inner))
+        piece_far = np.zeros(int(piece.max()) + 1)
+        np.maximum.at(piece_far, piece, far)
+        self._extend(piece_far, pieces, np.unique(piece[is_end.any(axis=0)]), most)
+        before = np.flatnonzero(~is_end[1])
+        beside = np.where(
+            piece[before] == piece[before + 1],
+            np.minimum(far[before], far[before + 1]),
+            np.minimum(piece_far[piece[before]], piece_far[piece[before + 1]]),
+        )
+        return np.maximum(beside, _beyond(piece, piece_far, owner, before))
+
+    def _pieces(self) -> Ints:
+        """Piece (V,) of each point: what edges that are not gone through connect."""
+        from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
+        from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
+
+        is_whole = np.ones(len(self._edges), dtype=bool)
+        is_whole[self.edges] = False
+        kept = self._edges[is_whole]
+        count = len(self._points)
+        links = coo_array((np.ones(len(kept)), (kept[:, 0], kept[:, 1])), shape=(count, count))
+        return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
+
+    def _far(self, places: Floats, most: float) -> Floats:
+        """Distances (n,) of places (n, 3) from the other surface, up to `most`."""
+        moved = places @ self._pose[:3, :3].T + self._pose[:3, 3]
+        return distances_to(self._other.tree, moved, 0.0, most)
+
+    def _parts_far(self, edges: Ints, begins: Floats, ends: Floats, most: float) -> Floats:
+        """Greatest distances (n,) on parts of edges (n,), from share to share."""
+        corners = self._points[self._edges[edges]]
+        shares = begins[:, None] + PLACES * (ends - begins)[:, None]
+        places = corners[:, :1] + shares[..., None] * (corners[:, 1:] - corners[:, :1])
+        far = self._far(places.reshape(-1, 3), most)
+        return np.asarray(far.reshape(-1, len(PLACES)).max(axis=1))
+
+    def _extend(self, piece_far: Floats, pieces: Ints, asked: Ints, most: float) -> None:
+        """Measure points of the pieces asked for, in place, until each is far enough or all are."""
+        order = np.argsort(pieces, kind="stable")
+        starts = np.searchsorted(pieces[order], asked)
+        ends = np.searchsorted(pieces[order], asked, side="right")
+        for number, start, end in zip(asked.tolist(), starts.tolist(), ends.tolist(), strict=True):
+            for at in range(start, end, CHUNK):
+                if piece_far[number] >= most:
+                    break
+                points = self._points[order[at : min(at + CHUNK, end)]]
+                piece_far[number] = max(piece_far[number], float(self._far(points, most).max()))
+
+
+def _beyond(piece: Ints, piece_far: Floats, owner: Ints, before: Ints) -> Floats:
+    """Lesser of the farthest pieces (P,) on both sides of each place along its edge.
+
+    Zero where both are one piece. piece, owner (Q,) : of each part; before (P,) : the part before
+    each place.
+    """
+    best = np.stack([np.arange(len(piece)), np.arange(len(piece))])  # to the left, to the right
+    for side, step in ((0, 1), (1, -1)):
+        order = range(1, len(piece)) if step == 1 else range(len(piece) - 2, -1, -1)
+        for k in order:
+            last = k - step
+            if owner[last] == owner[k]:
+                known = best[side, last]
+                if piece_far[piece[known]] >= piece_far[piece[k]]:
+                    best[side, k] = known
+    left, right = piece[best[0, before]], piece[best[1, before + 1]]
+    return np.where(left == right, 0.0, np.minimum(piece_far[left], piece_far[right]))

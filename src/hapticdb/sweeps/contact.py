@@ -22,8 +22,8 @@ class Followed(NamedTuple):
     deepest: float
     allowed: float
     until: float
-    is_apart: bool
-    refused: tuple[float, Cut] | None
+    is_apart: bool = False
+    refused: tuple[float, Cut] | None = None
 
     def is_sliding(self, contact: float) -> bool:
         """Whether the tool moves on while it touches."""
@@ -43,7 +43,7 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
     while True:
         gap = float(pair.measure(np.array([way]), np.array([2.0 * contact])).at_least[0])
         if gap > contact and way > 0.0:
-            return Followed(start, deepest, allowed, way, True, None)
+            return Followed(start, deepest, allowed, way, is_apart=True)
         found = Cut(0.0, np.zeros(3))
         if gap <= 0.0:
             found = cut(object_mesh, tool_mesh, pair.way.at([way])[0], most)
@@ -53,7 +53,7 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
             most = allowed + contact
         deepest = max(deepest, found.depth)
         if found.depth > allowed - 0.5 * contact:
-            return Followed(start, deepest, allowed, way, False, (way, found))
+            return Followed(start, deepest, allowed, way, refused=(way, found))
         if way >= pair.way.length:
-            return Followed(start, deepest, allowed, way, False, None)
+            return Followed(start, deepest, allowed, way)
         way = min(way + gap + contact, pair.way.length)

@@ -1,19 +1,19 @@
 """How deep two surfaces overlap, open or closed: what gets through, and how far.
 
-Where a surface goes through another one, the other parts it into pieces. A piece that gets less
-than some metres away from the other surface is pushed through by less than that, on whichever side
-it is: a peg's end in a wall, the patch of a wall in a peg. So where surfaces cross, one gets through
-the other by the lesser of the greatest distances of its two pieces there. Along one curve on which
-two surfaces cross, the cut is the lesser of what either gets through the other: an edge that is
-stuck through a sheet by little cuts by little, though it parts the sheet. The cut of the surfaces
-is the greatest of all curves. No inside is needed.
+Where a surface goes through another one, the other parts it into pieces. A piece that stays within
+some metres of the other surface is pushed through by no more than that, on whichever side it is: a
+peg's end in a wall, the patch of a wall in a peg. So where surfaces cross, one gets through the
+other by the lesser of the greatest distances of its two pieces there. Along one curve on which two
+surfaces cross, the cut is the lesser of what either gets through the other: an edge that is stuck
+through a sheet by little cuts by little, though it parts the sheet. The cut of the surfaces is the
+greatest of all curves. No inside is needed.
 
 Pieces are told by edges: those of the mesh, and in each triangle that is gone through, edges from
-there to its corners, so that the inside of a large triangle is seen, too. An edge is parted where it
-goes through the other surface. What is connected by edges without such a place is one piece. Where
-both sides of a place are one piece, as where a sheet is stuck on the border of another, the parts
-of the edge itself count. Beyond a thin piece the next one counts, so that a plate is gone through
-though its inside is near both of its faces.
+there to its corners, so that the inside of a large triangle is seen, too. An edge is parted where
+it goes through the other surface. What is connected by edges without such a place is one piece.
+Where both sides of a place are one piece, as where a sheet is stuck on the border of another, the
+parts of the edge itself count. Beyond a thin piece the next one counts, so that a plate is gone
+through though its inside is near both of its faces.
 
 What this does not see: pieces that lie wholly inside one triangle beside the edges drawn;
 connections of meshes whose triangles do not share corners, whose pieces count as smaller than they
@@ -214,7 +214,10 @@ class _Parted:
         n_cuts = np.diff(np.append(first, len(self.shares)))
         # an edge of n places has n + 1 parts; part k of all is before place k - (edges before it)
         starts = np.concatenate([[0], np.cumsum(n_cuts + 1)])
-        begins, ends = np.insert(self.shares, first, 0.0), np.insert(self.shares, first + n_cuts, 1.0)
+        begins, ends = (
+            np.insert(self.shares, first, 0.0),
+            np.insert(self.shares, first + n_cuts, 1.0),
+        )
         owner = np.repeat(np.arange(len(cut_edges)), n_cuts + 1)
         far = self._parts_far(cut_edges[owner], begins, ends, most)
         is_end = np.zeros((2, len(owner)), dtype=bool)

@@ -33,9 +33,8 @@ class OverTimeError(Exception):
 
 
 class Least(NamedTuple):
-    """Bounds of a least distance, metres, and the way of its place with the places found there."""
+    """A distance, metres, the way where it is found, and the places (3,) that are so near there."""
 
-    at_least: float
     at_most: float
     way: float
     on_object: Floats
@@ -46,12 +45,16 @@ class Pair:
     """The tool and one object along a path.
 
     tree, tool : triangles of the object, world frame, and of the tool; way : the path; until : time
-    of `time.monotonic` at which it ends by OverTimeError.
+    of `time.monotonic` at which it ends by OverTimeError; radius : of a ball whose middle is the
+    tool, metres.
     """
 
-    def __init__(self, tree: TriangleTree, tool: TriangleTree, way: Way, until: float) -> None:
+    def __init__(
+        self, tree: TriangleTree, tool: TriangleTree, way: Way, until: float, radius: float = 0.0
+    ) -> None:
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
         self.looks = 0
+        self._radius = radius
 
     def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
         """Measure at ways (n,); farthest (n,), enough : as for `kernels.triangles.nearest`."""
@@ -59,16 +62,25 @@ class Pair:
         for at in range(0, max(len(ways), 1), AT_ONCE):
             some = slice(at, at + AT_ONCE)
             poses = self.way.at(ways[some])
-            found.append(nearest(self.tree, self.tool, poses, farthest[some], enough=enough))
+            found.append(
+                nearest(
+                    self.tree,
+                    self.tool,
+                    poses,
+                    farthest[some] + self._radius,
+                    enough=enough + self._radius,
+                )
+            )
             self.looks += len(poses)
             if time.monotonic() > self.until:
                 raise OverTimeError
-        return Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        near = Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        return near if self._radius == 0.0 else _of_ball(near, self._radius)
 
-    def least(self, lows: Floats, highs: Floats, best: float) -> Least | None:
+    def least(self, lows: Floats, highs: Floats, best: float) -> tuple[Least | None, float]:
         """Least distance on stretches of the path (n,), if it is less than `best`; else None.
 
-        Ends as soon as the surfaces have met.
+        Returns what is proved of the stretches, too. Ends as soon as the surfaces have met.
         """
         found: Least | None = None
         closed = best
@@ -78,38 +90,43 @@ class Pair:
             n = int(np.argmin(near.at_most))
             if near.at_most[n] < best:
                 best = float(near.at_most[n])
-                found = Least(0.0, best, float(middles[n]), near.on_a[n], near.on_b[n])
+                found = Least(best, float(middles[n]), near.on_a[n], near.on_b[n])
             if best <= MEETING:
-                return found
+                return found, 0.0
             bounds = near.at_least - halves
             is_open = bounds < best - error_of(best)
             closed = min(closed, float(bounds[~is_open].min(initial=np.inf)))
             lows, highs = halved(lows, highs, is_open)
-        return None if found is None else found._replace(at_least=max(min(closed, best), 0.0))
+        return found, max(min(closed, best), 0.0)
 
-    def first(self, lows: Floats, highs: Floats, known: float) -> Least:
-        """Where on stretches of the path (n,) the surfaces meet first; known : a way where they do.
+    def first(self, lows: Floats, highs: Floats, known: Least) -> Least:
+        """Where on stretches of the path (n,) the surfaces meet first; known : where they do.
 
         Before it they keep half of `MEETING` apart.
         """
-        found = self._at(known)
+        found = known
         while len(lows):
             middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
             near = self.measure(middles, MEETING + halves, 0.0)
             met = np.flatnonzero((near.at_most <= MEETING) & (middles < found.way))
             if len(met):
                 n = int(met[np.argmin(middles[met])])
-                found = Least(
-                    0.0, float(near.at_most[n]), float(middles[n]), near.on_a[n], near.on_b[n]
-                )
+                found = Least(float(near.at_most[n]), float(middles[n]), near.on_a[n], near.on_b[n])
             is_open = (near.at_least - halves < 0.5 * MEETING) & (lows < found.way)
             is_open &= halves > 0.25 * MEETING
             lows, highs = halved(lows, highs, is_open)
         return found
 
-    def _at(self, way: float) -> Least:
-        near = self.measure(np.array([way]), np.array([2.0 * MEETING]))
-        return Least(0.0, float(near.at_most[0]), way, near.on_a[0], near.on_b[0])
+
+def _of_ball(near: Nearest, radius: float) -> Nearest:
+    """Distances of a ball's surface from those of its middle."""
+    away = near.on_a - near.on_b
+    away *= (np.minimum(radius, near.at_most) / np.maximum(near.at_most, 1e-300))[:, None]
+    return near._replace(
+        at_least=np.maximum(near.at_least - radius, 0.0),
+        at_most=np.maximum(near.at_most - radius, 0.0),
+        on_b=near.on_b + away,
+    )
 
 
 def error_of(distance: float) -> float:

@@ -76,8 +76,8 @@ class Swept:
     Attributes
     ----------
     path : Way
-        The poses given, and the motion between them: `path.at(fractions * path.length)` gives poses,
-        and no place of the tool moves more than `path.length` metres.
+        The poses given, and the motion between them: `path.at(fractions * path.length)` gives
+        poses, and no place of the tool moves more than `path.length` metres.
     gap : Gap
         Of all objects while they do not touch; 0 if anything is hit.
     hits : tuple of Place

@@ -4,8 +4,8 @@ The objects' boxes say which of them may be near the path, never too few. Their 
 """
 
 import time
+from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import dataclass, field
 from typing import NamedTuple
 
 import numpy as np
@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
-from hapticdb.pointshell.coverage import Interior
+from hapticdb.mesh import Part
+from hapticdb.pointshell.coverage import Ball, Interior
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
@@ -22,9 +24,9 @@ from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import Followed, follow
 from hapticdb.sweeps.cut import Mesh
-from hapticdb.sweeps.gap import MEETING, Least, OverTimeError, Pair, error_of
-from hapticdb.sweeps.near import Near, boxes_along
+from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
 from hapticdb.sweeps.result import Gap, Place, Profile, Swept, Touching
+from hapticdb.sweeps.stretches import Stretches
 from hapticdb.sweeps.way import Way
 
 CONTACT = 5e-5
@@ -33,3 +35,281 @@ WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
 
 Floats = NDArray[np.float64]
+SweepCallback = Callable[[int, int], None]
+"""Called with how much is done and the total: of objects, or of straight pulls."""
+
+
+def sweep(
+    env: Environment,
+    shell: PointShell,
+    poses: ArrayLike,
+    *,
+    where: Words = (),
+    exclude: Words = (),
+    contact: float = CONTACT,
+    about: ArrayLike | None = None,
+    limit: float | None = None,
+    seconds: float | None = None,
+    profile: bool = False,
+    proportions: Proportions | None = None,
+    progress: SweepCallback | None = None,
+) -> Swept:
+    """Move a tool along a path; say what it hits and where, or how near it comes.
+
+    Parameters
+    ----------
+    env : Environment
+        With the surfaces of its objects. The sweep reads one revision of it.
+    shell : PointShell
+        The tool. Its surface is what moves; its points do not matter.
+    poses : (M, 4, 4) array
+        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `Way`.
+    where, exclude : iterable of int or str
+        What can be met: the objects that `where` chooses, all if it is empty, without those of
+        `exclude`. A part that is taken out must not hit itself. Words as for `Environment.find`.
+    contact : float
+        Metres. Objects so near at the first pose may touch, and overlap by so much more than
+        there; once they are so far apart, they may not touch again.
+    about : (3,) array or None
+        The tool's point that moves straight and that turns are about, tool frame, metres; the
+        middle of the tool's box unless given.
+    limit : float or None
+        Greatest distance that is told, metres; unlimited unless given.
+    seconds : float or None
+        Time after which the sweep ends undecided; unlimited unless given.
+    profile : bool
+        Compute the distance along the path, too.
+    proportions : Proportions or None
+        Of the same tool, path and scene, with their units; compared here in metres unless given.
+    progress : callable or None
+        Called with the number of objects decided, and of all near the path.
+
+    Raises
+    ------
+    UsageError
+        If a pose is not rigid, a number is out of range, or the tool has no surface.
+    ObjectNotFoundError
+        If a word of `where` or `exclude` chooses no object.
+    NoSurfaceError
+        If an object's surface is not in the database.
+    """
+    asked = _Asked(contact, np.inf if limit is None else limit, profile, progress)
+    if not (0.0 < contact < np.inf and asked.limit > 0.0):
+        raise UsageError(f"contact {contact} m, limit {limit} m: give lengths above 0")
+    if seconds is not None and not seconds > 0.0:
+        raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
+    tool = _Tool.of(shell)
+    middle = 0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0))
+    center = middle if about is None else np.asarray(about, dtype=np.float64)
+    if center.shape != (3,) or not np.isfinite(center).all():
+        raise UsageError(f"a centre of turns {about}: give three lengths, metres")
+    way = Way.of(poses, tool.corners, center)
+    until = np.inf if seconds is None else time.monotonic() + seconds
+    if proportions is None:
+        proportions = compare_proportions(
+            env.felt(where, exclude), env.grid.voxel_size, shell, poses
+        )
+    with suppress(ConnectionLostError):
+        return _Sweep(env, tool, way, asked, until).swept(where, exclude, proportions)
+    return _Sweep(env, tool, way, asked, until).swept(where, exclude, proportions)
+
+
+class _Asked(NamedTuple):
+    """What is asked, as for `sweep`."""
+
+    contact: float
+    limit: float
+    profile: bool
+    progress: SweepCallback | None
+
+
+class _Tool:
+    """The surface that moves.
+
+    tree : its triangles, or the middle of a ball; corners (V, 3); radius : of a ball, else 0.
+    """
+
+    def __init__(self, surface: Surface | Ball) -> None:
+        self.surface = surface
+        if isinstance(surface, Ball):
+            self.radius, triangles = surface.radius, np.zeros((1, 3, 3))
+            self.corners = surface.radius * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        else:
+            self.radius, triangles = 0.0, surface.triangles
+            self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
+        self.tree = _tree_of(triangles)
+        self.mesh = Mesh(self.tree)
+
+    @classmethod
+    def of(cls, shell: PointShell) -> "_Tool":
+        """Surface of a shell; UsageError if it has none."""
+        if shell.surface is None:
+            raise UsageError("the tool has points but no surface: give its mesh, not a saved shell")
+        return cls(shell.surface)
+
+
+class _Sweep:
+    """State of one sweep."""
+
+    def __init__(
+        self, env: Environment, tool: _Tool, way: Way, asked: _Asked, until: float
+    ) -> None:
+        self._env, self._tool, self._way, self._asked, self._until = env, tool, way, asked, until
+        self._looks = 0
+        self._best = asked.limit
+        self._closed = asked.limit  # proved where nothing nearer was looked for
+        self._nearest: Place | None = None
+        self._hits: list[Place] = []
+        self._touching: list[Touching] = []
+        self._enclosed: list[Object] = []
+        self._fractions = np.linspace(0.0, 1.0, WINDOWS)
+        self._gaps = np.full(WINDOWS, asked.limit)
+
+    def swept(self, where: Words, exclude: Words, proportions: Proportions) -> Swept:
+        """Sweep, in one snapshot."""
+        began, is_stopped = time.monotonic(), False
+        with self._env.store.snapshot():
+            revision = self._env.store.revision()
+            objects = self._env.felt(where, exclude)
+            stretches = Stretches(self._way, self._tool.corners, objects)
+            try:
+                near = self._decide(objects, stretches)
+            except OverTimeError:
+                near, is_stopped = len(objects), True
+        hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
+        gap = Gap(max(min(self._closed, self._best), 0.0), self._best, self._nearest)
+        if hits or self._enclosed:
+            gap = Gap(0.0, 0.0, hits[0] if hits else None)
+        elif is_stopped:
+            gap = gap._replace(at_least=0.0)
+        return Swept(
+            path=self._way, gap=gap, hits=hits, touching=tuple(self._touching),
+            enclosed=tuple(self._enclosed), contact=self._asked.contact, objects=near,
+            looks=self._looks, revision=revision, elapsed=time.monotonic() - began,
+            proportions=proportions, is_stopped=is_stopped,
+            profile=Profile(self._fractions, self._gaps) if self._asked.profile else None,
+        )  # fmt: skip
+
+    def _decide(self, objects: list[Object], stretches: Stretches) -> int:
+        """Look at objects, the nearest boxes first; returns how many were looked at."""
+        order = np.argsort(stretches.least, kind="stable")
+        n_near = int((stretches.least < self._asked.limit).sum())
+        for n, i in enumerate(order.tolist()):
+            least = float(stretches.least[i])
+            if least >= self._wanted() and not self._is_profiled(least):
+                self._closed = min(self._closed, least)
+                return n
+            ((obj, part),) = parts_of(self._env.store, [objects[i]])
+            self._look_at(obj, part, stretches.gaps[i], stretches)
+            if self._asked.progress is not None:
+                self._asked.progress(n + 1, n_near)
+        return len(objects)
+
+    def _wanted(self) -> float:
+        """Distance below which something changes the result."""
+        if self._hits or self._enclosed:
+            return 2.0 * MEETING
+        return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
+
+    def _is_profiled(self, least: float) -> bool:
+        return self._asked.profile and least < float(self._gaps.max())
+
+    def _look_at(self, obj: Object, part: Part, gaps: Floats, stretches: Stretches) -> None:
+        """Decide about one object; gaps (W,) : of its box from the tool's on each stretch."""
+        triangles = _corners_of(part, obj)
+        pair = Pair(_tree_of(triangles), self._tool.tree, self._way, self._until, self._tool.radius)
+        try:
+            start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
+            begin = 0.0
+            if start <= self._asked.contact and not part.is_cloud:
+                begin = self._follow(obj, pair)
+            elif self._holds(triangles, obj, gaps):
+                self._enclosed.append(obj)
+            if begin < self._way.length or start > self._asked.contact or part.is_cloud:
+                self._measure(obj, pair, gaps, stretches, begin)
+        finally:
+            self._looks += pair.looks
+
+    def _follow(self, obj: Object, pair: Pair) -> float:
+        """Follow a contact; returns the way from which on the object counts as any other."""
+        contact = self._asked.contact
+        found = follow(pair, contact, Mesh(pair.tree), self._tool.mesh)
+        refused = None
+        if found.refused is not None:
+            way, cut = found.refused
+            refused = self._place(obj, way, cut.place, cut.place)
+            self._hits.append(refused)
+        self._touching.append(_told(obj, found, self._way, contact, refused))
+        return found.until if found.is_apart else self._way.length
+
+    def _measure(
+        self, obj: Object, pair: Pair, gaps: Floats, stretches: Stretches, begin: float
+    ) -> None:
+        """Find where an object is met first from a way on, or how near it comes."""
+        if self._asked.profile:
+            self._note_profile(pair, begin)
+        wanted = self._wanted()
+        lows, highs = stretches.nearer(gaps, wanted, begin)
+        best = min(self._best, 2.0 * MEETING) if self._hits or self._enclosed else self._best
+        least, closed = pair.least(lows, highs, best)
+        self._closed = min(self._closed, closed, float(gaps[gaps >= wanted].min(initial=np.inf)))
+        if least is None:
+            return
+        if least.at_most <= MEETING:
+            lows, highs = stretches.nearer(gaps, MEETING, begin)
+            first = pair.first(lows, highs, least)
+            self._hits.append(self._place(obj, first.way, first.on_tool, first.on_object))
+            return
+        self._best = least.at_most
+        self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)
+
+    def _note_profile(self, pair: Pair, begin: float) -> None:
+        ways = self._fractions * self._way.length
+        at = np.flatnonzero(ways >= begin)
+        near = pair.measure(ways[at], self._gaps[at])
+        self._gaps[at] = np.minimum(self._gaps[at], near.at_most)
+
+    def _place(self, obj: Object, way: float, on_tool: Floats, on_object: Floats) -> Place:
+        ways = np.array([way])
+        segment = int(self._way.segments(ways)[0])
+        return Place(
+            obj, self._way.fraction(way), segment, self._way.at(ways)[0], on_tool, on_object
+        )
+
+    def _holds(self, triangles: Floats, obj: Object, gaps: Floats) -> bool:
+        """Whether the object is in a closed body of the tool, or around it, at the start.
+
+        Both are apart there; the first stretch has their boxes one in the other.
+        """
+        if gaps[0] > 0.0:
+            return False
+        pose = self._way.at([0.0])[0]
+        corners = np.unique(triangles.reshape(-1, 3), axis=0)
+        inside = Interior(self._tool.surface)
+        if inside and inside.holds((corners - pose[:3, 3]) @ pose[:3, :3]).any():
+            return True
+        tool = self._tool.corners @ pose[:3, :3].T + pose[:3, 3]
+        if not ((tool >= obj.bounds[0]) & (tool <= obj.bounds[1])).all():
+            return False
+        around = Interior(orient(triangles))
+        return bool(around and around.holds(tool).any())
+
+
+def _told(
+    obj: Object, found: Followed, way: Way, contact: float, refused: Place | None
+) -> Touching:
+    until = way.fraction(found.until) if found.is_apart or refused is not None else 1.0
+    return Touching(
+        obj, found.start, found.deepest, found.allowed, until, found.is_sliding(contact), refused
+    )
+
+
+def _corners_of(part: Part, obj: Object) -> Floats:
+    """Triangles (F, 3, 3) of an object, world frame; those of a cloud are points."""
+    if part.is_cloud:
+        return np.repeat(part.world_points(obj.transform)[:, None], 3, axis=1)
+    return part.triangles(obj.transform)
+
+
+def _tree_of(triangles: Floats) -> TriangleTree:
+    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))

@@ -204,16 +204,13 @@ def nearest(
     farthest: Floats,
     *,
     enough: float = 0.0,
-    first: Ints | None = None,
 ) -> Nearest:
     """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
 
-    farthest (N,): the greatest distance that is looked for; a distance of `enough` or less ends the
-    search at a pose, and is then that of some triangles; first (2,): triangles that are tried first.
+    farthest (N,): the greatest distance that is looked for. A distance of `enough` or less ends the
+    search at a pose, and is then that of some triangles.
     """
     pairs = np.full((len(poses), 2), -1, dtype=np.int64)
-    if first is not None and len(poses):
-        pairs[0] = first
     out = np.zeros((len(poses), 8))
     nearest_kernel(
         a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out

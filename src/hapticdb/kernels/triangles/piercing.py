@@ -20,7 +20,7 @@ def piercing_kernel(edges, tree, pose, where, shares):
     """Find where edges (E, 2, 3), moved by a pose (4, 4) into the tree's frame, go through it.
 
     where (P, 2): edge and triangle of the tree; shares (P,): share of the edge. Returns how many
-    there are, which may be more than P. An edge that lies in a triangle's plane does not go through.
+    there are, which may be more than P. An edge in a triangle's plane does not go through it.
     """
     waiting = np.empty(STACK, dtype=np.int64)
     one = np.zeros((1, 3, 3))

@@ -1,21 +1,38 @@
 """Objects that the tool touches where its path starts: followed until they are apart."""
 
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hapticdb.sweeps.cut import Cut, Mesh, cut
+from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.sweeps.cut import NONE, Cut, Mesh, cut
 from hapticdb.sweeps.gap import Pair
+
+Floats = NDArray[np.float64]
 
 SLIDE = 4.0
 """Contact tolerances that the tool moves on while it touches, from which it slides."""
+STEP = 1.5
+"""Contact tolerances of the way between two looks. Larger: fewer looks, and less than `KEPT` would
+be in hand."""
+KEPT = 0.8
+"""Contact tolerances by which a cut must stay below what is allowed: between two looks it is deeper
+by half of `STEP` at most."""
+EASE = 0.2
+"""Contact tolerances by which surfaces are shifted, to see that they only touch."""
+BLOCK = 64
+"""Looks that are measured together."""
+PATIENCE = 16
+"""Looks without shifts, after none of them freed the surfaces."""
 
 
 class Followed(NamedTuple):
     """How a contact goes on: as `result.Touching`, with ways in metres.
 
-    until : way at which they are apart, the path's length if they never are; refused : way and cut
-    where they overlap by more than is allowed, or None.
+    until : way at which they are apart, or where it ends; is_apart : whether they are apart there;
+    refused : way and cut where they overlap by more than is allowed, or None.
     """
 
     start: float
@@ -33,27 +50,66 @@ class Followed(NamedTuple):
 def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Followed:
     """Follow a contact from the start of the path, where the surfaces are within `contact` metres.
 
-    A cut may grow to the greater one of the start's and `contact`, and by `contact` more. It is
-    measured every `contact` metres of the way while surfaces cross, and a depth changes by half of
-    that in between: so half of `contact` is kept in hand.
+    A cut may grow to the greater one of the start's and `contact`, and by `contact` more.
     """
-    most = np.inf
-    way, start, deepest = 0.0, 0.0, 0.0
-    allowed = 2.0 * contact
-    while True:
-        gap = float(pair.measure(np.array([way]), np.array([2.0 * contact])).at_least[0])
-        if gap > contact and way > 0.0:
-            return Followed(start, deepest, allowed, way, is_apart=True)
-        found = Cut(0.0, np.zeros(3))
-        if gap <= 0.0:
-            found = cut(object_mesh, tool_mesh, pair.way.at([way])[0], most)
-        if way == 0.0:
-            start = found.depth
-            allowed = max(start, contact) + contact
-            most = allowed + contact
-        deepest = max(deepest, found.depth)
-        if found.depth > allowed - 0.5 * contact:
-            return Followed(start, deepest, allowed, way, refused=(way, found))
-        if way >= pair.way.length:
-            return Followed(start, deepest, allowed, way)
-        way = min(way + gap + contact, pair.way.length)
+    depths = _Depths(pair, contact, object_mesh, tool_mesh)
+    start = depths.cut(pair.way.at([0.0])[0], np.inf).depth
+    allowed = max(start, contact) + contact
+    deepest, way, length = start, 0.0, pair.way.length
+    while way < length:
+        ways = np.minimum(way + STEP * contact * np.arange(1, BLOCK + 1), length)
+        ways = ways[: int(np.searchsorted(ways, length)) + 1]
+        gaps = pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
+        for way, gap, pose in zip(ways.tolist(), gaps.tolist(), pair.way.at(ways), strict=True):
+            if gap > contact:
+                return Followed(start, deepest, allowed, way, is_apart=True)
+            found = depths.of(pose, allowed + contact) if gap <= 0.0 else NONE
+            deepest = max(deepest, found.depth)
+            if found.depth > allowed - KEPT * contact:
+                return Followed(start, deepest, allowed, way, refused=(way, found))
+    return Followed(start, deepest, allowed, length)
+
+
+class _Depths:
+    """How deep the surfaces overlap at poses, or a bound of it."""
+
+    def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
+        self._pair, self._object, self._tool = pair, object_mesh, tool_mesh
+        self._ease = EASE * contact
+        ways = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
+        self._shifts = self._ease * ways / np.linalg.norm(ways, axis=1)[:, None]
+        self._known = 0
+        self._resting = 0
+
+    def of(self, pose: Floats, most: float) -> Cut:
+        """Cut at a pose, up to `most` metres.
+
+        Surfaces that a shift by `ease` frees overlap by that much at most, which is told then.
+        """
+        if self._is_freed(pose):
+            return Cut(self._ease, pose[:3, 3])
+        return self.cut(pose, most)
+
+    def _is_freed(self, pose: Floats) -> bool:
+        """Whether a small shift frees the surfaces; the last one that did is tried first."""
+        if self._resting:
+            self._resting -= 1
+            return False
+        order = [self._known, *(n for n in range(len(self._shifts)) if n != self._known)]
+        for some in (order[:1], order[1:]):
+            poses = np.tile(pose, (len(some), 1, 1))
+            poses[:, :3, 3] += self._shifts[some]
+            apart = nearest(
+                self._pair.tree, self._pair.tool, poses, np.full(len(some), self._ease)
+            ).at_least
+            self._pair.looks += len(some)
+            free = np.flatnonzero(apart > 0.0)
+            if len(free):
+                self._known = some[int(free[0])]
+                return True
+        self._resting = PATIENCE
+        return False
+
+    def cut(self, pose: Floats, most: float) -> Cut:
+        """Cut at a pose, up to `most` metres."""
+        return cut(self._object, self._tool, pose, most)

@@ -22,6 +22,8 @@ KEPT = 0.8
 by half of `STEP` at most."""
 EASE = 0.2
 """Contact tolerances by which surfaces are shifted, to see that they only touch."""
+SHIFT = 0.05
+"""Contact tolerances by which surfaces are shifted, to measure how deep they overlap."""
 BLOCK = 64
 """Looks that are measured together."""
 PATIENCE = 16
@@ -53,7 +55,7 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
     A cut may grow to the greater one of the start's and `contact`, and by `contact` more.
     """
     depths = _Depths(pair, contact, object_mesh, tool_mesh)
-    start = depths.cut(pair.way.at([0.0])[0], np.inf).depth
+    start = depths.cut(pair.way.at([0.0])[0], np.inf, contact).depth
     allowed = max(start, contact) + contact
     deepest, way, length = start, 0.0, pair.way.length
     while way < length:
@@ -63,7 +65,7 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
         for way, gap, pose in zip(ways.tolist(), gaps.tolist(), pair.way.at(ways), strict=True):
             if gap > contact:
                 return Followed(start, deepest, allowed, way, is_apart=True)
-            found = depths.of(pose, allowed + contact) if gap <= 0.0 else NONE
+            found = depths.of(pose, allowed) if gap <= 0.0 else NONE
             deepest = max(deepest, found.depth)
             if found.depth > allowed - KEPT * contact:
                 return Followed(start, deepest, allowed, way, refused=(way, found))
@@ -75,20 +77,20 @@ class _Depths:
 
     def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
         self._pair, self._object, self._tool = pair, object_mesh, tool_mesh
-        self._ease = EASE * contact
+        self._contact, self._ease = contact, EASE * contact
         ways = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
         self._shifts = self._ease * ways / np.linalg.norm(ways, axis=1)[:, None]
         self._known = 0
         self._resting = 0
 
-    def of(self, pose: Floats, most: float) -> Cut:
-        """Cut at a pose, up to `most` metres.
+    def of(self, pose: Floats, allowed: float) -> Cut:
+        """Cut at a pose, little more than is allowed if it is more.
 
         Surfaces that a shift by `ease` frees overlap by that much at most, which is told then.
         """
         if self._is_freed(pose):
             return Cut(self._ease, pose[:3, 3])
-        return self.cut(pose, most)
+        return self.cut(pose, allowed + self._contact, allowed - KEPT * self._contact)
 
     def _is_freed(self, pose: Floats) -> bool:
         """Whether a small shift frees the surfaces; the last one that did is tried first."""
@@ -110,6 +112,6 @@ class _Depths:
         self._resting = PATIENCE
         return False
 
-    def cut(self, pose: Floats, most: float) -> Cut:
-        """Cut at a pose, up to `most` metres."""
-        return cut(self._object, self._tool, pose, most)
+    def cut(self, pose: Floats, most: float, enough: float) -> Cut:
+        """Cut at a pose, up to `most` metres; `enough` ends its search."""
+        return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough)

@@ -1,0 +1,132 @@
+"""Paths of boxes, against the exact distance of boxes: no false clear, no false hit, true gaps."""
+
+import time
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
+
+from draws import drawn
+from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
+from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
+from hapticdb.sweeps.way import Way
+from moving_boxes import Boxes, distances, mesh
+from naive_motion import poses_at
+
+Floats = NDArray[np.float64]
+
+KINDS = {"rod": (0.4, 0.4, 8.0), "plate": (0.3, 6.0, 9.0), "cube": (3.0, 3.0, 3.0)}
+"""Half edges, cm."""
+PLACES = 400
+"""Places of a path at which the oracle looks."""
+
+
+def random_boxes(rng: np.random.Generator, spread: float) -> Boxes:
+    pose = np.eye(4)
+    if rng.random() < 0.7:  # others lie along the axes, as most parts do
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+    pose[:3, 3] = rng.uniform(-spread, spread, 3)
+    kind = list(KINDS.values())[rng.integers(len(KINDS))]
+    return Boxes(pose[None], 0.01 * rng.permutation(kind)[None] * rng.uniform(0.6, 1.5))
+
+
+def tree_of(boxes: Boxes) -> TriangleTree:
+    triangles = np.array(mesh(boxes.halves[0]).triangles)
+    pose = boxes.poses[0]
+    triangles = triangles @ pose[:3, :3].T + pose[:3, 3]
+    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
+
+
+def random_path(rng: np.random.Generator) -> Floats:
+    poses = []
+    for _ in range(int(rng.integers(2, 5))):
+        pose = np.eye(4)
+        if poses and rng.random() < 0.3:
+            pose[:3, :3] = poses[-1][:3, :3]
+        else:
+            pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        pose[:3, 3] = rng.uniform(-0.25, 0.25, 3)
+        poses.append(pose)
+    return np.array(poses)
+
+
+def check_a_path(rng: np.random.Generator) -> str:
+    """Sweep a box past another; returns what was told."""
+    still, tool = random_boxes(rng, 0.05), random_boxes(rng, 0.0)._replace(poses=np.eye(4)[None])
+    poses, center = random_path(rng), rng.uniform(-0.02, 0.02, 3)
+    way = Way.of(poses, tool.corners()[0], center)
+    pair = Pair(tree_of(still), tree_of(tool), way, np.inf)
+    whole = np.zeros(1), np.array([way.length])
+    found, closed = pair.least(*whole, np.inf)
+    assert found is not None
+    times = np.linspace(0.0, len(poses) - 1.0, PLACES)
+    placed = Boxes(poses_at(poses, center, times), np.repeat(tool.halves, PLACES, axis=0))
+    others = Boxes(np.repeat(still.poses, PLACES, axis=0), np.repeat(still.halves, PLACES, axis=0))
+    exact, _ = distances(others, placed)
+    here = Boxes(way.at([found.way]), tool.halves)
+    at_place = float(distances(still, here)[0][0])
+    assert at_place == pytest.approx(found.at_most, abs=1e-9)
+    if found.at_most <= MEETING:
+        first = pair.first(*whole, found)
+        where = Boxes(way.at([first.way]), tool.halves)
+        assert distances(still, where)[0][0] <= MEETING + 1e-9
+        if first.way > MEETING:
+            before = way.at(np.linspace(0.0, first.way - MEETING, PLACES))
+            earlier = distances(others, Boxes(before, placed.halves))[0]
+            assert earlier.min() >= 0.5 * MEETING - 1e-9
+        return "hits"
+    assert closed - 1e-9 <= exact.min()
+    assert found.at_most - closed <= error_of(found.at_most) + 1e-12
+    return "clear"
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_random_paths_of_boxes_are_told_as_they_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    told = [check_a_path(rng) for _ in range(20)]
+    assert min(told.count("hits"), told.count("clear")) >= 2
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("seed", drawn(range(100, 120), 2))
+def test_a_thousand_random_paths_are_told_as_they_are(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    told = [check_a_path(rng) for _ in range(50)]
+    assert min(told.count("hits"), told.count("clear")) >= 5
+
+
+@pytest.mark.parametrize("gap", [5e-5, 4e-4, 8e-3])
+def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
+    still = Boxes(np.eye(4)[None], np.array([[0.3, 0.05, 0.02]]))
+    tool = Boxes(np.eye(4)[None], np.array([[0.02, 0.02, 0.02]]))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = [[-0.2, 0.0, 0.04 + gap], [0.2, 0.01, 0.04 + gap]]
+    way = Way.of(poses, tool.corners()[0], np.zeros(3))
+    pair = Pair(tree_of(still), tree_of(tool), way, np.inf)
+    found, closed = pair.least(np.zeros(1), np.array([way.length]), np.inf)
+    assert found is not None
+    assert found.at_most == pytest.approx(gap, rel=1e-9)
+    assert gap - error_of(gap) - 1e-12 <= closed <= gap
+
+
+def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
+    still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
+    poses = np.tile(np.eye(4), (2, 1, 1))
+    poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
+    way = Way.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
+    point = triangle_tree(np.zeros((1, 3, 3)), np.zeros(1, dtype=np.int64))
+    pair = Pair(tree_of(still), point, way, np.inf, radius=0.03)
+    found, _ = pair.least(np.zeros(1), np.array([way.length]), np.inf)
+    assert found is not None
+    assert found.at_most == pytest.approx(0.02, rel=0.01)
+    assert np.allclose(found.on_tool, [0.12, 0.02, 0.0], atol=3e-4)
+    assert np.allclose(found.on_object, [0.1, 0.02, 0.0], atol=3e-4)
+
+
+def test_a_limit_of_time_ends_the_search() -> None:
+    still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
+    way = Way.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
+    pair = Pair(tree_of(still), tree_of(still), way, time.monotonic() - 1.0)
+    with pytest.raises(OverTimeError):
+        pair.least(np.zeros(1), np.zeros(1), np.inf)

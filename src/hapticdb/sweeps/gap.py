@@ -56,8 +56,10 @@ class Pair:
         self.looks = 0
         self._radius = radius
 
-    def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
-        """Measure at ways (n,); farthest (n,), enough : as for `kernels.triangles.nearest`."""
+    def measure(
+        self, ways: Floats, farthest: Floats, then: float = np.inf, enough: float = 0.0
+    ) -> Nearest:
+        """Measure at ways (n,); the others are as for `kernels.triangles.nearest`."""
         found = []
         for at in range(0, max(len(ways), 1), AT_ONCE):
             some = slice(at, at + AT_ONCE)
@@ -68,6 +70,7 @@ class Pair:
                     self.tool,
                     poses,
                     farthest[some] + self._radius,
+                    then=then + self._radius,
                     enough=enough + self._radius,
                 )
             )
@@ -86,7 +89,8 @@ class Pair:
         closed = best
         while len(lows):
             middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
-            near = self.measure(middles, best + halves, MEETING)
+            wanted = best - error_of(best) if np.isfinite(best) else best
+            near = self.measure(middles, wanted + halves, best, MEETING)
             n = int(np.argmin(near.at_most))
             if near.at_most[n] < best:
                 best = float(near.at_most[n])
@@ -107,7 +111,7 @@ class Pair:
         found = known
         while len(lows):
             middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
-            near = self.measure(middles, MEETING + halves, 0.0)
+            near = self.measure(middles, MEETING + halves, MEETING)
             met = np.flatnonzero((near.at_most <= MEETING) & (middles < found.way))
             if len(met):
                 n = int(met[np.argmin(middles[met])])
@@ -121,7 +125,7 @@ class Pair:
 def _of_ball(near: Nearest, radius: float) -> Nearest:
     """Distances of a ball's surface from those of its middle."""
     away = near.on_a - near.on_b
-    away *= (np.minimum(radius, near.at_most) / np.maximum(near.at_most, 1e-300))[:, None]
+    away *= np.minimum(radius / np.maximum(near.at_most, 1e-300), 1.0)[:, None]
     return near._replace(
         at_least=np.maximum(near.at_least - radius, 0.0),
         at_most=np.maximum(near.at_most - radius, 0.0),

@@ -22,6 +22,14 @@ WAITING = 256
 """Pairs of nodes that wait to be visited: more than the height of two trees over 2^31 leaves."""
 
 
+FLAT = 1e-3
+"""Least area of a triangle, as twice a share of its longest edge squared, whose plane is asked: the
+normal of a thinner one is not exact enough."""
+PLANE = 1e-12
+"""Greatest error of a distance from a plane, as a share of the largest coordinate: more than the
+rounding of a normal, 2e-16 / `FLAT`, moves what is as far as that."""
+
+
 @leaf
 def place_corners(corners, first, last, pose, out):
     """Write triangles first .. last - 1, moved by a pose (4, 4), into out (.., 3, 3)."""
@@ -88,7 +96,25 @@ def triangle_gap(one, n, other, m):
 
 
 @leaf
-def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
+def plane_gap(one, n, other, m):
+    """How far triangle m keeps from the plane of triangle n, all of it on one side; else 0."""
+    x, y, z = one[n, 0, 0], one[n, 0, 1], one[n, 0, 2]
+    ux, uy, uz = one[n, 1, 0] - x, one[n, 1, 1] - y, one[n, 1, 2] - z
+    vx, vy, vz = one[n, 2, 0] - x, one[n, 2, 1] - y, one[n, 2, 2] - z
+    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = math.sqrt(nx * nx + ny * ny + nz * nz)
+    longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
+    if not length > FLAT * longest:
+        return 0.0
+    low, high = math.inf, -math.inf
+    for i in range(3):
+        off = (other[m, i, 0] - x) * nx + (other[m, i, 1] - y) * ny + (other[m, i, 2] - z) * nz
+        low, high = min(low, off), max(high, off)
+    return max(low, -high, 0.0) / length
+
+
+@leaf
+def _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, out):
     """Measure the triangles of two leaves; notes what is nearer than out[0] from below.
 
     The nearest pair from above has its triangles in pair (2,) and its places in out[2:8].
@@ -99,15 +125,21 @@ def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
     first = (node - a.boxes.shape[0] // 2) * LEAF_SIZE
     for n in range(first, min(first + LEAF_SIZE, a.corners.shape[0])):
         for m in range(begin, end):
-            if triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]:
+            far = out[0] + PLANE * size
+            if (
+                triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]
+                and plane_gap(a.corners, n, placed, m - begin) < far
+                and plane_gap(placed, m - begin, a.corners, n) < far
+            ):
                 below, above = measure_pair(a.corners, n, placed, m - begin, size, found)
-                _keep(below, above, n, m, found, pair, out)
+                _keep(below, above, n, m, then, found, pair, out)
 
 
 @leaf
-def _keep(below, above, n, m, found, pair, out):
+def _keep(below, above, n, m, then, found, pair, out):
     """Note a pair of triangles where it is nearer than what is known."""
-    out[0] = min(out[0], below)
+    if below < out[0]:
+        out[0] = min(below, then)
     if above < out[1]:
         out[1] = above
         pair[0], pair[1] = n, m
@@ -116,13 +148,15 @@ def _keep(below, above, n, m, found, pair, out):
 
 
 @leaf
-def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
+def nearest_pair(a, b, pose, then, enough, nodes, squares, placed, found, pair, out):
     """Find the nearest triangles of tree a and of tree b, moved by a pose (4, 4) into a's frame.
 
     out (8,): bounds of the distance from below and from above, which begin as the greatest distance
-    that is looked for, then the place on each. pair (2,): triangles that are tried first, -1 where
-    none is known; afterwards the nearest ones, or -1. Ends at once where the bound above is
-    `enough` or less. nodes (.., 2), squares, placed, found are scratch.
+    that is looked for and infinity, then the place on each. Once something is nearer than that,
+    only what is nearer than `then` is looked for, and the bound below is `then` at most. pair (2,):
+    triangles that are tried first, -1 where none is known; afterwards the nearest ones, or -1. Ends
+    at once where the bound above is `enough` or less. nodes (.., 2), squares, placed, found are
+    scratch.
     """
     size = largest(a.boxes)
     reach = largest(b.boxes)
@@ -134,7 +168,7 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
     if first >= 0:
         place_corners(b.corners, second, second + 1, pose, placed)
         below, above = measure_pair(a.corners, first, placed, 0, size, found)
-        _keep(below, above, first, second, found, pair, out)
+        _keep(below, above, first, second, then, found, pair, out)
     leaves_a, leaves_b = a.boxes.shape[0] // 2, b.boxes.shape[0] // 2
     nodes[0, 0], nodes[0, 1] = 0, 0
     squares[0] = box_gap(a.boxes, np.int64(0), b.boxes, np.int64(0), pose, slack)
@@ -145,7 +179,7 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
             continue
         node, other = nodes[top, 0], nodes[top, 1]
         if node >= leaves_a and other >= leaves_b:
-            _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out)
+            _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, out)
             continue
         if other >= leaves_b or (
             node < leaves_a and _extent(a.boxes, node) >= _extent(b.boxes, other)
@@ -164,12 +198,12 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
         top += 1
 
 
-@entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, INTS2, FLOATS2)
-def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
+@entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, FLOAT, INTS2, FLOATS2)
+def nearest_kernel(a, b, poses, farthest, then, enough, pairs, out):
     """Find the nearest triangles at poses (N, 4, 4), which lead b into a's frame.
 
-    farthest (N,): the greatest distance that is looked for; pairs (N, 2), out (N, 8): as for
-    `nearest_pair`. The pair of a pose is tried first at the next one that has none.
+    farthest (N,): the greatest distance that is looked for; then, enough, pairs (N, 2), out (N, 8):
+    as for `nearest_pair`. The pair of a pose is tried first at the next one that has none.
     """
     nodes = np.empty((WAITING, 2), dtype=np.int64)
     squares = np.empty(WAITING)
@@ -178,16 +212,16 @@ def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
     for n in range(poses.shape[0]):
         if n and pairs[n, 0] < 0:
             pairs[n, 0], pairs[n, 1] = pairs[n - 1, 0], pairs[n - 1, 1]
-        out[n, 0] = out[n, 1] = farthest[n]
-        nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
+        out[n, 0], out[n, 1] = farthest[n], math.inf
+        nearest_pair(a, b, poses[n], then, enough, nodes, squares, placed, found, pairs[n], out[n])
 
 
 class Nearest(NamedTuple):
     """Distances of two surfaces at N poses, metres, in the frame of the first.
 
-    at_least, at_most (N,): bounds; the greatest distance that was looked for where nothing is
-    nearer; on_a, on_b (N, 3): the nearest places, whose distance is `at_most`; pairs (N, 2):
-    numbers of the triangles in the trees, -1 where nothing is nearer.
+    at_least, at_most (N,): bounds; where nothing is nearer than the greatest distance that was
+    looked for, that distance and infinity; on_a, on_b (N, 3): the nearest places, whose distance is
+    `at_most`; pairs (N, 2): numbers of the triangles in the trees, -1 where nothing is nearer.
     """
 
     at_least: Floats
@@ -203,16 +237,19 @@ def nearest(
     poses: Floats,
     farthest: Floats,
     *,
+    then: float = math.inf,
     enough: float = 0.0,
 ) -> Nearest:
     """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
 
-    farthest (N,): the greatest distance that is looked for. A distance of `enough` or less ends the
-    search at a pose, and is then that of some triangles.
+    farthest (N,): the greatest distance that is looked for. Once something is nearer, only what is
+    nearer than `then` is looked for: `at_least` is `then` at most, and `at_most` some distance if
+    it is more. A distance of `enough` or less ends the search at a pose, and is that of some
+    triangles.
     """
     pairs = np.full((len(poses), 2), -1, dtype=np.int64)
     out = np.zeros((len(poses), 8))
     nearest_kernel(
-        a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out
+        a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), then, enough, pairs, out
     )
     return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)

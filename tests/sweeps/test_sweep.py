@@ -1,46 +1,32 @@
-"""Sweeps of a path, against plain Python: samples, hits, objects, clearance."""
+"""Sweeps in an environment, decided on surfaces: what is hit, touched, left and enclosed."""
 
-import itertools
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pytest
 import trimesh
-from hypothesis import HealthCheck, given, settings
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb import Environment, Grid, PointShell
-from hapticdb.errors import GeometryChangedError, ObjectNotFoundError, UsageError
-from hapticdb.pointshell.shell import fibonacci_sphere
+from hapticdb import Environment, PointShell
+from hapticdb.errors import NoSurfaceError, ObjectNotFoundError, UsageError
 from hapticdb.poses import rotation_of
-from hapticdb.resident.table import LEAST_BUDGET, slots_within
-from hapticdb.store.base import Layout
-from hapticdb.sweeps import run as sweeping
-from hapticdb.sweeps.path import SweepPath
+from hapticdb.sweeps.gap import MEETING
 from hapticdb.sweeps.result import Swept
-from hapticdb.sweeps.run import sweep
+from hapticdb.sweeps.run import CONTACT, sweep
 from hapticdb.testing import write_voxels
-from naive_frame import NaiveTouch, touch
 
 Floats = NDArray[np.float64]
-Voxels = NDArray[np.int64]
 
-SIZE = 0.01
-GRID = Grid(SIZE, (-0.2, 0.1, 0.3), 7)
-MIDDLE = np.array(GRID.origin) + 0.5 * GRID.edge
-KINDS: list[tuple[Layout, str]] = [("brick", "hilbert"), ("voxel", "z")]
-
-numbers = st.floats(-1.0, 1.0, allow_nan=False, width=32)
-triples = st.tuples(numbers, numbers, numbers)
-quadruples = st.tuples(numbers, numbers, numbers, numbers).filter(
-    lambda q: sum(x * x for x in q) > 0.01
-)
-turned = st.tuples(triples, quadruples)
+PARTS = {
+    "plate": ((0.3, 0.3, 0.02), (0.0, 0.0, -0.01)),
+    "wall": ((0.02, 0.3, 0.2), (0.15, 0.0, 0.1)),
+    "shelf": ((0.1, 0.1, 0.01), (-0.1, 0.0, 0.125)),
+}
+"""Boxes: edges and middles, metres. The plate's upper side is at 0, the wall's side at x 0.14."""
+CUBE = 0.04
 
 
 def pose_of(place: Any, quaternion: Any = (1, 0, 0, 0)) -> Floats:  # noqa: ANN401 - any triple
@@ -52,291 +38,271 @@ def pose_of(place: Any, quaternion: Any = (1, 0, 0, 0)) -> Floats:  # noqa: ANN4
 
 
 def line(*places: Any) -> Floats:  # noqa: ANN401
-    return np.array([pose_of(MIDDLE + np.asarray(place)) for place in places])
+    return np.array([pose_of(place) for place in places])
 
 
-def ball(n_points: int = 24, radius: float = 0.024) -> PointShell:
-    out = fibonacci_sphere(n_points)
-    return PointShell(out * radius, -out, np.zeros(3))
+def box_at(edges: Any, middle: Any) -> trimesh.Trimesh:  # noqa: ANN401
+    made = trimesh.creation.box(edges)
+    made.apply_translation(middle)
+    return made
 
 
-def block(low: Any, high: Any) -> Voxels:  # noqa: ANN401
-    """Voxels (n, 3) from `low` to `high`, `high` excluded."""
-    axes = [np.arange(a, b) for a, b in zip(low, high, strict=True)]
-    return np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+def imported(folder: Path, parts: dict[str, trimesh.Trimesh], bits: int = 5) -> Environment:
+    folder.mkdir(exist_ok=True)
+    scene = trimesh.Scene()
+    for name, made in parts.items():
+        scene.add_geometry(made, node_name=name, geom_name=name)
+    file = folder / "parts.glb"
+    file.write_bytes(scene.export(file_type="glb"))
+    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=bits), distances=False)
+    hapticdb.import_files(folder / "parts.db", [file], options)
+    return hapticdb.open(folder / "parts.db")
 
 
-# a wall with a hole across the path, a plate above, and a post that shares voxels with the wall
-WALL = np.array(
-    [v for v in block((80, 40, 40), (82, 90, 90)) if not (60 <= v[1] < 68 and 60 <= v[2] < 68)]
-)
-PLATE = block((20, 50, 90), (60, 80, 91))
-POST = block((81, 50, 50), (84, 54, 54))
+def shell_of(made: trimesh.Trimesh) -> PointShell:
+    return PointShell.from_mesh(made.vertices, made.faces)
 
 
-@pytest.fixture(scope="module", params=KINDS, ids="-".join)
-def env(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
-) -> Iterator[Environment]:
-    layout, curve = request.param
-    url = tmp_path_factory.mktemp("swept") / "scene.db"
-    with hapticdb.create(url, replace(GRID, curve=curve), layout=layout) as made:
-        for ijk, name in ((WALL, "wall"), (PLATE, "plate"), (POST, "post")):
-            write_voxels(made.store, ijk, name)
+TOOL = shell_of(trimesh.creation.box((CUBE,) * 3))
+
+
+@pytest.fixture(scope="module")
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    parts = {name: box_at(*placed) for name, placed in PARTS.items()}
+    with imported(tmp_path_factory.mktemp("swept"), parts) as made:
         yield made
 
 
-IDS_IN: dict[tuple[int, int, int], list[int]] = {}
-for number, voxels in enumerate((WALL, PLATE, POST), 1):
-    for i, j, k in voxels.tolist():
-        IDS_IN.setdefault((i, j, k), []).append(number)
+def names(found: Swept) -> list[str]:
+    return [place.object.name for place in found.hits]
 
 
-def naive(shell: PointShell, pose: Floats, exclude: tuple[int, ...] = ()) -> NaiveTouch:
-    points: Any = shell.points.tolist()
-    normals: Any = shell.normals.tolist()
-    center: Any = shell.center.tolist()
-    return touch(
-        IDS_IN, points, normals, center, pose.tolist(), GRID.origin, SIZE, GRID.side,
-        exclude=exclude,
-    )  # fmt: skip
+def test_a_gap_is_told_with_its_places_whatever_the_voxels(tmp_path: Path) -> None:
+    parts = {name: box_at(*placed) for name, placed in PARTS.items()}
+    told = []
+    for bits in (4, 7):
+        with imported(tmp_path / str(bits), parts, bits) as env:
+            found = sweep(env, TOOL, line((-0.05, 0.1, 0.0204), (0.05, 0.1, 0.0204)))
+        assert found.verdict == "clear"
+        assert found.comes_out
+        assert found.gap.at_most == pytest.approx(4e-4, abs=1e-7)
+        assert 4e-4 - 1e-5 <= found.gap.at_least <= 4e-4 + 1e-7
+        place = found.gap.place
+        assert place is not None
+        assert place.object.name == "plate"
+        assert place.on_object[2] == pytest.approx(0.0, abs=1e-6)
+        assert place.on_tool[2] == pytest.approx(4e-4, abs=1e-6)
+        told.append((found.gap.at_least, found.gap.at_most, place.fraction))
+    assert told[0] == told[1]
 
 
-def naive_clearance(shell: PointShell, poses: Floats, exclude: tuple[int, ...] = ()) -> float:
-    """Least distance in metres of any point at any pose to the cube of any occupied voxel."""
-    voxels = [v for v, ids in IDS_IN.items() if set(ids) - set(exclude)]
-    low = np.array(GRID.origin) + SIZE * np.array(voxels, dtype=float)
-    least = np.inf
-    for pose in poses:
-        for point in shell.points @ pose[:3, :3].T + pose[:3, 3]:
-            outside = np.maximum(np.maximum(low - point, point - (low + SIZE)), 0.0)
-            least = min(least, float(np.sqrt((outside**2).sum(axis=1)).min()))
-    return least
+def test_the_first_contact_of_each_object_is_told_in_order(env: Environment) -> None:
+    found = sweep(env, TOOL, line((-0.1, 0.0, 0.06), (-0.1, 0.0, 0.16), (0.2, 0.0, 0.16)))
+    assert found.verdict == "hits"
+    assert names(found) == ["shelf", "wall"]
+    shelf, wall = found.hits
+    # the tool's upper side meets the shelf's lower one after 4 cm of 40
+    assert shelf.fraction == pytest.approx(0.1, abs=2.0 * MEETING / 0.4)
+    assert shelf.segment == 0
+    assert shelf.on_object[2] == pytest.approx(0.12, abs=2.0 * MEETING)
+    assert wall.segment == 1
+    assert wall.pose[0, 3] == pytest.approx(0.12, abs=2.0 * MEETING)
+    assert (found.gap.at_least, found.gap.at_most) == (0.0, 0.0)
 
 
-def samples_of(found: Swept) -> Floats:
-    return found.path.sample(0, found.samples)
+def test_what_is_chosen_can_be_met_and_nothing_else(env: Environment) -> None:
+    path = line((-0.1, 0.0, 0.06), (-0.1, 0.0, 0.16))
+    assert names(sweep(env, TOOL, path)) == ["shelf"]
+    assert sweep(env, TOOL, path, exclude=["shelf"]).verdict == "clear"
+    near = sweep(env, TOOL, path, where=["wall"]).gap.place
+    assert near is not None
+    assert near.object.name == "wall"
+    with pytest.raises(ObjectNotFoundError, match="no object 77"):
+        sweep(env, TOOL, path, exclude=[77])
 
 
-# --- the path ------------------------------------------------------------------------------------
+# --- contact at the start ------------------------------------------------------------------------
+
+SEATED = (0.0, 0.0, 0.5 * CUBE)
 
 
-@settings(max_examples=60, deadline=None)
-@given(
-    poses=st.lists(turned, min_size=1, max_size=4),
-    points=st.lists(triples, min_size=1, max_size=6),
-    offset=triples,
-    size=st.sampled_from([0.05, 0.3, 4.0]),
-)
-def test_no_point_moves_more_than_half_a_voxel_between_samples(
-    poses: list[Any], points: list[Any], offset: tuple[float, ...], size: float
-) -> None:
-    inward = np.tile([0.0, 0.0, 1.0], (len(points), 1))
-    shell = PointShell(np.array(points) + 10.0 * np.array(offset), inward, np.zeros(3))
-    given_poses = np.array([pose_of(*pose) for pose in poses])
-    path = SweepPath.of(given_poses, shell, size)
-    samples = path.sample(0, len(path))
-    placed = np.einsum("nab,pb->npa", samples[:, :3, :3], shell.points) + samples[:, None, :3, 3]
-    moved = np.linalg.norm(np.diff(placed, axis=0), axis=2)
-    assert moved.max(initial=0.0) <= 0.5 * size * (1 + 1e-9)
-    assert np.array_equal(samples[path.starts], given_poses)
-    travels = np.diff(path.travels(0, len(path))) * size
-    assert (moved.max(axis=1, initial=0.0) <= travels + 1e-12).all()
+def test_a_part_lifts_off_what_it_stands_on(env: Environment) -> None:
+    found = sweep(env, TOOL, line(SEATED, (0.0, 0.0, 0.1)))
+    assert found.verdict == "clear"
+    assert found.comes_out
+    (plate,) = found.touching
+    assert plate.object.name == "plate"
+    assert plate.until <= 5.0 * CONTACT / 0.08
+    assert not plate.is_sliding
 
 
-def test_fractions_go_by_the_way_and_not_by_the_number_of_poses() -> None:
-    path = SweepPath.of(line((0, 0, 0), (0.001, 0, 0), (0.101, 0, 0)), ball(), SIZE)
-    assert path.fractions(path.starts) == pytest.approx([0.0, 0.001 / 0.101, 1.0])
-    assert path.segments([0, int(path.starts[1]), len(path) - 1]).tolist() == [0, 1, 1]
+def test_a_part_slides_along_what_it_stands_on(env: Environment) -> None:
+    path = line(SEATED, (0.05, 0.0, 0.5 * CUBE), (0.05, 0.0, 0.1))
+    found = sweep(env, TOOL, path)
+    assert found.verdict == "slides"
+    assert found.comes_out
+    assert found.touching[0].until == pytest.approx(0.05 / 0.13, abs=1e-3)
+    still = sweep(env, TOOL, path[:2])
+    assert still.verdict == "slides"
+    assert still.is_free
+    assert not still.comes_out
 
 
-# --- hits ----------------------------------------------------------------------------------------
-
-PATHS = st.lists(
-    st.tuples(st.tuples(*[st.floats(-0.3, 0.3)] * 3), quadruples), min_size=1, max_size=3
-)
-SLOW = settings(
-    max_examples=6,
-    deadline=None,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
+@pytest.mark.parametrize("deep", [0.02, 0.5])
+def test_a_part_may_not_be_pushed_into_what_it_stands_on(env: Environment, deep: float) -> None:
+    found = sweep(env, TOOL, line(SEATED, (0.0, 0.0, 0.5 * CUBE - deep * CUBE)))
+    assert names(found) == ["plate"]
+    cut = found.touching[0].cut
+    assert cut is not None
+    assert cut.pose[2, 3] == pytest.approx(0.5 * CUBE - 2.0 * CONTACT, abs=2.0 * CONTACT)
 
 
-@SLOW
-@given(poses=PATHS, exclude=st.sampled_from([(), (1,), (2, 3)]))
-def test_hits_contacts_and_objects_are_those_of_every_sample(
-    env: Environment, poses: list[Any], exclude: tuple[int, ...]
-) -> None:
-    shell = ball()
-    given_poses = np.array([pose_of(MIDDLE + np.array(p), q) for p, q in poses])
-    found = sweep(env, shell, given_poses, exclude=exclude, clearance_limit=0)
-    frames = [naive(shell, pose, exclude) for pose in samples_of(found)]
-    assert found.hits == sum(bool(frame.hits) for frame in frames)
-    assert found.contacts == sum(bool(frame.contacts) for frame in frames)
-    first = next((n for n, frame in enumerate(frames) if frame.hits), None)
-    assert (found.first_hit.sample if found.first_hit else None) == first
-    if found.first_hit is not None and first is not None:
-        assert [obj.id for obj in found.first_hit.objects] == frames[first].ids
-        assert np.array_equal(found.first_hit.pose, samples_of(found)[first])
-    touched = next((n for n, frame in enumerate(frames) if frame.contacts), None)
-    assert (found.first_contact.sample if found.first_contact else None) == touched
-    if found.first_contact is not None and touched is not None:
-        ids = {i for n, i in frames[touched].pairs if n in frames[touched].contacts}
-        assert [obj.id for obj in found.first_contact.objects] == sorted(ids)
-    depth = max((max(frame.depths, default=0.0) for frame in frames), default=0.0)
-    assert (found.deepest.depth if found.deepest else 0.0) == depth
-    met = {one.object.id: one for one in found.objects}
-    assert set(met) == {i for frame in frames for i in frame.ids}
-    for i, one in met.items():
-        at = [n for n, frame in enumerate(frames) if i in frame.ids]
-        assert one.samples == len(at)
-        assert [one.first, one.last] == found.path.fractions([at[0], at[-1]]).tolist()
-        depths = [
-            frame.depths[frame.hits.index(n)] for frame in frames for n, j in frame.pairs if j == i
-        ]
-        assert one.deepest == max(depths)
-        points = [sum(j == i for _, j in frame.pairs) for frame in frames]
-        assert one.points == max(points)
+def test_no_cut_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> None:
+    for deep in (0.5, 0.9, 2.1, 3.0):
+        found = sweep(env, TOOL, line(SEATED, (0.01, 0.0, 0.5 * CUBE - deep * CONTACT)))
+        assert (found.verdict == "hits") == (deep > 2.0), deep
 
 
-def test_hits_near_one_another_are_one_interval(env: Environment) -> None:
-    """The tool passes through the wall twice, there and back; each pass is one interval."""
-    far = 0.3
-    found = sweep(env, ball(), line((0, -0.1, 0), (far, -0.1, 0), (0, -0.1, 0)))
-    hits = [bool(naive(ball(), pose).hits) for pose in samples_of(found)]
-    runs = [
-        list(run) for is_hit, run in itertools.groupby(range(len(hits)), hits.__getitem__) if is_hit
-    ]
-    assert len(runs) >= 2
-    assert len(found.hit_intervals) == 2
-    assert found.hit_intervals[0, 0] == found.path.fractions(runs[0][0])
-    assert found.hit_intervals[-1, 1] == found.path.fractions(runs[-1][-1])
+def test_what_was_left_may_not_be_touched_again(env: Environment) -> None:
+    away = (0.0, 0.0, 0.5 * CUBE + 0.01)
+    found = sweep(env, TOOL, line(SEATED, away, SEATED))
+    assert names(found) == ["plate"]
+    assert found.hits[0].fraction == pytest.approx(1.0, abs=0.01)
+    assert found.touching[0].until < 0.1
 
 
-# --- clearance -----------------------------------------------------------------------------------
+@pytest.mark.parametrize("more", [0.0, 0.01, 0.05])
+def test_a_peg_leaves_its_hole_though_it_is_too_thick(tmp_path: Path, more: float) -> None:
+    """In mm: 8 wide, of equal size to its hole, or pressed into it."""
+    ring = trimesh.creation.annulus(4e-3, 12e-3, 10e-3, sections=32)
+    peg = shell_of(trimesh.creation.cylinder(4e-3 + 1e-3 * more, 20e-3, sections=32))
+    with imported(tmp_path / "ring", {"ring": ring}) as env:
+        out = sweep(env, peg, line((0.0, 0.0, 8e-3), (0.0, 0.0, 30e-3)))
+        aside = sweep(env, peg, line((0.0, 0.0, 8e-3), (2e-3, 0.0, 8e-3)))
+    assert out.comes_out
+    assert out.touching[0].start == pytest.approx(1e-3 * more, abs=1e-5)
+    assert names(aside) == ["ring"]
 
 
-@SLOW
-@given(poses=PATHS, exclude=st.sampled_from([(), (1, 3)]))
-def test_clearance_is_the_least_distance_of_any_point_to_any_voxel(
-    env: Environment, poses: list[Any], exclude: tuple[int, ...]
-) -> None:
-    shell = ball(8)
-    given_poses = np.array([pose_of(MIDDLE + np.array(p), q) for p, q in poses])
-    limit = 0.2
-    found = sweep(env, shell, given_poses, exclude=exclude, clearance_limit=limit)
-    expected = naive_clearance(shell, samples_of(found), exclude)
-    clearance = found.clearance
-    assert clearance is not None
-    assert clearance.is_beyond == (expected >= limit)
-    if clearance.is_beyond:
-        assert (clearance.distance, clearance.moment) == (limit, None)
-        return
-    assert clearance.distance == pytest.approx(expected, abs=1e-9)
-    assert (clearance.distance == 0.0) == (found.verdict == "hits")
-    if not found.hits:
-        assert clearance.moment is not None
-        assert clearance.point is not None
-        assert clearance.voxel is not None
-        outside = np.maximum(np.abs(clearance.point - clearance.voxel) - 0.5 * SIZE, 0.0)
-        assert np.linalg.norm(outside) == pytest.approx(clearance.distance, abs=1e-9)
-        voxel = tuple(GRID.voxels_of(clearance.voxel[None])[0].tolist())
-        ids = [i for i in IDS_IN[voxel] if i not in exclude]
-        assert [obj.id for obj in clearance.moment.objects] == ids
+def test_a_tolerance_tells_what_touches(env: Environment) -> None:
+    path = line((0.0, 0.0, 0.5 * CUBE + 2e-4), (0.05, 0.0, 0.5 * CUBE + 2e-4))
+    assert sweep(env, TOOL, path).verdict == "clear"
+    assert sweep(env, TOOL, path, contact=3e-4).verdict == "slides"
 
 
-def test_clearance_along_the_path_is_that_of_the_samples_there(env: Environment) -> None:
-    shell = ball(12)
-    found = sweep(env, shell, line((-0.2, 0, 0), (0.05, 0, 0)), clearance_limit=0.15, profile=True)
+# --- inside --------------------------------------------------------------------------------------
+
+
+def test_a_part_inside_a_closed_body_is_told(tmp_path: Path) -> None:
+    tank = {"tank": trimesh.creation.box((0.3, 0.3, 0.3))}
+    with imported(tmp_path / "tank", tank) as env:
+        found = sweep(env, TOOL, line((0.0, 0.0, 0.0), (0.02, 0.0, 0.0)))
+        out = sweep(env, TOOL, line((0.0, 0.0, 0.0), (0.3, 0.0, 0.0)))
+    assert [obj.name for obj in found.enclosed] == ["tank"]
+    assert found.verdict == "hits"
+    assert found.hits == ()
+    assert names(out) == ["tank"]
+
+
+def test_a_part_inside_the_tool_is_told(tmp_path: Path) -> None:
+    with imported(tmp_path / "pea", {"pea": trimesh.creation.box((0.01,) * 3)}) as env:
+        found = sweep(env, TOOL, line((0.0, 0.0, 0.0), (0.002, 0.0, 0.0)))
+        hollow = trimesh.creation.box((CUBE,) * 3)
+        hollow.update_faces(np.arange(len(hollow.faces)) > 1)  # a box without a side is open
+        assert sweep(env, shell_of(hollow), line((0.0, 0.0, 0.0))).enclosed == ()
+    assert [obj.name for obj in found.enclosed] == ["pea"]
+
+
+# --- turns, balls, clouds ------------------------------------------------------------------------
+
+
+def test_a_turn_is_about_the_middle_or_a_place_that_is_named(env: Environment) -> None:
+    rod = shell_of(box_at((0.2, 0.01, 0.01), (0.1, 0.0, 0.0)))
+    quarter = [pose_of((0.0, 0.0, 0.005), (1, 0, 0, 0)), pose_of((0.0, 0.0, 0.005), (1, 0, 0, 1))]
+    path = np.array(quarter) + pose_of((-0.1, 0.0, 0.05)) - np.eye(4)
+    about = sweep(env, rod, path, where=["wall"], about=(0.0, 0.0, 0.0))
+    # about its end, 0.24 m from the wall, the rod of 0.2 m keeps away by 0.04 m less its edge
+    corner = np.hypot(0.2, 0.005)
+    assert about.gap.at_most == pytest.approx(0.24 - corner, rel=0.01)
+    with pytest.raises(UsageError, match="centre of turns"):
+        sweep(env, rod, path, about=(0.0, np.nan, 0.0))
+
+
+def test_a_ball_is_swept_by_its_radius(env: Environment) -> None:
+    ball = PointShell.sphere(0.03)
+    found = sweep(env, ball, line((0.0, 0.0, 0.05), (0.05, 0.0, 0.05)))
+    assert found.gap.at_most == pytest.approx(0.02, rel=0.01)
+
+
+def test_the_points_of_a_cloud_are_met_and_never_touched(tmp_path: Path) -> None:
+    file = tmp_path / "cloud.ply"
+    x, y = np.meshgrid(np.linspace(-0.1, 0.1, 41), np.linspace(-0.1, 0.1, 41))
+    points = np.stack([x.ravel(), y.ravel(), np.zeros(x.size)], axis=1)
+    trimesh.PointCloud(points).export(file)
+    hapticdb.import_files(tmp_path / "cloud.db", [file])
+    with hapticdb.open(tmp_path / "cloud.db") as env:
+        above = line((0.0, 0.0, 0.5 * CUBE + 1e-3), (0.02, 0.0, 0.5 * CUBE + 1e-3))
+        assert sweep(env, TOOL, above).gap.at_most == pytest.approx(1e-3, rel=0.01)
+        resting = sweep(env, TOOL, line((0.0, 0.0, 0.5 * CUBE), (0.0, 0.0, 0.1)))
+        assert resting.touching == ()
+        assert resting.verdict == "hits"
+
+
+# --- profile, limits, revisions, wrong use -------------------------------------------------------
+
+
+def test_the_profile_tells_the_distance_along_the_path(env: Environment) -> None:
+    found = sweep(
+        env, TOOL, line((0.0, 0.0, 0.05), (0.0, 0.0, 0.09)), where=["plate"], profile=True
+    )
     profile = found.profile
-    assert len(profile.fractions) == found.samples < sweeping.WINDOWS
-    each = [min(naive_clearance(shell, pose[None]), 0.15) for pose in samples_of(found)]
-    assert profile.clearances == pytest.approx(each, abs=1e-9)
-    assert found.clearance is not None
-    assert found.clearance.distance == pytest.approx(min(each), abs=1e-9)
+    assert profile is not None
+    assert np.allclose(profile.gaps, 0.03 + 0.04 * profile.fractions, atol=1e-9)
 
 
-def test_clearance_that_is_not_asked_for_is_not_given(env: Environment) -> None:
-    found = sweep(env, ball(), line((0, 0, 0)), clearance_limit=0)
-    assert found.clearance is None
-    assert np.isnan(found.profile.clearances).all()
+def test_a_limit_ends_what_is_told(env: Environment) -> None:
+    found = sweep(env, TOOL, line((0.0, 0.0, 0.05)), limit=0.01)
+    assert found.gap == (0.01, 0.01, None)
+    assert found.verdict == "clear"
 
 
-def test_clearance_says_what_it_means_for_surfaces(env: Environment) -> None:
-    """1.5 voxels from the wall's voxels; the surface lies at most a voxel's diagonal deeper."""
-    shell = PointShell(np.zeros((1, 3)), np.array([[1.0, 0.0, 0.0]]), np.zeros(3), cover=0.002)
-    place = env.grid.centers([[78, 60, 50]])[0]
-    aside = place - (0.0, 0.25 * SIZE, 0.0)
-    for poses, off in (([pose_of(place)], 0.0), ([pose_of(place), pose_of(aside)], 0.125 * SIZE)):
-        found = sweep(env, shell, poses)
-        assert found.proof.off == pytest.approx(off, abs=1e-6 * SIZE)
-        assert found.clearance is not None
-        assert found.clearance.distance == pytest.approx(1.5 * SIZE)
-        assert found.clearance.at_least == pytest.approx(1.5 * SIZE - off - 0.002, abs=1e-6 * SIZE)
-        assert found.clearance.at_most == pytest.approx((1.5 + 3**0.5) * SIZE)
+def test_time_that_is_over_leaves_it_undecided(env: Environment) -> None:
+    found = sweep(env, TOOL, line((0.0, 0.0, 0.05), (0.05, 0.0, 0.05)), seconds=1e-9)
+    assert found.verdict == "not decided"
+    assert found.gap.at_least == 0.0
 
 
-def test_beside_the_grid_nothing_is_hit_and_the_border_counts(env: Environment) -> None:
-    shell = ball(12)
-    poses = np.array([pose_of(np.array(GRID.origin) - 1.0), pose_of(np.array(GRID.origin) - 0.9)])
-    found = sweep(env, shell, poses)
-    assert found.hits == 0
-    assert found.clearance is not None
-    assert found.clearance.is_beyond
-
-
-# --- memory, revisions, wrong use ----------------------------------------------------------------
-
-
-def test_the_least_budget_finds_the_same(tmp_path: Path) -> None:
-    """The grid has many cells, and the cell table holds few of them."""
-    grid = Grid(0.002, (0.0, 0.0, 0.0), 10)
-    spots = np.random.default_rng(3).integers(0, 1024, (4000, 3))
-    shell = ball(60, 0.05)
-    poses = [pose_of((0.3, 0.3, 0.3)), pose_of((1.7, 1.5, 1.2), (1, 1, 0, 0))]
-    with hapticdb.create(tmp_path / "spots.db", grid) as env:
-        write_voxels(env.store, np.unique(spots, axis=0), "spots")
-        large = sweep(env, shell, poses, clearance_limit=0.05, profile=True)
-        small = sweep(
-            env, shell, poses, clearance_limit=0.05, profile=True, budget_bytes=LEAST_BUDGET
-        )
-    assert small.cells > 2 * slots_within(LEAST_BUDGET)  # so cells have made room for others
-    assert (small.hits, small.contacts) == (large.hits, large.contacts)
-    assert np.array_equal(small.profile.clearances, large.profile.clearances)
-    for one, same in zip(small.objects, large.objects, strict=True):
-        assert (one.samples, one.contacts, one.points) == (same.samples, same.contacts, same.points)
-        assert np.array_equal(one.intervals, same.intervals)
-        assert (one.deepest, one.length) == (same.deepest, same.length)
-
-
-def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path, monkeypatch: Any) -> None:  # noqa: ANN401
-    monkeypatch.setattr(sweeping, "BLOCK", 8)
-    poses = line((-0.3, 0, 0), (0.3, 0, 0))
-    url = tmp_path / "scene.db"
-    with hapticdb.create(url, GRID) as env, hapticdb.open(url) as other:
-        write_voxels(env.store, PLATE, "plate")
-        before = sweep(env, ball(), poses)
-
-        def obstruct(done: int, total: int) -> None:
-            if done < total:
-                write_voxels(
-                    other.store, block((90, 50, 50), (92, 80, 80 + done % 2)), f"wall{done}"
-                )
-
-        meanwhile = sweep(env, ball(), poses, progress=obstruct)
-        after = sweep(env, ball(), poses)
-    assert before.hits == 0
-    assert (meanwhile.hits, meanwhile.revision) == (0, before.revision)
-    assert after.verdict == "hits"
-    assert after.revision > before.revision
-
-
-def test_progress_is_told_after_each_block(env: Environment, monkeypatch: Any) -> None:  # noqa: ANN401
-    monkeypatch.setattr(sweeping, "BLOCK", 10)
+def test_progress_counts_objects(env: Environment) -> None:
     told: list[tuple[int, int]] = []
-    found = sweep(env, ball(), line((0, 0, 0), (0.1, 0, 0)), progress=lambda *now: told.append(now))
-    assert told[-1] == (found.samples, found.samples)
-    assert [done for done, _ in told[:-1]] == list(range(10, found.samples, 10))
+    sweep(env, TOOL, line((0.0, 0.0, 0.05)), progress=lambda *now: told.append(now))
+    assert told
+    assert [done for done, _ in told] == list(range(1, len(told) + 1))
+
+
+def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path) -> None:
+    parts = {name: box_at(*placed) for name, placed in PARTS.items()}
+    with imported(tmp_path / "shared", parts) as env, hapticdb.open(env.url) as other:
+        before = env.store.revision()
+        path = line((-0.1, 0.0, 0.06), (-0.1, 0.0, 0.16))
+        shelf = other.find("shelf")[0]
+
+        def take_away(done: int, total: int) -> None:
+            del total
+            if done == 1:
+                other.remove(shelf.id)
+
+        meanwhile = sweep(env, TOOL, path, progress=take_away)
+        after = sweep(env, TOOL, path)
+    assert (names(meanwhile), meanwhile.revision) == (["shelf"], before)
+    assert (names(after), after.revision) == ([], before + 1)
+
+
+def test_an_object_without_a_surface_is_refused_in_one_line(tmp_path: Path) -> None:
+    grid = hapticdb.Grid(0.01, (0.0, 0.0, 0.0), 5)
+    with hapticdb.create(tmp_path / "x.db", grid) as env:
+        write_voxels(env.store, np.array([[3, 3, 3]]), "voxels")
+        with pytest.raises(NoSurfaceError, match="hapticdb upgrade"):
+            sweep(env, TOOL, line((0.03, 0.03, 0.03)))
 
 
 @pytest.mark.parametrize(
@@ -351,76 +317,14 @@ def test_progress_is_told_after_each_block(env: Environment, monkeypatch: Any) -
 )
 def test_a_path_that_is_none_is_refused(env: Environment, poses: Any, words: str) -> None:  # noqa: ANN401
     with pytest.raises(UsageError, match=words):
-        sweep(env, ball(), poses)
+        sweep(env, TOOL, poses)
 
 
-def test_wrong_use_is_refused(env: Environment, tmp_path: Path) -> None:
-    poses = line((0, 0, 0))
-    with pytest.raises(ObjectNotFoundError, match="no object 77"):
-        sweep(env, ball(), poses, exclude=[77])
-    with pytest.raises(UsageError, match="finite length"):
-        sweep(env, ball(), poses, clearance_limit=-1.0)
-    with pytest.raises(UsageError, match="larger budget"):
-        sweep(env, ball(), poses, clearance_limit=1.0, budget_bytes=1 << 20)
-    grid = replace(GRID, curve="lexicographic")
-    with (
-        hapticdb.create(tmp_path / "x.db", grid, layout="voxel") as other,
-        pytest.raises(UsageError, match="lexicographic"),
-    ):
-        sweep(other, ball(), poses)
-
-
-# --- an object as the tool -----------------------------------------------------------------------
-
-
-@pytest.fixture
-def boxes(tmp_path: Path) -> Iterator[Environment]:
-    """A small box a few voxels above a large box, both mirrored and scaled by two."""
-    scene = trimesh.Scene()
-    doubled = np.diag([-2.0, 2.0, 2.0, 1.0])
-    for name, side, height in (("small", 0.05, 0.1), ("large", 0.2, -0.11)):
-        placed = doubled.copy()
-        placed[2, 3] = 2.0 * height
-        scene.add_geometry(
-            trimesh.creation.box((side,) * 3), node_name=name, geom_name=name, transform=placed
-        )
-    file = tmp_path / "boxes.glb"
-    file.write_bytes(scene.export(file_type="glb"))
-    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(voxel_size=0.005))
-    hapticdb.import_files(tmp_path / "boxes.db", [file], options)
-    with hapticdb.open(tmp_path / "boxes.db") as env:
-        yield env
-
-
-def test_an_object_becomes_the_tool_where_it_sits(boxes: Environment) -> None:
-    part = next(obj for obj in boxes.objects() if obj.name == "small")
-    shell = boxes.shell(part.id, points=500)
-    assert (shell.points >= part.bounds[0] - 1e-9).all()
-    assert (shell.points <= part.bounds[1] + 1e-9).all()
-    itself = sweep(boxes, shell, [np.eye(4)])
-    assert [one.object.name for one in itself.objects] == ["small"]
-    away = [np.eye(4), pose_of((0, 0, 0.2))]
-    out = sweep(boxes, shell, away, exclude=[part.id])
-    assert out.comes_out
-    assert out.clearance is not None
-    bottom = float(part.bounds[0, 2]) - max(obj.bounds[1, 2] for obj in boxes.objects()[1:])
-    assert out.clearance.at_least <= bottom <= out.clearance.at_most
-    down = [np.eye(4), pose_of((0, 0, -0.2))]
-    caught = sweep(boxes, shell, down, exclude=[part.id])
-    assert [one.object.name for one in caught.objects] == ["large"]
-
-
-def test_an_object_whose_file_has_changed_is_no_tool(boxes: Environment) -> None:
-    obj = boxes.objects()[0]
-    Path(obj.link).write_bytes(trimesh.creation.box((1, 1, 1)).export(file_type="glb"))
-    with pytest.raises(GeometryChangedError, match="no longer holds"):
-        boxes.shell(obj.id)
-    Path(obj.link).unlink()
-    with pytest.raises(GeometryChangedError, match="cannot be read"):
-        boxes.shell(obj.id)
-
-
-@pytest.mark.parametrize("far", [1e7, 1e307])
-def test_a_path_of_absurd_length_is_refused_in_one_line_before_work(far: float) -> None:
-    with pytest.raises(UsageError, match=r"^the path moves \S+ m, and turns a tool"):
-        SweepPath.of(line((0, 0, 0), (far, far, 0)), ball(), SIZE)
+def test_wrong_use_is_refused(env: Environment) -> None:
+    path = line((0.0, 0.0, 0.05))
+    points = PointShell(TOOL.points, TOOL.normals, TOOL.center)
+    with pytest.raises(UsageError, match="no surface"):
+        sweep(env, points, path)
+    for wrong in ({"contact": 0.0}, {"limit": -1.0}, {"seconds": 0.0}):
+        with pytest.raises(UsageError):
+            sweep(env, TOOL, path, **wrong)  # type: ignore[arg-type] - on purpose

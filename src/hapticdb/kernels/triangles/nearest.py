@@ -138,9 +138,10 @@ def _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, ou
 @leaf
 def _keep(below, above, n, m, then, found, pair, out):
     """Note a pair of triangles where it is nearer than what is known."""
-    if below < out[0]:
+    is_nearer = below < out[0]
+    if is_nearer:
         out[0] = min(below, then)
-    if above < out[1]:
+    if above < out[1] and (is_nearer or pair[0] >= 0):
         out[1] = above
         pair[0], pair[1] = n, m
         for k in range(6):

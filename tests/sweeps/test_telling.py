@@ -38,7 +38,7 @@ CUT = place_at(SEAT, 0.25, PATH)
         (swept(hits=tuple(place_at(one, 0.312, PATH) for one in (BOLT, SEAT, LID))), "hits",
          "hits bolt at 31.2 % of the path; then seat, lid"),
         (swept(hits=(CUT,), touching=(touching(SEAT, 0.6, deepest=2e-3, allowed=1e-4, cut=CUT),)),
-         "hits", "cuts into seat at 25 % of the path: 2 mm deep, 0.1 mm is allowed"),
+         "hits", "cuts into seat at 25 % of the path: 2 mm deep, 0 µm at the start"),
         (swept(hits=(place_at(SEAT, 0.8, PATH),), touching=(touching(SEAT, 0.1),)), "hits",
          "leaves seat and hits it again at 80 % of the path"),
         (swept(enclosed=(thing("tank", 4, 1.0), thing("pea", 5, 1e-3))), "hits",

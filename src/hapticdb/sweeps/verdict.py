@@ -67,8 +67,8 @@ def hit_text(found: Swept, place: Place) -> str:
             continue
         if one.cut is None or one.cut.fraction != place.fraction:
             return f"leaves {place.object.name} and hits it again {where}"
-        depth, allowed = length_text(one.deepest), length_text(one.allowed)
-        return f"cuts into {place.object.name} {where}: {depth} deep, {allowed} is allowed"
+        depth, start = length_text(one.deepest), length_text(one.start)
+        return f"cuts into {place.object.name} {where}: {depth} deep, {start} at the start"
     return f"hits {place.object.name} {where}"
 
 

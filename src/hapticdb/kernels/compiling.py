@@ -128,7 +128,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     ),
     "host": (*_RESIDENT, "hosting.*"),
     "replay": (*_RESIDENT, "resident.feeling.*", "rigid.poses_of"),
-    "sweep": (*_SHELL, "triangles.*", *_RANGES),
+    "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
     "extract": (
         *_SHELL,
         *_RESIDENT,

@@ -180,11 +180,11 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(
 ) -> None:
     add, left = SQLiteWriter.add, [1]
 
-    def interrupted(writer: SQLiteWriter, record: Object, rows: Rows) -> int:
+    def interrupted(writer: SQLiteWriter, record: Object, rows: Rows, surface: bytes) -> int:
         if not left:
             raise KeyboardInterrupt
         left.pop()
-        return add(writer, record, rows)
+        return add(writer, record, rows, surface)
 
     with monkeypatch.context() as patched:
         patched.setattr(SQLiteWriter, "add", interrupted)

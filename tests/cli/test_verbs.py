@@ -28,7 +28,7 @@ def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
     assert list(found) == [
         *("name", "engine", "voxel_size", "bits", "origin", "curve", "layout"),
         *("objects", "scene", "voxels", "rows", "bytes", "distances"),
-        *("standby", "statistics"),
+        *("surfaces", "standby", "statistics"),
     ]
     with hapticdb.open(scene, read_only=True) as env:
         assert found["voxels"] == sum(len(env.voxels(obj.id)) for obj in env.objects())

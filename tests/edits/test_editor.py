@@ -232,15 +232,6 @@ def test_what_another_has_imported_again_is_not_put_back(
     assert [obj.name for obj in env.objects()] == ["box0", "box1", "box2"]
 
 
-def test_what_was_taken_out_goes_back_without_its_file(
-    one: Editor, env: Environment, file: Path
-) -> None:
-    one.take_out(1)
-    file.unlink()
-    one.undo()
-    assert {obj.id for obj in env.objects()} == {1, 2, 3}
-
-
 STEPS = st.lists(
     st.tuples(st.integers(0, 1), st.sampled_from(["move", "out", "back", "undo", "redo", "look"])),
     max_size=14,

@@ -372,11 +372,11 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
     calls: list[str] = []
     add = SQLiteWriter.add
 
-    def overtaken(writer: SQLiteWriter, record: Object, rows: base.Rows) -> int:
+    def overtaken(writer: SQLiteWriter, record: Object, rows: base.Rows, surface: bytes) -> int:
         calls.append(record.name)
         if len(calls) == 2:
             raise present_already(record, "a.db")
-        return add(writer, record, rows)
+        return add(writer, record, rows, surface)
 
     monkeypatch.setattr(SQLiteWriter, "add", overtaken)
     report = import_one(tmp_path / "a.db", file)

@@ -129,12 +129,7 @@ class Environment(Queries):
         ObjectNotFoundError, UsageError
             As for `touch`.
         """
-        objects = self._store.objects()
-        left_out = Filter(where, exclude).left_out(objects, self.url)
-        for error in left_out.missing:
-            raise error
-        ids = set(left_out.ids.tolist())
-        return [obj for obj in objects if obj.id not in ids]
+        return Filter(where, exclude).felt(self._store.objects(), self.url)
 
     def shell(
         self,

@@ -4,15 +4,19 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
-from hapticdb import Environment, PointShell
+import hapticdb
+from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.batches import threads
 from hapticdb.errors import UsageError
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.testing import write_voxels
+from moving_boxes import Boxes, apart, mesh
 from realtime.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
 
 Floats = NDArray[np.float64]
@@ -139,3 +143,39 @@ def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
             pytest.raises(UsageError, match="more cells around a point"),
         ):
             feeler.clearance(poses, 400 * SIZE)
+
+
+def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
+    """Of surfaces, whatever the voxels: two boxes, and a box at poses around them."""
+    rng = np.random.default_rng(2)
+    halves = np.array([[0.05, 0.02, 0.03], [0.01, 0.06, 0.02]])
+    places = np.tile(np.eye(4), (2, 1, 1))
+    places[:, :3, :3] = Rotation.random(2, rng=rng).as_matrix()
+    places[:, :3, 3] = [[-0.1, 0.0, 0.0], [0.1, 0.02, 0.0]]
+    scene = trimesh.Scene()
+    for n in range(2):
+        scene.add_geometry(mesh(halves[n]), node_name=f"box{n}", transform=places[n])
+    file = tmp_path / "boxes.glb"
+    file.write_bytes(scene.export(file_type="glb"))
+    options = ImportOptions(grid=GridOptions(bits=4), distances=False)
+    hapticdb.import_files(tmp_path / "boxes.db", [file], options)
+    half = np.array([0.02, 0.01, 0.03])
+    made = mesh(half)
+    shell = PointShell.from_mesh(made.vertices, made.faces)
+    count, reach = 40, 0.15
+    poses = np.tile(np.eye(4), (count, 1, 1))
+    poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
+    poses[:, :3, 3] = rng.uniform(-0.2, 0.2, (count, 3))
+    expected, _ = apart(half, poses, Boxes(places, halves))
+    with hapticdb.open(tmp_path / "boxes.db") as env:
+        found = env.clearance(shell, poses, reach, exact=True)
+        only = env.clearance(shell, poses, reach, where=["box1"], exact=True)
+        with pytest.raises(UsageError, match="above 0"):
+            env.clearance(shell, poses, -1.0, exact=True)
+        with pytest.raises(UsageError, match="no surface"):
+            env.clearance(cloud(9), poses, exact=True)
+    assert found.distances == pytest.approx(np.minimum(expected.min(axis=1), reach), abs=1e-9)
+    assert only.distances == pytest.approx(np.minimum(expected[:, 1], reach), abs=1e-9)
+    assert found.is_beyond.tolist() == (expected.min(axis=1) >= reach).tolist()
+    assert found.at_least is not None
+    assert np.array_equal(found.at_least, found.distances)

@@ -8,7 +8,9 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from draws import drawn
+from hapticdb import PointShell
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
+from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
 from hapticdb.sweeps.way import Way
 from moving_boxes import Boxes, distances, mesh
@@ -38,8 +40,13 @@ def tree_of(boxes: Boxes) -> TriangleTree:
     return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
 
 
+def tool_of(boxes: Boxes) -> MovingSurface:
+    made = mesh(boxes.halves[0])
+    return MovingSurface(PointShell.from_mesh(made.vertices, made.faces, 10))
+
+
 def random_path(rng: np.random.Generator) -> Floats:
-    poses = []
+    poses: list[Floats] = []
     for _ in range(int(rng.integers(2, 5))):
         pose = np.eye(4)
         if poses and rng.random() < 0.3:
@@ -56,7 +63,7 @@ def check_a_path(rng: np.random.Generator) -> str:
     still, tool = random_boxes(rng, 0.05), random_boxes(rng, 0.0)._replace(poses=np.eye(4)[None])
     poses, center = random_path(rng), rng.uniform(-0.02, 0.02, 3)
     way = Way.of(poses, tool.corners()[0], center)
-    pair = Pair(tree_of(still), tree_of(tool), way, np.inf)
+    pair = Pair(tree_of(still), tool_of(tool), way)
     whole = np.zeros(1), np.array([way.length])
     found, closed = pair.least(*whole, np.inf)
     assert found is not None
@@ -103,7 +110,7 @@ def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[-0.2, 0.0, 0.04 + gap], [0.2, 0.01, 0.04 + gap]]
     way = Way.of(poses, tool.corners()[0], np.zeros(3))
-    pair = Pair(tree_of(still), tree_of(tool), way, np.inf)
+    pair = Pair(tree_of(still), tool_of(tool), way)
     found, closed = pair.least(np.zeros(1), np.array([way.length]), np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(gap, rel=1e-9)
@@ -115,8 +122,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
     way = Way.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
-    point = triangle_tree(np.zeros((1, 3, 3)), np.zeros(1, dtype=np.int64))
-    pair = Pair(tree_of(still), point, way, np.inf, radius=0.03)
+    pair = Pair(tree_of(still), MovingSurface(PointShell.sphere(0.03)), way)
     found, _ = pair.least(np.zeros(1), np.array([way.length]), np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(0.02, rel=0.01)
@@ -127,6 +133,6 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
 def test_a_limit_of_time_ends_the_search() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
     way = Way.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
-    pair = Pair(tree_of(still), tree_of(still), way, time.monotonic() - 1.0)
+    pair = Pair(tree_of(still), tool_of(still), way, time.monotonic() - 1.0)
     with pytest.raises(OverTimeError):
         pair.least(np.zeros(1), np.zeros(1), np.inf)

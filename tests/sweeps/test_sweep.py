@@ -325,6 +325,9 @@ def test_wrong_use_is_refused(env: Environment) -> None:
     points = PointShell(TOOL.points, TOOL.normals, TOOL.center)
     with pytest.raises(UsageError, match="no surface"):
         sweep(env, points, path)
-    for wrong in ({"contact": 0.0}, {"limit": -1.0}, {"seconds": 0.0}):
-        with pytest.raises(UsageError):
-            sweep(env, TOOL, path, **wrong)  # type: ignore[arg-type] - on purpose
+    with pytest.raises(UsageError, match="above 0"):
+        sweep(env, TOOL, path, contact=0.0)
+    with pytest.raises(UsageError, match="above 0"):
+        sweep(env, TOOL, path, limit=-1.0)
+    with pytest.raises(UsageError, match="seconds"):
+        sweep(env, TOOL, path, seconds=0.0)

@@ -166,9 +166,7 @@ class Feeler:
             As for `touch`; also if the reach is not a positive number, or needs too many cells.
         """
         size = self._residency.grid.voxel_size
-        limit = DEFAULT_REACH * size if reach is None else reach
-        if not (np.isfinite(limit) and limit > 0.0):
-            raise UsageError(f"clearance up to {limit} m: give a finite length above 0")
+        limit = reach_of(reach, size)
         places = as_poses(poses)
         order = order_of(places, self.shell.center, self._residency.grid)
         search = NearestSearch(self._frames, self._threads, limit / size)
@@ -313,3 +311,11 @@ class Feeler:
         exclude = self._residency.exclude
         for answer in self._query.run_many(self.shell, poses, exclude, self.law):
             yield answer.ids
+
+
+def reach_of(reach: float | None, voxel_size: float) -> float:
+    """Greatest distance that is searched, metres; UsageError if it is not above 0."""
+    limit = DEFAULT_REACH * voxel_size if reach is None else reach
+    if not (np.isfinite(limit) and limit > 0.0):
+        raise UsageError(f"clearance up to {limit} m: give a finite length above 0")
+    return float(limit)

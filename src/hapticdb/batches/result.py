@@ -110,7 +110,8 @@ class ClearanceBatch:
     distances : (B,) float64
         Metres from the nearest of the shell's points to the nearest occupied voxel's box: 0 for a
         pose with a hit, `reach` where nothing is nearer. No surface of the environment is nearer to
-        a point, because each lies in occupied voxels.
+        a point, because each lies in occupied voxels. If they are exact: from the tool's surface to
+        the nearest surface of an object, never too large.
     points : (B,) int64
         Index of a nearest point, -1 where nothing is within reach.
     reach : float

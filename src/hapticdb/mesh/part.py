@@ -102,6 +102,12 @@ class Part:
             return np.empty((0, 3, 3))
         return self.world_points(world_from_part)[self.faces]
 
+    def surface(self) -> NDArray[np.float64]:
+        """Corners (F, 3, 3) of the placed triangles; a cloud's points are ones without area."""
+        if self.faces is None:
+            return np.repeat(self.world_points()[:, None], 3, axis=1)
+        return self.triangles()
+
     @property
     def bounds(self) -> NDArray[np.float64]:
         """Least and greatest corner (2, 3) of the placed part, metres, world frame."""

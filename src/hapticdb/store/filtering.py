@@ -103,6 +103,14 @@ class Filter:
             out.update(obj.id for obj in objects if obj.id not in felt)
         return Unfelt(np.array(sorted(out), dtype=np.int64), tuple(missing))
 
+    def felt(self, objects: Sequence[Object], url: str) -> list[Object]:
+        """Objects that are felt; ObjectNotFoundError if a word chooses nothing. As `left_out`."""
+        left_out = self.left_out(objects, url)
+        for error in left_out.missing:
+            raise error
+        ids = set(left_out.ids.tolist())
+        return [obj for obj in objects if obj.id not in ids]
+
 
 def _chosen(
     listing: Listing,

@@ -6,7 +6,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.sweeps.cut import NONE, Cut, Mesh, cut
 from hapticdb.sweeps.gap import Pair
 
@@ -101,9 +100,8 @@ class _Depths:
         for some in (order[:1], order[1:]):
             poses = np.tile(pose, (len(some), 1, 1))
             poses[:, :3, 3] += self._shifts[some]
-            apart = nearest(
-                self._pair.tree, self._pair.tool, poses, np.full(len(some), self._ease)
-            ).at_least
+            far = np.full(len(some), self._ease)
+            apart = self._pair.tool.nearest(self._pair.tree, poses, far).at_least
             self._pair.looks += len(some)
             free = np.flatnonzero(apart > 0.0)
             if len(free):

@@ -13,7 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.kernels.triangles.nearest import Nearest
+from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -44,17 +45,15 @@ class Least(NamedTuple):
 class Pair:
     """The tool and one object along a path.
 
-    tree, tool : triangles of the object, world frame, and of the tool; way : the path; until : time
-    of `time.monotonic` at which it ends by OverTimeError; radius : of a ball whose middle is the
-    tool, metres.
+    tree : triangles of the object, world frame; until : time of `time.monotonic` at which it ends
+    by OverTimeError.
     """
 
     def __init__(
-        self, tree: TriangleTree, tool: TriangleTree, way: Way, until: float, radius: float = 0.0
+        self, tree: TriangleTree, tool: MovingSurface, way: Way, until: float = np.inf
     ) -> None:
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
         self.looks = 0
-        self._radius = radius
 
     def measure(
         self, ways: Floats, farthest: Floats, then: float = np.inf, enough: float = 0.0
@@ -65,20 +64,12 @@ class Pair:
             some = slice(at, at + AT_ONCE)
             poses = self.way.at(ways[some])
             found.append(
-                nearest(
-                    self.tree,
-                    self.tool,
-                    poses,
-                    farthest[some] + self._radius,
-                    then=then + self._radius,
-                    enough=enough + self._radius,
-                )
+                self.tool.nearest(self.tree, poses, farthest[some], then=then, enough=enough)
             )
             self.looks += len(poses)
             if time.monotonic() > self.until:
                 raise OverTimeError
-        near = Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
-        return near if self._radius == 0.0 else _of_ball(near, self._radius)
+        return Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
 
     def least(self, lows: Floats, highs: Floats, best: float) -> tuple[Least | None, float]:
         """Least distance on stretches of the path (n,), if it is less than `best`; else None.
@@ -120,17 +111,6 @@ class Pair:
             is_open &= halves > 0.25 * MEETING
             lows, highs = halved(lows, highs, is_open)
         return found
-
-
-def _of_ball(near: Nearest, radius: float) -> Nearest:
-    """Distances of a ball's surface from those of its middle."""
-    away = near.on_a - near.on_b
-    away *= np.minimum(radius / np.maximum(near.at_most, 1e-300), 1.0)[:, None]
-    return near._replace(
-        at_least=np.maximum(near.at_least - radius, 0.0),
-        at_most=np.maximum(near.at_most - radius, 0.0),
-        on_b=near.on_b + away,
-    )
 
 
 def error_of(distance: float) -> float:

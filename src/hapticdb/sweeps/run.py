@@ -14,10 +14,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
 from hapticdb.mesh import Part
-from hapticdb.pointshell.coverage import Ball, Interior
-from hapticdb.pointshell.orientation import Surface, orient
+from hapticdb.pointshell.coverage import Interior
+from hapticdb.pointshell.moving import MovingSurface, tree_of
+from hapticdb.pointshell.orientation import orient
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.store.base import Object
@@ -98,7 +98,7 @@ def sweep(
         raise UsageError(f"contact {contact} m, limit {limit} m: give lengths above 0")
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
-    tool = _Tool.of(shell)
+    tool = MovingSurface(shell)
     middle = 0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0))
     center = middle if about is None else np.asarray(about, dtype=np.float64)
     if center.shape != (3,) or not np.isfinite(center).all():
@@ -123,38 +123,14 @@ class _Asked(NamedTuple):
     progress: SweepCallback | None
 
 
-class _Tool:
-    """The surface that moves.
-
-    tree : its triangles, or the middle of a ball; corners (V, 3); radius : of a ball, else 0.
-    """
-
-    def __init__(self, surface: Surface | Ball) -> None:
-        self.surface = surface
-        if isinstance(surface, Ball):
-            self.radius, triangles = surface.radius, np.zeros((1, 3, 3))
-            self.corners = surface.radius * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
-        else:
-            self.radius, triangles = 0.0, surface.triangles
-            self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
-        self.tree = _tree_of(triangles)
-        self.mesh = Mesh(self.tree)
-
-    @classmethod
-    def of(cls, shell: PointShell) -> "_Tool":
-        """Surface of a shell; UsageError if it has none."""
-        if shell.surface is None:
-            raise UsageError("the tool has points but no surface: give its mesh, not a saved shell")
-        return cls(shell.surface)
-
-
 class _Sweep:
     """State of one sweep."""
 
     def __init__(
-        self, env: Environment, tool: _Tool, way: Way, asked: _Asked, until: float
+        self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked, until: float
     ) -> None:
         self._env, self._tool, self._way, self._asked, self._until = env, tool, way, asked, until
+        self._mesh = Mesh(tool.tree)
         self._looks = 0
         self._best = asked.limit
         self._closed = asked.limit  # proved where nothing nearer was looked for
@@ -216,8 +192,8 @@ class _Sweep:
 
     def _look_at(self, obj: Object, part: Part, gaps: Floats, stretches: Stretches) -> None:
         """Decide about one object; gaps (W,) : of its box from the tool's on each stretch."""
-        triangles = _corners_of(part, obj)
-        pair = Pair(_tree_of(triangles), self._tool.tree, self._way, self._until, self._tool.radius)
+        triangles = part.surface()
+        pair = Pair(tree_of(triangles), self._tool, self._way, self._until)
         try:
             start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
             begin = 0.0
@@ -233,7 +209,7 @@ class _Sweep:
     def _follow(self, obj: Object, pair: Pair) -> float:
         """Follow a contact; returns the way from which on the object counts as any other."""
         contact = self._asked.contact
-        found = follow(pair, contact, Mesh(pair.tree), self._tool.mesh)
+        found = follow(pair, contact, Mesh(pair.tree), self._mesh)
         refused = None
         if found.refused is not None:
             way, cut = found.refused
@@ -302,14 +278,3 @@ def _told(
     return Touching(
         obj, found.start, found.deepest, found.allowed, until, found.is_sliding(contact), refused
     )
-
-
-def _corners_of(part: Part, obj: Object) -> Floats:
-    """Triangles (F, 3, 3) of an object, world frame; those of a cloud are points."""
-    if part.is_cloud:
-        return np.repeat(part.world_points(obj.transform)[:, None], 3, axis=1)
-    return part.triangles(obj.transform)
-
-
-def _tree_of(triangles: Floats) -> TriangleTree:
-    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))

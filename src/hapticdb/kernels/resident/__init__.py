@@ -1,4 +1,4 @@
-"""Kernels of resident cells: the table in shared memory, and the frames and sweeps that read it."""
+"""Kernels of resident cells: the table in shared memory, the frames and searches that read it."""
 
 from hapticdb.kernels._later import later_modules
 

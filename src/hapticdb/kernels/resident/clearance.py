@@ -17,8 +17,23 @@ from hapticdb.kernels.resident.cells import (
     place_in_set,
     slot_of,
 )
-from hapticdb.kernels.resident.sweep import packed, unpacked
 from hapticdb.kernels.rigid import moved, transform_of
+
+AXIS_BITS = 21
+"""Bits of each coordinate of a packed voxel, i uppermost. Three coordinates must fit an int64."""
+AXIS_MASK = (1 << AXIS_BITS) - 1
+
+
+@leaf
+def packed(i, j, k):
+    """Voxel (i, j, k) as one number."""
+    return (i << (2 * AXIS_BITS)) | (j << AXIS_BITS) | k
+
+
+@leaf
+def unpacked(voxel):
+    """Voxel (i, j, k) of a number; undoes `packed`."""
+    return voxel >> (2 * AXIS_BITS), (voxel >> AXIS_BITS) & AXIS_MASK, voxel & AXIS_MASK
 
 
 @leaf

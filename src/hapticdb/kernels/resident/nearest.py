@@ -24,10 +24,11 @@ from hapticdb.kernels.resident.cells import (
     end_frame,
     spread_key,
 )
-from hapticdb.kernels.resident.clearance import nearest_voxel, square_to
-from hapticdb.kernels.resident.sweep import CAUTION, packed
+from hapticdb.kernels.resident.clearance import nearest_voxel, packed, square_to
 from hapticdb.kernels.rigid import moved, transform_of
 
+CAUTION = 1e-6
+"""Voxels by which a bound is lowered, so that rounding errors cannot make it wrong."""
 POINT, RUN, GROUPED = 0, 1, 2
 """What is looked around at once: a point, a run of points, a group of runs."""
 CUBE_OF_BALL = 2

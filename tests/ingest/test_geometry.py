@@ -1,0 +1,57 @@
+"""Geometry of objects from the database: bit for bit that of their file, each shape read once."""
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from assemblies import drop_surfaces
+from hapticdb.ingest.geometry import found_parts, parts_of
+from hapticdb.mesh import parse_in_process
+from recorded_scene import write_parts
+from servers import Place
+
+
+def test_parts_are_those_of_the_file_in_the_order_of_ids(tmp_path: Path, place: Place) -> None:
+    """On both engines; objects of one shape share its arrays."""
+    here, there = write_parts(tmp_path, 12), place()
+    parts = {part.name: part for part in parse_in_process(here.with_suffix(".glb")).parts}
+    hapticdb.copy_environment(here, there)
+    for url in (str(here), there):
+        with hapticdb.open(url, read_only=True) as env:
+            asked: list[str] = []
+            read = env.store.surfaces
+
+            def surfaces(digests: Sequence[str], read=read, asked=asked) -> dict[str, bytes]:  # type: ignore[no-untyped-def]  # noqa: ANN001 - of this turn
+                asked.extend(digests)
+                return read(digests)
+
+            env.store.surfaces = surfaces  # type: ignore[method-assign]
+            found = list(parts_of(env.store, env.objects()[::-1]))
+            assert [obj.id for obj, _ in found] == [obj.id for obj in env.objects()]
+            assert (
+                len(asked) == len(set(asked)) == len({obj.digest for obj, _ in found}) < len(found)
+            )
+            arrays: dict[str, set[int]] = {}
+            for obj, part in found:
+                wanted = parts[obj.name]
+                assert part.digest == obj.digest == wanted.digest
+                assert part.vertices.tobytes() == wanted.vertices.tobytes()
+                np.testing.assert_array_equal(part.faces, wanted.faces)
+                np.testing.assert_array_equal(part.triangles(), wanted.triangles())
+                arrays.setdefault(obj.digest, set()).add(id(part.vertices))
+            assert all(len(one) == 1 for one in arrays.values())
+
+
+def test_an_object_without_a_surface_is_none_or_an_error(tmp_path: Path) -> None:
+    path = write_parts(tmp_path, 12)
+    with hapticdb.open(path, read_only=True) as env:
+        first, *_, last = env.objects()
+        assert first.digest != last.digest
+        drop_surfaces(path, last.digest)
+        kept = {obj.id for obj, part in found_parts(env.store, env.objects()) if part is not None}
+        assert kept == {obj.id for obj in env.objects() if obj.digest != last.digest}
+        with pytest.raises(hapticdb.errors.NoSurfaceError, match="'hapticdb upgrade"):
+            list(parts_of(env.store, [last, first]))

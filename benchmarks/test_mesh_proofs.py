@@ -64,7 +64,7 @@ def close_pairs(file: Path, rng: np.random.Generator) -> tuple[Floats, Floats]:
     owner = np.repeat(np.arange(len(parts)), [len(part) for part in parts])
     middles = triangles.mean(axis=1)
     asked = rng.choice(len(triangles), 4 * PAIRS)
-    _, near = cKDTree(middles).query(middles[asked], k=40)
+    near = np.asarray(cKDTree(middles).query(middles[asked], k=40)[1])
     mate = near[np.arange(len(asked)), rng.integers(1, 40, len(asked))]
     is_other = owner[asked] != owner[mate]
     return triangles[asked[is_other]][:PAIRS], triangles[mate[is_other]][:PAIRS]
@@ -78,8 +78,12 @@ def test_close_triangles_of_assemblies_are_never_told_too_far(name: str) -> None
     assert len(mine) >= PAIRS // 2
     n_equal, zero, here = 0, np.zeros(1, dtype=np.int64), np.eye(4)
     for a, b in zip(mine, others, strict=True):
-        trees = triangle_tree(a[None], zero), triangle_tree(b[None], zero)
-        found = nearest(*trees, here[None], np.array([np.inf]))
+        found = nearest(
+            triangle_tree(a[None], zero),
+            triangle_tree(b[None], zero),
+            here[None],
+            np.array([np.inf]),
+        )
         peer = coal_distance(tree_in_mm(a[None]), tree_in_mm(b[None]), here)
         assert found.at_least[0] <= peer + 1e-9
         assert found.at_most[0] - found.at_least[0] <= 1e-8

@@ -113,12 +113,12 @@ def test_two_trees_are_as_near_as_their_nearest_triangles() -> None:
         pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
         pose[:3, 3] = rng.uniform(-2.0, 2.0, 3)
         placed = b @ pose[:3, :3].T + pose[:3, 3]
-        trees = [triangle_tree(t, np.zeros(len(t), dtype=np.int64)) for t in (a, b)]
-        found = nearest(*trees, np.stack([pose, pose]), np.array([np.inf, np.inf]))
+        mine, other = (triangle_tree(t, np.zeros(len(t), dtype=np.int64)) for t in (a, b))
+        found = nearest(mine, other, np.stack([pose, pose]), np.array([np.inf, np.inf]))
         at_least, at_most = brute(a, placed)
         assert np.allclose(found.at_least, at_least, rtol=0.0, atol=1e-12)
         assert np.allclose(found.at_most, at_most, rtol=0.0, atol=1e-12)
-        limited = nearest(*trees, pose[None], np.array([0.5 * at_least]))
+        limited = nearest(mine, other, pose[None], np.array([0.5 * at_least]))
         assert limited.at_least[0] == 0.5 * at_least
         assert limited.pairs[0].tolist() == [-1, -1]
 

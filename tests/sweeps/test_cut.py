@@ -37,7 +37,7 @@ def depth(one: trimesh.Trimesh, other: trimesh.Trimesh, *place: float, turn: flo
 
     found = told(mesh(one), mesh(other), pose)
     back = told(mesh(other), mesh(one), np.linalg.inv(pose))
-    moved = told(mesh(one, frame), mesh(other), frame @ pose)
+    moved = told(mesh(one, frame), mesh(other), np.asarray(frame @ pose))
     assert back == pytest.approx(found, rel=0.02, abs=2.0 * SHIFT)
     assert moved == pytest.approx(found, rel=0.02, abs=2.0 * SHIFT)
     return found

@@ -102,7 +102,7 @@ def sweep(
     middle = 0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0))
     center = middle if about is None else np.asarray(about, dtype=np.float64)
     if center.shape != (3,) or not np.isfinite(center).all():
-        raise UsageError(f"a centre of turns {about}: give three lengths, metres")
+        raise UsageError(f"a centre of turns {about!r}: give three lengths, metres")
     way = Way.of(poses, tool.corners, center)
     until = np.inf if seconds is None else time.monotonic() + seconds
     if proportions is None:

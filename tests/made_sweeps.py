@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from hapticdb import Object
 from hapticdb.proportions import Proportions
-from hapticdb.sweeps.result import Gap, Place, Profile, Swept, Touching
+from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -24,13 +24,13 @@ def thing(name: str, number: int = 1, side: float = 0.1) -> Object:
     return Object(name, "a.glb", "", np.eye(4), 1, np.stack([-half, half]), id=number)
 
 
-def place_at(found: Object, fraction: float, path: Way, apart: float = 0.0) -> Place:
+def place_at(found: Object, fraction: float, path: Way, apart: float = 0.0) -> PathPlace:
     """Where the tool is at a share of the path; apart : metres between the two surfaces."""
     way = np.array([fraction * path.length])
     pose = path.at(way)[0]
     on_tool = pose[:3, 3] - (0.0, 0.0, 0.01)
     on_object = on_tool - (0.0, 0.0, apart)
-    return Place(found, fraction, int(path.segments(way)[0]), pose, on_tool, on_object)
+    return PathPlace(found, fraction, int(path.segments(way)[0]), pose, on_tool, on_object)
 
 
 def line(*places: tuple[float, float, float]) -> Way:
@@ -41,9 +41,9 @@ def line(*places: tuple[float, float, float]) -> Way:
     return Way.of(poses, CORNERS, np.zeros(3))
 
 
-def touching(found: Object, until: float, **changed: Any) -> Touching:  # noqa: ANN401 - its fields
+def touching(found: Object, until: float, **changed: Any) -> TouchedObject:  # noqa: ANN401 - its fields
     """An object that the tool touches without overlap."""
-    one = Touching(found, 0.0, 0.0, 1e-4, until, is_sliding=False, cut=None)
+    one = TouchedObject(found, 0.0, 0.0, 1e-4, until, is_sliding=False, cut=None)
     return one._replace(**changed)
 
 

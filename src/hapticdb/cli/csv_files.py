@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from hapticdb.query.touches import Touch
     from hapticdb.recording.frame import Frames
     from hapticdb.store.base import Object
-    from hapticdb.sweeps.result import Place, Swept
+    from hapticdb.sweeps.result import PathPlace, Swept
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")
@@ -157,7 +157,7 @@ def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
     def row(
         what: str,
         obj: "Object",
-        place: "Place | None" = None,
+        place: "PathPlace | None" = None,
         depths: Sequence[float | str] = ("",) * 4,
         gap: float | str = "",
     ) -> list[object]:

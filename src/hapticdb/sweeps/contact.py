@@ -29,8 +29,8 @@ PATIENCE = 16
 """Looks without shifts, after none of them freed the surfaces."""
 
 
-class Followed(NamedTuple):
-    """How a contact goes on: as `result.Touching`, with ways in metres.
+class FollowedContact(NamedTuple):
+    """How a contact goes on: as `result.TouchedObject`, with ways in metres.
 
     until : way at which they are apart, or where it ends; is_apart : whether they are apart there;
     refused : way and cut where they overlap by more than is allowed, or None.
@@ -48,7 +48,7 @@ class Followed(NamedTuple):
         return self.until > SLIDE * contact
 
 
-def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Followed:
+def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> FollowedContact:
     """Follow a contact from the start of the path, where the surfaces are within `contact` metres.
 
     A cut may grow to the greater one of the start's and `contact`, and by `contact` more.
@@ -63,12 +63,12 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
         gaps = pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
         for way, gap, pose in zip(ways.tolist(), gaps.tolist(), pair.way.at(ways), strict=True):
             if gap > contact:
-                return Followed(start, deepest, allowed, way, is_apart=True)
+                return FollowedContact(start, deepest, allowed, way, is_apart=True)
             found = depths.of(pose, allowed) if gap <= 0.0 else NONE
             deepest = max(deepest, found.depth)
             if found.depth > allowed - KEPT * contact:
-                return Followed(start, deepest, allowed, way, refused=(way, found))
-    return Followed(start, deepest, allowed, length)
+                return FollowedContact(start, deepest, allowed, way, refused=(way, found))
+    return FollowedContact(start, deepest, allowed, length)
 
 
 class _Depths:

@@ -15,7 +15,7 @@ Floats = NDArray[np.float64]
 Verdict = Literal["clear", "slides", "hits", "not decided"]
 
 
-class Place(NamedTuple):
+class PathPlace(NamedTuple):
     """Where on the path an object is nearest, or is met.
 
     fraction : share of the path's motion before it, 0 .. 1; segment : index of the given pose where
@@ -41,10 +41,10 @@ class Gap(NamedTuple):
 
     at_least: float
     at_most: float
-    place: Place | None
+    place: PathPlace | None
 
 
-class Touching(NamedTuple):
+class TouchedObject(NamedTuple):
     """An object within the contact tolerance of the tool where the path starts.
 
     start, deepest : how deep the surfaces overlap at the start, and at most on the path while they
@@ -59,7 +59,7 @@ class Touching(NamedTuple):
     allowed: float
     until: float
     is_sliding: bool
-    cut: Place | None
+    cut: PathPlace | None
 
 
 class Profile(NamedTuple):
@@ -80,10 +80,10 @@ class Swept:
         poses, and no place of the tool moves more than `path.length` metres.
     gap : Gap
         Of all objects while they do not touch; 0 if anything is hit.
-    hits : tuple of Place
+    hits : tuple of PathPlace
         First place on the path where each object is hit, in that order: its surface is met (within
         0.01 mm), or, touched from the start, it is cut deeper than is allowed or met again.
-    touching : tuple of Touching
+    touching : tuple of TouchedObject
         Objects that the tool touches where the path starts.
     enclosed : tuple of Object
         Objects inside a closed body of the tool, or around the tool: they count as hit, since
@@ -108,8 +108,8 @@ class Swept:
 
     path: Way
     gap: Gap
-    hits: tuple[Place, ...]
-    touching: tuple[Touching, ...]
+    hits: tuple[PathPlace, ...]
+    touching: tuple[TouchedObject, ...]
     enclosed: tuple[Object, ...]
     contact: float
     objects: int

@@ -22,10 +22,10 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.contact import Followed, follow
+from hapticdb.sweeps.contact import FollowedContact, follow
 from hapticdb.sweeps.cut import Mesh
 from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
-from hapticdb.sweeps.result import Gap, Place, Profile, Swept, Touching
+from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
 from hapticdb.sweeps.stretches import Stretches
 from hapticdb.sweeps.way import Way
 
@@ -73,10 +73,8 @@ def sweep(
     about : (3,) array or None
         The tool's point that moves straight and that turns are about, tool frame, metres; the
         middle of the tool's box unless given.
-    limit : float or None
-        Greatest distance that is told, metres; unlimited unless given.
-    seconds : float or None
-        Time after which the sweep ends undecided; unlimited unless given.
+    limit, seconds : float or None
+        Greatest distance that is told, metres; time after which the sweep ends undecided.
     profile : bool
         Compute the distance along the path, too.
     proportions : Proportions or None
@@ -88,55 +86,70 @@ def sweep(
     ------
     UsageError
         If a pose is not rigid, a number is out of range, or the tool has no surface.
-    ObjectNotFoundError
-        If a word of `where` or `exclude` chooses no object.
-    NoSurfaceError
-        If an object's surface is not in the database.
+    ObjectNotFoundError, NoSurfaceError
+        If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _Asked(contact, np.inf if limit is None else limit, profile, progress)
-    if not (0.0 < contact < np.inf and asked.limit > 0.0):
-        raise UsageError(f"contact {contact} m, limit {limit} m: give lengths above 0")
-    if seconds is not None and not seconds > 0.0:
-        raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
+    asked = _asked(contact, limit, seconds, profile=profile, progress=progress)
     tool = MovingSurface(shell)
-    middle = 0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0))
-    center = middle if about is None else np.asarray(about, dtype=np.float64)
-    if center.shape != (3,) or not np.isfinite(center).all():
-        raise UsageError(f"a centre of turns {about!r}: give three lengths, metres")
-    way = Way.of(poses, tool.corners, center)
-    until = np.inf if seconds is None else time.monotonic() + seconds
+    way = Way.of(poses, tool.corners, _center_of(tool, about))
     if proportions is None:
-        proportions = compare_proportions(
-            env.felt(where, exclude), env.grid.voxel_size, shell, poses
-        )
+        felt = env.felt(where, exclude)
+        proportions = compare_proportions(felt, env.grid.voxel_size, shell, poses)
     with suppress(ConnectionLostError):
-        return _Sweep(env, tool, way, asked, until).swept(where, exclude, proportions)
-    return _Sweep(env, tool, way, asked, until).swept(where, exclude, proportions)
+        return _Sweep(env, tool, way, asked).swept(where, exclude, proportions)
+    return _Sweep(env, tool, way, asked).swept(where, exclude, proportions)
 
 
 class _Asked(NamedTuple):
-    """What is asked, as for `sweep`."""
+    """What is asked, as for `sweep`; until : time of `time.monotonic`."""
 
     contact: float
     limit: float
+    until: float
     profile: bool
     progress: SweepCallback | None
+
+
+def _asked(
+    contact: float,
+    limit: float | None,
+    seconds: float | None,
+    *,
+    profile: bool,
+    progress: SweepCallback | None,
+) -> _Asked:
+    """Check numbers; UsageError."""
+    most = np.inf if limit is None else limit
+    if not (0.0 < contact < np.inf and most > 0.0):
+        raise UsageError(f"contact {contact} m, limit {limit} m: give lengths above 0")
+    if seconds is not None and not seconds > 0.0:
+        raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
+    until = np.inf if seconds is None else time.monotonic() + seconds
+    return _Asked(contact, most, until, profile, progress)
+
+
+def _center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
+    """Centre (3,) of turns: as it is asked for, or the middle of the tool's box."""
+    if about is None:
+        return np.asarray(0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0)))
+    center = np.asarray(about, dtype=np.float64)
+    if center.shape != (3,) or not np.isfinite(center).all():
+        raise UsageError(f"a centre of turns {about}: give three lengths, metres")
+    return center
 
 
 class _Sweep:
     """State of one sweep."""
 
-    def __init__(
-        self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked, until: float
-    ) -> None:
-        self._env, self._tool, self._way, self._asked, self._until = env, tool, way, asked, until
+    def __init__(self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked) -> None:
+        self._env, self._tool, self._way, self._asked = env, tool, way, asked
         self._mesh = Mesh(tool.tree)
         self._looks = 0
         self._best = asked.limit
         self._closed = asked.limit  # proved where nothing nearer was looked for
-        self._nearest: Place | None = None
-        self._hits: list[Place] = []
-        self._touching: list[Touching] = []
+        self._nearest: PathPlace | None = None
+        self._hits: list[PathPlace] = []
+        self._touching: list[TouchedObject] = []
         self._enclosed: list[Object] = []
         self._fractions = np.linspace(0.0, 1.0, WINDOWS)
         self._gaps = np.full(WINDOWS, asked.limit)
@@ -193,7 +206,7 @@ class _Sweep:
     def _look_at(self, obj: Object, part: Part, gaps: Floats, stretches: Stretches) -> None:
         """Decide about one object; gaps (W,) : of its box from the tool's on each stretch."""
         triangles = part.surface()
-        pair = Pair(tree_of(triangles), self._tool, self._way, self._until)
+        pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until)
         try:
             start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
             begin = 0.0
@@ -245,10 +258,10 @@ class _Sweep:
         near = pair.measure(ways[at], self._gaps[at])
         self._gaps[at] = np.minimum(self._gaps[at], near.at_most)
 
-    def _place(self, obj: Object, way: float, on_tool: Floats, on_object: Floats) -> Place:
+    def _place(self, obj: Object, way: float, on_tool: Floats, on_object: Floats) -> PathPlace:
         ways = np.array([way])
         segment = int(self._way.segments(ways)[0])
-        return Place(
+        return PathPlace(
             obj, self._way.fraction(way), segment, self._way.at(ways)[0], on_tool, on_object
         )
 
@@ -272,9 +285,9 @@ class _Sweep:
 
 
 def _told(
-    obj: Object, found: Followed, way: Way, contact: float, refused: Place | None
-) -> Touching:
+    obj: Object, found: FollowedContact, way: Way, contact: float, refused: PathPlace | None
+) -> TouchedObject:
     until = way.fraction(found.until) if found.is_apart or refused is not None else 1.0
-    return Touching(
+    return TouchedObject(
         obj, found.start, found.deepest, found.allowed, until, found.is_sliding(contact), refused
     )

@@ -6,7 +6,7 @@ import numpy as np
 
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Place, Swept, Touching
+from hapticdb.sweeps.result import PathPlace, Swept, TouchedObject
 from hapticdb.units import length_text
 
 MOST_NAMED = 3
@@ -48,7 +48,7 @@ def gap_text(found: Swept) -> str:
     return f"more than {length_text(gap.at_least)}" if np.isfinite(gap.at_least) else "-"
 
 
-def where_text(found: Swept, place: Place) -> str:
+def where_text(found: Swept, place: PathPlace) -> str:
     """Write a place on the path: ``31.2 % of the path (segment 4)``."""
     segment = f" (segment {place.segment})" if len(found.path.poses) > 2 else ""
     return f"{percent(place.fraction)} of the path{segment}"
@@ -59,7 +59,7 @@ def until_text(fraction: float) -> str:
     return f"until {percent(fraction)} of the path" if fraction < 1.0 else "to the end of the path"
 
 
-def hit_text(found: Swept, place: Place) -> str:
+def hit_text(found: Swept, place: PathPlace) -> str:
     """Say how and where an object is hit."""
     where = f"at {where_text(found, place)}"
     for one in found.touching:
@@ -126,6 +126,6 @@ def _touching_clauses(found: Swept) -> Iterable[str]:
         yield f"touches {_touched_text(resting)}"
 
 
-def _touched_text(touched: Sequence[Touching]) -> str:
+def _touched_text(touched: Sequence[TouchedObject]) -> str:
     last = max(one.until for one in touched)
     return f"{names_of([one.object for one in touched])} {until_text(last)}"

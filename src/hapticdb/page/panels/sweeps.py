@@ -17,7 +17,7 @@ from hapticdb.page.widgets import put
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
-from hapticdb.sweeps.result import Place, Swept
+from hapticdb.sweeps.result import PathPlace, Swept
 from hapticdb.sweeps.run import sweep
 from hapticdb.sweeps.verdict import gap_text, percent, verdict_line
 
@@ -46,7 +46,7 @@ class _SweepAnswer(NamedTuple):
     swept: Swept
 
     @property
-    def place(self) -> Place | None:
+    def place(self) -> PathPlace | None:
         """Where something is hit first, or else where the tool comes nearest to anything."""
         return self.swept.hits[0] if self.swept.hits else self.swept.gap.place
 
@@ -135,7 +135,7 @@ class SweepPanel:
         )
         self._clear.visible = True
 
-    def _draw(self, found: _SweepAnswer, place: Place, name: str) -> None:
+    def _draw(self, found: _SweepAnswer, place: PathPlace, name: str) -> None:
         """Show the tool where it hits first or comes nearest, and the two places there."""
         scene, swept = self._browser.client.scene, found.swept
         ghost = tools.from_shell(name, found.shell)

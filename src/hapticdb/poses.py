@@ -132,6 +132,15 @@ def read_timed_poses(
     return times.copy(), _poses_of(rows)
 
 
+def pose_of_row(position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
+    """Pose (4, 4) of a position (3,) and a quaternion (4,), scalar first, of any length but 0."""
+    given = as_floats(quaternion, "a quaternion")
+    length = float(np.linalg.norm(given))
+    if not (length > 1e-9 and math.isfinite(length)):
+        raise UsageError(f"the quaternion {given.tolist()} is no rotation")
+    return _poses_of(np.concatenate([as_floats(position, "a position"), given / length])[None])[0]
+
+
 def _poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (M, 4, 4) of rows whose first columns are `COLUMNS`."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))

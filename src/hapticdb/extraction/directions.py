@@ -18,19 +18,24 @@ AGAINST = -0.2
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
-def candidate_directions(normals: Floats, seed: int) -> Floats:
-    """Unit directions (D, 3) to try, those that fewest contacts oppose first.
+def likely_directions(normals: Floats, own: Floats) -> Floats:
+    """Unit directions (D, 3) that a part's own axes (n, 3) and its contacts suggest, and the axes.
 
     normals (C, 3) : unit normals of the contacts at the start, into the part, so away from what
-    blocks it. Besides the axes and random directions, the list has the groups of normals, their
-    mean, and the directions along two groups at once, as a drawer slides along its walls.
+    blocks it. Of these: the groups, their mean, and the directions along two groups at once, as a
+    drawer slides along its walls. A part's own axes are exact where those of contacts are not.
     """
     groups = grouped(normals)
     mean = groups.sum(axis=0, keepdims=True)
     crosses = [np.cross(a, b) for a, b in combinations(groups, 2)]
     along = np.array([sign * cross for cross in crosses for sign in (1.0, -1.0)]).reshape(-1, 3)
+    return distinct(np.concatenate([own, -own, AXES, groups, mean, along]))
+
+
+def candidate_directions(normals: Floats, own: Floats, seed: int) -> Floats:
+    """Likely and random unit directions (D, 3), those that fewest contacts oppose first."""
     random = np.random.default_rng(seed).normal(size=(N_RANDOM, 3))
-    found = distinct(np.concatenate([AXES, groups, mean, along, random]))
+    found = distinct(np.concatenate([likely_directions(normals, own), random]))
     return found[np.argsort(np.round(opposed_shares(found, normals), 2), kind="stable")]
 
 

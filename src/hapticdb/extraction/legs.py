@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES
-from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.free_space import Room
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.loosening import Loosened
 from hapticdb.extraction.problem import Problem
@@ -36,15 +36,13 @@ MOST_STARTS = 12
 class Legs(NamedTuple):
     """Searches ways of one problem's parts.
 
-    problem, space, leaving : what is to come out, whether poses are free, where it is out;
-    is_guarded : whether the way is to be free with the guard; until : time of `time.monotonic` at
-    which the search ends.
+    problem, room, leaving : what is to come out, where it is free, where it is out; until : time of
+    `time.monotonic` at which the search ends.
     """
 
     problem: Problem
-    space: FreeSpace
+    room: Room
     leaving: Exit
-    is_guarded: bool
     until: float
 
     def search(self, starts: list[Loosened]) -> tuple[Loosened, Floats] | None:
@@ -63,7 +61,7 @@ class Legs(NamedTuple):
             if len(tried) > MOST_MOTIONS or time.monotonic() > self.until:
                 return None
             here, out = poses[-1], self._end(poses[-1], axis)
-            if self.space.is_motion_free(np.stack([here, out]), is_guarded=self.is_guarded):
+            if self.room.is_motion_free(np.stack([here, out])):
                 return start, np.concatenate([poses, out[None]])
         return None
 
@@ -94,7 +92,7 @@ class Legs(NamedTuple):
     def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
         """Places (n, 4, 4) along an axis as far as it is free; none if it is not for a voxel."""
         ends = np.stack([here, self._end(here, axis)])
-        last = self.space.farthest(ends, is_guarded=self.is_guarded)
+        last = self.room.farthest(ends)
         way = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
         if way < self.problem.voxel_size:
             return np.empty((0, 4, 4))
@@ -106,7 +104,7 @@ class Legs(NamedTuple):
         if not np.array_equal(begin[:3, :3], end[:3, :3]):
             return end[None]
         stops = _between(begin, end, n_stops)
-        return np.asarray(stops[self.space.are_free(stops, is_guarded=self.is_guarded)])
+        return np.asarray(stops[self.room.are_free(stops)])
 
 
 def _is_along_axis(start: Loosened) -> bool:

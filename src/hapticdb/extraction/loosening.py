@@ -1,8 +1,8 @@
 """Small motions, shifts and turns, by which a part leaves what it touches at its start.
 
 Voxels of two surfaces that touch are shared, so a part that touches something is not free at its
-start. A motion out of contact is believed while `ContactSpace` allows its poses: sliding along a
-surface, not cutting into it. The proof is that of a sweep.
+start. A sweep says how far each motion out of contact goes: sliding along a surface, not cutting
+into it.
 """
 
 import heapq
@@ -20,11 +20,11 @@ from hapticdb.extraction.directions import (
     distinct,
     grouped,
 )
-from hapticdb.extraction.free_space import ContactSpace, FreeSpace
+from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.judge import passed
 from hapticdb.extraction.problem import Problem
 from hapticdb.extraction.pulls import MOST_OPPOSED, first_run
 from hapticdb.poses import rotation_of
-from hapticdb.sweeps.path import SweepPath
 
 Floats = NDArray[np.float64]
 
@@ -43,18 +43,16 @@ MOST_GROUPS = 60
 """Greatest number of groups of contacts for which a motion that leaves all of them is computed."""
 APART = 2.0
 """Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
-BLOCK = 32
-"""Poses of a motion that are looked at together."""
 
 
 class Loosened(NamedTuple):
     """A way out of contact: displacements (M, 4, 4) from the start to a place that is free.
 
-    is_guarded : whether that place is free with the guard.
+    is_wide : whether that place is free in the wide room.
     """
 
     poses: Floats
-    is_guarded: bool
+    is_wide: bool
 
 
 class Twist(NamedTuple):
@@ -98,14 +96,12 @@ class Loosening:
         Number of motions tried so far.
     """
 
-    def __init__(
-        self, problem: Problem, space: FreeSpace, contact: ContactSpace, seed: int
-    ) -> None:
-        self._problem, self._space, self._contact, self._seed = problem, space, contact, seed
+    def __init__(self, problem: Problem, space: FreeSpace, seed: int) -> None:
+        self._problem, self._space, self._seed = problem, space, seed
         self.n_motions = 0
 
     def search(self, most_motions: int, until: float) -> list[Loosened]:
-        """Ways out of contact, those free with the guard first; ends at a time of `monotonic`."""
+        """Ways out of contact, those to the wide room first; ends at a time of `monotonic`."""
         found: list[Loosened] = []
         places = [np.eye(4)]
         waiting: list[tuple[int, int, Floats]] = [(0, 0, np.eye(4)[None])]
@@ -124,52 +120,34 @@ class Loosening:
             else:
                 continue
             break
-        return sorted(found, key=lambda one: not one.is_guarded)
+        return sorted(found, key=lambda one: not one.is_wide)
 
     def _follow(self, way: Floats, twist: Twist) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
-        """Move on while allowed: ways that end free, or (M, 4, 4) in contact with their hits."""
-        path = SweepPath.of(
-            twist.along(way[-1], FARTHEST * self._problem.radius),
-            self._space.extent,
-            self._problem.voxel_size,
-        )
-        poses, counts = self._allowed(path)
-        if len(counts) < 2:
+        """Move on until a hit: ways that end free, or (M, 4, 4) in contact with their hits."""
+        room, farthest = self._space.room, FARTHEST * self._problem.radius
+        moved = passed(self._problem, room, twist.along(way[-1], farthest))
+        if len(moved.poses) < 2:
             return [], []
+        counts = room.hits(moved.poses)
 
-        def longer(sample: int) -> Floats:
-            passed = path.poses[1:][path.starts[1:] < sample]
-            return np.concatenate([way, passed, poses[sample : sample + 1]])
+        def longer(n: int) -> Floats:
+            return np.concatenate([way[:-1], moved.until(n)])
 
         first, last = first_run(np.append(False, counts[1:] == 0))
         if first < last:
-            chosen, is_guarded = self._free(poses[first:last])
-            return [Loosened(longer(first + i), is_guarded) for i in chosen], []
+            chosen, is_wide = self._free(moved.poses[first:last])
+            return [Loosened(longer(first + i), is_wide) for i in chosen], []
         least = np.flatnonzero(counts[1:] == counts[1:].min()) + 1
         ends = {int(least[len(least) // 2]), len(counts) - 1}
-        return [], [(int(counts[i]), longer(i)) for i in sorted(ends)]
-
-    def _allowed(self, path: SweepPath) -> tuple[Floats, NDArray[np.int64]]:
-        """Poses (n, 4, 4) from the path's start on that are allowed, with their hits (n,)."""
-        poses, counts = [np.empty((0, 4, 4))], [np.empty(0, dtype=np.int64)]
-        for begin in range(0, len(path), BLOCK):
-            some = path.sample(begin, min(begin + BLOCK, len(path)))
-            is_allowed = self._contact.are_allowed(some)
-            n_allowed = len(some) if is_allowed.all() else int(np.argmin(is_allowed))
-            hits = self._space.hits(some[:n_allowed]) if n_allowed else counts[0]
-            poses.append(some[:n_allowed])
-            counts.append(hits)
-            if n_allowed < len(some) or (begin and not hits.any()):
-                break
-        return np.concatenate(poses), np.concatenate(counts)
+        return [], [(int(counts[n]), longer(n)) for n in sorted(ends)]
 
     def _free(self, poses: Floats) -> tuple[list[int], bool]:
-        """Middle and end of free poses (n, 4, 4): of those free with the guard, if any are."""
-        first, last = first_run(self._space.are_free(poses, is_guarded=True))
-        is_guarded = first < last
-        if not is_guarded:
+        """Middle and end of free poses (n, 4, 4): of those in the wide room, if any are."""
+        first, last = first_run(self._space.wide.are_free(poses))
+        is_wide = first < last
+        if not is_wide:
             first, last = 0, len(poses)
-        return sorted({(first + last) // 2, last - 1}), is_guarded
+        return sorted({(first + last) // 2, last - 1}), is_wide
 
     def _is_new(self, pose: Floats, places: list[Floats]) -> bool:
         """Whether a displacement differs from all others by more than `APART`, about."""
@@ -183,29 +161,27 @@ class Loosening:
     def _twists(self, pose: Floats) -> list[Twist]:
         """Motions to try at a displacement: those that press against fewest contacts first."""
         problem = self._problem
-        felt = self._contact.touch(pose)
+        felt = self._space.touch(pose)
         points, normals = felt.contact_points, felt.contact_normals
         center = pose[:3, :3] @ problem.center + pose[:3, 3]
-        found = [
-            twist
-            for twist in _candidate_twists(points, normals, center, problem.radius, self._seed)
-            if twist.opposed <= MOST_OPPOSED
-        ]
+        own = problem.own_axes @ pose[:3, :3].T
+        twists = _candidate_twists(points, normals, center, problem.radius, own, self._seed)
+        found = [twist for twist in twists if twist.opposed <= MOST_OPPOSED]
         return sorted(found, key=lambda twist: round(twist.opposed, 2))
 
 
 def _candidate_twists(
-    points: Floats, normals: Floats, center: Floats, radius: float, seed: int
+    points: Floats, normals: Floats, center: Floats, radius: float, own: Floats, seed: int
 ) -> list[Twist]:
     """Motions that contacts suggest: leaving all of them, shifts, and turns.
 
-    points, normals (C, 3) : contacts, unit normals away from what is touched; center (3,), radius :
-    of the part, metres.
+    points, normals (C, 3) : contacts, unit normals away from what is touched; center (3,), radius,
+    own (n, 3) : of the part, metres, and its axes.
     """
     middle = points.mean(axis=0) if len(points) else center
     still = np.zeros(3)
     leaving = leaving_twist(points, normals, center, radius)
-    shifts = candidate_directions(normals, seed)[:MOST_SHIFTS]
+    shifts = candidate_directions(normals, own, seed)[:MOST_SHIFTS]
     groups = grouped(normals)
     crosses = np.array([np.cross(a, b) for a, b in combinations(groups, 2)]).reshape(-1, 3)
     axes = distinct(np.concatenate([groups, AXES[:3], crosses]))

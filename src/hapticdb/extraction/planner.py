@@ -5,19 +5,20 @@ deadline.
 """
 
 import time
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError
-from hapticdb.extraction.free_space import ContactSpace, FreeSpace
-from hapticdb.extraction.goals import GoalSampler
+from hapticdb.extraction.free_space import FreeSpace, Room
+from hapticdb.extraction.goals import SAME, Goals
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.legs import Legs
 from hapticdb.extraction.loosening import Loosened, Loosening
 from hapticdb.extraction.planner_child import PlanRequest
 from hapticdb.extraction.problem import Problem
-from hapticdb.extraction.pulls import Pulls, shifted
+from hapticdb.extraction.pulls import Pulls, first_run
 from hapticdb.poses import quaternion_of, rotation_of
 from hapticdb.realtime.processes import Process
 
@@ -29,6 +30,9 @@ together."""
 STRIDE = 0.5
 """Greatest distance of two neighbouring states, in radii of the part. Larger: fewer questions in
 the open, more of them refused in narrow places."""
+SHARE_OF_WIDE = 0.6
+"""Share of the questions and of the time for ways that keep clearance; the rest is for narrower
+ones, of which more are refused by the proof."""
 SHARE_OF_SHIFTS = 0.3
 """Share of the questions and of the time that go to shifts without turns, which need far fewer."""
 SHARE_OF_LEGS = 0.3
@@ -45,11 +49,16 @@ QUARTERS = np.array(
      [[0, -1, 0], [1, 0, 0], [0, 0, 1]]], dtype=np.float64,
 )  # fmt: skip
 """Quarter turns about the axes: the planner seeks places outside also with these."""
-SAME = 1e-9
-"""Greatest difference of two states that are one: positions in metres, quaternions."""
 ENDING = 1.0
 """Seconds that a process that has closed its pipe has to end. Larger: its end is told later."""
 WORK = "hapticdb.extraction.planner_child:plan"
+
+
+class _Share(NamedTuple):
+    """A share of a search: the questions that it may ask, and when it ends."""
+
+    motions: int
+    until: float
 
 
 class Planner:
@@ -57,10 +66,14 @@ class Planner:
 
     Parameters
     ----------
-    problem, space, contact, leaving :
-        What is to come out, whether poses are free or allowed in contact, where it is out.
+    problem, space :
+        What is to come out, and where it is free.
     pulls : Pulls
         Pulls tried before: planning starts where they end.
+    goals : Goals
+        What is to be reached.
+    leaving : Exit or None
+        Where the parts are out; None: they are to reach a pose.
     seed, most_motions, until :
         Seed of the planner; questions that it may ask; time of `time.monotonic` at which it ends.
     """
@@ -69,20 +82,19 @@ class Planner:
         self,
         problem: Problem,
         space: FreeSpace,
-        contact: ContactSpace,
-        leaving: Exit,
         pulls: Pulls,
+        goals: Goals,
         *,
+        leaving: Exit | None,
         seed: int,
         most_motions: int,
         until: float,
     ) -> None:
-        self._problem, self._space, self._leaving = problem, space, leaving
-        self._contact, self._pulls = contact, pulls
+        self._problem, self._space = problem, space
+        self._pulls, self._goals, self._leaving = pulls, goals, leaving
         self._seed, self._most, self._until = seed, most_motions, until
         self._starts: list[Loosened] | None = None
         self._used: Loosened | None = None
-        self._goals = GoalSampler(problem, space, leaving, pulls, seed)
         self.n_motions = 0
 
     @property
@@ -96,9 +108,9 @@ class Planner:
         self._starts = [one for one in self._starts or [] if one is not self._used]
 
     def search(self) -> Floats | None:
-        """Path (M, 4, 4) of displacements from the start to where the part is out, or None.
+        """Path (M, 4, 4) of displacements from the start to the goal, or None.
 
-        Searched with the guard, first by shifts alone; without the guard if nothing is guarded.
+        Searched in the wide room first, and by shifts alone; then in all that is free.
 
         Raises
         ------
@@ -107,67 +119,67 @@ class Planner:
         """
         if self._starts is None:
             self._starts = self._found_starts()
-        is_guarded = any(one.is_guarded for one in self._starts)
-        starts = [one for one in self._starts if one.is_guarded == is_guarded]
-        if not starts:
-            return None
-        path = self._by_legs(starts, is_guarded=is_guarded)
-        if path is not None:
-            return path
-        del starts[MOST_STARTS:]
-        began, left = time.monotonic(), max(self._most - self.n_motions, 0)
-        soon = began + SHARE_OF_SHIFTS * (self._until - began)
-        asked = self.n_motions
-        for turning, until, share in (
-            (0.0, soon, SHARE_OF_SHIFTS),
-            (self._problem.radius, self._until, 1.0),
-        ):
-            most = max(int(share * (left - (self.n_motions - asked))), 1)
-            path = self._ask(starts, turning, most, until, is_guarded=is_guarded)
+        for room, share in ((self._space.wide, SHARE_OF_WIDE), (self._space.room, 1.0)):
+            is_wide = room is self._space.wide
+            starts = [one for one in self._starts if one.is_wide or not is_wide]
+            path = self._in_room(room, starts, self._part(share)) if starts else None
             if path is not None:
                 return path
         return None
 
+    def _part(self, share: float) -> _Share:
+        """A share of the questions and of the time that are left."""
+        now, left = time.monotonic(), max(self._most - self.n_motions, 0)
+        return _Share(max(int(share * left), 1), now + share * (self._until - now))
+
+    def _in_room(self, room: Room, starts: list[Loosened], part: _Share) -> Floats | None:
+        """Path from one of the starts, in one room: by legs, by shifts, by turns, too."""
+        if self._leaving is not None:
+            now = time.monotonic()
+            until = now + SHARE_OF_LEGS * (part.until - now)
+            found = Legs(self._problem, room, self._leaving, until).search(starts)
+            if found is not None:
+                self._used, path = found
+                return path
+        now, asked = time.monotonic(), self.n_motions
+        soon = _Share(
+            max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)
+        )
+        path = self._ask(room, starts[:MOST_STARTS], 0.0, soon)
+        if path is not None:
+            return path
+        left = part._replace(motions=max(part.motions - (self.n_motions - asked), 1))
+        return self._ask(room, starts[:MOST_STARTS], self._problem.radius, left)
+
     def _found_starts(self) -> list[Loosened]:
-        """Ways to where the planner starts: pulls; where none is free with the guard, others, too.
+        """Ways to where the planner starts: pulls; where none ends in the wide room, others, too.
 
         Of each pull that goes anywhere, the farthest place; the longest pulls first.
         """
         found: list[tuple[float, Loosened]] = []
         for pull in self._pulls.done:
-            way = pull.guarded[1] if pull.guarded is not None else pull.free
-            if way > 0.0:
-                poses = np.stack([np.eye(4), shifted(pull.direction * way)])
-                found.append((way, Loosened(poses, pull.guarded is not None)))
+            if pull.free <= 0.0:
+                continue
+            path = self._problem.path(pull.poses(np.array([0.0, pull.free])))
+            ways = self._space.room.ways(path)
+            poses = path.at(ways)
+            for room in (self._space.wide, self._space.room):
+                first, last = first_run(room.are_free(poses))
+                if first < last:
+                    way = np.stack([np.eye(4), poses[last - 1]])
+                    is_wide = room is self._space.wide
+                    found.append((float(ways[last - 1]), Loosened(way, is_wide)))
+                    break
         starts = [one for _, one in sorted(found, key=lambda one: -one[0])]
-        if not any(one.is_guarded for one in starts):
-            starts += self._loosened()
+        if self._space.start.objects and not any(one.is_wide for one in starts):
+            part = self._part(SHARE_OF_LOOSENING)
+            loosening = Loosening(self._problem, self._space, self._seed)
+            starts += loosening.search(part.motions, part.until)
+            self.n_motions += loosening.n_motions
         return starts
 
-    def _loosened(self) -> list[Loosened]:
-        """Ways out of contact by other motions than pulls."""
-        most = max(int(SHARE_OF_LOOSENING * self._most), 1)
-        now = time.monotonic()
-        until = now + SHARE_OF_LOOSENING * (self._until - now)
-        if not self._contact.touched:
-            return []
-        loosening = Loosening(self._problem, self._space, self._contact, self._seed)
-        found = loosening.search(most, until)
-        self.n_motions += loosening.n_motions
-        return found
-
-    def _by_legs(self, starts: list[Loosened], *, is_guarded: bool) -> Floats | None:
-        """Path (M, 4, 4) out by straight legs along axes, or None."""
-        now = time.monotonic()
-        until = now + SHARE_OF_LEGS * (self._until - now)
-        found = Legs(self._problem, self._space, self._leaving, is_guarded, until).search(starts)
-        if found is None:
-            return None
-        self._used, path = found
-        return path
-
     def _ask(
-        self, starts: list[Loosened], turning: float, most: int, until: float, *, is_guarded: bool
+        self, room: Room, starts: list[Loosened], turning: float, part: _Share
     ) -> Floats | None:
         """Let a process plan; returns displacements (M, 4, 4) from the start, or None.
 
@@ -180,14 +192,23 @@ class Planner:
         if turn is None:
             turns = np.concatenate([turns, *(turns @ quarter for quarter in QUARTERS)])
         turns = _distinct_turns(turns)[:MOST_TURNS]
-        goals = self._goals.poses(turns, is_guarded=is_guarded)
+        goals = self._goals.poses(room, turns, is_turning=turn is None)
+        if not len(goals):
+            return None
         first, last = self._rows(np.stack([one.poses[-1] for one in starts])), self._rows(goals)
-        room = np.concatenate([first, last])[:, :3]
+        held = np.concatenate([first[:, :3], last[:, :3], self._goals.corners])
+        margin = self._problem.voxel_size
         request = PlanRequest(
-            first, last, room.min(axis=0) - self._problem.voxel_size,
-            room.max(axis=0) + self._problem.voxel_size, turning, STRIDE * self._problem.radius,
-            self._seed, most,
+            first, last, held.min(axis=0) - margin, held.max(axis=0) + margin, turning,
+            STRIDE * self._problem.radius, self._seed, part.motions,
         )  # fmt: skip
+        rows = self._answer(room, request, turn, part.until)
+        return None if rows is None else self._path(rows, turn, starts, first)
+
+    def _answer(
+        self, room: Room, request: PlanRequest, turn: Floats | None, until: float
+    ) -> Floats | None:
+        """Answer a planner's questions until it has a path: its states (n, 7), or None."""
         with Process(WORK, request, ()) as process:
             while True:
                 message = process.receive(until - time.monotonic())
@@ -199,11 +220,10 @@ class Planner:
                     continue
                 rows = None if message.content is None else np.asarray(message.content)
                 if message.word == "path":
-                    return None if rows is None else self._path(rows, turn, starts, first)
+                    return rows
                 assert rows is not None  # noqa: S101 - a motion has two states
                 self.n_motions += 1
-                ends = self._poses(rows, turn)
-                process.send(self._space.is_motion_free(ends, is_guarded=is_guarded))
+                process.send(room.is_motion_free(self._poses(rows, turn)))
 
     def _rows(self, poses: Floats) -> Floats:
         """States (n, 7) of displacements (n, 4, 4): place of the part's middle, and its turn."""
@@ -224,7 +244,7 @@ class Planner:
     def _path(
         self, rows: Floats, turn: Floats | None, starts: list[Loosened], first: Floats
     ) -> Floats:
-        """Whole path of displacements (M, 4, 4): to where the planner began, on, and out."""
+        """Whole path of displacements (M, 4, 4): to where the planner began, and to the end."""
         off = np.abs(first[:, :3] - rows[0, :3]).max(axis=1)
         if turn is None:
             signs = np.sign((first[:, 3:] * rows[0, 3:]).sum(axis=1))[:, None]
@@ -232,9 +252,7 @@ class Planner:
         self._used = starts[int(np.argmin(off))]
         poses = self._poses(rows, turn)
         path = np.concatenate([self._used.poses, poses[1:]])
-        end = self._goals.exit_of(path[-1])
-        if end is not None:
-            path = np.concatenate([path, end[None]])
+        path = np.concatenate([path, self._goals.beyond(path[-1])])
         path[:, :3, :3] = rotation_of(quaternion_of(path[:, :3, :3]))
         return path
 

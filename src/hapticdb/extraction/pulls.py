@@ -1,7 +1,7 @@
 """Straight pulls: how far a part goes in each direction before something is in the way."""
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,25 +10,27 @@ from numpy.typing import NDArray
 from hapticdb.extraction.directions import (
     AGAINST,
     ALIKE,
-    AXES,
     candidate_directions,
-    grouped,
+    likely_directions,
     opposed_shares,
 )
-from hapticdb.extraction.free_space import GROWTH, ContactSpace, FreeSpace
+from hapticdb.extraction.free_space import STEP, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
+from hapticdb.store.base import Object
 from hapticdb.sweeps.run import SampleCallback
 
 Floats = NDArray[np.float64]
 
+GROWTH = 1.2
+"""A part slides along what it touches at its start while it has at most so many times the hits of
+its start. Larger: more pulls that the proof refuses."""
 MOST_OPPOSED = 0.1
-"""Greatest share of the contacts at the start that a pull may press against, unless nothing else
-leads out. Larger: pulls through thin walls are tried, too; the proof does not take them for
-proved."""
+"""Greatest share of the contacts at the start that a pull may press against. Larger: more pulls
+that the proof refuses."""
 BLOCKS = (8, 64)
-"""Samples, half a voxel apart, that are looked at together: at first, since most pulls are blocked
-soon, and at most; each block is twice as long as the one before."""
+"""Poses that are looked at together: at first, since most pulls are blocked soon, and at most; each
+block is twice as long as the one before."""
 
 
 class Pull(NamedTuple):
@@ -36,32 +38,25 @@ class Pull(NamedTuple):
 
     direction (3,) : unit vector; length : metres until the part is out; touching : metres in
     contact with what it touches at its start; free : metres until the first other hit, `length` if
-    there is none; guarded : metres from `touching` on with the guard free, as an interval (2,), or
-    None; blockers : ids of the objects at the first hit in the way.
+    there is none; blockers : ids of the objects at the first hit in the way; is_likely : whether
+    the part's axes or contacts suggest it.
     """
 
     direction: Floats
     length: float
     touching: float
     free: float
-    guarded: tuple[float, float] | None
     blockers: tuple[int, ...]
+    is_likely: bool
 
     @property
     def is_out(self) -> bool:
         """Whether nothing is in the way until the part is out."""
         return self.free >= self.length
 
-    def pose(self, way: float) -> Floats:
-        """Displacement (4, 4) after so many metres."""
-        return shifted(self.direction * way)
-
-
-def shifted(shift: Floats) -> Floats:
-    """Pose (4, 4) that shifts by (3,) metres."""
-    pose = np.eye(4)
-    pose[:3, 3] = shift
-    return pose
+    def poses(self, ways: Floats) -> Floats:
+        """Displacements (n, 4, 4) after (n,) metres."""
+        return poses_along(self.direction, ways)
 
 
 class Pulls:
@@ -70,22 +65,18 @@ class Pulls:
     Attributes
     ----------
     done : list of Pull
-        In the order in which they were tried.
-    touched : tuple of int
-        Ids of the objects that the part touches where it starts.
+        In the order in which they were tried: those that fewest contacts oppose first.
     """
 
-    def __init__(
-        self, problem: Problem, space: FreeSpace, contact: ContactSpace, leaving: Exit, seed: int
-    ) -> None:
+    def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
         self.done: list[Pull] = []
-        self._problem, self._space, self._contact = problem, space, contact
-        start, self.touched = contact.start, contact.touched
-        self._normals = start.contact_normals
-        self._pairs, self._contacts = start.contact_pairs, start.contacts
-        self._directions = candidate_directions(self._normals, seed)
+        self._space, self._step = space, STEP * problem.voxel_size
+        normals, own = space.start.contact_normals, problem.own_axes
+        self._directions = candidate_directions(normals, own, seed)
+        alike = self._directions @ likely_directions(normals, own).T >= ALIKE
+        self._is_likely = alike.any(axis=1)
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
-        self._opposed = opposed_shares(self._directions, self._normals)
+        self._is_opposed = opposed_shares(self._directions, normals) > MOST_OPPOSED
 
     def run(self, until: float, progress: SampleCallback | None) -> None:
         """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
@@ -93,96 +84,60 @@ class Pulls:
         for n in range(total):
             if self.done and time.monotonic() > until:
                 return
-            is_opposed = self._opposed[n] > MOST_OPPOSED
-            self.done.append(self._blocked(n) if is_opposed else self._pull(n))
+            self.done.append(self._pull(n))
             if progress is not None:
                 progress(n + 1, total)
 
-    def opposed_out(self, until: float) -> list[Pull]:
-        """Pulls that lead out though they press against more than `MOST_OPPOSED` of the contacts.
-
-        Only the axes and the groups of contact normals are tried, because a long slide takes time.
-        Contacts are points in voxels: in a recess hardly wider than the part, its front is in
-        contact, too. So a pull counts if the part is in contact only where it was at its start. A
-        bolt in its bore is; a part that is pulled through something else is not.
-        """
-        found = []
-        likely = np.concatenate([AXES, grouped(self._normals)])
-        is_likely = (self._directions @ likely.T >= ALIKE).any(axis=1)
-        for n in np.flatnonzero(is_likely & (self._opposed > MOST_OPPOSED)).tolist():
-            if time.monotonic() > until:
-                break
-            pull = self._pull(n)
-            if pull.is_out and self._contact.stays(self._in_contact(pull)):
-                found.append(pull)
-        return found
-
-    def _in_contact(self, pull: Pull) -> Floats:
-        """Poses (n, 4, 4) of a pull in contact, half a voxel apart or less."""
-        n = int(np.ceil(2.0 * pull.touching / self._problem.voxel_size)) + 1
-        return _poses_along(pull.direction, np.linspace(0.0, pull.touching, n))
-
-    def _blocked(self, n: int) -> Pull:
-        """A pull that is not tried, because it presses against contacts."""
-        direction = self._directions[n]
-        return Pull(direction, float(self._lengths[n]), 0.0, 0.0, None, self._opposing(direction))
-
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
-        ways = np.linspace(0.0, length, int(np.ceil(2.0 * length / self._problem.voxel_size)) + 1)
-        contact = 0  # samples in contact from the start on
-        most = -1.0
+        touching, free, blockers = 0.0, 0.0, self._opposing(direction)
+        if not self._is_opposed[n]:  # else it is blocked where it starts
+            ways = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
+            contact, end = self._followed(direction, ways)
+            if contact == len(ways):  # still in contact where it should be out
+                touching, blockers = length, _ids(self._space.start.objects)
+            else:
+                touching = float(ways[contact]) if contact < end else 0.0
+                free = float(ways[end - 1]) * (end > contact)
+                blockers = () if end == len(ways) else self._hit_at(direction * ways[end])
+        return Pull(direction, length, touching, free, blockers, bool(self._is_likely[n]))
+
+    def _followed(self, direction: Floats, ways: Floats) -> tuple[int, int]:
+        """Number of the first poses after (n,) metres in contact, and of those before a hit."""
+        contact, most, room = 0, -1.0, self._space.room
         for first, end in _blocks(len(ways)):
-            block = ways[first:end]
-            poses = _poses_along(direction, block)
+            poses = poses_along(direction, ways[first:end])
             slides = 0
             if contact == first:
-                hits = self._space.hits(poses)
+                hits = room.hits(poses)
                 most = GROWTH * float(hits[0]) if most < 0.0 else most
-                slides = self._slides(poses, hits, most)
+                is_hit = hits > 0
+                slides = int(np.argmin(np.append(is_hit & (hits <= most), False)))
             else:  # once out of contact, a pull is free until its first hit
-                hits = (~self._space.are_free(poses)).astype(np.int64)
-            for at, count in enumerate(hits.tolist(), start=first):
-                if count and contact == at and at - first < slides:
-                    contact += 1
-                elif count:
-                    found = self._contact.touch(shifted(direction * ways[at])).objects
-                    blockers = tuple(obj.id for obj in found)
-                    return self._ended(direction, ways, contact, at, blockers)
-        if contact == len(ways):  # still in contact where it should be out
-            return Pull(direction, length, length, 0.0, None, self.touched)
-        return self._ended(direction, ways, contact, len(ways), ())
+                is_hit = ~room.are_free(poses)
+            contact += slides
+            later = np.flatnonzero(is_hit[slides:])
+            if len(later):
+                return contact, first + slides + int(later[0])
+        return contact, len(ways)
 
-    def _slides(self, poses: Floats, hits: NDArray[np.int64], most: float) -> int:
-        """Number of the first poses (n, 4, 4) at which the part slides along what it touches."""
-        _, n = first_run(np.concatenate([[True], (hits > 0) & (hits <= most)]))
-        allowed = self._contact.are_allowed(poses[: n - 1], is_pull=True)
-        return int(first_run(np.concatenate([[True], allowed]))[1]) - 1
-
-    def _ended(
-        self, direction: Floats, ways: Floats, contact: int, end: int, blockers: tuple[int, ...]
-    ) -> Pull:
-        """Describe a pull that is free from sample `contact` to the one before `end`."""
-        length = float(ways[-1])
-        touching = float(ways[contact]) if contact < end else 0.0
-        free = length if end == len(ways) else float(ways[end - 1]) * (end > contact)
-        guarded = None
-        if end > contact:
-            poses = _poses_along(direction, ways[contact:end])
-            first, last = first_run(self._space.are_free(poses, is_guarded=True))
-            if first < last:
-                guarded = (float(ways[contact + first]), float(ways[contact + last - 1]))
-        return Pull(direction, length, touching, free, guarded, blockers)
+    def _hit_at(self, shift: Floats) -> tuple[int, ...]:
+        return _ids(self._space.touch(shifted(shift)).objects)
 
     def _opposing(self, direction: Floats) -> tuple[int, ...]:
         """Ids of the objects whose contacts at the start a direction presses against."""
-        against = self._contacts[self._normals @ direction < AGAINST]
-        pairs = self._pairs[np.isin(self._pairs[:, 0], against)]
+        start = self._space.start
+        against = start.contacts[start.contact_normals @ direction < AGAINST]
+        pairs = start.contact_pairs[np.isin(start.contact_pairs[:, 0], against)]
         return tuple(np.unique(pairs[:, 1]).tolist())
 
 
+def _ids(objects: Sequence[Object]) -> tuple[int, ...]:
+    return tuple(obj.id for obj in objects)
+
+
 def _blocks(n: int) -> Iterator[tuple[int, int]]:
-    """First and last + 1 sample of each block of `BLOCKS` samples, of n."""
+    """First and last + 1 pose of each block of `BLOCKS` poses, of n."""
     first, length = 0, BLOCKS[0]
     while first < n:
         yield first, min(first + length, n)
@@ -198,7 +153,13 @@ def first_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
     return first, first + length
 
 
-def _poses_along(direction: Floats, ways: Floats) -> Floats:
+def shifted(shift: Floats) -> Floats:
+    """Pose (4, 4) that shifts by (3,) metres."""
+    return np.asarray(poses_along(shift, np.ones(1))[0])
+
+
+def poses_along(direction: Floats, ways: Floats) -> Floats:
+    """Poses (n, 4, 4) that shift by (n,) metres in a direction (3,)."""
     poses = np.tile(np.eye(4), (len(ways), 1, 1))
     poses[:, :3, 3] = ways[:, None] * direction
     return poses

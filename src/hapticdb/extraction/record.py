@@ -7,7 +7,6 @@ from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.extraction.verdict import disassembly_line, extraction_line
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.sweeps.record import plain, sweep_record
-from hapticdb.sweeps.result import Swept
 
 
 def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
@@ -16,7 +15,7 @@ def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
     excluded : ids of the objects that were left out, those of the parts among them.
     """
     parts = [obj.id for obj in found.parts]
-    told = ("touched", "blockers", "pulls", "motions", "poses", "is_planned", "seconds", "seed")
+    told = ("to", "near", "blockers", "pulls", "motions", "poses", "is_planned", "seconds", "seed")
     return {
         "verdict": found.verdict,
         "line": extraction_line(found),
@@ -27,15 +26,9 @@ def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
 
 
 def _way(way: WayOut, shell: PointShell, parts: list[int], excluded: list[int]) -> dict[str, Any]:
-    def proof(swept: Swept | None) -> dict[str, Any] | None:
-        return None if swept is None else sweep_record(swept, shell, parts, excluded)
-
-    told = ("how", "poses", "length", "clearance", "rest_from", "depths")
-    return {
-        **{name: plain(getattr(way, name)) for name in told},
-        "proof": proof(way.swept),
-        "rest": proof(way.rest),
-        "beside": proof(way.beside),
+    told = ("how", "poses", "length", "gap")
+    return {name: plain(getattr(way, name)) for name in told} | {
+        "proof": sweep_record(way.swept, shell, parts, excluded)
     }
 
 

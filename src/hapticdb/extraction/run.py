@@ -1,7 +1,7 @@
-"""Searches a way out for parts: straight pulls first, then a planner; sweeps prove what is found.
+"""Searches a way out for parts, or a way to a pose: straight pulls first, then a planner.
 
-A path that is found may be proved or not. That no path is found proves nothing: the result then
-names what is in the way of the straight pulls.
+A sweep judges each path that is found. That no path is found proves nothing: the result then names
+what is in the way of the straight pulls.
 """
 
 import math
@@ -11,19 +11,22 @@ from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
-from hapticdb.extraction.free_space import ContactSpace, FreeSpace
+from hapticdb.extraction.free_space import FreeSpace
+from hapticdb.extraction.goals import GoalPose, Goals, GoalsOutside
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Problem, problem_of
-from hapticdb.extraction.pulls import Pull, Pulls
+from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut, WayOutVerdict
 from hapticdb.resident.table import DEFAULT_BUDGET
+from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
+from hapticdb.sweeps.path import checked_poses
 from hapticdb.sweeps.run import SampleCallback
 
 Floats = NDArray[np.float64]
@@ -32,16 +35,20 @@ DEFAULT_SECONDS = 60.0
 """Default time of a search."""
 DEFAULT_MOTIONS = 20_000
 """Default number of motions that the planner may ask about."""
-MOST_JUDGED = 4
-"""Greatest number of straight pulls that are proved, one after another, until one is. Larger: a
-proof is found more often, at the price of a sweep each."""
+DEFAULT_CONTACT = 5e-5
+"""Default contact tolerance, metres."""
+MOST_OUT = 8
+"""Greatest number of straight pulls that are judged of those that lead out by voxels."""
+MOST_LIKELY = 16
+"""The same of those that voxels refuse, but the part's axes or contacts suggest: surfaces may slide
+where voxels are shared. Larger: more oblique bores are left, at the price of a sweep each."""
 MOST_PLANS = 3
-"""Greatest number of planned paths that are proved, until one is not refuted. Larger: more ways are
-found past places that the search overlooks, at the price of a sweep each."""
+"""Greatest number of planned paths that are judged, until one is not refuted. Larger: more ways are
+found past places that the search overlooks."""
+FARTHEST = 1e3
+"""Greatest way to a pose, lengths of all that stands: a farther one is in a wrong unit."""
 MOST_SEED = 1 << 31
-RANK: dict[WayOutVerdict, int] = {
-    "comes out": 0, "slides out": 1, "comes out of contact": 2, "not decided": 3,
-}  # fmt: skip
+RANK: dict[WayOutVerdict, int] = {"comes out": 0, "slides": 1, "not decided": 2}
 
 
 def extract(
@@ -49,32 +56,36 @@ def extract(
     *words: int | str,
     where: Words = (),
     exclude: Words = (),
+    to: ArrayLike | None = None,
+    out: float | None = None,
+    contact: float = DEFAULT_CONTACT,
     seconds: float = DEFAULT_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
-    out: float | None = None,
     budget_bytes: int = DEFAULT_BUDGET,
     progress: SampleCallback | None = None,
 ) -> Extraction:
-    """Search a path on which parts come out of what stands around them.
+    """Search a path on which parts come out of what stands around them, or to a pose.
 
     Parameters
     ----------
     env : Environment
-        An environment whose order is not lexicographic, with the files it was imported from.
+        An environment whose order is not lexicographic.
     words : int or str
         Parts that move together, as for `Environment.find`.
-    where, exclude : iterable of int or str
-        What is felt, as for `hapticdb.sweep`; the parts themselves are not felt.
+    where, exclude, contact
+        As for `hapticdb.sweep`; the parts themselves are not felt.
+    to : (4, 4) array or None
+        Displacement that the parts are to reach, rigid, metres; out unless given.
+    out : float or None
+        Metres from the start at which the parts count as out; unless given, where their bounding
+        sphere has left the box of all that stands.
     seconds : float
-        Time of the search; proofs of what is found may take longer.
+        Time of the search; each sweep that judges a path has as much.
     seed : int
         The same seed gives the same path, unless the time ends the search.
     motions : int
         Motions that the planner may ask about; 0: straight pulls only.
-    out : float or None
-        Metres from the start at which the parts count as out; unless given, where their bounding
-        sphere has left the box of all that stands.
     budget_bytes : int
         Memory for resident cells.
     progress : callable or None
@@ -91,17 +102,20 @@ def extract(
     UsageError
         If a number is out of range, or nothing stands beside the parts.
     """
-    asked = _Asked(seconds, seed, motions, out, budget_bytes)
+    asked = _Asked(None, seconds, seed, motions, out, budget_bytes)
     asked.check()
     began = time.monotonic()
-    problem = problem_of(env, words, where, exclude, seed=seed)
+    problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, seconds=seconds)
+    if to is not None:
+        asked = asked._replace(to=_checked_goal(problem, to))
     found = _searched(problem, asked, progress)
     return replace(found, seconds=time.monotonic() - began)
 
 
 class _Asked(NamedTuple):
-    """Options of a search, as `extract` takes them."""
+    """Options of a search, as `extract` takes them; to : checked."""
 
+    to: Floats | None
     seconds: float
     seed: int
     motions: int
@@ -120,6 +134,18 @@ class _Asked(NamedTuple):
             raise UsageError(f"out at {self.out} m: give a length above 0")
 
 
+def _checked_goal(problem: Problem, to: ArrayLike) -> Floats:
+    """The pose (4, 4) to reach; UsageError if it is none, or far from everything."""
+    goal = checked_poses(np.asarray(to)[None])[0]
+    way, size = problem.path(np.stack([np.eye(4), goal])).length, np.ptp(problem.box, axis=0).max()
+    if way > FARTHEST * (size + problem.radius):
+        raise UsageError(
+            f"the pose to reach is {way:.4g} m away, and what stands is {size:.4g} m across: check "
+            "its unit"
+        )
+    return goal
+
+
 def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
     leaving = Exit(
@@ -131,34 +157,36 @@ def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) 
     )
     until = time.monotonic() + asked.seconds
     n_motions, is_planned = 0, False
-    with (
-        FreeSpace(problem, asked.budget_bytes) as space,
-        ContactSpace(problem, space, asked.budget_bytes) as contact,
-    ):
-        pulls = Pulls(problem, space, contact, leaving, asked.seed)
-        pulls.run(until, progress)
-        refuting: Counter[int] = Counter()
-        way = _best_pull(problem, pulls.done, asked.budget_bytes, refuting)
-        if way is None or way.verdict == "not decided":  # what blocks is counted already
-            last = _best_pull(problem, pulls.opposed_out(until), asked.budget_bytes, Counter())
-            way = last if last is not None and last.verdict != "not decided" else way
+    way = None if asked.to is None else judge(problem, np.stack([np.eye(4), asked.to]), "pull")
+    refuting = () if way is None else way.in_way
+    with FreeSpace(problem, asked.budget_bytes) as space:
+        pulls = Pulls(problem, space, leaving, asked.seed)
+        if way is None or refuting:
+            pulls.run(until, progress)
+            pulled = _best_pull(problem, pulls, until)
+            way = pulled if asked.to is None else None
         if asked.motions and (way is None or way.verdict == "not decided"):
+            goals: Goals = (
+                GoalsOutside(problem, leaving, pulls, asked.seed)
+                if asked.to is None
+                else GoalPose(problem, space, asked.to, until)
+            )
             planner = Planner(
-                problem, space, contact, leaving, pulls, seed=asked.seed,
+                problem, space, pulls, goals,
+                leaving=leaving if asked.to is None else None, seed=asked.seed,
                 most_motions=asked.motions, until=until,
             )  # fmt: skip
-            way, is_planned = _planned(problem, planner, way, pulls, asked.budget_bytes), True
+            way, is_planned = _planned(problem, planner, way, pulls), True
             n_motions = planner.n_motions
         n_poses = space.n_poses
     known = {obj.id: obj for obj in problem.standing}
     return Extraction(
         parts=problem.parts,
         shell=problem.shell,
+        to=asked.to,
         way=way,
-        touched=tuple(known[i] for i in pulls.touched if i in known),
-        blockers=tuple(
-            Blocker(known[i], n) for i, n in _blockers(pulls.done, refuting) if i in known
-        ),
+        near=tuple(space.start.objects),
+        blockers=tuple(Blocker(known[i], n) for i, n in _blockers(pulls, *refuting) if i in known),
         pulls=len(pulls.done),
         motions=n_motions,
         poses=n_poses,
@@ -168,44 +196,40 @@ def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) 
     )
 
 
-def _best_pull(
-    problem: Problem, pulls: list[Pull], budget_bytes: int, refuting: Counter[int]
-) -> WayOut | None:
-    """Prove the straight pulls that lead out, guarded and short ones first; returns the best.
+def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
+    """Judge the straight pulls that lead out, short ones first, then likely ones; the best of them.
 
-    The dense shell of the proof may hit what the search has not seen: these objects are counted.
+    Of the pulls that are judged, surfaces then say how far they are free, and what stops them.
     """
-
-    def rank(pull: Pull) -> tuple[bool, float, float]:
-        is_unguarded = pull.guarded is None or pull.guarded[1] < pull.length
-        return is_unguarded, pull.touching, pull.length
-
+    order = range(len(pulls.done))
+    outs = [n for n in order if pulls.done[n].is_out]
+    outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
+    likely = [n for n in order if pulls.done[n].is_likely and not pulls.done[n].is_out]
     best: WayOut | None = None
-    for pull in sorted((one for one in pulls if one.is_out), key=rank)[:MOST_JUDGED]:
-        poses = np.stack([np.eye(4), pull.pose(pull.length)])
-        way = judge(problem, poses, "pull", budget_bytes)
-        refuting.update(obj.id for obj in way.in_way)
-        if way.in_way:
-            continue
-        if best is None or RANK[way.verdict] < RANK[best.verdict]:
+    for n in outs[:MOST_OUT] + likely[:MOST_LIKELY]:
+        pull = pulls.done[n]
+        if not pull.is_out and time.monotonic() > until:
+            break
+        way = judge(problem, pull.poses(np.array([0.0, pull.length])), "pull")
+        blockers = tuple(obj.id for obj in way.in_way)
+        pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
+        if not blockers and (best is None or RANK[way.verdict] < RANK[best.verdict]):
             best = way
-        if best.verdict != "not decided":
+        if best is not None and best.verdict != "not decided":
             break
     return best
 
 
-def _planned(
-    problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls, budget_bytes: int
-) -> WayOut | None:
-    """Plan, and prove what is planned; returns the better one of that and the way so far.
+def _planned(problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls) -> WayOut | None:
+    """Plan, and judge what is planned; returns the better one of that and the way so far.
 
-    A path that the proof refutes is planned once more from another start, `MOST_PLANS` in all.
+    A path that the sweep refutes is planned once more from another start, `MOST_PLANS` in all.
     """
     for _ in range(MOST_PLANS):
         poses = _poses_of(problem, planner, way, pulls)
         if poses is None:
             return way
-        planned = judge(problem, poses, "plan", budget_bytes)
+        planned = judge(problem, poses, "plan")
         if not planned.in_way:
             return planned if way is None or RANK[planned.verdict] < RANK[way.verdict] else way
         if not planner.can_refuse:
@@ -223,12 +247,16 @@ def _poses_of(
     except MissingExtraError as error:
         if way is not None:
             return None
-        ids = [i for i, _ in _blockers(pulls.done, Counter())[:1]]
+        ids = [i for i, _ in _blockers(pulls)[:1]]
         name = "".join(f", {obj.name} is in the way" for obj in problem.standing if obj.id in ids)
         raise MissingExtraError(f"no straight pull leads out{name}; {error}") from error
 
 
-def _blockers(pulls: list[Pull], refuting: Counter[int]) -> list[tuple[int, int]]:
-    """Ids of the objects that stop pulls, with the number of pulls, largest number first."""
-    counts = refuting + Counter(i for pull in pulls if not pull.is_out for i in pull.blockers)
+def _blockers(pulls: Pulls, *refuting: Object) -> list[tuple[int, int]]:
+    """Ids of the objects that stop pulls, with the number of pulls, largest number first.
+
+    refuting : what stops the straight motion to a pose.
+    """
+    counts = Counter(i for pull in pulls.done if not pull.is_out for i in pull.blockers)
+    counts.update(obj.id for obj in refuting)
     return sorted(counts.items(), key=lambda item: (-item[1], item[0]))

@@ -3,7 +3,7 @@
 from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch
 from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.store.base import Object
-from hapticdb.sweeps.verdict import depth_text, names_of, verdict_line
+from hapticdb.sweeps.verdict import gap_text, names_of, until_text, verdict_line
 from hapticdb.units import length_text
 
 
@@ -13,37 +13,26 @@ def extraction_line(found: Extraction) -> str:
     if way is None:
         return _no_way(found)
     how = "straight" if way.how == "pull" else f"by {len(way.poses)} poses"
-    if way.cuts:
-        depths = "; ".join(f"in {one.object.name} {depth_text(one)}" for one in way.cuts)
-        return f"not decided: a path {how}, {length_text(way.length)} long, is refuted: {depths}"
-    if way.verdict == "not decided":
-        return (
-            f"not decided: a path {how}, {length_text(way.length)} long, is not proved: "
-            f"{verdict_line(way.swept, found.shell)}"
-        )
-    clearance = f", surfaces {length_text(way.clearance)} or more apart" if way.clearance else ""
-    if way.verdict == "comes out":
-        return f"comes out {how}, {length_text(way.length)}{clearance}"
-    if way.verdict == "slides out":
-        depths = "; ".join(f"in {one.object.name} {depth_text(one)}" for one in way.depths)
-        return (
-            f"comes out {how}, {length_text(way.length)}; while it leaves what it touches: {depths}"
-        )
-    return (
-        f"comes out {how}, {length_text(way.length)}, once it has left {_touched(way)}, which it "
-        f"touches at its start: proved from {length_text(way.rest_from)} on, not before{clearance}"
+    path = f"{how}, {length_text(way.length)}"
+    if not found.is_free:
+        return f"not decided: a path {path} long: {verdict_line(way.swept, found.shell)}"
+    does = "slides" if way.verdict == "slides" else "comes out"
+    return f"{does if found.to is None else 'reaches the pose'} {path}{_proved(way)}"
+
+
+def _proved(way: WayOut) -> str:
+    """Say how near surfaces come, and what is touched until when."""
+    said = "".join(
+        f"; touches {one.object.name} {until_text(one.until)}" for one in way.swept.touching[:3]
     )
-
-
-def _touched(way: WayOut) -> str:
-    return names_of([one.object for one in way.swept.objects])
+    return f", surfaces {gap_text(way.swept)} apart{said}"
 
 
 def _no_way(found: Extraction) -> str:
     pulls = f"{found.pulls} straight pull{'s' * (found.pulls != 1)}"
     tried = f"{pulls} and {found.motions:,} motions" if found.is_planned else pulls
     if found.is_planned and not found.motions:
-        tried = f"{pulls}, none of which gets free of what it touches"
+        tried = f"{pulls}, none of which gets free of what is near"
     if not found.blockers:
         return f"no way found in {tried}"
     first = found.blockers[0]
@@ -59,11 +48,7 @@ def disassembly_line(found: Disassembly) -> str:
         return _no_order(found)
     last = extraction_line(found.steps[-1].found)
     before = _taken_off(found)[: -len(found.parts)]
-    if not before:
-        return f"nothing has to come out before: {last}"
-    if found.verdict == "comes out":
-        return f"comes out after {names_of(before)}, each step proved: {last}"
-    return f"comes out after {names_of(before)}, not every step proved while in contact: {last}"
+    return f"after {names_of(before)}: {last}" if before else f"nothing goes before: {last}"
 
 
 def failed_line(failed: FailedSearch) -> str:

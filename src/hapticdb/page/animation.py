@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError
+from hapticdb.extraction.problem import corners_of
 from hapticdb.extraction.result import Extraction
 from hapticdb.ingest.geometry import found_parts
 from hapticdb.page import colours
@@ -186,8 +187,7 @@ def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
     corners = []
     for found, poses in zip(steps, paths, strict=True):
         low, high = found.shell.points.min(axis=0), found.shell.points.max(axis=0)
-        which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
-        own = np.stack([low, high])[which, np.arange(3)]
+        own = corners_of(np.stack([low, high]))
         corners.append(
             (own @ poses[:, :3, :3].swapaxes(1, 2) + poses[:, None, :3, 3]).reshape(-1, 3)
         )

@@ -16,19 +16,28 @@ from hapticdb.cli.options import (
     UrlArgument,
     WhereOption,
 )
-from hapticdb.cli.values import budget_bytes
-from hapticdb.cli.verbs.sweeping import PictureOption, UpName, UpOption, check_picture
+from hapticdb.cli.values import budget_bytes, numbers_of
+from hapticdb.cli.verbs.sweeping import (
+    MM,
+    ContactOption,
+    PictureOption,
+    UpName,
+    UpOption,
+    check_picture,
+)
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
     from hapticdb.environment import Environment
     from hapticdb.extraction.disassembly.result import Disassembly
     from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {
-    "comes out": 0, "slides out": 0, "comes out of contact": 3, "not decided": 3, "no way found": 1,
+    "comes out": 0, "slides": 0, "not decided": 3, "no way found": 1, "no order found": 1,
 }  # fmt: skip
-ORDER_EXIT_CODES = {"comes out": 0, "comes out of contact": 3, "no order found": 1}
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way, and of the table of searches that failed."""
 
@@ -45,9 +54,17 @@ MotionsOption = Annotated[
 OutOption = Annotated[
     float | None,
     typer.Option(
-        metavar="M",
-        help="Distance at which the part counts as out.",
+        metavar="MM",
+        help="Millimetres from the start at which the part counts as out.",
         show_default="clear of all that stands",
+    ),
+]
+ToOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="POSE",
+        help="Reach this displacement instead: x,y,z,qw,qx,qy,qz, millimetres; or a CSV file of "
+        "one pose, metres.",
     ),
 ]
 WayOption = Annotated[
@@ -75,23 +92,22 @@ AnimationOption = Annotated[
     typer.Option(metavar="HTML", help="Write a page that shows how the parts come out."),
 ]
 
-HELP = """Search a path on which parts come out, and prove it by a sweep.
+HELP = """Search a path on which parts come out, judged by a sweep of their surfaces.
 
 The parts that WORDS choose move together as one rigid body. Straight pulls are
 tried first: along the axes, away from contacts and along them, at random. If none
 leads out, a planner (OMPL, pip install 'hapticdb[extract]') searches a path round
 corners and with turns. A part is out when its bounding sphere is clear of the box
-of all that stands, or at --out.
+of all that stands, or at --out. With --to, a way to a pose is searched instead.
 
 The path is written by --path as displacements from the present place, as
 'hapticdb sweep --part' takes them. The same seed gives the same path, unless
 --seconds end the search.
 
-Comes out: a sweep proves it for the whole surface and the whole path. Comes out,
-no deeper than so much in what it touches at its start: proved, too, on the whole
-path. Comes out, once it has left what it touches: proved from a stated place on
-only; how deep it gets before is not known. Not decided: a path, but no proof. No way found:
-what blocks most of the straight pulls is named; this is no proof that there is none.
+Comes out: nothing is hit on the whole path, and nothing is touched at its end.
+Slides: nothing is hit, but the part still touches something at the end. Not
+decided: the time was over before the sweep of a path was. No way found: what
+blocks most of the straight pulls is named; this is no proof that there is none.
 
 With --disassemble, what blocks the parts is taken off first, each object alone
 and on a path that is proved; --keep names what stays. Each step has a file of its
@@ -101,8 +117,8 @@ necessary.
 --animation writes a page for any browser, with all that it needs in one file (pip
 install 'hapticdb[view]').
 
-The exit code is 0 when all of the path is proved, 3 when a path is found and not
-all of it is proved, 1 when no path is found.
+The exit code is 0 when it comes out or slides, 3 when it is not decided, 1 when no
+path is found.
 
 Example: hapticdb extract car.db body/hood --path out.csv --picture out.png
 """
@@ -120,6 +136,8 @@ def extract(
     seed: SeedOption = 0,
     motions: MotionsOption = 20_000,
     out: OutOption = None,
+    to: ToOption = None,
+    contact: ContactOption = 0.05,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
     budget: BudgetOption = 256.0,
@@ -138,10 +156,14 @@ def extract(
     _check_animation(animation)
     if not disassemble and (depth is not None or keep):
         raise UsageError("--depth and --keep go with --disassemble")
+    if to is not None and (disassemble or out is not None):
+        raise UsageError("--to goes neither with --out nor with --disassemble")
     asked = _Outputs(path, picture, animation, up, json)
     options: dict[str, Any] = {
-        "seed": seed, "motions": motions, "out": out, "budget_bytes": budget_bytes(budget),
+        "seed": seed, "motions": motions, "out": None if out is None else MM * out,
+        "contact": MM * contact, "budget_bytes": budget_bytes(budget),
     }  # fmt: skip
+    goal = None if to is None else _goal(to)
     if seconds is not None:
         options["seconds"] = seconds
     with hapticdb.open(url, read_only=True) as env:
@@ -157,15 +179,25 @@ def extract(
                     env, *ids, exclude=exclude or (), keep=kept, depth=chain, **options
                 )
             else:
-                found = run.extract(env, *ids, exclude=felt.exclude, **options)
+                found = run.extract(env, *ids, exclude=felt.exclude, to=goal, **options)
         if disassemble:
             _report_order(env, order, asked)
-            code = ORDER_EXIT_CODES[order.verdict]
         else:
             _report(env, found, felt.left_out, asked)
-            code = EXIT_CODES[found.verdict]
-    if code:
-        raise typer.Exit(code)
+    raise typer.Exit(EXIT_CODES[order.verdict if disassemble else found.verdict])
+
+
+def _goal(to: str) -> "NDArray[np.float64]":
+    """The pose (4, 4) that --to names: numbers in millimetres, or a file."""
+    from hapticdb.poses import pose_of_row, read_poses
+
+    if to.lower().endswith(".csv"):
+        poses = read_poses(to)
+        if len(poses) != 1:
+            raise UsageError(f"--to {to}: it has {len(poses)} poses, give a file of one")
+        return poses[0]
+    row = numbers_of(to, 7, "--to", "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv")
+    return pose_of_row([MM * x for x in row[:3]], row[3:])
 
 
 class _Outputs(NamedTuple):
@@ -249,10 +281,15 @@ def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
         if files.picture is not None and found.way is not None:
             from hapticdb.pictures.demo import save
             from hapticdb.pictures.sweep import compose_sweep
+            from hapticdb.sweeps.run import sweep
 
+            swept = sweep(
+                env, found.shell, found.way.poses, exclude=excluded, profile=True,
+                contact=found.way.swept.contact,
+            )  # fmt: skip
             figure = compose_sweep(
-                env, found.shell, found.way.swept, exclude=excluded,
-                verdict=extraction_line(found), up=asked.up,
+                env, found.shell, swept, exclude=excluded, verdict=extraction_line(found),
+                up=asked.up,
             )  # fmt: skip
             save(figure, files.picture)
     if asked.animation is not None and ways:
@@ -265,7 +302,7 @@ def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
 def _show(found: "Extraction", asked: _Outputs) -> None:
     """Print the verdict, what is in the way, and the figures of the search."""
     from hapticdb.extraction.verdict import extraction_line
-    from hapticdb.sweeps.verdict import depth_text, names_of
+    from hapticdb.sweeps.verdict import names_of
 
     render.say(extraction_line(found))
     if found.way is None and found.blockers:
@@ -275,12 +312,11 @@ def _show(found: "Extraction", asked: _Outputs) -> None:
         ]
         render.table(("id>", "in the way", "of pulls>"), rows)
     facts = [
-        ("touches at its start", names_of(found.touched) or "nothing"),
+        ("near its start", names_of(found.near) or "nothing"),
         ("searched", f"{found.pulls} pulls, {found.motions:,} motions, {found.poses:,} poses"),
         ("took", f"{found.seconds:.1f} s"),
     ]
     if found.way is not None:
-        facts += [(f"depth in {one.object.name}", depth_text(one)) for one in found.way.depths]
         files = asked._asdict()
         facts += [(name, files[name]) for name in ("path", "picture", "animation") if files[name]]
     render.facts(facts)

@@ -7,11 +7,7 @@ from typing import Literal, NamedTuple
 from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict
 from hapticdb.store.base import Object
 
-DisassemblyVerdict = Literal["comes out", "comes out of contact", "no order found"]
-WHOLLY_PROVED: tuple[WayOutVerdict, ...] = ("comes out", "slides out")
-"""Verdicts that prove the whole of a path."""
-PROVED: tuple[WayOutVerdict, ...] = (*WHOLLY_PROVED, "comes out of contact")
-"""Verdicts with which a part is taken off; the strongest first."""
+DisassemblyVerdict = Literal["comes out", "no order found"]
 
 
 def ids_of(parts: Sequence[Object]) -> tuple[int, ...]:
@@ -39,9 +35,8 @@ class FailedSearch(NamedTuple):
     """A search that proved no path.
 
     parts : what was to come out; n_gone : number of steps before it; verdict : of the search, or
-    None if the parts cannot be moved at all; blockers : what stops pulls, most pulls first, after
-    what a proved path presses against; reason : why the parts cannot be moved, or why a path that
-    is proved does not do, else empty.
+    None if the parts cannot be moved at all; blockers : what stops pulls, most pulls first; reason
+    : why the parts cannot be moved, else empty.
     """
 
     parts: tuple[Object, ...]
@@ -87,11 +82,8 @@ class Disassembly:
 
     @property
     def verdict(self) -> DisassemblyVerdict:
-        """The weakest verdict of the steps; "no order found" proves nothing."""
-        if not self.is_found:
-            return "no order found"
-        is_clear = all(step.found.verdict in WHOLLY_PROVED for step in self.steps)
-        return "comes out" if is_clear else "comes out of contact"
+        """Each step is proved on its whole path; "no order found" proves nothing."""
+        return "comes out" if self.is_found else "no order found"
 
     @property
     def blockers(self) -> tuple[Blocker, ...]:

@@ -8,31 +8,17 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
-
-import numpy as np
-from numpy.typing import NDArray
+from typing import Any, NamedTuple
 
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
-from hapticdb.extraction.directions import AGAINST
-from hapticdb.extraction.disassembly.result import (
-    PROVED,
-    WHOLLY_PROVED,
-    Disassembly,
-    FailedSearch,
-    Removal,
-    ids_of,
-)
-from hapticdb.extraction.judge import judge
-from hapticdb.extraction.problem import problem_of
-from hapticdb.extraction.result import Blocker, Extraction
-from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
+from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Removal, ids_of
+from hapticdb.extraction.result import Extraction
+from hapticdb.extraction.run import DEFAULT_CONTACT, DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.run import SampleCallback, sweep
-from hapticdb.sweeps.verdict import names_of
 
 DEFAULT_ORDER_SECONDS = 600.0
 """Default time of the search for an order."""
@@ -41,9 +27,6 @@ DEFAULT_DEPTH = 3
 MOST_BLOCKERS = 12
 """Greatest number of objects tried that block one part. Larger: more orders are found, and more
 time is spent where there is none."""
-PRESSED = 0.2
-"""Share of the contacts with one object that may press against it. Larger: parts are taken off
-that cut through what holds them; smaller: rough surfaces count as obstacles."""
 LEAST = 0.1
 """Seconds of a search for which no time is left: it tries one pull."""
 SHARE = 0.25
@@ -55,10 +38,11 @@ def disassemble(
     *words: int | str,
     where: Words = (),
     exclude: Words = (),
+    out: float | None = None,
+    contact: float = DEFAULT_CONTACT,
     seconds: float = DEFAULT_ORDER_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
-    out: float | None = None,
     depth: int = DEFAULT_DEPTH,
     keep: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
@@ -72,11 +56,10 @@ def disassemble(
 
     Parameters
     ----------
-    env, words, where, exclude, seed, out, budget_bytes, progress
+    env, words, where, exclude, out, contact, seed, budget_bytes, progress
         As for `extract`.
     seconds : float
-        Time of all searches together; one search has a quarter of it at most. Proofs of what is
-        found may take longer.
+        Time of all searches together; one search has a quarter of it at most.
     motions : int
         Motions that the planner may ask about in one search; 0: straight pulls only. Objects that
         block are first tried by straight pulls alone.
@@ -101,7 +84,11 @@ def disassemble(
     stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
     left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
-    asked = _Asked(parts, left_out, kept, seconds, seed, motions, out, budget_bytes, progress)
+    options = {
+        "out": out, "contact": contact, "seed": seed, "budget_bytes": budget_bytes,
+        "progress": progress,
+    }  # fmt: skip
+    asked = _Asked(parts, left_out, kept, seconds, motions, options)
     return replace(_ordered(env, asked, depth), seconds=time.monotonic() - began)
 
 
@@ -119,7 +106,7 @@ def _ordered(env: Environment, asked: "_Asked", depth: int) -> Disassembly:
         raise search.missing
     return Disassembly(
         asked.parts, tuple(search.steps), tuple(search.failed),
-        not is_found and search.is_spent, 0.0, asked.seed,
+        not is_found and search.is_spent, 0.0, asked.options["seed"],
     )  # fmt: skip
 
 
@@ -127,18 +114,16 @@ class _Asked(NamedTuple):
     """Options of all searches.
 
     parts : what is to come out in the end; exclude : ids of what the caller does not feel, none of
-    `parts`, which block what comes out before them; keep : ids of what is never taken off.
+    `parts`, which block what comes out before them; keep : ids of what is never taken off; options
+    : of `extract`, the same for each search.
     """
 
     parts: tuple[Object, ...]
     exclude: tuple[int, ...]
     keep: frozenset[int]
     seconds: float
-    seed: int
     motions: int
-    out: float | None
-    budget_bytes: int
-    progress: SampleCallback | None
+    options: dict[str, Any]
 
 
 class _Known(NamedTuple):
@@ -235,32 +220,14 @@ class _OrderSearch:
                 raise
             failed = FailedSearch(parts, n_gone, None, (), str(error))
         else:
-            left_out = tuple(sorted({*ids, *excluded}))
-            refused = self._failed(found, left_out)
-            if refused is None:
-                self.steps.append(Removal(found, left_out))
+            if found.is_free:
+                self.steps.append(Removal(found, tuple(sorted({*ids, *excluded}))))
                 return None
-            failed = refused
-            met |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.touched)}
+            failed = FailedSearch(parts, n_gone, found.verdict, found.blockers)
+            met |= {*ids_of([one.object for one in failed.blockers]), *ids_of(found.near)}
         self._known[ids] = _Known(n_gone, motions, met, failed)
         self.failed.append(failed)
         return failed
-
-    def _failed(self, found: Extraction, left_out: tuple[int, ...]) -> FailedSearch | None:
-        """Say why a search does not do for a step; None if it does."""
-        n_gone = len(self.steps)
-        if found.verdict not in PROVED:
-            return FailedSearch(found.parts, n_gone, found.verdict, found.blockers)
-        if found.verdict in WHOLLY_PROVED:
-            return None
-        pressed = _pressed_objects(self._env, found, left_out)
-        if not pressed:
-            return None
-        pulls = {one.object.id: one.pulls for one in found.blockers}
-        first = [Blocker(obj, pulls.get(obj.id, 0)) for obj in pressed]
-        rest = [one for one in found.blockers if one.object.id not in ids_of(pressed)]
-        reason = f"the path found presses against {names_of(pressed)} at its start"
-        return FailedSearch(found.parts, n_gone, found.verdict, (*first, *rest), reason)
 
     def _still_holds(self, known: _Known, motions: int) -> bool:
         """Whether a search would fail again, with what was taken off since.
@@ -293,9 +260,8 @@ class _OrderSearch:
 
         def search(motions: int) -> Extraction:
             return extract(
-                self._env, *ids, exclude=excluded, seconds=max(left, LEAST), seed=asked.seed,
-                motions=motions, out=asked.out, budget_bytes=asked.budget_bytes,
-                progress=asked.progress,
+                self._env, *ids, exclude=excluded, seconds=max(left, LEAST), motions=motions,
+                **asked.options,
             )  # fmt: skip
 
         if self.missing is None:
@@ -317,63 +283,17 @@ class _OrderSearch:
     def _proved_with(self, n: int) -> list[Removal] | None:
         """Steps after step n, proved anew with what it takes off in its place; None if not all are.
 
-        What the last step meets is looked at first: it is mostly the reason why step n was made.
+        The last step is looked at first: it is mostly the reason why step n was made.
         """
-        stays = self.steps[n].ids
-        later = self.steps[n + 1 :]
-        for step in reversed(later):
-            assert step.found.way is not None  # noqa: S101 - steps are proved
-            poses = step.found.way.poses
-            if not sweep(self._env, step.found.shell, poses, where=stays).comes_out:
+        proved: list[Removal] = []
+        for step in reversed(self.steps[n + 1 :]):
+            found, way = step.found, step.found.way
+            assert way is not None  # noqa: S101 - steps are proved
+            excluded = tuple(i for i in step.excluded if i not in self.steps[n].ids)
+            again = sweep(
+                self._env, found.shell, way.poses, exclude=excluded, contact=way.swept.contact
+            )
+            if not again.is_free:
                 return None
-        proved = [self._proved(step, stays) for step in later]
-        return None if None in proved else [step for step in proved if step is not None]
-
-    def _proved(self, step: Removal, stays: tuple[int, ...]) -> Removal | None:
-        """Prove the path of a step with some objects back in their places; None if that fails."""
-        found, way = step.found, step.found.way
-        assert way is not None  # noqa: S101 - steps are proved
-        excluded = tuple(i for i in step.excluded if i not in stays)
-        problem = problem_of(self._env, step.ids, (), excluded, seed=found.seed)
-        again = judge(problem, way.poses, way.how, self._asked.budget_bytes)
-        if again.verdict != way.verdict:
-            return None
-        return Removal(replace(found, way=again), excluded)
-
-
-def _pressed_objects(
-    env: Environment, found: Extraction, exclude: tuple[int, ...]
-) -> tuple[Object, ...]:
-    """Objects that the first motion of a found path presses against, ordered by id.
-
-    A part that only leaves contact slides along surfaces, or away from them. Voxels do not tell
-    that from cutting through a thin flange: the contacts' normals do. exclude : ids of what is not
-    felt, the parts among them.
-    """
-    assert found.way is not None  # noqa: S101 - there is a path
-    if len(found.way.poses) < 2:
-        return ()
-    touched = env.touch(found.shell, np.eye(4), exclude=exclude, law="plane")
-    points = found.shell.points[touched.contacts]
-    against = opposed(points, touched.contact_normals, found.way.poses[1])
-    pairs = touched.contact_pairs
-    is_against = np.isin(pairs[:, 0], touched.contacts[against])
-    pressed = []
-    for obj in touched.objects:
-        mine = is_against[pairs[:, 1] == obj.id]
-        if len(mine) and mine.mean() > PRESSED:
-            pressed.append(obj)
-    return tuple(pressed)
-
-
-def opposed(
-    points: NDArray[np.float64], normals: NDArray[np.float64], pose: NDArray[np.float64]
-) -> NDArray[np.bool_]:
-    """Whether contacts (C, 3) with unit normals (C, 3) into the part press as it moves to a pose.
-
-    pose (4, 4) : displacement; a contact presses if it moves more than 12 degrees into what it
-    touches.
-    """
-    moves = points @ (pose[:3, :3] - np.eye(3)).T + pose[:3, 3]
-    lengths = np.linalg.norm(moves, axis=1)
-    return np.asarray((moves * normals).sum(axis=1) < AGAINST * lengths)
+            proved.append(Removal(replace(found, way=replace(way, swept=again)), excluded))
+        return proved[::-1]

@@ -1,6 +1,7 @@
 """Assemblies of boxes with a part that comes out, or does not, by construction."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import trimesh
@@ -36,10 +37,10 @@ def imported(folder: Path, size: float = SIZE, **parts: trimesh.Trimesh) -> Path
     return folder / "parts.db"
 
 
-def found_in(url: Path, part: str, **options: float) -> Extraction:
+def found_in(url: Path, part: str, **options: Any) -> Extraction:  # noqa: ANN401
     """The way out of a part."""
     with hapticdb.open(url, read_only=True) as env:
-        return extract(env, part, **{"seconds": 500.0, **options})  # type: ignore[arg-type]
+        return extract(env, part, **{"seconds": 500.0, **options})
 
 
 def is_out(found: Extraction, url: Path) -> bool:
@@ -95,6 +96,33 @@ def studded(folder: Path) -> Path:
         folder,
         lower=joined(box((-0.05, -0.05, -0.05), (0.05, 0.05, 0.005)), stud),
         upper=walls((-HALF_STUD, -HALF_STUD, 0.005), (HALF_STUD, HALF_STUD, 0.03), 0.03, "-z"),
+    )
+
+
+def recessed(folder: Path, tilt: float) -> Path:
+    """A bolt in a block, with a twentieth of a voxel of room around shaft and head, and below.
+
+    The recess and the bore below it are open at the top, +z, where head and block end. Both are
+    tilted by an angle about y.
+    """
+    head, shaft, room = 0.008, 0.003, 0.05 * SIZE
+    block = []
+    for low, high, hole in ((0.0, 0.02 - room, shaft + room), (0.02 - room, 0.03, head + room)):
+        block += [
+            box((-0.04, -0.04, low), (-hole, 0.04, high)),
+            box((hole, -0.04, low), (0.04, 0.04, high)),
+            box((-hole, -0.04, low), (hole, -hole, high)),
+            box((-hole, hole, low), (hole, 0.04, high)),
+        ]
+    bolt = joined(
+        box((-shaft, -shaft, 0.0), (shaft, shaft, 0.021)),
+        box((-head, -head, 0.02), (head, head, 0.03)),
+    )
+    turn = trimesh.transformations.rotation_matrix(tilt, [0.0, 1.0, 0.0])
+    return imported(
+        folder,
+        block=joined(*block).apply_transform(turn),
+        bolt=bolt.apply_transform(turn),
     )
 
 

@@ -13,11 +13,12 @@ from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
 from disassembly_scenes import CHAIN, STACK
 from disassembly_scenes import made as made_of
 from extraction_scenes import enclosed, lid
+from hapticdb.poses import write_poses
 
 
 def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
     """Three boxes in a row, 0.1 m apart: the middle one comes out to the side."""
-    words = ("--motions", 0, "--out", 0.1)
+    words = ("--motions", 0, "--out", 100)
     code, out, err = run("extract", scene, "box1", *words, "--path", "out.csv")
     assert (code, err) == (0, "")
     lines = out.splitlines()
@@ -27,7 +28,7 @@ def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
     assert np.array_equal(poses[0], np.eye(4))
     assert np.linalg.norm(poses[-1][:3, 3]) == pytest.approx(0.1)
     code, out, _ = run("sweep", scene, "--part", "box1", "--path", "out.csv")
-    assert (code, out[:9]) == (0, "comes out")
+    assert (code, out[:5]) == (0, "clear")
 
 
 def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
@@ -35,19 +36,25 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     assert (code, err) == (0, "")
     found = json.loads(out)
     assert list(found) == [
-        "verdict", "line", "parts", "way", "touched", "blockers", "pulls", "motions", "poses",
+        "verdict", "line", "parts", "way", "to", "near", "blockers", "pulls", "motions", "poses",
         "is_planned", "seconds", "seed",
     ]  # fmt: skip
-    assert set(found["way"]) == {
-        "how", "poses", "length", "clearance", "rest_from", "proof", "rest", "depths", "beside",
-    }  # fmt: skip
-    assert (found["verdict"], found["way"]["how"]) == ("slides out", "pull")
-    assert found["way"]["proof"]["verdict"] == "hits"
-    assert found["way"]["rest"]["verdict"] == found["way"]["beside"]["verdict"] == "comes out"
-    (depth,) = found["way"]["depths"]
-    assert (depth["name"], depth["is_bounded"], depth["is_cut"]) == ("pot", True, False)
-    assert depth["deepest_most"] <= depth["at_start"] + depth["allowed"]
-    assert [obj["name"] for obj in found["touched"]] == ["pot"]
+    assert set(found["way"]) == {"how", "poses", "length", "gap", "proof"}
+    assert (found["verdict"], found["way"]["how"]) == ("comes out", "pull")
+    (touched,) = found["way"]["proof"]["touching"]
+    assert (touched["name"], touched["cut"]) == ("pot", None)
+    assert [obj["name"] for obj in found["near"]] == ["pot"]
+
+
+def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> None:
+    code, out, err = run("extract", scene, "box1", "--to", "0,0,300,1,0,0,0", "--path", "to.csv")
+    assert (code, err) == (0, "")
+    assert out.startswith("reaches the pose straight, 0.3 m, ")
+    goal = hapticdb.read_poses("to.csv")[-1:]
+    assert np.allclose(goal[0, :3, 3], [0.0, 0.0, 0.3])
+    write_poses("goal.csv", goal)
+    code, out, _ = run("extract", scene, "box1", "--to", "goal.csv", "--json")
+    assert (code, json.loads(out)["to"]) == (0, goal[0].tolist())
 
 
 def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
@@ -74,6 +81,9 @@ def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:
     refused(run("extract", scene, "box*"), "nothing stands")
     refused(run("extract", scene, "box0", "--picture", "a.jpg"), ".png")
     refused(run("extract", "missing.db", "box0"), "missing.db")
+    refused(run("extract", scene, "box0", "--to", "0,0,1"), "--to '0,0,1'")
+    refused(run("extract", scene, "box0", "--to", "0,0,1,0,0,0,0"), "no rotation")
+    refused(run("extract", scene, "box0", "--to", "0,0,1,1,0,0,0", "--out", 1), "--out")
 
 
 @pytest.mark.long
@@ -83,7 +93,7 @@ def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) 
     code, out, err = run("extract", url, "lid", *words, "--path", "off.csv")
     assert (code, err) == (0, "")
     lines = out.splitlines()
-    assert lines[0].startswith("comes out after weight, each step proved: comes out straight, ")
+    assert lines[0].startswith("after weight: comes out straight, ")
     assert [line.partition(":")[0] for line in lines[1:3]] == ["1. weight", "2. lid"]
     assert "off-1.csv ... off-2.csv" in out
     assert run("sweep", url, "--part", "weight", "--path", "off-1.csv")[0] == 0
@@ -102,7 +112,7 @@ def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
         "verdict", "line", "parts", "steps", "failed", "is_out_of_time", "seconds", "seed",
     ]  # fmt: skip
     assert [step["parts"][0]["name"] for step in found["steps"]] == ["weight", "lid"]
-    assert [step["way"]["proof"]["verdict"] for step in found["steps"]] == ["comes out"] * 2
+    assert [step["way"]["proof"]["verdict"] for step in found["steps"]] == ["clear"] * 2
     assert [len(step["excluded"]) for step in found["steps"]] == [1, 2]
     assert found["failed"][0]["blockers"][0].keys() == {"id", "name", "pulls"}
 

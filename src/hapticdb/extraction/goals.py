@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES, likely_directions
-from hapticdb.extraction.free_space import Room
+from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.judge import passed
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem, corners_of

@@ -32,7 +32,7 @@ FARTHEST = 4.0
 """Length of a shift in contact, radii of the part. Larger: longer slots are left, more poses."""
 WIDEST = 2.0
 """Angle of a turn in contact, radians. Larger: wider turns are found, more poses."""
-ARC = 0.2
+ARC = 0.17
 """Angle of a step of a turn, radians. Smaller: turns about places far from the part's middle are
 followed more exactly, by more poses."""
 MOST_SHIFTS = 24
@@ -67,13 +67,13 @@ class Twist(NamedTuple):
     center: Floats
     opposed: float
 
-    def along(self, pose: Floats, farthest: float) -> Floats:
-        """Displacements (M, 4, 4) from a first one on: by `farthest` metres, or a turn's `WIDEST`.
+    def along(self, pose: Floats, farthest: float, widest: float = WIDEST) -> Floats:
+        """Displacements (M, 4, 4) from a first one on: by `farthest` metres, or `widest` radians.
 
         Between two of them a part moves straight while it turns: a turn has steps of `ARC`.
         """
         speed = float(np.linalg.norm(self.turn))
-        amount = min(farthest, WIDEST / speed) if speed > 0.0 else farthest
+        amount = min(farthest, widest / speed) if speed > 0.0 else farthest
         angles = np.linspace(0.0, amount * speed, 1 + max(int(np.ceil(amount * speed / ARC)), 1))
         found = np.tile(np.eye(4), (len(angles), 1, 1))
         if speed > 0.0:

@@ -139,8 +139,8 @@ class Planner:
             until = now + SHARE_OF_LEGS * (part.until - now)
             found = Legs(self._problem, room, self._leaving, until).search(starts)
             if found is not None:
-                self._used, path = found
-                return path
+                self._used, way = found
+                return way
         now, asked = time.monotonic(), self.n_motions
         soon = _Share(
             max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)

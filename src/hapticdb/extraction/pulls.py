@@ -73,10 +73,10 @@ class Pulls:
         self._space, self._step = space, STEP * problem.voxel_size
         normals, own = space.start.contact_normals, problem.own_axes
         self._directions = candidate_directions(normals, own, seed)
-        alike = self._directions @ likely_directions(normals, own).T >= ALIKE
-        self._is_likely = alike.any(axis=1)
+        alike = self._directions @ likely_directions(normals, own).T
+        self._is_likely = alike.max(axis=1) >= ALIKE
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
-        self._is_opposed = opposed_shares(self._directions, normals) > MOST_OPPOSED
+        self._opposed = opposed_shares(self._directions, normals)
 
     def run(self, until: float, progress: SampleCallback | None) -> None:
         """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
@@ -91,7 +91,7 @@ class Pulls:
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
         touching, free, blockers = 0.0, 0.0, self._opposing(direction)
-        if not self._is_opposed[n]:  # else it is blocked where it starts
+        if self._opposed[n] <= MOST_OPPOSED:  # else it is blocked where it starts
             ways = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
             contact, end = self._followed(direction, ways)
             if contact == len(ways):  # still in contact where it should be out

@@ -13,7 +13,7 @@ from hapticdb.sweeps.result import Swept
 Floats = NDArray[np.float64]
 
 WayOutVerdict = Literal["comes out", "slides", "not decided", "no way found"]
-How = Literal["pull", "plan"]
+How = Literal["pull", "screw", "plan"]
 
 
 class Blocker(NamedTuple):
@@ -31,8 +31,8 @@ class WayOut:
     ----------
     poses : (M, 4, 4) float64
         Displacements of the parts, world frame; the first is the identity.
-    how : {'pull', 'plan'}
-        Whether it is one straight pull, or the planner found it.
+    how : {'pull', 'screw', 'plan'}
+        Whether it is one straight pull, a screw motion, or the planner found it.
     swept : Swept
         Sweep of the whole path.
     """
@@ -68,7 +68,7 @@ class WayOut:
     @property
     def length(self) -> float:
         """Metres that the farthest-moving point moves at most."""
-        return float(self.swept.path.motion.sum())
+        return self.swept.path.length
 
     @property
     def gap(self) -> float | None:

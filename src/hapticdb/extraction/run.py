@@ -23,6 +23,7 @@ from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut, WayOutVerdict
+from hapticdb.extraction.screws import unscrewed
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
@@ -58,6 +59,7 @@ def extract(
     exclude: Words = (),
     to: ArrayLike | None = None,
     out: float | None = None,
+    screw: float | None = None,
     contact: float = DEFAULT_CONTACT,
     seconds: float = DEFAULT_SECONDS,
     seed: int = 0,
@@ -80,6 +82,8 @@ def extract(
     out : float or None
         Metres from the start at which the parts count as out; unless given, where their bounding
         sphere has left the box of all that stands.
+    screw : float or None
+        Pitch of a thread, metres a turn: screw motions of both hands are tried after the pulls.
     seconds : float
         Time of the search; each sweep that judges a path has as much.
     seed : int
@@ -102,8 +106,10 @@ def extract(
     UsageError
         If a number is out of range, or nothing stands beside the parts.
     """
-    asked = _Asked(None, seconds, seed, motions, out, budget_bytes)
+    asked = _Asked(None, seconds, seed, motions, out, screw, budget_bytes)
     asked.check()
+    if to is not None and (out is not None or screw is not None):
+        raise UsageError("a way to a pose: give neither out nor screw")
     began = time.monotonic()
     problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, seconds=seconds)
     if to is not None:
@@ -120,6 +126,7 @@ class _Asked(NamedTuple):
     seed: int
     motions: int
     out: float | None
+    screw: float | None
     budget_bytes: int
 
     def check(self) -> None:
@@ -130,13 +137,14 @@ class _Asked(NamedTuple):
             raise UsageError(f"seed {self.seed}: give 0 .. {MOST_SEED - 1}")
         if self.motions < 0:
             raise UsageError(f"{self.motions} motions: give 0 or more")
-        if self.out is not None and not (math.isfinite(self.out) and self.out > 0.0):
-            raise UsageError(f"out at {self.out} m: give a length above 0")
+        for name, length in (("out at", self.out), ("a screw's pitch of", self.screw)):
+            if length is not None and not (math.isfinite(length) and length > 0.0):
+                raise UsageError(f"{name} {length} m: give a length above 0")
 
 
 def _checked_goal(problem: Problem, to: ArrayLike) -> Floats:
     """The pose (4, 4) to reach; UsageError if it is none, or far from everything."""
-    goal = checked_poses(np.asarray(to)[None])[0]
+    goal = np.asarray(checked_poses(np.asarray(to)[None])[0])
     way, size = problem.path(np.stack([np.eye(4), goal])).length, np.ptp(problem.box, axis=0).max()
     if way > FARTHEST * (size + problem.radius):
         raise UsageError(
@@ -165,6 +173,8 @@ def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) 
             pulls.run(until, progress)
             pulled = _best_pull(problem, pulls, until)
             way = pulled if asked.to is None else None
+            if asked.screw is not None and (way is None or way.verdict == "not decided"):
+                way = unscrewed(problem, pulls, asked.screw, until) or way
         if asked.motions and (way is None or way.verdict == "not decided"):
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)

@@ -12,7 +12,8 @@ def extraction_line(found: Extraction) -> str:
     way = found.way
     if way is None:
         return _no_way(found)
-    how = "straight" if way.how == "pull" else f"by {len(way.poses)} poses"
+    hows = {"pull": "straight", "screw": "by a screw motion"}
+    how = hows.get(way.how, f"by {len(way.poses)} poses")
     path = f"{how}, {length_text(way.length)}"
     if not found.is_free:
         return f"not decided: a path {path} long: {verdict_line(way.swept, found.shell)}"

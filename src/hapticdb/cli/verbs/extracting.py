@@ -67,6 +67,10 @@ ToOption = Annotated[
         "one pose, metres.",
     ),
 ]
+ScrewOption = Annotated[
+    float | None,
+    typer.Option(metavar="MM", help="Millimetres a turn: the pitch of a thread, of either hand."),
+]
 WayOption = Annotated[
     str | None, typer.Option("--path", metavar="CSV", help="Write the path that was found.")
 ]
@@ -95,10 +99,11 @@ AnimationOption = Annotated[
 HELP = """Search a path on which parts come out, judged by a sweep of their surfaces.
 
 The parts that WORDS choose move together as one rigid body. Straight pulls are
-tried first: along the axes, away from contacts and along them, at random. If none
-leads out, a planner (OMPL, pip install 'hapticdb[extract]') searches a path round
-corners and with turns. A part is out when its bounding sphere is clear of the box
-of all that stands, or at --out. With --to, a way to a pose is searched instead.
+tried first: along the axes, away from contacts and along them, at random; with
+--screw then screw motions. If none leads out, a planner (OMPL, pip install
+'hapticdb[extract]') searches a path round corners and with turns. A part is out
+when its bounding sphere is clear of the box of all that stands, or at --out. With
+--to, a way to a pose is searched instead.
 
 The path is written by --path as displacements from the present place, as
 'hapticdb sweep --part' takes them. The same seed gives the same path, unless
@@ -137,6 +142,7 @@ def extract(
     motions: MotionsOption = 20_000,
     out: OutOption = None,
     to: ToOption = None,
+    screw: ScrewOption = None,
     contact: ContactOption = 0.05,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
@@ -156,11 +162,11 @@ def extract(
     _check_animation(animation)
     if not disassemble and (depth is not None or keep):
         raise UsageError("--depth and --keep go with --disassemble")
-    if to is not None and (disassemble or out is not None):
-        raise UsageError("--to goes neither with --out nor with --disassemble")
+    if to is not None and (disassemble or out is not None or screw is not None):
+        raise UsageError("--to goes with none of --disassemble, --out and --screw")
     asked = _Outputs(path, picture, animation, up, json)
     options: dict[str, Any] = {
-        "seed": seed, "motions": motions, "out": None if out is None else MM * out,
+        "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
         "contact": MM * contact, "budget_bytes": budget_bytes(budget),
     }  # fmt: skip
     goal = None if to is None else _goal(to)
@@ -187,15 +193,21 @@ def extract(
     raise typer.Exit(EXIT_CODES[order.verdict if disassemble else found.verdict])
 
 
+def _metres(length: float | None) -> float | None:
+    return None if length is None else MM * length
+
+
 def _goal(to: str) -> "NDArray[np.float64]":
     """The pose (4, 4) that --to names: numbers in millimetres, or a file."""
+    import numpy as np
+
     from hapticdb.poses import pose_of_row, read_poses
 
     if to.lower().endswith(".csv"):
         poses = read_poses(to)
         if len(poses) != 1:
             raise UsageError(f"--to {to}: it has {len(poses)} poses, give a file of one")
-        return poses[0]
+        return np.asarray(poses[0])
     row = numbers_of(to, 7, "--to", "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv")
     return pose_of_row([MM * x for x in row[:3]], row[3:])
 

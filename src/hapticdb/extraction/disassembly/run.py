@@ -39,6 +39,7 @@ def disassemble(
     where: Words = (),
     exclude: Words = (),
     out: float | None = None,
+    screw: float | None = None,
     contact: float = DEFAULT_CONTACT,
     seconds: float = DEFAULT_ORDER_SECONDS,
     seed: int = 0,
@@ -56,7 +57,7 @@ def disassemble(
 
     Parameters
     ----------
-    env, words, where, exclude, out, contact, seed, budget_bytes, progress
+    env, words, where, exclude, out, screw, contact, seed, budget_bytes, progress
         As for `extract`.
     seconds : float
         Time of all searches together; one search has a quarter of it at most.
@@ -85,8 +86,8 @@ def disassemble(
     left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
     options = {
-        "out": out, "contact": contact, "seed": seed, "budget_bytes": budget_bytes,
-        "progress": progress,
+        "out": out, "screw": screw, "contact": contact, "seed": seed,
+        "budget_bytes": budget_bytes, "progress": progress,
     }  # fmt: skip
     asked = _Asked(parts, left_out, kept, seconds, motions, options)
     return replace(_ordered(env, asked, depth), seconds=time.monotonic() - began)

@@ -133,7 +133,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("large", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --budget-points 9"),
     ("replay", "replay a.hdbrec a.db"),
     ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
-    ("extract", "extract a.db 12 --motions 0 --out 0.1"),
+    ("extract", "extract a.db 12 --motions 0 --out 100"),
     ("move", "move a.db 12 --translate 0,0,0.001"),
     ("copy", "copy a.db b.db --layout voxel --curve hilbert"),
     ("copy", "diff a.db b.db"),

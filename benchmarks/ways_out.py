@@ -25,6 +25,7 @@ import page_tables
 import records
 from batch_peers import mesh_of, tree_of_boxes
 from hapticdb import Environment, Extraction, GridOptions, ImportOptions
+from hapticdb.extraction.result import WayOut
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.sample import write_sample
@@ -115,7 +116,7 @@ def _record(env: Environment, question: Question, found: Extraction) -> dict[str
     }
     if found.way is not None and found.is_free:
         standing = env.felt((), (*(obj.id for obj in found.parts), *question.exclude))
-        row |= _of_way(found.way) | by_meshes(found, standing)
+        row |= _of_way(found.way) | by_meshes(env, found, standing)
     return row
 
 
@@ -140,11 +141,9 @@ def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str,
             row = {
                 "parts": ", ".join(obj.name for obj in step.found.parts),
                 "verdict": step.found.verdict,
-                "length_m": way.length,
-                "clearance_m": way.clearance,
-                "proved_from_m": way.rest_from,
             }
-            steps.append(row | by_meshes(env, step.found, env.felt((), step.excluded)))
+            meshes = by_meshes(env, step.found, env.felt((), step.excluded))
+            steps.append(row | _of_way(way) | meshes)
     return {
         "parts": ", ".join(words),
         "verdict": found.verdict,
@@ -154,7 +153,9 @@ def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str,
     }
 
 
-def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[str, Any]:
+def by_meshes(
+    env: Environment, found: Extraction, standing: Sequence[hapticdb.Object]
+) -> dict[str, Any]:
     """Least distance of the exact meshes at places of the path where nothing is touched.
 
     coal measures in millimetres: in metres its tolerances are as large as small triangles.
@@ -165,9 +166,7 @@ def by_meshes(found: Extraction, standing: Sequence[hapticdb.Object]) -> dict[st
     path = way.swept.path
     begin = max((one.until for one in way.swept.touching), default=0.0)
     ways = np.linspace(begin * path.length, path.length, MOST_POSES)
-    others = [
-        part.triangles(obj.transform) for obj, part in parts_of(standing, "compared", "import it")
-    ]
+    others = [part.triangles(obj.transform) for obj, part in parts_of(env.store, standing)]
     tool = tree_of_boxes(*mesh_of(1e3 * surface.triangles))
     scene = tree_of_boxes(*mesh_of(1e3 * np.concatenate(others)))
     here, request = coal.Transform3s(), coal.DistanceRequest()

@@ -46,6 +46,6 @@ def passed(problem: Problem, room: Room, poses: Floats) -> Passed:
     """Sweep the parts along a path of displacements (M, 4, 4) to shortly before the first hit."""
     way, path = judge(problem, poses, "pull"), problem.path(poses)
     ways = room.ways(path)
-    if way.in_way:
+    if not way.swept.is_free:
         ways = ways[ways <= way.free_share * path.length - BACK * problem.voxel_size]
     return Passed(path.poses, path.ways, path.at(ways), ways)

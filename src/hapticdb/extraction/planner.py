@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import HapticDBError
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.goals import SAME, Goals
+from hapticdb.extraction.judge import BACK
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.legs import Legs
 from hapticdb.extraction.loosening import Loosened, Loosening
@@ -158,9 +159,10 @@ class Planner:
         """
         found: list[tuple[float, Loosened]] = []
         for pull in self._pulls.done:
-            if pull.free <= 0.0:
+            farthest = pull.free - BACK * self._problem.voxel_size
+            if farthest <= 0.0:
                 continue
-            path = self._problem.path(pull.poses(np.array([0.0, pull.free])))
+            path = self._problem.path(pull.poses(np.array([0.0, farthest])))
             ways = self._space.room.ways(path)
             poses = path.at(ways)
             for room in (self._space.wide, self._space.room):

@@ -60,8 +60,8 @@ class WayOut:
 
     @property
     def free_share(self) -> float:
-        """Share of the path's motion before the first hit."""
-        if self.swept.enclosed:
+        """Share of the path's motion that is proved to be free before the first hit."""
+        if self.swept.enclosed or self.swept.is_stopped:
             return 0.0
         return min((one.fraction for one in self.swept.hits), default=1.0)
 

@@ -222,7 +222,8 @@ def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
             break
         way = judge(problem, pull.poses(np.array([0.0, pull.length])), "pull")
         blockers = tuple(obj.id for obj in way.in_way)
-        pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
+        if not way.swept.is_stopped:
+            pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
         if not blockers and (best is None or RANK[way.verdict] < RANK[best.verdict]):
             best = way
         if best is not None and best.verdict != "not decided":

@@ -155,8 +155,12 @@ class Planner:
     def _found_starts(self) -> list[Loosened]:
         """Ways to where the planner starts: pulls; where none ends in the wide room, others, too.
 
-        Of each pull that goes anywhere, the farthest place; the longest pulls first.
+        Of each pull that goes anywhere, the farthest place; the longest pulls first. Before them
+        the start itself, if a pose is to be reached.
         """
+        here = np.eye(4)[None]
+        if self._leaving is None and self._space.wide.are_free(here)[0]:
+            return [Loosened(here, is_wide=True)]
         found: list[tuple[float, Loosened]] = []
         for pull in self._pulls.done:
             farthest = pull.free - BACK * self._problem.voxel_size

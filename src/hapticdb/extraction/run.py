@@ -167,12 +167,13 @@ def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) 
     n_motions, is_planned = 0, False
     way = None if asked.to is None else judge(problem, np.stack([np.eye(4), asked.to]), "pull")
     refuting = () if way is None else way.in_way
+    way = None if refuting else way
     with FreeSpace(problem, asked.budget_bytes) as space:
         pulls = Pulls(problem, space, leaving, asked.seed)
-        if way is None or refuting:
+        if way is None or way.verdict == "not decided":
             pulls.run(until, progress)
             pulled = _best_pull(problem, pulls, until)
-            way = pulled if asked.to is None else None
+            way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict == "not decided"):
                 way = unscrewed(problem, pulls, asked.screw, until) or way
         if asked.motions and (way is None or way.verdict == "not decided"):

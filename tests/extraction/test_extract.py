@@ -11,6 +11,7 @@ from hypothesis import strategies as st
 
 import hapticdb
 from extraction_scenes import (
+    PITCH,
     box,
     corner,
     drawer,
@@ -23,6 +24,7 @@ from extraction_scenes import (
     recessed,
     room_with_a_door,
     studded,
+    threaded,
     walls,
 )
 from hapticdb import extract
@@ -91,16 +93,28 @@ def test_a_bolt_comes_out_of_a_bore_a_twentieth_of_a_voxel_wider(
     assert found.way.swept.verdict == "clear"
 
 
-def test_what_is_open_has_no_depth_and_stays_proved_after_its_contact_only(tmp_path: Path) -> None:
+def test_a_nut_leaves_its_bolt_by_a_screw_motion_only(tmp_path: Path) -> None:
+    url = threaded(tmp_path)
+    assert found_in(url, "nut", motions=0).way is None
+    found = found_in(url, "nut", motions=0, screw=PITCH)
+    assert found.way is not None
+    assert (found.verdict, found.way.how) == ("comes out", "screw")
+    assert found.way.gap is not None
+    assert 0.00005 < found.way.gap < 0.0003
+    assert extraction_line(found).startswith("comes out by a screw motion, ")
+    assert found_in(url, "nut", motions=0, screw=1.3 * PITCH).way is None
+
+
+def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:
+    """Neither has an inside: that they cut nothing is told by what goes through them."""
     open_pot = walls((0.0, 0.0, 0.0), (0.2, 0.2, 0.1), 0.02, "+z")
     open_pot.update_faces(np.arange(len(open_pot.faces)) > 1)
     cap = box((-0.02, -0.02, 0.1), (0.22, 0.22, 0.12))
     cap.update_faces(np.arange(len(cap.faces)) > 1)
     found = found_in(imported(tmp_path, 0.01, pot=open_pot, lid=cap), "lid", motions=0)
     assert found.way is not None
-    assert found.verdict == "comes out of contact"
-    assert "once it has left pot" in extraction_line(found)
-    assert ["nothing has an inside" in one.why for one in found.way.depths] == [True]
+    assert found.verdict == "comes out"
+    assert [one.object.name for one in found.way.swept.touching] == ["pot"]
 
 
 def test_a_drawer_comes_out_the_open_way_only(tmp_path: Path) -> None:

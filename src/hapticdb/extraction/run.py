@@ -175,7 +175,7 @@ def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) 
             pulled = _best_pull(problem, pulls, until)
             way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict == "not decided"):
-                way = unscrewed(problem, pulls, asked.screw, until) or way
+                way = unscrewed(problem, space, pulls, asked.screw, until) or way
         if asked.motions and (way is None or way.verdict == "not decided"):
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)

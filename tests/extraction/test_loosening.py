@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from extraction_scenes import (
@@ -19,7 +17,6 @@ from extraction_scenes import (
     solids,
 )
 from hapticdb import Extraction
-from hapticdb.extraction.loosening import leaving_twist
 
 Floats = NDArray[np.float64]
 
@@ -115,35 +112,3 @@ def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
     assert is_out(found, url)
     assert places_in_boxes(found, url, "plate", 0.0) == 0
     assert turn_of(poses_of(found)).max() > 0.5
-
-
-# --- motions -------------------------------------------------------------------------------------
-
-numbers = st.floats(-1.0, 1.0)
-vectors = st.tuples(numbers, numbers, numbers)
-MARGIN = 0.1
-
-
-@given(st.lists(st.tuples(vectors, vectors), min_size=1, max_size=20), vectors)
-def test_no_motion_leaves_the_slowest_contact_faster(
-    contacts: list[tuple[tuple[float, ...], tuple[float, ...]]], center: tuple[float, ...]
-) -> None:
-    """Where a shift along z leaves all contacts by a margin, the found motion has it, too."""
-    points = np.array([point for point, _ in contacts])
-    normals = np.array([normal for _, normal in contacts])
-    normals[:, 2] = np.abs(normals[:, 2]) + 2.0 * MARGIN
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    margin = float(normals[:, 2].min())
-    found = leaving_twist(points, normals, np.array(center), 1.0)
-    assert np.linalg.norm(found) == pytest.approx(1.0)
-    speeds = found[:3] + np.cross(found[3:], points - np.array(center))
-    assert float((speeds * normals).sum(axis=1).min()) >= margin - 1e-6
-
-
-def test_a_part_that_is_held_all_around_is_left_by_no_motion() -> None:
-    """The middles of a box's sides hold no turn; its corners, touched on all sides, do."""
-    corners = np.array(np.meshgrid([-1.0, 1.0], [-1.0, 1.0], [-1.0, 1.0])).reshape(3, -1).T
-    points = np.repeat(corners, 3, axis=0)
-    normals = np.concatenate([-np.diag(corner) for corner in corners])
-    assert not leaving_twist(points, normals, np.zeros(3), 1.0).any()
-    assert not leaving_twist(np.empty((0, 3)), np.empty((0, 3)), np.zeros(3), 1.0).any()

@@ -7,19 +7,12 @@ into it.
 
 import heapq
 import time
-from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.extraction.directions import (
-    AGAINST,
-    AXES,
-    candidate_directions,
-    distinct,
-    grouped,
-)
+from hapticdb.extraction.directions import AGAINST, candidate_directions, likely_directions
 from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.judge import passed
 from hapticdb.extraction.problem import Problem
@@ -37,10 +30,8 @@ ARC = 0.17
 followed more exactly, by more poses."""
 MOST_SHIFTS = 24
 """Greatest number of shifts tried from a place. Larger: oblique ways are found, a slower search."""
-MOST_TURNED = 6
-"""Greatest number of axes of turns through a centre."""
-MOST_GROUPS = 60
-"""Greatest number of groups of contacts for which a motion that leaves all of them is computed."""
+MOST_TURNED = 12
+"""Greatest number of turns about a centre, to the right or to the left."""
 APART = 2.0
 """Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
 
@@ -159,73 +150,25 @@ class Loosening:
         return bool((motions > APART * self._problem.voxel_size).all())
 
     def _twists(self, pose: Floats) -> list[Twist]:
-        """Motions to try at a displacement: those that press against fewest contacts first."""
-        problem = self._problem
-        felt = self._space.touch(pose)
+        """Shifts and turns to try at a displacement: those that fewest contacts oppose first."""
+        problem, felt = self._problem, self._space.touch(pose)
         points, normals = felt.contact_points, felt.contact_normals
-        center = pose[:3, :3] @ problem.center + pose[:3, 3]
+        center, still = pose[:3, :3] @ problem.center + pose[:3, 3], np.zeros(3)
+        middle = points.mean(axis=0) if len(points) else center
         own = problem.own_axes @ pose[:3, :3].T
-        twists = _candidate_twists(points, normals, center, problem.radius, own, self._seed)
-        found = [twist for twist in twists if twist.opposed <= MOST_OPPOSED]
-        return sorted(found, key=lambda twist: round(twist.opposed, 2))
-
-
-def _candidate_twists(
-    points: Floats, normals: Floats, center: Floats, radius: float, own: Floats, seed: int
-) -> list[Twist]:
-    """Motions that contacts suggest: leaving all of them, shifts, and turns.
-
-    points, normals (C, 3) : contacts, unit normals away from what is touched; center (3,), radius,
-    own (n, 3) : of the part, metres, and its axes.
-    """
-    middle = points.mean(axis=0) if len(points) else center
-    still = np.zeros(3)
-    leaving = leaving_twist(points, normals, center, radius)
-    shifts = candidate_directions(normals, own, seed)[:MOST_SHIFTS]
-    groups = grouped(normals)
-    crosses = np.array([np.cross(a, b) for a, b in combinations(groups, 2)]).reshape(-1, 3)
-    axes = distinct(np.concatenate([groups, AXES[:3], crosses]))
-    kept = [a for i, a in enumerate(axes) if not any(abs(float(a @ b)) > 0.99 for b in axes[:i])]
-    motions = [(leaving[:3], leaving[3:] / radius, center)] if leaving.any() else []
-    motions += [(direction, still, center) for direction in shifts]
-    for about in (center, middle) if np.linalg.norm(middle - center) > 0.1 * radius else (center,):
-        motions += [
-            (still, sign * axis / radius, about)
-            for axis in kept[:MOST_TURNED]
-            for sign in (1.0, -1.0)
+        motions = [
+            (direction, still, center)
+            for direction in candidate_directions(normals, own, self._seed)[:MOST_SHIFTS]
         ]
-    return [
-        Twist(shift, turn, about, _opposed(shift, turn, about, points, normals))
-        for shift, turn, about in motions
-    ]
-
-
-def leaving_twist(points: Floats, normals: Floats, center: Floats, radius: float) -> Floats:
-    """Unit twist (6,) that leaves all contacts: shift, and turn about `center` times radius.
-
-    It is the point of the convex hull of the contacts' wrenches that is nearest to zero: no contact
-    is left more slowly by it than the slowest one by any other. Zeros if the contacts hold the part
-    to first order, or there are none.
-    """
-    from scipy.optimize import nnls  # noqa: PLC0415 - a third of a second, for parts in contact
-
-    if not len(points):
-        return np.zeros(6)
-    wrenches = np.hstack([normals, np.cross(points - center, normals) / radius])
-    if len(wrenches) > MOST_GROUPS:
-        _, firsts, counts = np.unique(
-            np.rint(3.0 * wrenches), axis=0, return_index=True, return_counts=True
-        )
-        wrenches = wrenches[firsts[np.argsort(-counts, kind="stable")[:MOST_GROUPS]]]
-    weight = 100.0  # of the condition that the shares sum to 1
-    shares, _ = nnls(
-        np.vstack([wrenches.T, np.full(len(wrenches), weight)]), np.array([0.0] * 6 + [weight])
-    )
-    twist = wrenches.T @ shares
-    length = float(np.linalg.norm(twist))
-    if length < 1e-3 or float((wrenches @ twist).min()) < 0.0:
-        return np.zeros(6)
-    return np.asarray(twist / length)
+        is_aside = np.linalg.norm(middle - center) > 0.1 * problem.radius
+        motions += [
+            (still, axis / problem.radius, about)
+            for about in ((center, middle) if is_aside else (center,))
+            for axis in likely_directions(normals, own)[:MOST_TURNED]
+        ]
+        found = [Twist(*each, _opposed(*each, points, normals)) for each in motions]
+        found = [twist for twist in found if twist.opposed <= MOST_OPPOSED]
+        return sorted(found, key=lambda twist: round(twist.opposed, 2))
 
 
 def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals: Floats) -> float:

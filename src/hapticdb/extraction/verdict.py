@@ -3,7 +3,7 @@
 from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch
 from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.store.base import Object
-from hapticdb.sweeps.verdict import gap_text, names_of, until_text, verdict_line
+from hapticdb.sweeps.verdict import MOST_NAMED, gap_text, names_of, until_text, verdict_line
 from hapticdb.units import length_text
 
 
@@ -22,11 +22,12 @@ def extraction_line(found: Extraction) -> str:
 
 
 def _proved(way: WayOut) -> str:
-    """Say how near surfaces come, and what is touched until when."""
-    said = "".join(
-        f"; touches {one.object.name} {until_text(one.until)}" for one in way.swept.touching[:3]
-    )
-    return f", surfaces {gap_text(way.swept)} apart{said}"
+    """Say what is touched until when; if nothing is, how near surfaces come."""
+    touching = way.swept.touching
+    if not touching:
+        return f", surfaces {gap_text(way.swept)} apart"
+    said = (f"{one.object.name} {until_text(one.until)}" for one in touching[:MOST_NAMED])
+    return f", touches {', '.join(said)}"
 
 
 def _no_way(found: Extraction) -> str:

@@ -18,7 +18,7 @@ from hapticdb.extraction.free_space import STEP, FreeSpace
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.problem import Problem
 from hapticdb.store.base import Object
-from hapticdb.sweeps.run import SampleCallback
+from hapticdb.sweeps.run import SweepCallback
 
 Floats = NDArray[np.float64]
 
@@ -78,7 +78,7 @@ class Pulls:
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
         self._opposed = opposed_shares(self._directions, normals)
 
-    def run(self, until: float, progress: SampleCallback | None) -> None:
+    def run(self, until: float, progress: SweepCallback | None) -> None:
         """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
         total = len(self._directions)
         for n in range(total):

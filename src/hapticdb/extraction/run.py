@@ -28,7 +28,7 @@ from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.path import checked_poses
-from hapticdb.sweeps.run import SampleCallback
+from hapticdb.sweeps.run import CONTACT, SweepCallback
 
 Floats = NDArray[np.float64]
 
@@ -36,8 +36,6 @@ DEFAULT_SECONDS = 60.0
 """Default time of a search."""
 DEFAULT_MOTIONS = 20_000
 """Default number of motions that the planner may ask about."""
-DEFAULT_CONTACT = 5e-5
-"""Default contact tolerance, metres."""
 MOST_OUT = 8
 """Greatest number of straight pulls that are judged of those that lead out by voxels."""
 MOST_LIKELY = 16
@@ -60,12 +58,12 @@ def extract(
     to: ArrayLike | None = None,
     out: float | None = None,
     screw: float | None = None,
-    contact: float = DEFAULT_CONTACT,
+    contact: float = CONTACT,
     seconds: float = DEFAULT_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SampleCallback | None = None,
+    progress: SweepCallback | None = None,
 ) -> Extraction:
     """Search a path on which parts come out of what stands around them, or to a pose.
 
@@ -154,7 +152,7 @@ def _checked_goal(problem: Problem, to: ArrayLike) -> Floats:
     return goal
 
 
-def _searched(problem: Problem, asked: _Asked, progress: SampleCallback | None) -> Extraction:
+def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
     leaving = Exit(
         problem.box[0],

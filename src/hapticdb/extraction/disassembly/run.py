@@ -14,11 +14,11 @@ from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
 from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Removal, ids_of
 from hapticdb.extraction.result import Extraction
-from hapticdb.extraction.run import DEFAULT_CONTACT, DEFAULT_MOTIONS, extract
+from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import SampleCallback, sweep
+from hapticdb.sweeps.run import CONTACT, SweepCallback, sweep
 
 DEFAULT_ORDER_SECONDS = 600.0
 """Default time of the search for an order."""
@@ -40,14 +40,14 @@ def disassemble(
     exclude: Words = (),
     out: float | None = None,
     screw: float | None = None,
-    contact: float = DEFAULT_CONTACT,
+    contact: float = CONTACT,
     seconds: float = DEFAULT_ORDER_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
     depth: int = DEFAULT_DEPTH,
     keep: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SampleCallback | None = None,
+    progress: SweepCallback | None = None,
 ) -> Disassembly:
     """Search an order in which objects are taken off so that parts come out.
 

@@ -126,30 +126,26 @@ def recessed(folder: Path, tilt: float) -> Path:
     )
 
 
-PITCH = 0.004
+PITCH = 0.008
 """Metres a turn of the thread of `threaded`."""
 
 
 def threaded(folder: Path) -> Path:
-    """A nut on a right-handed bolt along z: ridges 1.5 mm high, with 0.3 mm of room to the nut."""
+    """A nut on a right-handed bolt along z: ridges 3 mm high, with 2 mm of room to the nut."""
 
     def thread(low: float, high: float, room: float) -> trimesh.Trimesh:
-        """Triangles of a thread: radii are those of a ridge that winds around z once a pitch."""
-        turns, heights = (
-            np.linspace(0.0, 1.0, 37),
-            np.linspace(low, high, 1 + int(2500 * (high - low))),
-        )
-        turn, height = np.meshgrid(turns, heights)
-        share = np.abs((height / PITCH - turn) % 1.0 - 0.5)
-        radius = 0.006 + 0.003 * share + room
+        """Triangles of a thread: a ridge winds around z once a pitch."""
+        heights = np.linspace(low, high, 1 + round(1000 * (high - low)))
+        turn, height = np.meshgrid(np.linspace(0.0, 1.0, 13), heights)
+        radius = 0.006 + 0.006 * np.abs((height / PITCH - turn) % 1.0 - 0.5) + room
         angle = 2.0 * np.pi * turn
         places = np.stack([radius * np.cos(angle), radius * np.sin(angle), height], axis=-1)
-        n = np.arange(places[..., 0].size).reshape(turn.shape)
+        n = np.arange(turn.size).reshape(turn.shape)
         a, b, c, d = n[:-1, :-1], n[:-1, 1:], n[1:, :-1], n[1:, 1:]
         faces = np.concatenate([np.stack([a, b, d], -1), np.stack([a, d, c], -1)]).reshape(-1, 3)
         return trimesh.Trimesh(places.reshape(-1, 3), faces, process=False)
 
-    return imported(folder, 0.001, bolt=thread(0.0, 0.02, 0.0), nut=thread(0.004, 0.012, 0.0003))
+    return imported(folder, 0.001, bolt=thread(0.0, 0.012, 0.0), nut=thread(0.003, 0.009, 0.002))
 
 
 def drawer(folder: Path) -> Path:

@@ -100,9 +100,9 @@ def test_a_nut_leaves_its_bolt_by_a_screw_motion_only(tmp_path: Path) -> None:
     assert found.way is not None
     assert (found.verdict, found.way.how) == ("comes out", "screw")
     assert found.way.gap is not None
-    assert 0.00005 < found.way.gap < 0.0003
+    assert 0.0005 < found.way.gap < 0.002
     assert extraction_line(found).startswith("comes out by a screw motion, ")
-    assert found_in(url, "nut", motions=0, screw=1.3 * PITCH).way is None
+    assert found_in(url, "nut", motions=0, screw=2.0 * PITCH).way is None
 
 
 def test_open_surfaces_come_out_of_contact_too(tmp_path: Path) -> None:

@@ -171,7 +171,7 @@ class GoalPose:
             if time.monotonic() > self._until:
                 break
             end = shifted(RETREAT * self._problem.radius * direction) @ goal
-            poses = passed(self._problem, room, np.stack([goal, end])).poses
+            poses = passed(self._problem, room, np.stack([goal, end]), self._until).poses
             first, last = first_run(room.are_free(poses))
             found += [poses[i] for i in sorted({first, last - 1}) if first < last]
         return found

@@ -1,5 +1,7 @@
 """One sweep of the part's surface judges a path, as any other path."""
 
+import math
+import time
 from typing import NamedTuple
 
 import numpy as np
@@ -12,15 +14,18 @@ from hapticdb.sweeps.run import sweep
 
 Floats = NDArray[np.float64]
 
+LEAST = 0.1
+"""Seconds that each sweep has."""
 BACK = 0.1
 """Voxels from the first hit at which a motion ends. Larger: less of a narrow way is used."""
 
 
-def judge(problem: Problem, poses: Floats, how: How) -> WayOut:
-    """Sweep the parts along a path of displacements (M, 4, 4)."""
+def judge(problem: Problem, poses: Floats, how: How, until: float = math.inf) -> WayOut:
+    """Sweep the parts along a path of displacements (M, 4, 4), until a time of `monotonic`."""
+    left = max(min(problem.seconds, until - time.monotonic()), LEAST)
     found = sweep(
         problem.env, problem.shell, poses, where=problem.where, exclude=problem.exclude,
-        contact=problem.contact, seconds=problem.seconds,
+        contact=problem.contact, seconds=left,
     )  # fmt: skip
     return WayOut(poses, how, found)
 
@@ -42,9 +47,9 @@ class Passed(NamedTuple):
         return np.concatenate([self.given[self.at < self.ways[n]], self.poses[n : n + 1]])
 
 
-def passed(problem: Problem, room: Room, poses: Floats) -> Passed:
+def passed(problem: Problem, room: Room, poses: Floats, until: float) -> Passed:
     """Sweep the parts along a path of displacements (M, 4, 4) to shortly before the first hit."""
-    way, path = judge(problem, poses, "pull"), problem.path(poses)
+    way, path = judge(problem, poses, "pull", until), problem.path(poses)
     ways = room.ways(path)
     if not way.swept.is_free:
         ways = ways[ways <= way.free_share * path.length - BACK * problem.voxel_size]

@@ -102,7 +102,7 @@ class Loosening:
                 if self.n_motions >= most_motions or time.monotonic() > until:
                     break
                 self.n_motions += 1
-                ends, nexts = self._follow(way, twist)
+                ends, nexts = self._follow(way, twist, until)
                 found += ends
                 for hits, longer in nexts:
                     if self._is_new(longer[-1], places):
@@ -113,10 +113,12 @@ class Loosening:
             break
         return sorted(found, key=lambda one: not one.is_wide)
 
-    def _follow(self, way: Floats, twist: Twist) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
+    def _follow(
+        self, way: Floats, twist: Twist, until: float
+    ) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
         """Move on until a hit: ways that end free, or (M, 4, 4) in contact with their hits."""
         room, farthest = self._space.room, FARTHEST * self._problem.radius
-        moved = passed(self._problem, room, twist.along(way[-1], farthest))
+        moved = passed(self._problem, room, twist.along(way[-1], farthest), until)
         if len(moved.poses) < 2:
             return [], []
         counts = room.hits(moved.poses)

@@ -22,7 +22,7 @@ from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
-from hapticdb.extraction.result import Blocker, Extraction, WayOut, WayOutVerdict
+from hapticdb.extraction.result import Blocker, Extraction, WayOut
 from hapticdb.extraction.screws import unscrewed
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
@@ -41,13 +41,14 @@ MOST_OUT = 8
 MOST_LIKELY = 16
 """The same of those that voxels refuse, but the part's axes or contacts suggest: surfaces may slide
 where voxels are shared. Larger: more oblique bores are left, at the price of a sweep each."""
+SHARE_OF_LIKELY = 0.3
+"""Greatest share of the time for them."""
 MOST_PLANS = 3
 """Greatest number of planned paths that are judged, until one is not refuted. Larger: more ways are
 found past places that the search overlooks."""
 FARTHEST = 1e3
 """Greatest way to a pose, lengths of all that stands: a farther one is in a wrong unit."""
 MOST_SEED = 1 << 31
-RANK: dict[WayOutVerdict, int] = {"comes out": 0, "slides": 1, "not decided": 2}
 
 
 def extract(
@@ -170,10 +171,11 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
         pulls = Pulls(problem, space, leaving, asked.seed)
         if way is None or way.verdict == "not decided":
             pulls.run(until, progress)
-            pulled = _best_pull(problem, pulls, until)
+            soon = time.monotonic() + SHARE_OF_LIKELY * max(until - time.monotonic(), 0.0)
+            pulled = _best_pull(problem, pulls, soon)
             way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict == "not decided"):
-                way = unscrewed(problem, space, pulls, asked.screw, until) or way
+                way = unscrewed(problem, space, leaving, asked.screw, until) or way
         if asked.motions and (way is None or way.verdict == "not decided"):
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)
@@ -206,7 +208,7 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
 
 
 def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
-    """Judge the straight pulls that lead out, short ones first, then likely ones; the best of them.
+    """First of the straight pulls that is proved: of those that lead out, then of likely ones.
 
     Of the pulls that are judged, surfaces then say how far they are free, and what stops them.
     """
@@ -214,20 +216,21 @@ def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
     outs = [n for n in order if pulls.done[n].is_out]
     outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
     likely = [n for n in order if pulls.done[n].is_likely and not pulls.done[n].is_out]
-    best: WayOut | None = None
+    undecided: WayOut | None = None
     for n in outs[:MOST_OUT] + likely[:MOST_LIKELY]:
         pull = pulls.done[n]
         if not pull.is_out and time.monotonic() > until:
             break
-        way = judge(problem, pull.poses(np.array([0.0, pull.length])), "pull")
-        blockers = tuple(obj.id for obj in way.in_way)
+        poses = pull.poses(np.array([0.0, pull.length]))
+        way = judge(problem, poses, "pull", math.inf if pull.is_out else until)
         if not way.swept.is_stopped:
+            blockers = tuple(obj.id for obj in way.in_way)
             pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
-        if not blockers and (best is None or RANK[way.verdict] < RANK[best.verdict]):
-            best = way
-        if best is not None and best.verdict != "not decided":
-            break
-    return best
+        elif pull.is_out and undecided is None:
+            undecided = way
+        if way.swept.is_free:
+            return way
+    return undecided
 
 
 def _planned(problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls) -> WayOut | None:
@@ -241,7 +244,7 @@ def _planned(problem: Problem, planner: Planner, way: WayOut | None, pulls: Pull
             return way
         planned = judge(problem, poses, "plan")
         if not planned.in_way:
-            return planned if way is None or RANK[planned.verdict] < RANK[way.verdict] else way
+            return planned if planned.swept.is_free or way is None else way
         if not planner.can_refuse:
             return way
         planner.refuse()

@@ -223,7 +223,7 @@ def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
             break
         poses = pull.poses(np.array([0.0, pull.length]))
         way = judge(problem, poses, "pull", math.inf if pull.is_out else until)
-        if not way.swept.is_stopped:
+        if way.in_way or way.swept.is_free:
             blockers = tuple(obj.id for obj in way.in_way)
             pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
         elif pull.is_out and undecided is None:

@@ -49,7 +49,8 @@ class Passed(NamedTuple):
 
 def passed(problem: Problem, room: Room, poses: Floats, until: float) -> Passed:
     """Sweep the parts along a path of displacements (M, 4, 4) to shortly before the first hit."""
-    way, path = judge(problem, poses, "pull", until), problem.path(poses)
+    way = judge(problem, poses, "pull", until)
+    path = way.swept.path
     ways = room.ways(path)
     if not way.swept.is_free:
         ways = ways[ways <= way.free_share * path.length - BACK * problem.voxel_size]

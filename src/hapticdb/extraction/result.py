@@ -55,8 +55,8 @@ class WayOut:
 
     @property
     def in_way(self) -> tuple[Object, ...]:
-        """Objects that refute the path: they are hit, or enclosed."""
-        return (*(one.object for one in self.swept.hits), *self.swept.enclosed)
+        """Objects that refute the path, the first one first: they are enclosed, or hit."""
+        return (*self.swept.enclosed, *(one.object for one in self.swept.hits))
 
     @property
     def free_share(self) -> float:

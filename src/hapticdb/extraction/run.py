@@ -175,7 +175,7 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
             pulled = _best_pull(problem, pulls, soon)
             way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict == "not decided"):
-                way = unscrewed(problem, space, leaving, asked.screw, until) or way
+                way = unscrewed(problem, leaving, asked.screw, until) or way
         if asked.motions and (way is None or way.verdict == "not decided"):
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)
@@ -224,7 +224,7 @@ def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
         poses = pull.poses(np.array([0.0, pull.length]))
         way = judge(problem, poses, "pull", math.inf if pull.is_out else until)
         if way.in_way or way.swept.is_free:
-            blockers = tuple(obj.id for obj in way.in_way)
+            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
             pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
         elif pull.is_out and undecided is None:
             undecided = way

@@ -5,7 +5,6 @@ import time
 import numpy as np
 
 from hapticdb.extraction.directions import AXES, distinct
-from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.loosening import Twist
@@ -13,19 +12,19 @@ from hapticdb.extraction.problem import Problem, corners_of
 from hapticdb.extraction.result import WayOut
 
 
-def unscrewed(
-    problem: Problem, space: FreeSpace, leaving: Exit, pitch: float, until: float
-) -> WayOut | None:
+def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> WayOut | None:
     """First screw motion that is not refuted, along the part's axes and the world's, of both hands.
 
     pitch : metres a turn. The axis goes through the middle of the part. A bolt turns for its own
-    length, a nut until it is past what it is near; then either goes straight.
+    length, a nut until it is past what its box meets; then either goes straight.
     """
+    low, high = problem.corners.min(axis=0), problem.corners.max(axis=0)
+    boxes = [obj.bounds for obj in problem.standing]
+    met = [corners_of(box) for box in boxes if (box[0] <= high).all() and (box[1] >= low).all()]
     axes = distinct(np.concatenate([problem.own_axes, -problem.own_axes, AXES]))
     for direction, way_out in zip(axes, leaving.distances(axes).tolist(), strict=True):
         heights = problem.corners @ direction
-        near = [corners_of(obj.bounds) @ direction for obj in space.start.objects]
-        past = max((one.max() - heights.min() for one in near), default=0.0)
+        past = max((one @ direction).max() for one in [*met, problem.corners]) - heights.min()
         for hand in (1.0, -1.0):
             for length in (np.ptp(heights), past):
                 if time.monotonic() > until:
@@ -39,7 +38,6 @@ def unscrewed(
                 way = judge(problem, poses, "screw", until)
                 if not way.in_way:
                     return way
-                helix = problem.path(poses[:-1]).length
-                if way.free_share * way.length < 0.99 * helix:
+                if way.free_share * way.length < way.swept.path.ways[-2]:
                     break  # it is not this thread's
     return None

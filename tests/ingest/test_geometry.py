@@ -14,7 +14,9 @@ from recorded_scene import write_parts
 from servers import Place
 
 
-def test_parts_are_those_of_the_file_in_the_order_of_ids(tmp_path: Path, place: Place) -> None:
+def test_parts_are_those_of_the_file_in_the_order_of_ids(
+    tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """On both engines; objects of one shape share its arrays."""
     here, there = write_parts(tmp_path, 12), place()
     parts = {part.name: part for part in parse_in_process(here.with_suffix(".glb")).parts}
@@ -24,11 +26,11 @@ def test_parts_are_those_of_the_file_in_the_order_of_ids(tmp_path: Path, place: 
             asked: list[str] = []
             read = env.store.surfaces
 
-            def surfaces(digests: Sequence[str], read=read, asked=asked) -> dict[str, bytes]:  # type: ignore[no-untyped-def]  # noqa: ANN001 - of this turn
-                asked.extend(digests)
-                return read(digests)
+            def surfaces(digests: Sequence[str]) -> dict[str, bytes]:
+                asked.extend(digests)  # noqa: B023 - called in this turn
+                return read(digests)  # noqa: B023
 
-            env.store.surfaces = surfaces  # type: ignore[method-assign]
+            monkeypatch.setattr(env.store, "surfaces", surfaces)
             found = list(parts_of(env.store, env.objects()[::-1]))
             assert [obj.id for obj, _ in found] == [obj.id for obj in env.objects()]
             assert (

@@ -114,8 +114,10 @@ def test_a_file_that_is_there_is_replaced_only_when_that_is_said(copy: Path, pat
 
 
 def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
+    with closing(SQLiteStore.open(path, read_only=True)) as store:
+        ((end,),) = store._connection.fetch("SELECT max(pageno) FROM dbstat WHERE name = 'brick'")
     content = bytearray(path.read_bytes())
-    content[-8192:] = bytes(8192)
+    content[8192 * (end - 1) : 8192 * end] = bytes(8192)
     path.write_bytes(content)
     with pytest.raises(hapticdb.errors.DamagedError, match="what was to be copied is damaged"):
         backup_environment(path, tmp_path / "copy.db")

@@ -19,9 +19,6 @@ CLOSE = 0.1
 """Tolerance of a computed covering radius: it exceeds the least one by at most this share, or comes
 from triangles with sides of at most this share of the points' spacing. A smaller value cuts more
 triangles."""
-LINES = 32
-"""Lines that vote at most whether a body encloses a place. Larger: slower; one decides, if it meets
-no edge."""
 AT_ONCE = 1 << 16
 """Triangles that are cut and measured at a time. A larger value takes more memory."""
 
@@ -133,53 +130,17 @@ class Interior:
         """
         if self._ball is not None:
             return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)
-        return self.bodies_around(positions) > 0
-
-    def bodies_around(
-        self,
-        positions: Floats,
-        without: NDArray[np.int64] | None = None,
-        lines: int = LINES,
-    ) -> NDArray[np.int64]:
-        """How many bodies hold each of the positions (Q, 3), less the voids that do: (Q,).
-
-        without (Q,) int64: a body of each position that does not count; lines: that vote at most.
-        """
         count = np.zeros(len(positions), dtype=np.int64)
         for body, sign in self._bodies:
-            held = self.holds_in(body, positions, lines)
-            count += sign * (held if without is None else held & (without != body))
-        return count
+            count += sign * self._holds_in(body, positions)
+        return count > 0
 
-    def holds_in(self, body: int, positions: Floats, lines: int = LINES) -> NDArray[np.bool_]:
-        """Whether a closed body encloses each of the positions (Q, 3), metres: (Q,)."""
+    def _holds_in(self, body: int, positions: Floats) -> NDArray[np.bool_]:
+        """Whether a closed body encloses each of the positions (Q, 3): (Q,)."""
         local = np.ascontiguousarray(positions - self._origin)
-        held = np.zeros(len(local), dtype=bool)
-        which = np.flatnonzero(self.is_around(body, positions))
-        if len(which):
-            held[which] = _encloses(self._tree, body, local[which], lines)
-        return held
-
-    def is_around(self, body: int, positions: Floats) -> NDArray[np.bool_]:
-        """Whether a closed body's bounding box holds each of the positions (Q, 3)."""
-        local = positions - self._origin
         low, high = self._boxes[body]
-        return np.asarray(((local >= low) & (local <= high)).all(axis=1))
-
-    @property
-    def bodies(self) -> tuple[tuple[int, int], ...]:
-        """The closed bodies, each with 1 if it is solid and -1 if it is a void."""
-        return tuple(self._bodies)
-
-
-def _encloses(
-    tree: "sides.TriangleTree", body: int, positions: Floats, lines: int
-) -> NDArray[np.bool_]:
-    """As `sides.encloses`, by the votes of fewer lines."""
-    numbers = np.arange(len(positions))
-    pairs = np.stack([numbers, np.full(len(positions), body)], axis=1)
-    out = np.zeros(len(positions), dtype=np.uint8)
-    directions = sides._directions(lines)  # noqa: SLF001
-    picks = np.repeat(numbers[:, None], lines, axis=1)
-    sides.nesting_kernel(tree, pairs, picks, directions, positions, out)
-    return out.astype(np.bool_)
+        held = ((local >= low) & (local <= high)).all(axis=1)
+        which = np.flatnonzero(held)
+        if len(which):
+            held[which] = sides.encloses(self._tree, body, local[which])
+        return np.asarray(held)

@@ -138,7 +138,8 @@ def pose_of_row(position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float6
     length = float(np.linalg.norm(given))
     if not (length > 1e-9 and math.isfinite(length)):
         raise UsageError(f"the quaternion {given.tolist()} is no rotation")
-    return _poses_of(np.concatenate([as_floats(position, "a position"), given / length])[None])[0]
+    row = np.concatenate([as_floats(position, "a position"), given / length])
+    return np.asarray(_poses_of(row[None])[0])
 
 
 def _poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:

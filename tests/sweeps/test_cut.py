@@ -36,7 +36,7 @@ def depth(one: trimesh.Trimesh, other: trimesh.Trimesh, *place: float, turn: flo
         return cut(here, there, placed, 100.0, SHIFT, 0.0).depth
 
     found = told(mesh(one), mesh(other), pose)
-    back = told(mesh(other), mesh(one), np.linalg.inv(pose))
+    back = told(mesh(other), mesh(one), np.asarray(np.linalg.inv(pose), dtype=np.float64))
     moved = told(mesh(one, frame), mesh(other), np.asarray(frame @ pose))
     assert back == pytest.approx(found, rel=0.02, abs=2.0 * SHIFT)
     assert moved == pytest.approx(found, rel=0.02, abs=2.0 * SHIFT)

@@ -139,8 +139,8 @@ class Interior:
         """Whether a closed body encloses each of the positions (Q, 3): (Q,)."""
         local = np.ascontiguousarray(positions - self._origin)
         low, high = self._boxes[body]
-        held = ((local >= low) & (local <= high)).all(axis=1)
+        held = np.asarray(((local >= low) & (local <= high)).all(axis=1))
         which = np.flatnonzero(held)
         if len(which):
             held[which] = sides.encloses(self._tree, body, local[which])
-        return np.asarray(held)
+        return held

@@ -111,7 +111,7 @@ def cut(
 
 def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float) -> Cut:
     """Greatest cut without a shift."""
-    other_from_one = np.linalg.inv(one_from_other)
+    other_from_one: Floats = np.asarray(np.linalg.inv(one_from_other), dtype=np.float64)
     mine, theirs = _Parted(one, other, other_from_one), _Parted(other, one, one_from_other)
     if not (len(mine.shares) or len(theirs.shares)):
         return NONE

@@ -27,8 +27,8 @@ from hapticdb.extraction.screws import unscrewed
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.path import checked_poses
 from hapticdb.sweeps.run import CONTACT, SweepCallback
+from hapticdb.sweeps.way import checked_poses
 
 Floats = NDArray[np.float64]
 

@@ -159,18 +159,17 @@ def batch_ratios(results: Results) -> str:
 
 
 def ways_out(results: Results) -> str:
-    """Answer, seconds and lengths of each question; what blocks first where no way was found."""
+    """Answer and lengths of each question; what blocks first where no way was found."""
     rows = []
     for one in results["ways_out"]["rows"]:
-        answer, lengths = one["verdict"], [NONE] * 4
+        answer, lengths = one["verdict"], [NONE] * 3
         if "length_m" in one:
-            keys = ["length_m", "proved_from_m", "clearance_m", "mesh_distance_m"]
+            keys = ["length_m", "gap_m", "mesh_distance_m"]
             lengths = [f"{1e3 * one[key]:,.{0 if key == 'length_m' else 2}f}" for key in keys]
         elif one["blockers"]:
             answer += f", {one['blockers'][0][0]} named first"
-        rows.append([one["parts"], answer, f"{one['s']:.1f}", *lengths])
-    head = ["part", "answer", "seconds", "path, mm", "proved from, mm", "proved gap, mm"]
-    return table([*head, "gap of the triangles, mm"], rows)
+        rows.append([one["parts"], answer, *lengths])
+    return table(["part", "answer", "path, mm", "proved gap, mm", "coal's gap, mm"], rows)
 
 
 def contact_proxies(results: Results) -> str:

@@ -1,13 +1,12 @@
 """Ways out: which parts are found to come out, how soon, and what exact meshes say of the paths.
 
-    python benchmarks/ways_out.py      # questions of the sample car, an order, ten bricks
+    python benchmarks/ways_out.py      # questions of the sample car
 
 coal compares the triangles of the part with those of all that stands, at places of each found path.
 So neither voxels nor triangle code of hapticdb take part in its answer.
 """
 
 import argparse
-import os
 import tempfile
 from collections.abc import Sequence
 from pathlib import Path
@@ -32,10 +31,7 @@ from hapticdb.sample import write_sample
 
 Floats = NDArray[np.float64]
 BITS = 11
-VINTAGE = "demo_vintage_car/vintage_car.glb"
 SECONDS = 60.0
-ORDER_SECONDS = 1200.0
-"""Time of the search for an order."""
 MOTIONS = 20_000
 MOST_POSES = 4000
 """Places of a path that coal looks at."""
@@ -130,29 +126,6 @@ def _of_way(way: WayOut) -> dict[str, Any]:
     }
 
 
-def measured_order(url: Path, words: Sequence[str], seconds: float) -> dict[str, Any]:
-    """Search an order in which parts come out, and ask coal about each step."""
-    steps: list[dict[str, Any]] = []
-    with hapticdb.open(url, read_only=True) as env:
-        found = hapticdb.disassemble(env, *words, seconds=seconds)
-        for step in found.steps:
-            way = step.found.way
-            assert way is not None
-            row = {
-                "parts": ", ".join(obj.name for obj in step.found.parts),
-                "verdict": step.found.verdict,
-            }
-            meshes = by_meshes(env, step.found, env.felt((), step.excluded))
-            steps.append(row | _of_way(way) | meshes)
-    return {
-        "parts": ", ".join(words),
-        "verdict": found.verdict,
-        "s": found.seconds,
-        "steps": steps,
-        "failed": len(found.failed),
-    }
-
-
 def by_meshes(
     env: Environment, found: Extraction, standing: Sequence[hapticdb.Object]
 ) -> dict[str, Any]:
@@ -179,16 +152,9 @@ def by_meshes(
 
 
 def measure(
-    folder: Path,
-    model: Path | None,
-    bits: int,
-    questions: Sequence[Question],
-    order: Sequence[str] = (),
+    folder: Path, model: Path | None, bits: int, questions: Sequence[Question]
 ) -> dict[str, Any]:
-    """Import the model, the sample car with a spark plug unless one is given, and ask all.
-
-    order : words of the parts for which an order is searched.
-    """
+    """Import the model, the sample car with a spark plug unless one is given, and ask all."""
     file = model or write_sample(folder / "sample").car
     files = [file]
     if model is None:
@@ -205,9 +171,6 @@ def measure(
     for question in questions:
         found["rows"].append(measured(url, question, SECONDS, MOTIONS))
         print(_line(found["rows"][-1]), flush=True)
-    if order:
-        found["order"] = measured_order(url, order, ORDER_SECONDS)
-        print(f"order for {', '.join(order)}: {found['order']['verdict']}", flush=True)
     return found
 
 
@@ -222,13 +185,8 @@ def _line(row: dict[str, Any]) -> str:
 def main() -> None:
     """Measure, print, and fill the table of docs/paths.md."""
     argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
-    vintage = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), VINTAGE)
-    bricks = [Question((f"{n}",)) for n in (1, *range(20, 200, 20))]
     with tempfile.TemporaryDirectory() as folder:
-        found = {"ways_out": measure(Path(folder), None, BITS, SAMPLE, WHEEL)}
-    if vintage.is_file():
-        with tempfile.TemporaryDirectory() as folder:
-            found["ways_out_vintage"] = measure(Path(folder), vintage, 10, bricks)
+        found = {"ways_out": measure(Path(folder), None, BITS, SAMPLE)}
     records.write(Path("results"), found)
     page_tables.refill("docs/paths.md", Path("results"))
 

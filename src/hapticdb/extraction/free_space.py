@@ -60,13 +60,24 @@ class Room:
         self.n_poses += len(poses)
         return ~self._frames.collides(poses)
 
+    def _between(self, ends: Floats) -> Floats:
+        """Poses (n, 4, 4) between two poses (2, 4, 4), as in `ways`; sooner without a turn."""
+        if not np.array_equal(ends[0, :3, :3], ends[1, :3, :3]):
+            path = self._problem.path(ends)
+            return path.at(self.ways(path))
+        way = ends[1, :3, 3] - ends[0, :3, 3]
+        steps = float(np.linalg.norm(way)) / (STEP * self._problem.voxel_size)
+        shares = np.linspace(0.0, 1.0, 1 + max(int(np.ceil(steps)), 1))
+        poses = np.tile(ends[0], (len(shares), 1, 1))
+        poses[:, :3, 3] += shares[:, None] * way
+        return poses
+
     def farthest(self, ends: Floats) -> Floats:
         """Last displacement (4, 4) before the first hit between two poses (2, 4, 4).
 
         The first pose is taken for free.
         """
-        path = self._problem.path(ends)
-        poses = path.at(self.ways(path))
+        poses = self._between(ends)
         for begin in range(1, len(poses), AT_ONCE):
             is_free = self.are_free(poses[begin : begin + AT_ONCE])
             if not is_free.all():
@@ -78,8 +89,7 @@ class Room:
 
         The end comes first, then poses far apart: a blocked motion is mostly refused by few.
         """
-        path = self._problem.path(ends)
-        poses = path.at(self.ways(path))
+        poses = self._between(ends)
         return all(self.are_free(poses[some]).all() for some in _from_coarse_to_fine(len(poses)))
 
 

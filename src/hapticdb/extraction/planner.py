@@ -120,13 +120,29 @@ class Planner:
         """
         if self._starts is None:
             self._starts = self._found_starts()
-        for room, share in ((self._space.wide, SHARE_OF_WIDE), (self._space.room, 1.0)):
-            is_wide = room is self._space.wide
-            starts = [one for one in self._starts if one.is_wide or not is_wide]
+        wide = [one for one in self._starts if one.is_wide]
+        if self._leaving is not None and self._starts:
+            path = self._by_legs(self._leaving, wide)
+            if path is not None:
+                return path
+        for room, starts, share in (
+            (self._space.wide, wide, SHARE_OF_WIDE),
+            (self._space.room, self._starts, 1.0),
+        ):
             path = self._in_room(room, starts, self._part(share)) if starts else None
             if path is not None:
                 return path
         return None
+
+    def _by_legs(self, leaving: Exit, wide: list[Loosened]) -> Floats | None:
+        """Path (M, 4, 4) out by straight legs along axes, from starts in the wide room if any."""
+        room = self._space.wide if wide else self._space.room
+        until = self._part(SHARE_OF_LEGS).until
+        found = Legs(self._problem, room, leaving, until).search(wide or self._starts or [])
+        if found is None:
+            return None
+        self._used, path = found
+        return path
 
     def _part(self, share: float) -> _Share:
         """A share of the questions and of the time that are left."""
@@ -134,14 +150,7 @@ class Planner:
         return _Share(max(int(share * left), 1), now + share * (self._until - now))
 
     def _in_room(self, room: Room, starts: list[Loosened], part: _Share) -> Floats | None:
-        """Path from one of the starts, in one room: by legs, by shifts, by turns, too."""
-        if self._leaving is not None:
-            now = time.monotonic()
-            until = now + SHARE_OF_LEGS * (part.until - now)
-            found = Legs(self._problem, room, self._leaving, until).search(starts)
-            if found is not None:
-                self._used, way = found
-                return way
+        """Path from one of the starts, in one room: by shifts, and by turns, too."""
         now, asked = time.monotonic(), self.n_motions
         soon = _Share(
             max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)

@@ -164,16 +164,18 @@ class Planner:
     def _found_starts(self) -> list[Loosened]:
         """Ways to where the planner starts: pulls; where none ends in the wide room, others, too.
 
-        Of each pull that goes anywhere, the farthest place; the longest pulls first. Before them
-        the start itself, if a pose is to be reached.
+        Of each pull that goes anywhere, the farthest place; the longest pulls first. Where parts
+        are near something, voxels do not tell which pulls these are. If a pose is to be reached,
+        the start itself does, where it is free.
         """
+        is_near = bool(self._space.start.objects)
         here = np.eye(4)[None]
         if self._leaving is None and self._space.wide.are_free(here)[0]:
             return [Loosened(here, is_wide=True)]
         found: list[tuple[float, Loosened]] = []
         for pull in self._pulls.done:
             farthest = pull.free - BACK * self._problem.voxel_size
-            if farthest <= 0.0:
+            if farthest <= 0.0 or (is_near and not pull.is_swept):
                 continue
             path = self._problem.path(pull.poses(np.array([0.0, farthest])))
             ways = self._space.room.ways(path)
@@ -186,7 +188,7 @@ class Planner:
                     found.append((float(ways[last - 1]), Loosened(way, is_wide)))
                     break
         starts = [one for _, one in sorted(found, key=lambda one: -one[0])]
-        if self._space.start.objects and not any(one.is_wide for one in starts):
+        if is_near and not any(one.is_wide for one in starts):
             part = self._part(SHARE_OF_LOOSENING)
             loosening = Loosening(self._problem, self._space, self._seed)
             starts += loosening.search(part.motions, part.until)

@@ -39,7 +39,7 @@ class Pull(NamedTuple):
     direction (3,) : unit vector; length : metres until the part is out; touching : metres in
     contact with what it touches at its start; free : metres until the first other hit, `length` if
     there is none; blockers : ids of the objects at the first hit in the way; is_likely : whether
-    the part's axes or contacts suggest it.
+    the part's axes or contacts suggest it; is_swept : whether a sweep says so, not voxels.
     """
 
     direction: Floats
@@ -48,6 +48,7 @@ class Pull(NamedTuple):
     free: float
     blockers: tuple[int, ...]
     is_likely: bool
+    is_swept: bool = False
 
     @property
     def is_out(self) -> bool:

@@ -215,18 +215,21 @@ def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
     order = range(len(pulls.done))
     outs = [n for n in order if pulls.done[n].is_out]
     outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
-    likely = [n for n in order if pulls.done[n].is_likely and not pulls.done[n].is_out]
+    del outs[MOST_OUT:]
+    likely = [n for n in order if pulls.done[n].is_likely and n not in outs]
     undecided: WayOut | None = None
-    for n in outs[:MOST_OUT] + likely[:MOST_LIKELY]:
+    for n in outs + likely[:MOST_LIKELY]:
         pull = pulls.done[n]
-        if not pull.is_out and time.monotonic() > until:
+        if n not in outs and time.monotonic() > until:
             break
         poses = pull.poses(np.array([0.0, pull.length]))
-        way = judge(problem, poses, "pull", math.inf if pull.is_out else until)
+        way = judge(problem, poses, "pull", math.inf if n in outs else until)
         if way.in_way or way.swept.is_free:
             blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
-            pulls.done[n] = pull._replace(free=way.free_share * pull.length, blockers=blockers)
-        elif pull.is_out and undecided is None:
+            pulls.done[n] = pull._replace(
+                free=way.free_share * pull.length, blockers=blockers, is_swept=True
+            )
+        elif n in outs and undecided is None:
             undecided = way
         if way.swept.is_free:
             return way

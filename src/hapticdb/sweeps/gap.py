@@ -25,8 +25,9 @@ SHARE = 0.009
 """Share of a least distance to which it is found. Larger: fewer measurements."""
 MEETING = 1e-5
 """Metres: surfaces that come so near have met."""
-AT_ONCE = 2048
-"""Measurements after which the time is looked at. Larger: a limit of time is overrun by more."""
+AT_ONCE = 512
+"""Stretches that are measured together. Larger: more memory, and a limit of time is overrun by
+more."""
 
 
 class OverTimeError(Exception):
@@ -59,17 +60,10 @@ class Pair:
         self, ways: Floats, farthest: Floats, then: float = np.inf, enough: float = 0.0
     ) -> Nearest:
         """Measure at ways (n,); the others are as for `kernels.triangles.nearest`."""
-        found = []
-        for at in range(0, max(len(ways), 1), AT_ONCE):
-            some = slice(at, at + AT_ONCE)
-            poses = self.way.at(ways[some])
-            found.append(
-                self.tool.nearest(self.tree, poses, farthest[some], then=then, enough=enough)
-            )
-            self.looks += len(poses)
-            if time.monotonic() > self.until:
-                raise OverTimeError
-        return Nearest(*(np.concatenate(parts) for parts in zip(*found, strict=True)))
+        if time.monotonic() > self.until:
+            raise OverTimeError
+        self.looks += len(ways)
+        return self.tool.nearest(self.tree, self.way.at(ways), farthest, then=then, enough=enough)
 
     def least(self, lows: Floats, highs: Floats, best: float) -> tuple[Least | None, float]:
         """Least distance on stretches of the path (n,), if it is less than `best`; else None.
@@ -79,7 +73,8 @@ class Pair:
         found: Least | None = None
         closed = best
         while len(lows):
-            middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
+            (low, high), (lows, highs) = _last(lows, highs)
+            middles, halves = 0.5 * (low + high), 0.5 * (high - low)
             wanted = best - error_of(best) if np.isfinite(best) else best
             near = self.measure(middles, wanted + halves, best, MEETING)
             n = int(np.argmin(near.at_most))
@@ -91,25 +86,31 @@ class Pair:
             bounds = near.at_least - halves
             is_open = bounds < best - error_of(best)
             closed = min(closed, float(bounds[~is_open].min(initial=np.inf)))
-            lows, highs = halved(lows, highs, is_open)
+            low, high = _halved(low, high, is_open)
+            lows, highs = np.concatenate([lows, low]), np.concatenate([highs, high])
         return found, max(min(closed, best), 0.0)
 
     def first(self, lows: Floats, highs: Floats, known: Least) -> Least:
-        """Where on stretches of the path (n,) the surfaces meet first; known : where they do.
+        """Where on stretches of the path (n,), ascending, the surfaces meet first.
 
-        Before it they keep half of `MEETING` apart.
+        known : where they do. Before the place that is told they keep half of `MEETING` apart.
         """
         found = known
+        lows, highs = lows[::-1], highs[::-1]
         while len(lows):
-            middles, halves = 0.5 * (lows + highs), 0.5 * (highs - lows)
+            (low, high), (lows, highs) = _last(lows, highs)
+            middles, halves = 0.5 * (low + high), 0.5 * (high - low)
             near = self.measure(middles, MEETING + halves, MEETING)
             met = np.flatnonzero((near.at_most <= MEETING) & (middles < found.way))
             if len(met):
                 n = int(met[np.argmin(middles[met])])
                 found = Least(float(near.at_most[n]), float(middles[n]), near.on_a[n], near.on_b[n])
-            is_open = (near.at_least - halves < 0.5 * MEETING) & (lows < found.way)
+            is_open = (near.at_least - halves < 0.5 * MEETING) & (low < found.way)
             is_open &= halves > 0.25 * MEETING
-            lows, highs = halved(lows, highs, is_open)
+            low, high = _halved(low[::-1], high[::-1], is_open[::-1])
+            is_before = lows < found.way
+            lows = np.concatenate([lows[is_before], low[::-1]])
+            highs = np.concatenate([highs[is_before], high[::-1]])
         return found
 
 
@@ -118,7 +119,12 @@ def error_of(distance: float) -> float:
     return max(FINE, SHARE * distance)
 
 
-def halved(lows: Floats, highs: Floats, is_open: NDArray[np.bool_]) -> tuple[Floats, Floats]:
+def _last(lows: Floats, highs: Floats) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
+    """The last stretches, `AT_ONCE` at most, and those before them."""
+    return (lows[-AT_ONCE:], highs[-AT_ONCE:]), (lows[:-AT_ONCE], highs[:-AT_ONCE])
+
+
+def _halved(lows: Floats, highs: Floats, is_open: NDArray[np.bool_]) -> tuple[Floats, Floats]:
     """Both halves of the stretches that are open, in order."""
     low, high = lows[is_open], highs[is_open]
     middle = 0.5 * (low + high)

@@ -23,6 +23,9 @@ EASE = 0.2
 """Contact tolerances by which surfaces are shifted, to see that they only touch."""
 SHIFT = 0.05
 """Contact tolerances by which surfaces are shifted, to measure how deep they overlap."""
+ERROR = 0.05
+"""Share of a cut by which its measurements differ at most, where places and corners are few: what
+overlaps at the start may seem deeper by so much later. Larger: more of it is allowed."""
 BLOCK = 64
 """Looks that are measured together."""
 PATIENCE = 16
@@ -51,11 +54,12 @@ class FollowedContact(NamedTuple):
 def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> FollowedContact:
     """Follow a contact from the start of the path, where the surfaces are within `contact` metres.
 
-    A cut may grow to the greater one of the start's and `contact`, and by `contact` more.
+    A cut may grow to the greater one of the start's and `contact`, and by `contact` more, or by
+    `ERROR` of the start's if that is more.
     """
     depths = _Depths(pair, contact, object_mesh, tool_mesh)
     start = depths.cut(pair.way.at([0.0])[0], np.inf, contact).depth
-    allowed = max(start, contact) + contact
+    allowed = max(start, contact) + max(contact, ERROR * start)
     deepest, way, length = start, 0.0, pair.way.length
     while way < length:
         ways = np.minimum(way + STEP * contact * np.arange(1, BLOCK + 1), length)

@@ -79,7 +79,7 @@ class Swept:
         The poses given, and the motion between them: `path.at(fractions * path.length)` gives
         poses, and no place of the tool moves more than `path.length` metres.
     gap : Gap
-        Of all objects while they do not touch; 0 if anything is hit.
+        Of all objects that are not touched where the path starts; 0 if anything is hit.
     hits : tuple of PathPlace
         First place on the path where each object is hit, in that order: its surface is met (within
         0.01 mm), or, touched from the start, it is cut deeper than is allowed or met again.

@@ -209,13 +209,14 @@ class _Sweep:
         pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until)
         try:
             start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
-            begin = 0.0
             if start <= self._asked.contact and not part.is_cloud:
                 begin = self._follow(obj, pair)
-            elif self._holds(triangles, obj, gaps):
-                self._enclosed.append(obj)
-            if begin < self._way.length or start > self._asked.contact or part.is_cloud:
-                self._measure(obj, pair, gaps, stretches, begin)
+                if begin < self._way.length:
+                    self._measure(obj, pair, gaps, stretches, begin)
+            else:
+                if self._holds(triangles, obj, gaps):
+                    self._enclosed.append(obj)
+                self._measure(obj, pair, gaps, stretches, 0.0)
         finally:
             self._looks += pair.looks
 
@@ -234,20 +235,27 @@ class _Sweep:
     def _measure(
         self, obj: Object, pair: Pair, gaps: Floats, stretches: Stretches, begin: float
     ) -> None:
-        """Find where an object is met first from a way on, or how near it comes."""
+        """Find where an object is met first from a way on, or how near it comes.
+
+        What was touched begins to be near, so it has no part in the gap: is it met again?
+        """
         if self._asked.profile:
             self._note_profile(pair, begin)
-        wanted = self._wanted()
+        is_counted = not (begin or self._hits or self._enclosed)
+        wanted = self._wanted() if is_counted else 2.0 * MEETING
         lows, highs = stretches.nearer(gaps, wanted, begin)
-        best = min(self._best, 2.0 * MEETING) if self._hits or self._enclosed else self._best
-        least, closed = pair.least(lows, highs, best)
-        self._closed = min(self._closed, closed, float(gaps[gaps >= wanted].min(initial=np.inf)))
+        least, closed = pair.least(lows, highs, self._best if is_counted else 2.0 * MEETING)
+        if is_counted:
+            beyond = float(gaps[gaps >= wanted].min(initial=np.inf))
+            self._closed = min(self._closed, closed, beyond)
         if least is None:
             return
         if least.at_most <= MEETING:
             lows, highs = stretches.nearer(gaps, MEETING, begin)
             first = pair.first(lows, highs, least)
             self._hits.append(self._place(obj, first.way, first.on_tool, first.on_object))
+            return
+        if not is_counted:
             return
         self._best = least.at_most
         self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 import hapticdb
-from assemblies import drop_surfaces
+from assemblies import assembly, drop_surfaces, write_obj
+from hapticdb.ingest import geometry
 from hapticdb.ingest.geometry import found_parts, parts_of
 from hapticdb.mesh import parse_in_process
 from recorded_scene import write_parts
@@ -57,3 +58,14 @@ def test_an_object_without_a_surface_is_none_or_an_error(tmp_path: Path) -> None
         assert kept == {obj.id for obj in env.objects() if obj.digest != last.digest}
         with pytest.raises(hapticdb.errors.NoSurfaceError, match="'hapticdb upgrade"):
             list(parts_of(env.store, [last, first]))
+
+
+def test_a_surface_too_large_for_a_row_is_told_and_nothing_is_made(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(geometry, "MOST_BYTES", 100)
+    file = write_obj(tmp_path / "assembly.obj", assembly(2))
+    (report,) = hapticdb.import_files(tmp_path / "e.db", [file])
+    assert report.status == "failed"
+    assert "part 'ball 0': its surface takes" in str(report.error)
+    assert not (tmp_path / "e.db").exists()

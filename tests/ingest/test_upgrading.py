@@ -178,6 +178,15 @@ def test_surfaces_come_from_the_files_once(
         assert check_environment(env.url).findings == []
 
 
+def test_any_file_that_holds_a_shape_will_do(file: Path, tmp_path: Path) -> None:
+    other = write_obj(tmp_path / "other.obj", assembly(N_PARTS))
+    hapticdb.import_files(tmp_path / "e.db", [file, other], small_options())
+    drop_surfaces(tmp_path / "e.db")
+    file.unlink()
+    report = upgrade_environment(tmp_path / "e.db")
+    assert (report.surfaces, report.left_out) == (2 * N_PARTS, ())
+
+
 def test_objects_whose_file_is_gone_are_left_out_once(plain: Path, file: Path) -> None:
     """One reason for all of them. When the file is back, the same call goes on."""
     drop_surfaces(plain)

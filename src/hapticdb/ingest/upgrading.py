@@ -118,22 +118,28 @@ class _Run:
         self.left_out: list[LeftOut] = []
 
     def give_surfaces(self, objects: Sequence[Object]) -> None:
-        """Write the surfaces of objects from their files."""
+        """Write the surfaces of objects from their files; any file that holds a shape will do."""
         written: set[str] = set()
+        failed: list[LeftOut] = []
         for some, part in _parts_in_files(objects):
             self._link = some[0].link
-            if not isinstance(part, Part):
-                self._leave_out(some, part)
+            if isinstance(part, HapticDBError):
+                failed.append(LeftOut(some, part))
                 continue
-            if part.digest not in written:
-                try:
+            try:
+                if part.digest not in written:
                     self._store.add_surface(part.digest, packed_surface(part))
-                except FileError as error:  # too large
-                    self._leave_out(some, error)
-                    continue
-                written.add(part.digest)
-            self.n_surfaces += 1
+            except FileError as error:  # too large
+                failed.append(LeftOut(some, error))
+                continue
+            written.add(part.digest)
             self._advance(1)
+        for left in failed:
+            lacking = tuple(obj for obj in left.objects if obj.digest not in written)
+            self._advance(len(left.objects) - len(lacking))
+            if lacking:
+                self._leave_out(lacking, left.error)
+        self.n_surfaces = sum(obj.digest in written for obj in objects)
 
     def give_distances(self, objects: Sequence[Object], jobs: int) -> None:
         """Write the distances of objects."""

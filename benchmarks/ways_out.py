@@ -129,7 +129,7 @@ def _of_way(way: WayOut) -> dict[str, Any]:
 def by_meshes(
     env: Environment, found: Extraction, standing: Sequence[hapticdb.Object]
 ) -> dict[str, Any]:
-    """Least distance of the exact meshes at places of the path where nothing is touched.
+    """Least distance of the exact meshes at places of the path, of what is not touched at its start.
 
     coal measures in millimetres: in metres its tolerances are as large as small triangles.
     """
@@ -137,9 +137,10 @@ def by_meshes(
     assert way is not None
     assert isinstance(surface, Surface)
     path = way.swept.path
-    begin = max((one.until for one in way.swept.touching), default=0.0)
-    ways = np.linspace(begin * path.length, path.length, MOST_POSES)
-    others = [part.triangles(obj.transform) for obj, part in parts_of(env.store, standing)]
+    ways = np.linspace(0.0, path.length, MOST_POSES)
+    touched = {one.object.id for one in way.swept.touching}
+    free = [obj for obj in standing if obj.id not in touched]
+    others = [part.triangles() for _, part in parts_of(env.store, free)]
     tool = tree_of_boxes(*mesh_of(1e3 * surface.triangles))
     scene = tree_of_boxes(*mesh_of(1e3 * np.concatenate(others)))
     here, request = coal.Transform3s(), coal.DistanceRequest()

@@ -58,7 +58,7 @@ def test_a_lid_on_its_pot_comes_out_though_it_touches_it(tmp_path: Path) -> None
     assert [one.object.name for one in found.way.swept.touching] == ["pot"]
     assert found.way.poses[-1][2, 3] >= 0.0  # not through the pot
     assert is_out(found, url)
-    assert ", touches pot until " in extraction_line(found)
+    assert "; touches pot until " in extraction_line(found)
 
 
 def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:

@@ -22,12 +22,11 @@ def extraction_line(found: Extraction) -> str:
 
 
 def _proved(way: WayOut) -> str:
-    """Say what is touched until when; if nothing is, how near surfaces come."""
-    touching = way.swept.touching
-    if not touching:
-        return f", surfaces {gap_text(way.swept)} apart"
-    said = (f"{one.object.name} {until_text(one.until)}" for one in touching[:MOST_NAMED])
-    return f", touches {', '.join(said)}"
+    """Say how near surfaces come, and what is touched until when."""
+    swept, gap = way.swept, gap_text(way.swept)
+    said = [f"{one.object.name} {until_text(one.until)}" for one in swept.touching[:MOST_NAMED]]
+    apart = "" if gap == "-" else f", surfaces {gap} apart"
+    return apart + (f"; touches {', '.join(said)}" if said else "")
 
 
 def _no_way(found: Extraction) -> str:

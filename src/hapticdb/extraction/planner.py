@@ -28,6 +28,9 @@ Floats = NDArray[np.float64]
 MOST_STARTS = 12
 """Greatest number of pulls at whose ends the planner starts. Larger: more directions are tried
 together."""
+LEAVING = 2.0
+"""Voxels in contact up to which voxels tell how far a pull goes; of a longer one a sweep has to.
+Larger: more starts on the far side of thin walls."""
 STRIDE = 0.5
 """Greatest distance of two neighbouring states, in radii of the part. Larger: fewer questions in
 the open, more of them refused in narrow places."""
@@ -164,18 +167,17 @@ class Planner:
     def _found_starts(self) -> list[Loosened]:
         """Ways to where the planner starts: pulls; where none ends in the wide room, others, too.
 
-        Of each pull that goes anywhere, the farthest place; the longest pulls first. Where parts
-        are near something, voxels do not tell which pulls these are. If a pose is to be reached,
-        the start itself does, where it is free.
+        Of each pull that goes anywhere, the farthest place; the longest pulls first. If a pose is
+        to be reached, the start itself, where it is free.
         """
-        is_near = bool(self._space.start.objects)
         here = np.eye(4)[None]
         if self._leaving is None and self._space.wide.are_free(here)[0]:
             return [Loosened(here, is_wide=True)]
         found: list[tuple[float, Loosened]] = []
         for pull in self._pulls.done:
             farthest = pull.free - BACK * self._problem.voxel_size
-            if farthest <= 0.0 or (is_near and not pull.is_swept):
+            is_told = pull.is_swept or pull.touching <= LEAVING * self._problem.voxel_size
+            if farthest <= 0.0 or not is_told:
                 continue
             path = self._problem.path(pull.poses(np.array([0.0, farthest])))
             ways = self._space.room.ways(path)
@@ -188,7 +190,7 @@ class Planner:
                     found.append((float(ways[last - 1]), Loosened(way, is_wide)))
                     break
         starts = [one for _, one in sorted(found, key=lambda one: -one[0])]
-        if is_near and not any(one.is_wide for one in starts):
+        if self._space.start.objects and not any(one.is_wide for one in starts):
             part = self._part(SHARE_OF_LOOSENING)
             loosening = Loosening(self._problem, self._space, self._seed)
             starts += loosening.search(part.motions, part.until)

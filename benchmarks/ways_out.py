@@ -129,7 +129,7 @@ def _of_way(way: WayOut) -> dict[str, Any]:
 def by_meshes(
     env: Environment, found: Extraction, standing: Sequence[hapticdb.Object]
 ) -> dict[str, Any]:
-    """Least distance of the exact meshes at places of the path, of what is not touched at its start.
+    """Least distance of the exact meshes on the path, of what is not touched at its start.
 
     coal measures in millimetres: in metres its tolerances are as large as small triangles.
     """

@@ -13,19 +13,19 @@ Floats = NDArray[np.float64]
 
 SLIDE = 4.0
 """Contact tolerances that the tool moves on while it touches, from which it slides."""
-STEP = 1.5
-"""Contact tolerances of the way between two looks. Larger: fewer looks, and less than `KEPT` would
-be in hand."""
-KEPT = 0.8
-"""Contact tolerances by which a cut must stay below what is allowed: between two looks it is deeper
-by half of `STEP` at most."""
+STEP, STEP_OF_GROWTH = 1.5, 0.75
+"""Way between two looks: contact tolerances, or a share of what a cut may grow by if that is more.
+Larger: fewer looks, and less is allowed at each."""
+KEPT = 0.53
+"""Share of that way by which a cut must stay below what is allowed, since it is deeper by half of
+the way at most between two looks."""
 EASE = 0.2
 """Contact tolerances by which surfaces are shifted, to see that they only touch."""
 SHIFT = 0.05
 """Contact tolerances by which surfaces are shifted, to measure how deep they overlap."""
-ERROR = 0.05
-"""Share of a cut by which its measurements differ at most, where places and corners are few: what
-overlaps at the start may seem deeper by so much later. Larger: more of it is allowed."""
+DEEP = 0.06
+"""Share of the start's cut by which it may grow, if that is more than the tolerance: measurements
+differ by half as much where places and corners are few. Larger: more of it is allowed."""
 BLOCK = 64
 """Looks that are measured together."""
 PATIENCE = 16
@@ -55,22 +55,26 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
     """Follow a contact from the start of the path, where the surfaces are within `contact` metres.
 
     A cut may grow to the greater one of the start's and `contact`, and by `contact` more, or by
-    `ERROR` of the start's if that is more.
+    `DEEP` of the start's if that is more.
     """
     depths = _Depths(pair, contact, object_mesh, tool_mesh)
     start = depths.cut(pair.way.at([0.0])[0], np.inf, contact).depth
-    allowed = max(start, contact) + max(contact, ERROR * start)
+    growth = max(contact, DEEP * start)
+    step = max(STEP * contact, STEP_OF_GROWTH * growth)
+    allowed = max(start, contact) + growth
     deepest, way, length = start, 0.0, pair.way.length
     while way < length:
-        ways = np.minimum(way + STEP * contact * np.arange(1, BLOCK + 1), length)
+        ways = np.minimum(way + step * np.arange(1, BLOCK + 1), length)
         ways = ways[: int(np.searchsorted(ways, length)) + 1]
         gaps = pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
         for way, gap, pose in zip(ways.tolist(), gaps.tolist(), pair.way.at(ways), strict=True):
             if gap > contact:
                 return FollowedContact(start, deepest, allowed, way, is_apart=True)
-            found = depths.of(pose, allowed) if gap <= 0.0 else NONE
+            found = NONE
+            if gap <= 0.0:
+                found = depths.of(pose, allowed + contact, allowed - KEPT * step)
             deepest = max(deepest, found.depth)
-            if found.depth > allowed - KEPT * contact:
+            if found.depth > allowed - KEPT * step:
                 return FollowedContact(start, deepest, allowed, way, refused=(way, found))
     return FollowedContact(start, deepest, allowed, length)
 
@@ -86,14 +90,14 @@ class _Depths:
         self._known = 0
         self._resting = 0
 
-    def of(self, pose: Floats, allowed: float) -> Cut:
-        """Cut at a pose, little more than is allowed if it is more.
+    def of(self, pose: Floats, most: float, enough: float) -> Cut:
+        """Cut at a pose, as `cut`.
 
         Surfaces that a shift by `ease` frees overlap by that much at most, which is told then.
         """
         if self._is_freed(pose):
             return Cut(self._ease, pose[:3, 3])
-        return self.cut(pose, allowed + self._contact, allowed - KEPT * self._contact)
+        return self.cut(pose, most, enough)
 
     def _is_freed(self, pose: Floats) -> bool:
         """Whether a small shift frees the surfaces; the last one that did is tried first."""

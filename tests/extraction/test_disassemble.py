@@ -129,6 +129,7 @@ def test_without_a_planner_straight_orders_are_found(
         found_in(made(tmp_path / "chain", CHAIN), "left", motions=100)
 
 
+@pytest.mark.long
 def test_a_path_through_what_holds_is_no_step(tmp_path: Path) -> None:
     """A small bolt's head is a tenth of the contacts: the pull alone would cut through it."""
     found = found_in(made(tmp_path, held_by_a_head()), "plate", keep=["base"])

@@ -30,9 +30,8 @@ from extraction_scenes import (
 from hapticdb import extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
 from hapticdb.extraction.judge import judge
-from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
-from hapticdb.extraction.problem import problem_of
+from hapticdb.extraction.problem import Exit, problem_of
 from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
 
@@ -68,6 +67,7 @@ def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:
     assert extraction_line(found).startswith("slides straight, 10 mm")
 
 
+@pytest.mark.long
 def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
     """Pulled across, the walls of the upper one pass through the stud of the lower one."""
     with hapticdb.open(studded(tmp_path), read_only=True) as env:

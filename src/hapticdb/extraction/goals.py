@@ -15,8 +15,7 @@ from numpy.typing import NDArray
 from hapticdb.extraction.directions import AXES, likely_directions
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.judge import passed
-from hapticdb.extraction.leaving import Exit
-from hapticdb.extraction.problem import Problem, corners_of
+from hapticdb.extraction.problem import Exit, Problem, corners_of
 from hapticdb.extraction.pulls import Pulls, first_run, shifted
 
 Floats = NDArray[np.float64]

@@ -15,9 +15,8 @@ from numpy.typing import NDArray
 
 from hapticdb.extraction.directions import AXES
 from hapticdb.extraction.free_space import Room
-from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.loosening import Loosened
-from hapticdb.extraction.problem import Problem
+from hapticdb.extraction.problem import Exit, Problem
 
 Floats = NDArray[np.float64]
 

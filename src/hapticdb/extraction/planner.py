@@ -14,11 +14,10 @@ from hapticdb.errors import HapticDBError
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.goals import SAME, Goals
 from hapticdb.extraction.judge import BACK
-from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.legs import Legs
 from hapticdb.extraction.loosening import Loosened, Loosening
 from hapticdb.extraction.planner_child import PlanRequest
-from hapticdb.extraction.problem import Problem
+from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.pulls import Pulls, first_run
 from hapticdb.poses import quaternion_of, rotation_of
 from hapticdb.realtime.processes import Process

@@ -15,8 +15,7 @@ from hapticdb.extraction.directions import (
     opposed_shares,
 )
 from hapticdb.extraction.free_space import STEP, FreeSpace
-from hapticdb.extraction.leaving import Exit
-from hapticdb.extraction.problem import Problem
+from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.store.base import Object
 from hapticdb.sweeps.run import SweepCallback
 

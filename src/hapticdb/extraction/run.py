@@ -18,9 +18,8 @@ from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.goals import GoalPose, Goals, GoalsOutside
 from hapticdb.extraction.judge import judge
-from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.planner import Planner
-from hapticdb.extraction.problem import Problem, problem_of
+from hapticdb.extraction.problem import Exit, Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut
 from hapticdb.extraction.screws import unscrewed
@@ -107,12 +106,10 @@ def extract(
     """
     asked = _Asked(None, seconds, seed, motions, out, screw, budget_bytes)
     asked.check()
-    if to is not None and (out is not None or screw is not None):
-        raise UsageError("a way to a pose: give neither out nor screw")
     began = time.monotonic()
     problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, seconds=seconds)
     if to is not None:
-        asked = asked._replace(to=_checked_goal(problem, to))
+        asked = asked._replace(to=_checked_goal(problem, to, asked))
     found = _searched(problem, asked, progress)
     return replace(found, seconds=time.monotonic() - began)
 
@@ -141,8 +138,10 @@ class _Asked(NamedTuple):
                 raise UsageError(f"{name} {length} m: give a length above 0")
 
 
-def _checked_goal(problem: Problem, to: ArrayLike) -> Floats:
+def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
     """The pose (4, 4) to reach; UsageError if it is none, or far from everything."""
+    if asked.out is not None or asked.screw is not None:
+        raise UsageError("a way to a pose: give neither out nor screw")
     goal = np.asarray(checked_poses(np.asarray(to)[None])[0])
     way, size = problem.path(np.stack([np.eye(4), goal])).length, np.ptp(problem.box, axis=0).max()
     if way > FARTHEST * (size + problem.radius):

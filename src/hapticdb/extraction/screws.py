@@ -6,9 +6,8 @@ import numpy as np
 
 from hapticdb.extraction.directions import AXES, distinct
 from hapticdb.extraction.judge import judge
-from hapticdb.extraction.leaving import Exit
 from hapticdb.extraction.loosening import Twist
-from hapticdb.extraction.problem import Problem, corners_of
+from hapticdb.extraction.problem import Exit, Problem, corners_of
 from hapticdb.extraction.result import WayOut
 
 

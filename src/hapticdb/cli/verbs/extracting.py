@@ -162,16 +162,15 @@ def extract(
     _check_animation(animation)
     if not disassemble and (depth is not None or keep):
         raise UsageError("--depth and --keep go with --disassemble")
-    if to is not None and (disassemble or out is not None or screw is not None):
+    if to and (disassemble or out or screw):
         raise UsageError("--to goes with none of --disassemble, --out and --screw")
+    goal = _goal(to) if to else None
     asked = _Outputs(path, picture, animation, up, json)
     options: dict[str, Any] = {
         "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
         "contact": MM * contact, "budget_bytes": budget_bytes(budget),
     }  # fmt: skip
-    goal = None if to is None else _goal(to)
-    if seconds is not None:
-        options["seconds"] = seconds
+    options |= {} if seconds is None else {"seconds": seconds}
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")
         felt = felt_objects(env, where, exclude, ids)

@@ -88,8 +88,7 @@ def extract(
         The same seed gives the same path, unless the time ends the search.
     motions : int
         Motions that the planner may ask about; 0: straight pulls only.
-    budget_bytes : int
-        Memory for resident cells.
+    budget_bytes : int, as for `Environment.feeler`
     progress : callable or None
         Called after each straight pull with the pulls tried and their total.
 
@@ -108,9 +107,8 @@ def extract(
     asked.check()
     began = time.monotonic()
     problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, seconds=seconds)
-    if to is not None:
-        asked = asked._replace(to=_checked_goal(problem, to, asked))
-    found = _searched(problem, asked, progress)
+    goal = None if to is None else _checked_goal(problem, to, asked)
+    found = _searched(problem, asked._replace(to=goal), progress)
     return replace(found, seconds=time.monotonic() - began)
 
 

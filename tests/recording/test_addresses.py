@@ -98,17 +98,18 @@ def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
     assert err == f"hapticdb: {recording} names {scene}, which is opened\n"
 
 
-def test_an_object_whose_link_is_an_address_has_no_file(
-    scene: Path, listening: socket.socket
+@pytest.mark.parametrize("address", ["http://{}/a.glb", "ws://{}/a.stl", "file:///a.ply"])
+def test_objects_whose_links_are_addresses_have_no_file(
+    scene: Path, listening: socket.socket, address: str
 ) -> None:
-    port = listening.getsockname()[1]
-    addresses = [f"http://127.0.0.1:{port}/a.glb", f"ws://127.0.0.1:{port}/a.stl", "file:///a.ply"]
+    link = address.format(f"127.0.0.1:{listening.getsockname()[1]}")
     with hapticdb.open(scene) as env:
-        for address in addresses:
-            env.restore(replace(env.remove(1), link=address))
-            drop_surfaces(scene)
-            (left,) = hapticdb.upgrade_environment(scene).left_out
-            assert "there is no such file" in str(left.error)
+        for obj in env.objects():  # the file of any of them would give its shape to all
+            env.restore(replace(env.remove(obj.id), link=link))
+        drop_surfaces(scene)
+        left_out = hapticdb.upgrade_environment(scene).left_out
+    assert left_out
+    assert all("there is no such file" in str(left.error) for left in left_out)
 
 
 @pytest.mark.parametrize(

@@ -13,6 +13,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Mesh = tuple[Floats, NDArray[np.int64]]
+
+MM = 1e3
+"""python-fcl and coal are asked in millimetres: in metres they are wrong for small triangles."""
 """Vertices (V, 3), metres, and faces (F, 3)."""
 
 POINTS_AT_ONCE = 1 << 20
@@ -84,12 +87,12 @@ class FclBatch(BatchPeer):
         """A tree of boxes around triangles, at rest."""
         model = self._fcl.BVHModel()
         model.beginModel(len(faces), len(vertices))
-        model.addSubModel(vertices, faces)
+        model.addSubModel(MM * vertices, faces)
         model.endModel()
         return self._fcl.CollisionObject(model, self._fcl.Transform())
 
     def _move(self, pose: Floats) -> None:
-        self._tool.setTransform(self._fcl.Transform(pose[:3, :3], pose[:3, 3]))
+        self._tool.setTransform(self._fcl.Transform(pose[:3, :3], MM * pose[:3, 3]))
 
     def touches_at(self, pose: Floats) -> bool:
         self._move(pose)
@@ -99,7 +102,7 @@ class FclBatch(BatchPeer):
     def distance_at(self, pose: Floats) -> float:
         self._move(pose)
         result = self._fcl.DistanceResult()
-        return float(self._fcl.distance(self._car, self._tool, self._distance, result))
+        return float(self._fcl.distance(self._car, self._tool, self._distance, result)) / MM
 
 
 class FclPartsBatch(FclBatch):
@@ -124,7 +127,7 @@ class FclPartsBatch(FclBatch):
         self._move(pose)
         asked = self._fcl.DistanceData()
         self._parts.distance(self._tool, asked, self._fcl.defaultDistanceCallback)
-        return float(asked.result.min_distance)
+        return float(asked.result.min_distance) / MM
 
 
 def tree_of_boxes(vertices: Floats, faces: NDArray[np.int64]) -> Any:  # noqa: ANN401 - no types
@@ -144,14 +147,14 @@ class CoalBatch(BatchPeer):
 
     def __init__(self, parts: Sequence[Floats], tool: Mesh) -> None:
         self._coal = coal = _loaded("coal")
-        self._car = tree_of_boxes(*mesh_of(np.concatenate(parts)))
-        self._tool = tree_of_boxes(*tool)
+        self._car = tree_of_boxes(*mesh_of(MM * np.concatenate(parts)))
+        self._tool = tree_of_boxes(MM * tool[0], tool[1])
         self._here = coal.Transform3s()
         self._collision, self._distance = coal.CollisionRequest(), coal.DistanceRequest()
         self._collision.enable_contact = False
 
     def _there(self, pose: Floats) -> Any:  # noqa: ANN401
-        return self._coal.Transform3s(pose[:3, :3].copy(), pose[:3, 3].copy())
+        return self._coal.Transform3s(pose[:3, :3].copy(), MM * pose[:3, 3])
 
     def touches_at(self, pose: Floats) -> bool:
         sides = (self._car, self._here, self._tool, self._there(pose))
@@ -159,7 +162,7 @@ class CoalBatch(BatchPeer):
 
     def distance_at(self, pose: Floats) -> float:
         sides = (self._car, self._here, self._tool, self._there(pose))
-        return float(self._coal.distance(*sides, self._distance, self._coal.DistanceResult()))
+        return float(self._coal.distance(*sides, self._distance, self._coal.DistanceResult())) / MM
 
 
 class CoalPartsBatch(CoalBatch):
@@ -169,12 +172,12 @@ class CoalPartsBatch(CoalBatch):
 
     def __init__(self, parts: Sequence[Floats], tool: Mesh) -> None:
         self._coal = coal = _loaded("coal")
-        self._all = [coal.CollisionObject(tree_of_boxes(*mesh_of(part))) for part in parts]
+        self._all = [coal.CollisionObject(tree_of_boxes(*mesh_of(MM * part))) for part in parts]
         self._parts = coal.DynamicAABBTreeCollisionManager()
         for part in self._all:
             self._parts.registerObject(part)
         self._parts.setup()
-        self._tool = coal.CollisionObject(tree_of_boxes(*tool))
+        self._tool = coal.CollisionObject(tree_of_boxes(MM * tool[0], tool[1]))
 
     def _asked(self, pose: Floats, asked: Any) -> Any:  # noqa: ANN401
         self._tool.setTransform(self._there(pose))
@@ -192,7 +195,7 @@ class CoalPartsBatch(CoalBatch):
         asked = self._asked(pose, self._coal.DistanceCallBackDefault())
         asked.init()
         self._parts.distance(self._tool, asked)
-        return float(asked.data.result.min_distance)
+        return float(asked.data.result.min_distance) / MM
 
 
 class Open3DBatch(BatchPeer):

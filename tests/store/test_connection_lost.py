@@ -123,9 +123,10 @@ def test_a_write_whose_commit_is_not_answered_counts_once(
             assert contents(env) == after
         obj = env.object(3)
         rows = env.store.rows_of(3, *(np.array([key]) for key in (0, 2**62)))
+        (surface,) = env.store.surfaces([obj.digest]).values()
         env.remove(3)
         proxy.cut = how
-        assert env.store.add(obj, rows) == 3
+        assert env.store.add(obj, rows, surface) == 3
         # conditional on a revision: a repeated move would raise a conflict
         proxy.cut = how
         env.move(3, placement(0.01, 0, 0), revision=env.object(3).revision)

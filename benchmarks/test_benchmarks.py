@@ -109,7 +109,7 @@ def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
     question = ways_out.Question(("engine/spark_plug",))
     (row,) = ways_out.measure(tmp_path, model, 7, [question])["rows"]
     assert (row["verdict"], row["how"]) == ("comes out", "pull")
-    assert 0.0 < row["clearance_m"] <= row["mesh_distance_m"]
+    assert 0.0 < row["gap_m"] <= row["mesh_distance_m"]
 
 
 def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFiles) -> None:

@@ -12,26 +12,12 @@ from pathlib import Path
 
 import numpy as np
 
-from mesh_files import MESH_3MF, TRIANGLE, glb_of, gltf, threemf
+from mesh_files import COLLADA, MESH_3MF, TRIANGLE, glb_of, gltf, threemf
 
 MOST_BYTES = 20_000
 """Size in bytes of the largest file of HAPTICDB_TEST_DATA that becomes a seed. Larger: slower."""
 OTHERS = (".npz", ".csv", ".hdbrec")
 """Suffixes of saved shells, paths and recordings. They are read in the caller's own process."""
-
-_DAE = """<?xml version="1.0"?><COLLADA xmlns="http://www.collada.org/2005/11/COLLADASchema"
-version="1.4.1"><asset><unit meter="0.01"/><up_axis>Z_UP</up_axis></asset><library_geometries>
-<geometry id="g" name="leaf"><mesh><source id="p"><float_array id="pa" count="12">0 0 0 1 0 0 1 1 0
-0 1 0</float_array><technique_common><accessor source="#pa" count="4" stride="3">
-<param name="X" type="float"/><param name="Y" type="float"/><param name="Z" type="float"/>
-</accessor></technique_common></source><vertices id="v"><input semantic="POSITION" source="#p"/>
-</vertices><polylist count="2"><input semantic="VERTEX" source="#v" offset="0"/>
-<vcount>4 3</vcount><p>0 1 2 3 0 1 2</p></polylist><triangles count="1">
-<input semantic="VERTEX" source="#v" offset="0"/><p>0 1 2</p></triangles></mesh></geometry>
-</library_geometries><library_visual_scenes><visual_scene id="s"><node id="a" name="tree">
-<translate>100 0 0</translate><node id="b" name="branch"><scale>2 2 2</scale>
-<instance_geometry url="#g"/></node></node></visual_scene></library_visual_scenes><scene>
-<instance_visual_scene url="#s"/></scene></COLLADA>"""
 
 _STEP = """ISO-10303-21;
 HEADER;
@@ -132,7 +118,7 @@ def _texts() -> list[tuple[str, bytes]]:
             (".off", f"COFF 5 1 0\n{rows}3 0 1 4\n"),
             (".stl", solid + solid.replace(" a\n", " b\n")),
             (".ply", f"{ply}{coloured}4 0 1 2 3\n3 0 1 4\n"),
-            (".dae", _DAE),
+            (".dae", COLLADA),
             (".step", _STEP),
         )
     ]

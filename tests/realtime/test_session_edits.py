@@ -1,15 +1,27 @@
 """A running session feels edits of the environment, on both engines."""
 
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.query.law import PLANE
+from hapticdb.devices.profiles import SCRIPTED
+from hapticdb.kernels.large.sleeping import Sleepers
+from hapticdb.kernels.records import MOST_MISSED, SERVO
+from hapticdb.kernels.resident import cells as resident
+from hapticdb.kernels.resident.cell_table import publish
+from hapticdb.query.law import PLANE, SMOOTH
+from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.drive import DirectDrive, SmoothDrive
 from hapticdb.realtime.session import Session
 from hapticdb.recording.frame import State
+from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.table import CellTable
+from hapticdb.store.base import NO_KEYS
 from hapticdb.testing import floor_voxels
 from realtime.hands import stroking
 from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
@@ -32,6 +44,56 @@ def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
     grid = Grid(SIZE, (-32 * SIZE,) * 3, 6)
     with floored(hapticdb.create(place(), grid, layout="brick")) as env:
         check_edits(env, sphere, tmp_path / "edited.hdbrec")
+
+
+@dataclass
+class Scene:
+    """What a drive reads, of a table without cells."""
+
+    cells: resident.Cells
+    row: int
+    clusters: resident.Clusters
+    servo: NDArray[np.void]
+    pose: NDArray[np.float64]
+    missed: NDArray[np.int64]
+    place: resident.Place
+    sleepers: Sleepers | None = None
+    budget: int = 300
+
+
+@pytest.mark.parametrize("is_smooth", [False, True])
+def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
+    sphere: PointShell, monkeypatch: pytest.MonkeyPatch, *, is_smooth: bool
+) -> None:
+    """Others write just before its kernel begins, and again as soon as it has ended."""
+    law = SMOOTH if is_smooth else PLANE
+    with CellTable.create(8 << 20, distances=is_smooth) as table, table.reading() as row:
+        control, servo = table.cells.control, np.zeros((), SERVO)
+        servo["hand"]["quaternion"][0] = 1.0
+        place = resident.Place(0.0, 0.0, 0.0, 0.01, 64.0)
+        missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        scene = Scene(table.cells, row, clusters_of(sphere, 0.01), servo, np.eye(4), missed, place)
+        drive: DirectDrive | SmoothDrive
+        if is_smooth:
+            spring = Coupling().settled(SCRIPTED, 500.0, 1.0, 0.024).spring()
+            drive = SmoothDrive(scene, spring, law)
+        else:
+            drive = DirectDrive(scene, Coupling().direct(SCRIPTED, 1.0, 0.024).terms(), 0.024, law)
+        frame = drive._frame
+
+        def edited(*arguments: NDArray[np.float64]) -> int:
+            publish(control, 2, 8, NO_KEYS)
+            left_out = frame(*arguments)  # type: ignore[arg-type]
+            publish(control, 3, 9, NO_KEYS)
+            return left_out
+
+        publish(control, 1, 7, NO_KEYS)
+        monkeypatch.setattr(drive, "_frame", edited)
+        if is_smooth:
+            drive.feel()
+        else:
+            drive.step(1e-3)
+        assert servo["sent"]["revision"] == 8
 
 
 def check_edits(edited: Environment, sphere: PointShell, path: Path) -> None:

@@ -24,10 +24,9 @@ from hapticdb.kernels.hand.near_points import (
 from hapticdb.kernels.large.sleeping import LEFT_OUT, Sleepers
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS, pose_numbers
 from hapticdb.kernels.resident.cells import (
-    BUFFERS,
-    REVISION,
+    FELT_REVISION,
+    READER_STRIDE,
     UNKNOWNS,
-    VERSION,
     Cells,
     Clusters,
     Place,
@@ -89,6 +88,8 @@ class _Drive:
         self._tool, self._sent = scene.servo["tool"], scene.servo["sent"]
         self._tool_before = self._tool.copy()
         self._left_out = self._sent["left_out"]
+        at = scene.row * READER_STRIDE + FELT_REVISION
+        self._revision = scene.cells.readers[at : at + 1]
 
     def _frame(self, poses: Floats, missed: Indices, out: Floats) -> int:
         """Compute the frame at poses (1, 4, 4) into out (1, RESULTS), unless the pose is NaN.
@@ -144,11 +145,10 @@ class DirectDrive(_Drive):
 
     def step(self, dt: float) -> None:
         """Feel the scene at the hand, a period `dt` (s) later; `sent` then has the wrench."""
-        scene, control = self._scene, self._scene.cells.control
-        # read before the frame: what is written meanwhile is then felt under an older revision
-        revision = control[REVISION + control[VERSION] % BUFFERS]
+        scene = self._scene
         poses_of(self._hand_pose, self._at_hand)
         left_out = self._frame(self._at_hand, scene.missed, self._felt)
+        revision = self._revision.item()
         direct.render(self._terms, scene.clusters.center, scene.servo, self._felt, revision, dt)
         self._left_out[()] = left_out
 
@@ -214,11 +214,13 @@ class SmoothDrive(_Drive):
     def feel(self) -> None:
         """Compute the law's frame at the tool's pose for the recording, after `step`.
 
-        `tool.felt` takes its result. If cells were evicted since the step, points may be unknown
+        `tool.felt` takes its result, and `sent.revision` its revision: cells may have changed since
+        the step. If cells were evicted since the step, points may be unknown
         by now: `sent.unknown` counts them, and a replay leaves the frame out.
         """
         felt = self._felt_here[0]
         left_out = self._frame(self._scene.pose[None], self._missed_here, self._felt_here)
         self._left_out[()] = max(self._left_out, left_out)
         self._felt[:] = felt
+        self._sent["revision"] = self._revision.item()
         self._unknown += np.int64(felt[UNKNOWNS])

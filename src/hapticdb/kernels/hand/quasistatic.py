@@ -72,10 +72,10 @@ from hapticdb.kernels.resident.cells import (
     CLUSTERS,
     CONTACTS,
     DEEPEST,
+    FELT_REVISION,
     HITS,
     PLACE,
     READER_STRIDE,
-    REVISION,
     WRENCH,
     begin_frame,
     end_frame,
@@ -395,7 +395,6 @@ def advance(
         found = _move_tool(
             cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
         )
-    revision = cells.control[REVISION + which]  # before end_frame: then the buffer may be reused
     end_frame(cells, reader)
     is_held = is_held or found == NOT_KNOWN
     sent.marks = finish(
@@ -409,4 +408,4 @@ def advance(
     if follower.n_active > 0:  # a period in contact without a look rests on the last look
         sent.left_out = max(sent.left_out, follower.n_left_out)
     sent.n_steps = follower.n_looks
-    sent.revision = revision
+    sent.revision = cells.readers[reader * READER_STRIDE + FELT_REVISION]

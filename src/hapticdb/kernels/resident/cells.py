@@ -65,6 +65,8 @@ CHANGES_KEPT = 2048
 (`waking`). Larger: seldomer, and 8 bytes more for each."""
 READER_STRIDE = 8
 """Numbers from one reader to the next: a cache line, so readers do not slow one another down."""
+FELT_REVISION = 1
+"""Index into a reader's numbers: the database's revision of the cells that its last frame read."""
 LISTED = 0
 """Index into a frame's list of unknown cells: their number. Their keys follow."""
 GROUP = 4
@@ -220,7 +222,9 @@ def begin_frame(cells, reader):
         readers[reader * READER_STRIDE] = version
         fence()
         if control[VERSION] == version:
-            return version % BUFFERS
+            which = version % BUFFERS
+            readers[reader * READER_STRIDE + FELT_REVISION] = control[REVISION + which]
+            return which
 
 
 @leaf

@@ -84,7 +84,7 @@ def _moments(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def write_parts(folder: Path, n_balls: int = 30) -> Path:
-    """An environment of equal balls, one of them mirrored, boxes, and a rod; returns its path."""
+    """An environment of equal balls, one of them mirrored, boxes, and a red rod; its path."""
     scene = trimesh.Scene()
     ball = trimesh.creation.icosphere(1, 0.03)
     for n in range(n_balls):
@@ -98,6 +98,7 @@ def write_parts(folder: Path, n_balls: int = 30) -> Path:
         at = trimesh.transformations.translation_matrix([0.1, 0.2, 0.2 + 0.1 * n])
         scene.add_geometry(box, f"frame-{n}", geom_name=f"box-{n}", transform=at)
     rod = trimesh.creation.cylinder(0.02, 0.4, sections=24)
+    rod.visual.vertex_colors = [[200, 40, 40, 255]] * len(rod.vertices)
     scene.add_geometry(rod, "rod", geom_name="rod", transform=np.diag([1.0, 2.0, 1.0, 1.0]))
     scene.export(folder / "parts.glb")
     grid = hapticdb.Grid(0.01, (-0.5, -0.5, -0.5), 8)

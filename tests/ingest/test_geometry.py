@@ -43,6 +43,9 @@ def test_parts_are_those_of_the_file_in_the_order_of_ids(
                 assert part.digest == obj.digest == wanted.digest
                 assert part.vertices.tobytes() == wanted.vertices.tobytes()
                 np.testing.assert_array_equal(part.faces, wanted.faces)
+                assert (part.colours is not None) == (obj.name == "rod")
+                if part.colours is not None and wanted.colours is not None:
+                    np.testing.assert_array_equal(part.colours, wanted.colours)
                 np.testing.assert_array_equal(part.triangles(), wanted.triangles())
                 arrays.setdefault(obj.digest, set()).add(id(part.vertices))
             assert all(len(one) == 1 for one in arrays.values())

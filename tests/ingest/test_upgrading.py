@@ -3,6 +3,7 @@
 An upgrade that is interrupted is a process of its own that says how many objects it has written.
 """
 
+import dataclasses
 import signal
 import subprocess
 import sys
@@ -18,6 +19,7 @@ from children import child
 from hapticdb import Environment, ImportOptions, upgrade_environment
 from hapticdb.check import check_environment
 from hapticdb.ingest.files import ImportProgress
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import parse_in_process
 from hapticdb.store.base import Layout
@@ -235,3 +237,22 @@ def test_an_object_with_other_voxels_than_its_surface_gives_is_left_out(plain: P
     assert report.upgraded == N_PARTS - 1
     with pytest.raises(hapticdb.errors.UsageError, match="0 jobs"):
         upgrade_environment(plain, jobs=0)
+
+
+def test_parts_that_were_imported_without_their_colours_get_their_surfaces(tmp_path: Path) -> None:
+    """An import that asks for what has changed brings the colours."""
+    name, url = "coloured.mtl", tmp_path / "plain.db"
+    file = write_obj(tmp_path / "assembly.obj", assembly(2))
+    file.write_text(f"mtllib {name}\nusemtl red\n{file.read_text()}")
+    hapticdb.import_files(url, [file], small_options())
+    drop_surfaces(url)
+    (tmp_path / name).write_text("newmtl red\nKd 1 0 0\n")
+    assert upgrade_environment(url).is_complete
+    with hapticdb.open(url) as env:
+        assert [part.colours for _, part in parts_of(env.store, env.objects())] == [None, None]
+        again = dataclasses.replace(small_options(), replace=True)
+        hapticdb.import_files(url, [file], again)
+        for _, part in parts_of(env.store, env.objects()):
+            assert part.colours is not None
+            assert (part.colours == [255, 0, 0, 255]).all()
+    assert check_environment(url).is_sound

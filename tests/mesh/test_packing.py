@@ -13,26 +13,35 @@ from hapticdb.mesh.packing import HEADER, pack, unpack
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Geometry = tuple[Floats, Ints | None, NDArray[np.uint8] | None]
+SHADES = st.sampled_from([st.just(7), st.sampled_from([0, 255]), st.integers(0, 255)])
 FINITE = st.floats(allow_nan=False, allow_infinity=False)
 FEW = st.sampled_from([0.0, -0.0, 1.0, 0.001, 5e-324, -1.7e308])
 
 
 @st.composite
-def geometries(draw: st.DrawFn) -> tuple[Floats, Ints | None]:
-    """Vertices, many of them alike, and any triangles of them, or none."""
+def geometries(draw: st.DrawFn) -> Geometry:
+    """Vertices, many of them alike; any triangles of them, or none; colours, or none."""
     n = draw(st.integers(0, 300))
     vertices = draw(arrays(np.float64, (n, 3), elements=st.one_of(FINITE, FEW)))
+    faces = None
     if draw(st.booleans()):
-        return vertices, None
-    n_faces = draw(st.integers(0, 40)) if n else 0
-    return vertices, draw(arrays(np.int64, (n_faces, 3), elements=st.integers(0, max(n - 1, 0))))
+        n_faces = draw(st.integers(0, 40)) if n else 0
+        faces = draw(arrays(np.int64, (n_faces, 3), elements=st.integers(0, max(n - 1, 0))))
+    if draw(st.booleans()):
+        return vertices, faces, None
+    shape = (n if faces is None else len(faces), 4)
+    return vertices, faces, draw(arrays(np.uint8, shape, elements=draw(SHADES)))
 
 
 @settings(max_examples=200, deadline=None)
 @given(geometries())
-def test_what_is_packed_returns_bit_for_bit(geometry: tuple[Floats, Ints | None]) -> None:
-    vertices, faces = geometry
-    found, corners = unpack(pack(vertices, faces))
+def test_what_is_packed_returns_bit_for_bit(geometry: Geometry) -> None:
+    vertices, faces, colours = geometry
+    found, corners, painted = unpack(pack(vertices, faces, colours))
+    assert (painted is None) == (colours is None)
+    if painted is not None and colours is not None:
+        np.testing.assert_array_equal(painted, colours)
     assert found.tobytes() == np.ascontiguousarray(vertices).tobytes()
     assert found.shape == vertices.shape
     if faces is None:
@@ -58,17 +67,20 @@ def ball(n: int) -> tuple[Floats, Ints]:
 def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObject) -> None:
     """Never a position that is no number, nor a triangle of a vertex that is not there."""
     vertices, faces = ball(9)
-    whole = bytearray(pack(vertices, faces if data.draw(st.booleans()) else None))
+    colours = np.arange(4 * len(faces), dtype=np.uint8).reshape(-1, 4) // 64
+    is_mesh = data.draw(st.booleans())
+    whole = bytearray(pack(vertices, *((faces, colours) if is_mesh else (None,))))
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(whole) - 1))
         whole[at] ^= data.draw(st.integers(1, 255))
     damaged = bytes(whole[: data.draw(st.integers(0, len(whole)))])
     try:
-        found, corners = unpack(damaged)
+        found, corners, painted = unpack(damaged)
     except ValueError:
         return
     assert np.isfinite(found).all()
     assert corners is None or not corners.size or 0 <= corners.min() <= corners.max() < len(found)
+    assert painted is None or len(painted) == len(found if corners is None else corners)
 
 
 @pytest.mark.parametrize("n_faces", [0, 1 << 40, (1 << 64) - 1])

@@ -2,6 +2,7 @@
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -58,13 +59,13 @@ def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Objec
 def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
     """Geometry of an object from its packed surface; DamagedError if it is not that of its digest.
 
-    The digest is a checksum of all positions and corners, so no other geometry is ever returned.
+    The digest is a checksum of positions, corners and colours, so nothing else is ever returned.
     """
     try:
-        vertices, faces = packing.unpack(surface)
+        vertices, faces, colours = packing.unpack(surface)
     except ValueError as error:
         raise damaged(url, f"object {obj.id}: {error}") from None
-    part = Part(obj.name, vertices, faces, obj.transform)
+    part = Part(obj.name, vertices, faces, obj.transform, colours=colours)
     if part.digest != obj.digest:
         raise damaged(url, f"object {obj.id}: its surface is not the one that was written")
     return part
@@ -72,7 +73,7 @@ def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
 
 def packed_surface(part: Part) -> bytes:
     """Pack the geometry of a part; FileError if it is more than a database holds in a row."""
-    surface = packing.pack(part.vertices, part.faces)
+    surface = packing.pack(part.vertices, part.faces, part.colours)
     if len(surface) > MOST_BYTES:
         raise FileError(
             f"part {part.name!r}: its surface takes {len(surface) / 1e9:.1f} GB packed, and at "
@@ -106,4 +107,4 @@ def shell_of_objects(
 
 def _placed(shape: Part, obj: Object) -> Part:
     """A shape as the part of an object; objects of one shape share its arrays."""
-    return Part(obj.name, shape.vertices, shape.faces, obj.transform, shared=shape.shared)
+    return replace(shape, name=obj.name, world_from_part=obj.transform)

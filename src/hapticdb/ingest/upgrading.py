@@ -218,11 +218,14 @@ def _parts_in_files(
         if len(some) > 1:
             first += f" and {len(some) - 1} of the same file"
         try:
-            parts = {(part.name, part.digest): part for part in read_file(link, unit=unit).parts}
+            found = read_file(link, unit=unit).parts
         except HapticDBError as error:
             unread = FileError(f"{first} cannot be upgraded, its file cannot be read: {error}")
             yield tuple(some), unread
             continue
+        parts = {(part.name, part.digest): part for part in found}
+        bare = [part.uncoloured for part in found if part.colours is not None]
+        parts |= {(part.name, part.digest): part for part in bare}
         for obj in some:
             part = parts.get((obj.name, obj.digest))
             yield (

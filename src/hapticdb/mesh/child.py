@@ -92,7 +92,11 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
     number = {key: n for n, key in enumerate(first)}
     head = {
         "geometries": [
-            [len(part.vertices), None if part.faces is None else len(part.faces)]
+            [
+                len(part.vertices),
+                None if part.faces is None else len(part.faces),
+                part.colours is not None,
+            ]
             for part in first.values()
         ],
         "parts": [
@@ -103,7 +107,12 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         "names_unit": file.names_unit,
         "up": file.up,
     }
-    arrays = [a for part in first.values() for a in (part.vertices, part.faces) if a is not None]
+    arrays = [
+        array
+        for part in first.values()
+        for array in (part.vertices, part.faces, part.colours)
+        if array is not None
+    ]
     out.write(json.dumps(head).encode() + b"\n")
     out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in arrays)
 

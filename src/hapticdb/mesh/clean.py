@@ -5,7 +5,7 @@ from dataclasses import replace
 from typing import TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
@@ -31,10 +31,10 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
     parts: list[Part] = []
     total = parsed.defects
     names = _Names()
-    worlds, is_near = _worlds(parsed.placements, [vertices for vertices, _, _ in checked], scale)
+    worlds, is_near = _worlds(parsed.placements, [one[0] for one in checked], scale)
     is_flat = _are_flat(worlds)
     for n, placement in enumerate(parsed.placements):
-        vertices, faces, defects = checked[placement.shape]
+        vertices, faces, defects, colours = checked[placement.shape]
         n_found = len(vertices if faces is None else faces)
         if n_found and is_near[n]:
             if faces is not None and is_flat[n]:
@@ -42,7 +42,7 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
                 defects = replace(defects, degenerate=flattened)
             name = names.unique(_printable(placement.name))
             known = shared[placement.shape]
-            parts.append(Part(name, vertices, faces, worlds[n], defects, known))
+            parts.append(Part(name, vertices, faces, worlds[n], defects, known, colours))
             if defects:
                 total += defects
         elif n_found:
@@ -60,8 +60,8 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
 
 def _checked(
     shape: Shape, scale: float
-) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Defects]:
-    """Sound vertices in metres and faces of a shape, read-only, and the shape's defects."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64] | None, Defects, NDArray[np.uint8] | None]:
+    """Sound vertices in metres and faces of a shape, read-only; its defects; its colours."""
     vertices = np.asarray(shape.vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise UnreadableError("its vertices do not have three coordinates each")
@@ -70,10 +70,12 @@ def _checked(
             points = _metric(vertices, scale)
             finite = np.isfinite(points).all(axis=1)
             lost = Defects(non_finite=int((~finite).sum()))
-            return read_only(points[finite]), None, shape.defects + lost
+            colours = _of_sound(shape.colours, finite)
+            return read_only(points[finite]), None, shape.defects + lost, colours
         faces = np.asarray(shape.faces).astype(np.int64, copy=False).reshape(-1, 3)
         inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
         out_of_range = len(faces) - int(inside.sum())
+        colours = _of_sound(shape.colours, inside)
         vertices, faces = _compact(vertices, faces[inside] if out_of_range else faces)
         positions = _metric(vertices, scale)
         finite = np.asarray(np.isfinite(positions).all(axis=1))
@@ -81,9 +83,15 @@ def _checked(
         non_finite = len(faces) - int(sound.sum())
         if non_finite:
             positions, faces = _compact(positions, faces[sound])
+            colours = _of_sound(colours, sound)
         degenerate = _count_degenerate(positions, faces, np.eye(3))
     lost = Defects(degenerate=degenerate, non_finite=non_finite, out_of_range=out_of_range)
-    return read_only(positions), read_only(faces), shape.defects + lost
+    return read_only(positions), read_only(faces), shape.defects + lost, colours
+
+
+def _of_sound(colours: NDArray[np.uint8] | None, is_sound: ArrayLike) -> NDArray[np.uint8] | None:
+    """Colours of the triangles or points that are kept, read-only."""
+    return None if colours is None else read_only(colours[np.asarray(is_sound)])
 
 
 def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:

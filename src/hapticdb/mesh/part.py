@@ -1,7 +1,7 @@
 """What a mesh file holds once read: parts, their placements, and what was wrong with them."""
 
 import hashlib
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any
 
 import numpy as np
@@ -66,7 +66,10 @@ class Part:
     """(4, 4) affine transform, metres; it may mirror, scale or flatten."""
     defects: Defects = field(default_factory=Defects)
     shared: dict[str, str] = field(default_factory=dict, repr=False)
-    """The digest, once it is computed; instances of one mesh share the dictionary."""
+    """Digests, once they are computed; instances of one mesh share the dictionary."""
+    colours: NDArray[np.uint8] | None = None
+    """(F, 4) red, green, blue (sRGB) and opacity of each triangle, or (V, 4) of each point of a
+    cloud; None if the file has none."""
 
     @property
     def is_cloud(self) -> bool:
@@ -75,19 +78,26 @@ class Part:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of the geometry in the part's frame, 64 hex digits; the placement is left out."""
-        if "digest" not in self.shared:
+        """SHA-256 of geometry and colours in the part's frame, 64 hex digits, without placement."""
+        return self._hashed("digest", (self.vertices, self.faces, self.colours))
+
+    @property
+    def uncoloured(self) -> "Part":
+        """The part without colours, as versions that read none had it."""
+        digest = self._hashed("uncoloured", (self.vertices, self.faces))
+        return replace(self, colours=None, shared={"digest": digest})
+
+    def _hashed(self, key: str, arrays: tuple[NDArray[Any] | None, ...]) -> str:
+        if key not in self.shared:
             content = hashlib.sha256()
             content.update(b"cloud" if self.faces is None else b"mesh")
-            arrays: list[NDArray[Any]] = [self.vertices]
-            if self.faces is not None:
-                arrays.append(self.faces)
             for array in arrays:
-                little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
-                content.update(len(little).to_bytes(8, "little"))
-                content.update(little.data)
-            self.shared["digest"] = content.hexdigest()
-        return self.shared["digest"]
+                if array is not None:
+                    little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
+                    content.update(len(little).to_bytes(8, "little"))
+                    content.update(little.data)
+            self.shared[key] = content.hexdigest()
+        return self.shared[key]
 
     def world_points(
         self, world_from_part: NDArray[np.float64] | None = None

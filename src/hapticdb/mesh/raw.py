@@ -29,12 +29,14 @@ class Shape:
     """Geometry as read: indices may be out of range, coordinates may be NaN.
 
     vertices (V, 3), the file's unit, any number type; faces (F, 3) of any integer type, or None for
-    a point cloud; defects : what the reader itself dropped.
+    a point cloud; defects : what the reader itself dropped; colours : (F, 4) of the triangles or
+    (V, 4) of a cloud's points, as `Part` has them, None if the file has none.
     """
 
     vertices: NDArray[np.generic]
     faces: NDArray[np.generic] | None
     defects: Defects = field(default_factory=Defects)
+    colours: NDArray[np.uint8] | None = None
 
 
 @dataclass(frozen=True)

@@ -223,20 +223,26 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
     """Answer of the child: parts from its head, arrays from the stream behind it."""
     if "error" in head:
         raise UnreadableError(head["error"])
-    geometries: list[tuple[NDArray[np.float64], NDArray[np.int64] | None]] = []
-    for n_vertices, n_faces in head["geometries"]:
+    geometries: list[tuple[NDArray[Any], NDArray[Any] | None, NDArray[Any] | None]] = []
+    for n_vertices, n_faces, is_coloured in head["geometries"]:
         vertices = np.empty((n_vertices, 3), dtype=np.float64)
         _fill(vertices, stream)
         faces = None
         if n_faces is not None:
             faces = np.empty((n_faces, 3), dtype=np.int64)
             _fill(faces, stream)
-        geometries.append((vertices, faces))
+        colours = None
+        if is_coloured:
+            n_colours = n_vertices if n_faces is None else n_faces
+            colours = np.empty((n_colours, 4), dtype=np.uint8)
+            _fill(colours, stream)
+        geometries.append((vertices, faces, colours))
     shared: list[dict[str, str]] = [{} for _ in geometries]
-    parts = [
-        Part(name, *geometries[int(n)], np.array(transform), Defects(**defects), shared[n])
-        for name, n, transform, defects in head["parts"]
-    ]
+    parts = []
+    for name, n, transform, defects in head["parts"]:
+        vertices, faces, colours = geometries[n]
+        placed = np.array(transform)
+        parts.append(Part(name, vertices, faces, placed, Defects(**defects), shared[n], colours))
     return MeshFile(link, parts, Defects(**head["defects"]), head["names_unit"], head["up"])
 
 

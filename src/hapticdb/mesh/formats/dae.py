@@ -11,9 +11,12 @@ import collada
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.mesh.formats.painting import Colours, joined, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan, walk
 
+_Palette = dict[str, tuple[float, ...]]
+"""Colours and opacity, 0 to 1, by the symbol that triangles name."""
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 
 
@@ -24,21 +27,21 @@ def read(path: Path) -> Parsed:
     document = collada.Collada(str(path), ignore=lenient)
     if document.scene is None:
         raise UnreadableError("it has no scene")
-    shapes: dict[str, int] = {}
-    geometries: list[Any] = []
+    shapes: dict[tuple[str, ...], int] = {}
+    geometries: list[tuple[Any, _Palette]] = []
     placements: list[Placement] = []
     for nodes, world_from_node in walk(_links(document.scene.nodes), _children):
-        for geometry in _geometries(nodes[-1]):
-            key = str(geometry.id)
+        for geometry, palette in _geometries(nodes[-1]):
+            key = (str(geometry.id), *(f"{name} {palette[name]}" for name in sorted(palette)))
             if key not in shapes:
                 shapes[key] = len(geometries)
-                geometries.append(geometry)
+                geometries.append((geometry, palette))
             name = "/".join(filter(None, (node.name for node in nodes)))
             name = name or str(geometry.name or geometry.id)
             placements.append(Placement(name, shapes[key], world_from_node))
     unit = document.assetInfo.unitmeter if document.assetInfo is not None else None
     return Parsed(
-        [_shape(geometry) for geometry in geometries],
+        [_shape(geometry, palette) for geometry, palette in geometries],
         placements,
         metres=1.0 if unit is None else float(unit),
         up=_UP_AXES.get(str(getattr(document.assetInfo, "upaxis", None))),
@@ -61,21 +64,35 @@ def _children(node: Any) -> list[tuple[Any, NDArray[np.float64]]]:  # noqa: ANN4
     return _links(node.children)
 
 
-def _geometries(node: Any) -> list[Any]:  # noqa: ANN401 - untyped library
-    """Geometries of a node itself; skinned geometries are in their rest pose."""
+def _geometries(node: Any) -> list[tuple[Any, _Palette]]:  # noqa: ANN401 - untyped library
+    """Geometries of a node itself, and colours; skinned geometries are in their rest pose."""
     found = []
     for child in node.children:
         if isinstance(child, collada.scene.GeometryNode):
-            found.append(child.geometry)
+            found.append((child.geometry, _palette(child.materials)))
         elif isinstance(child, collada.scene.ControllerNode):
-            found.append(child.controller.geometry)
+            found.append((child.controller.geometry, _palette(child.materials)))
     return found
 
 
-def _shape(geometry: Any) -> Shape:  # noqa: ANN401 - untyped library
+def _palette(bindings: list[Any]) -> _Palette:
+    """Colours of the materials that a placement binds to the symbols of its triangles."""
+    found = {}
+    for binding in bindings:
+        effect = getattr(binding.target, "effect", None)
+        diffuse = getattr(effect, "diffuse", None)
+        if isinstance(diffuse, tuple) and len(diffuse) in (3, 4):
+            clear = getattr(effect, "transparency", None)
+            opacity = clear if isinstance(clear, float) and 0 < clear < 1 else 1.0
+            found[str(binding.symbol)] = (*map(float, diffuse[:3]), opacity)
+    return found
+
+
+def _shape(geometry: Any, palette: _Palette) -> Shape:  # noqa: ANN401 - untyped library
     """Triangles of a geometry's primitives; lines have no surface."""
     vertices: list[NDArray[np.generic]] = []
     faces: list[NDArray[np.int64]] = []
+    painted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = incomplete = 0
     for primitive in geometry.primitives:
         found, n_short = _faces(primitive)
@@ -85,12 +102,14 @@ def _shape(geometry: Any) -> Shape:  # noqa: ANN401 - untyped library
         incomplete += n_short
         inside = (found >= 0) & (found < len(primitive.vertex))
         faces.append(np.where(inside, found + n_vertices, -1))
+        colour = palette.get(str(primitive.material))
+        painted.append((None if colour is None else rgba(colour), len(found)))
         vertices.append(primitive.vertex)
         n_vertices += len(primitive.vertex)
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
     if not faces:
         return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
-    return Shape(np.concatenate(vertices), np.concatenate(faces), defects)
+    return Shape(np.concatenate(vertices), np.concatenate(faces), defects, joined(painted))
 
 
 def _faces(primitive: Any) -> tuple[NDArray[np.int64] | None, int]:  # noqa: ANN401 - untyped library

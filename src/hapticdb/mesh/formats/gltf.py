@@ -7,6 +7,7 @@ does not read the numbers, either.
 
 import json
 import struct
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -21,11 +22,13 @@ from hapticdb.mesh.formats.accessors import (
     objects_of,
     whole,
 )
+from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, of_light, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, walk
 from hapticdb.poses import rotation_of
 
 _MAGIC = b"glTF"
+_Materials = list[NDArray[np.float64] | None]
 _POINTS, _TRIANGLES, _STRIP = 0, 4, 5
 # Extensions that do not change geometry; a file that requires another extension is refused.
 _HARMLESS = (
@@ -41,12 +44,12 @@ def read(path: Path) -> Parsed:
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
     _refuse_unreadable(tree, accessors)
-    meshes = objects_of(tree, "meshes")
+    meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
     placements, empty = _placements(tree, meshes)
     used = sorted({placement.shape for placement in placements})
     number = {mesh: i for i, mesh in enumerate(used)}
     return Parsed(
-        shapes=[_shape(meshes[mesh], mesh, accessors) for mesh in used],
+        shapes=[_shape(meshes[mesh], mesh, accessors, materials) for mesh in used],
         placements=[Placement(p.name, number[p.shape], p.world_from_part) for p in placements],
         metres=1.0,
         defects=Defects(empty=empty),
@@ -120,12 +123,14 @@ def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
                 raise UnreadableError("its positions are sparse or normalized, which is not read")
 
 
-def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
+def _shape(mesh: dict[str, Any], number: int, accessors: Accessors, materials: _Materials) -> Shape:
     """One shape from a mesh's pieces; vertices that pieces share are kept once."""
     vertices: dict[int, NDArray[np.generic]] = {}
     offsets: dict[int, int] = {}
     faces: list[NDArray[np.int64]] = []
     points: list[NDArray[np.generic]] = []
+    painted: list[tuple[Colours | None, int]] = []
+    dotted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = 0
     for piece in mesh["primitives"]:
         mode = piece.get("mode", _TRIANGLES)
@@ -140,6 +145,8 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
             raise UnreadableError("its vertices do not have three coordinates each")
         if mode == _POINTS:
             points.append(corners)
+            each = np.repeat(np.arange(len(corners))[:, None], 3, axis=1)
+            dotted.append((_paint(piece, each, accessors, materials), len(corners)))
             continue
         if position not in offsets:
             offsets[position], vertices[position] = n_vertices, corners
@@ -148,13 +155,55 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors) -> Shape:
         found = _corners(piece, mode, len(corners), accessors, number)
         inside = (found >= 0) & (found < len(corners))
         faces.append(np.where(inside, found + offsets[position], -1))
+        painted.append((_paint(piece, found, accessors, materials), len(found)))
     defects = Defects(unsupported=unsupported)
     if faces:
         lost = Defects(unsupported=len(points))
-        return Shape(_one(list(vertices.values())), _one(faces), defects + lost)
+        whole_faces = _one(faces)
+        return Shape(_one(list(vertices.values())), whole_faces, defects + lost, joined(painted))
     if points:
-        return Shape(_one(points), None, defects)
+        return Shape(_one(points), None, defects, joined(dotted))
     return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
+
+
+def _base_colours(tree: dict[str, Any]) -> _Materials:
+    """Base colour of each material, amounts of light and opacity; None if a texture has it."""
+    found: _Materials = []
+    materials = tree.get("materials")
+    for material in materials if isinstance(materials, list) else []:
+        colour = None
+        try:
+            surface = material.get("pbrMetallicRoughness", {})
+            old = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+            values = surface.get("baseColorFactor", old.get("diffuseFactor"))
+            if values is not None or "baseColorTexture" not in surface:
+                colour = np.array(values or (1, 1, 1, 1), dtype=np.float64).reshape(4)
+                if material.get("alphaMode", "OPAQUE") != "BLEND":
+                    colour[3] = 1.0
+        except (AttributeError, TypeError, ValueError):
+            colour = None
+        found.append(colour)
+    return found
+
+
+def _paint(
+    piece: dict[str, Any], faces: NDArray[np.int64], accessors: Accessors, materials: _Materials
+) -> Colours | None:
+    """Colours (F, 4) of a piece's triangles, or (1, 4) for all; None if it has none."""
+    base = None
+    if "material" in piece:
+        with suppress(UnreadableError):
+            (base,) = materials[whole(piece["material"], "a material") :][:1] or [None]
+    try:
+        values: NDArray[Any] = accessors.array(piece["attributes"]["COLOR_0"])
+    except (KeyError, UnreadableError):
+        return None if base is None else rgba(of_light(base[None]))
+    if values.shape[1] not in (3, 4) or not len(values):
+        return None
+    most = 1 if values.dtype.kind == "f" else np.iinfo(values.dtype).max
+    light = np.ones((len(faces), 4))
+    light[:, : values.shape[1]] = mean_of_corners(values, faces) / most
+    return rgba(of_light(light if base is None else light * base))
 
 
 def _one(arrays: list[Any]) -> NDArray[Any]:

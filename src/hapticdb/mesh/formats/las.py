@@ -12,6 +12,7 @@ import numpy as np
 from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
+from hapticdb.mesh.formats.painting import Colours
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
 
 _MODEL, _LINEAR_UNIT = 1024, 3076
@@ -19,6 +20,8 @@ _PROJECTED = 1
 _CODES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
 """Metres of a projected system's unit of length, by its code in a GeoTIFF key."""
 _WKT_UNIT = re.compile(r'(?:LENGTH)?UNIT\["[^"]*",\s*([0-9.eE+-]+)')
+_COLOURS = ("red", "green", "blue")
+_BYTE = 255
 _HEADER = 227
 _HEADER_1_4 = 375
 _RECORD, _LONG_RECORD = 54, 60
@@ -38,6 +41,7 @@ def read(path: Path) -> Parsed:
     """Points of a LAS or LAZ file, in the unit of its coordinates, z up."""
     _check_header(path)
     pieces: list[NDArray[np.float64]] = []
+    painted: list[NDArray[np.uint16]] = []
     with laspy.open(path) as reader:
         promised = reader.header.point_count
         _check_chunks(reader.header)
@@ -49,14 +53,28 @@ def read(path: Path) -> Parsed:
                 break
             axes = [np.asarray(axis, dtype=np.float64) for axis in (points.x, points.y, points.z)]
             pieces.append(np.stack(axes, axis=1))
+            if {*_COLOURS}.issubset(points.point_format.dimension_names):
+                channels = [np.asarray(points[name]) for name in _COLOURS]
+                painted.append(np.stack(channels, axis=1))
     found = sum(map(len, pieces))
     if found != promised:
         raise UnreadableError(
             f"it is cut short: its header promises {promised:,} points, {found:,} are there"
         )
     whole = np.concatenate(pieces) if pieces else np.empty((0, 3))
-    parsed = placed_once([(path.stem, Shape(whole, None))])
+    parsed = placed_once([(path.stem, Shape(whole, None, colours=_screen(painted)))])
     return replace(parsed, likely_metres=unit, up="z")
+
+
+def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
+    """Colours (N, 4) from 16 bits a channel, or the 8 of some programs; None if all are black."""
+    most = max((int(some.max()) for some in painted), default=0)
+    if not most:
+        return None
+    channels = np.concatenate(painted)
+    colours = np.full((len(channels), 4), 255, dtype=np.uint8)
+    colours[:, :3] = channels if most <= _BYTE else channels // 257
+    return colours
 
 
 def _unit_of(records: Iterable[object]) -> float | None:

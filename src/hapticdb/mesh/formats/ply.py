@@ -8,7 +8,10 @@ import numpy as np
 from trimesh.exchange.ply import load_ply
 from trimesh.geometry import triangulate_quads
 
+from hapticdb.mesh.formats.painting import Colours, mean_of_corners, rgba
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
+
+_CHANNELS = 3
 
 
 def read(path: Path) -> Parsed:
@@ -28,8 +31,28 @@ def read(path: Path) -> Parsed:
         return placed_once([])
     vertices, faces = loaded["vertices"], loaded.get("faces")
     if faces is None:
-        return placed_once([(path.stem, Shape(vertices, None))])
-    return placed_once([(path.stem, Shape(vertices, triangulate_quads(faces).reshape(-1, 3)))])
+        shape = Shape(vertices, None, colours=_colours(elements["vertex"], len(vertices)))
+        return placed_once([(path.stem, shape)])
+    triangles = triangulate_quads(faces).reshape(-1, 3)
+    colours = _colours(elements.get("face", {}), len(triangles))
+    if colours is None:
+        painted = _colours(elements["vertex"], len(vertices))
+        if painted is not None:
+            colours = rgba(mean_of_corners(painted, triangles) / 255)
+    return placed_once([(path.stem, Shape(vertices, triangles, colours=colours))])
+
+
+def _colours(element: dict[str, Any], n: int) -> Colours | None:
+    """Colours (n, 4) of an element's rows; None if it has none, or another number of rows."""
+    rows = element.get("data")
+    names = [name for name in ("red", "green", "blue", "alpha") if name in element["properties"]]
+    if rows is None or len(names) < _CHANNELS:
+        return None
+    columns = [np.asarray(rows[name]).reshape(-1) for name in names]
+    if any(len(column) != n for column in columns):
+        return None
+    most = 1.0 if columns[0].dtype.kind == "f" and max(map(np.max, columns)) <= 1 else 255.0
+    return rgba(np.stack(columns, axis=1) / most)
 
 
 def _check_length(name: str, element: dict[str, Any]) -> None:

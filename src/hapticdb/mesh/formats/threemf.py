@@ -13,6 +13,7 @@ from xml.parsers import expat
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.mesh.formats.painting import PLAIN
 from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, numbers, walk
 
 _METRES = {
@@ -37,9 +38,13 @@ class _Object:
     """One object of a 3MF model: a mesh, or components."""
 
     name: str
+    group: str = ""
+    """Its group of colours."""
     corners: "array.array[float]" = field(default_factory=lambda: array.array("d"))
     indices: "array.array[int]" = field(default_factory=lambda: array.array("q"))
     components: list[Link] = field(default_factory=list)
+    paints: "array.array[int]" = field(default_factory=lambda: array.array("q"))
+    """Number of each triangle's colour in `_Model.colours`; -1 without."""
 
 
 @dataclass
@@ -49,6 +54,9 @@ class _Model:
     objects: dict[Key, _Object] = field(default_factory=dict)
     items: list[Link] = field(default_factory=list)
     metres: float = 1e-3
+    colours: list[tuple[int, ...]] = field(default_factory=list)
+    number_of: dict[tuple[str, str, str], int] = field(default_factory=dict)
+    """Numbers of colours by model file, group and place in the group."""
     packed: int = 0
     unpacked: int = 0
 
@@ -70,7 +78,8 @@ def read(path: Path) -> Parsed:
         names = [model.objects[key].name for key in keys]
         number = shapes.setdefault(keys[-1], len(shapes))
         placements.append(Placement(budget.joined(names), number, world_from_object))
-    return Parsed([_shape(model.objects[key]) for key in shapes], placements, model.metres, up="z")
+    read_shapes = [_shape(model.objects[key], model.colours) for key in shapes]
+    return Parsed(read_shapes, placements, model.metres, up="z")
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
@@ -103,22 +112,36 @@ def _read_model(
     """Add one model file's objects, and the root's build items, to `model`."""
     parser = expat.ParserCreate(namespace_separator=" ")
     parser.buffer_text = True
-    thing = _Object("")
+    thing, own, group, n_group = _Object(""), -1, "", 0
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal thing
+        nonlocal thing, own, group, n_group
         kind = tag.rpartition(" ")[2]
         if kind == "vertex":
             x, y, z = attributes["x"], attributes["y"], attributes["z"]
             thing.corners.extend((float(x), float(y), float(z)))
         elif kind == "triangle":
             thing.indices.extend(_index(attributes[v]) for v in ("v1", "v2", "v3"))
+            of_group = attributes.get("pid", thing.group)
+            thing.paints.append(
+                model.number_of.get((member, of_group, attributes["p1"]), own)
+                if "p1" in attributes
+                else own
+            )
         elif kind == "component":
             thing.components.append(_link(attributes, member))
         elif kind == "object":
             number = attributes["id"]
             thing = _Object(attributes.get("name") or f"object {number}")
             model.objects[member, number] = thing
+            thing.group = attributes.get("pid", "")
+            own = model.number_of.get((member, thing.group, attributes.get("pindex", "0")), -1)
+        elif kind in {"basematerials", "colorgroup"}:
+            group, n_group = attributes.get("id", ""), 0
+        elif kind in {"base", "color"}:
+            model.number_of[member, group, str(n_group)] = len(model.colours)
+            model.colours.append(_colour(attributes.get("displaycolor", attributes.get("color"))))
+            n_group += 1
         elif kind == "item" and is_root:
             model.items.append(_link(attributes, member))
         elif kind == "model" and is_root:
@@ -178,8 +201,21 @@ def _link(attributes: dict[str, str], member: str) -> Link:
     return key, transform
 
 
-def _shape(thing: _Object) -> Shape:
+def _colour(word: str | None) -> tuple[int, ...]:
+    """Red, green, blue and opacity of '#RRGGBB' or '#RRGGBBAA'; `PLAIN` for anything else."""
+    try:
+        channels = bytes.fromhex((word or "").lstrip("#"))
+    except ValueError:
+        channels = b""
+    return (*channels, 255)[:4] if len(channels) in (3, 4) else PLAIN
+
+
+def _shape(thing: _Object, colours: list[tuple[int, ...]]) -> Shape:
     """Arrays of an object's mesh."""
     corners = np.frombuffer(thing.corners, dtype=np.float64) if thing.corners else np.empty(0)
     indices = np.frombuffer(thing.indices, dtype=np.int64) if thing.indices else np.empty(0, int)
-    return Shape(corners.reshape(-1, 3), indices.reshape(-1, 3))
+    paints = np.array(thing.paints, dtype=np.int64)
+    painted = None
+    if len(paints) and paints.max() >= 0:
+        painted = np.array([*colours, PLAIN], dtype=np.uint8)[paints]
+    return Shape(corners.reshape(-1, 3), indices.reshape(-1, 3), colours=painted)

@@ -6,12 +6,15 @@ refuses the whole file for one face out of range.
 """
 
 import re
-from dataclasses import dataclass, field
+from collections.abc import Iterator
+from contextlib import suppress
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import (
     Parsed,
@@ -27,6 +30,10 @@ _TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
 _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
 _NUMBERS = {"v", "f"}
 _OUTSIDE = -1
+_WITH_COLOUR = 6
+"""Numbers of a vertex with a colour."""
+MOST_BYTES = 16 << 20
+"""Of a file of materials. A larger value reads larger ones, and takes more memory."""
 
 
 @dataclass
@@ -36,6 +43,8 @@ class _Group:
     lines: list[str] = field(default_factory=list)
     n_before: list[int] = field(default_factory=list)
     unsupported: int = 0
+    materials: list[str] = field(default_factory=list)
+    """Name of each line's material."""
 
 
 def read(path: Path) -> Parsed:
@@ -43,7 +52,8 @@ def read(path: Path) -> Parsed:
     text = path.read_bytes().decode("utf-8", "replace")
     vertex_lines: list[str] = []
     groups: dict[tuple[str, str], _Group] = {}
-    key = ("", "")
+    libraries: list[str] = []
+    key, material = ("", ""), ""
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
         if word in _NUMBERS and "#" in rest:  # names may hold one
@@ -54,22 +64,86 @@ def read(path: Path) -> Parsed:
             group = groups.setdefault(key, _Group())
             group.lines.append(rest)
             group.n_before.append(len(vertex_lines))
+            group.materials.append(material)
         elif word == "o":
             key = (rest.strip(), "")
         elif word == "g":
             key = (key[0], rest.strip())
+        elif word == "usemtl":
+            material = rest.strip()
+        elif word == "mtllib":
+            libraries.append(rest.strip())
         elif word in _NO_SURFACE:
             groups.setdefault(key, _Group()).unsupported += 1
     vertices = _vertices(vertex_lines)
-    parts = [
-        ("/".join(filter(None, names)) or path.stem, _shape(group, vertices))
+    palette = {name: colour for file in libraries for name, colour in _materials(path, file)}
+    painted = _painted(vertex_lines)
+    return placed_once(
+        ("/".join(filter(None, names)) or path.stem, _coloured(group, vertices, palette, painted))
         for names, group in groups.items()
-    ]
-    return placed_once(parts)
+    )
+
+
+def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:
+    """Names and colours (1, 4) of the materials in a plain file beside the OBJ file."""
+    file = path.parent / name
+    if "/" in name or not file.is_file() or file.stat().st_size > MOST_BYTES:
+        return
+    material, values = None, np.ones(4)
+    for line in [*file.read_text("utf-8", "replace").splitlines(), "newmtl"]:
+        word, _, rest = line.strip().replace("\t", " ").partition(" ")
+        with suppress(UnreadableError, ValueError):
+            if word == "newmtl":
+                if material is not None:
+                    yield material, rgba(values)
+                material, values = rest.strip(), np.array([0.8, 0.8, 0.8, 1.0])
+            elif word == "Kd":
+                values[:3] = numbers(rest, np.float64)
+            elif word in {"d", "Tr"}:
+                opacity = float(rest.split()[-1])
+                values[3] = opacity if word == "d" else 1.0 - opacity
+
+
+def _painted(lines: list[str]) -> Colours | None:
+    """Colours (V, 4) that follow the coordinates of vertices; None if not all have one."""
+    words = [line.split()[3:6] for line in lines if len(line.split()) >= _WITH_COLOUR]
+    if not lines or len(words) != len(lines):
+        return None
+    try:
+        values = np.array(words, dtype=np.float64)
+    except ValueError:
+        return None
+    return rgba(values / 255 if values.max() > 1 else values)
+
+
+def _coloured(
+    group: _Group,
+    vertices: NDArray[np.float64],
+    palette: dict[str, Colours],
+    painted: Colours | None,
+) -> Shape:
+    """One group's triangles with their colours, material after material where those are known."""
+    if not palette.keys() & set(group.materials):
+        shape = _shape(group, vertices)
+        if painted is None or shape.faces is None:
+            return shape
+        faces = shape.faces.astype(np.int64)
+        return replace(shape, colours=rgba(mean_of_corners(painted, faces) / 255))
+    pieces: dict[str, _Group] = {}
+    for line, n, material in zip(group.lines, group.n_before, group.materials, strict=True):
+        piece = pieces.setdefault(material, _Group())
+        piece.lines.append(line)
+        piece.n_before.append(n)
+    shapes = [_shape(piece, vertices) for piece in pieces.values()]
+    runs = [np.asarray(shape.faces) for shape in shapes]
+    defects = sum((shape.defects for shape in shapes), Defects(unsupported=group.unsupported))
+    named = zip(pieces, runs, strict=True)
+    colours = joined([(palette.get(name), len(run)) for name, run in named])
+    return Shape(vertices, np.concatenate(runs), defects, colours)
 
 
 def _vertices(lines: list[str]) -> NDArray[np.float64]:
-    """Vertices (V, 3); weights and colours that follow the coordinates are left out."""
+    """Vertices (V, 3); what follows the coordinates is left out."""
     words = [line.split(None, 3)[:3] for line in lines]
     if any(len(three) < 3 for three in words):
         raise UnreadableError("a vertex has fewer than three coordinates")

@@ -1,0 +1,124 @@
+"""Colours of triangles and points, as each format has them; a broken one loses no geometry."""
+
+import base64
+import json
+from pathlib import Path
+
+import laspy
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.mesh import read_file
+from mesh_files import COLLADA, MESH_3MF, gltf, text, threemf
+
+RED, GREEN, GLASS = (255, 0, 0, 255), (0, 255, 0, 255), (0, 0, 255, 64)
+
+
+def colours_of(path: Path) -> NDArray[np.uint8]:
+    """Colours of the file's first part, read as users read it."""
+    colours = read_file(path).parts[0].colours
+    assert colours is not None
+    return colours
+
+
+def test_gltf_base_colours_are_light_and_an_opaque_material_has_no_alpha(tmp_path: Path) -> None:
+    material = {"pbrMetallicRoughness": {"baseColorFactor": [0.5, 0, 1, 0.25]}}
+    piece = {"attributes": {"POSITION": 0}, "indices": 1, "material": 0}
+    plain = {"attributes": {"POSITION": 0}, "indices": 1, "material": 7}
+    tree = {"meshes": [{"primitives": [piece, plain]}]}
+    for mode, opacity in (("OPAQUE", 255), ("BLEND", 64)):
+        path = gltf(tree | {"materials": [material | {"alphaMode": mode}]}, tmp_path / "a.gltf")
+        first, second = colours_of(path)
+        np.testing.assert_array_equal(first, [188, 0, 255, opacity])
+        assert second[3] == 255  # of a material that is not there
+    for broken in ([None], [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}], "none"):
+        path = gltf(tree | {"materials": broken}, tmp_path / "broken.gltf")
+        assert read_file(path).parts[0].colours is None
+
+
+def test_gltf_vertex_colours_are_averaged_over_the_corners(tmp_path: Path) -> None:
+    shades = np.array([[255, 0, 0, 255], [255, 0, 0, 255], [255, 0, 0, 255]], dtype=np.uint8)
+    uri = "data:;base64," + base64.b64encode(shades.tobytes()).decode()
+    path = gltf({}, tmp_path / "plain.gltf")
+    tree = json.loads(path.read_text())
+    tree["buffers"].append({"byteLength": shades.nbytes, "uri": uri})
+    tree["bufferViews"].append({"buffer": 1, "byteLength": shades.nbytes})
+    tree["accessors"].append(
+        {"bufferView": 2, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC4"}
+    )
+    tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 2
+    path.write_text(json.dumps(tree))
+    np.testing.assert_array_equal(colours_of(path), [RED])
+
+
+def test_obj_materials_come_from_a_file_beside_it(tmp_path: Path) -> None:
+    body = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 1 1 0\n"
+    faces = "usemtl pane\nf 1 2 3\nusemtl red\nf 2 3 4\nf -1 -2 -3\nusemtl none\nf 1 2 4\n"
+    text(tmp_path / "m.mtl", "newmtl red\nKd 1 0 0\nmap_Kd x.png\nnewmtl pane\nKd 0 0 1\nTr 0.75\n")
+    path = text(tmp_path / "a.obj", "mtllib m.mtl\n" + body + faces)
+    found = colours_of(path)
+    np.testing.assert_array_equal(found[:3], [GLASS, RED, RED])
+    assert len(found) == 4
+    assert found[3, 3] == 255
+    for elsewhere in (f"{tmp_path}/m.mtl", "../m.mtl", "missing.mtl"):
+        path = text(tmp_path / "b.obj", f"mtllib {elsewhere}\n" + body + faces)
+        assert read_file(path).parts[0].colours is None
+
+
+def test_obj_vertices_may_have_colours(tmp_path: Path) -> None:
+    path = text(tmp_path / "a.obj", "v 0 0 0 1 0 0\nv 1 0 0 1 0 0\nv 0 1 0 1 0 0\nf 1 2 3\n")
+    np.testing.assert_array_equal(colours_of(path), [RED])
+
+
+def test_3mf_triangles_take_their_own_colour_or_the_object_s(tmp_path: Path) -> None:
+    group = '<basematerials id="5"><base name="r" displaycolor="#FF0000"/>'
+    group += '<base name="b" displaycolor="#0000FF40"/></basematerials>'
+    two = MESH_3MF.replace("</triangles>", '<triangle v1="0" v2="2" v3="1" p1="1"/></triangles>')
+    thing = f'{group}<object id="1" type="model" pid="5" pindex="0">{two}</object>'
+    path = threemf(tmp_path / "a.3mf", thing, '<item objectid="1"/>')
+    np.testing.assert_array_equal(colours_of(path), [RED, GLASS])
+
+
+def test_collada_materials_are_those_of_the_placement(tmp_path: Path) -> None:
+    effect = (
+        '<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse>'
+        "<color>1 0 0 1</color></diffuse></lambert></technique></profile_COMMON></effect>"
+        '</library_effects><library_materials><material id="m"><instance_effect url="#e"/>'
+        "</material></library_materials>"
+    )
+    bound = (
+        '<instance_geometry url="#g"><bind_material><technique_common><instance_material '
+        'symbol="paint" target="#m"/></technique_common></bind_material></instance_geometry>'
+    )
+    content = COLLADA.replace("<library_geometries>", effect + "<library_geometries>")
+    content = content.replace('<instance_geometry url="#g"/>', bound)
+    content = content.replace('<polylist count="2">', '<polylist count="2" material="paint">')
+    found = colours_of(text(tmp_path / "a.dae", content))
+    np.testing.assert_array_equal(found[:3], [RED] * 3)
+    assert len(found) == 4
+
+
+def test_ply_has_colours_of_faces_or_of_vertices(tmp_path: Path) -> None:
+    shade = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
+    place = "property float x\nproperty float y\nproperty float z\n"
+    corners = "property list uchar int vertex_indices\n"
+    head = "ply\nformat ascii 1.0\nelement vertex 3\n" + place
+    of_vertices = f"{head}{shade}element face 1\n{corners}end_header\n"
+    of_vertices += "0 0 0 0 255 0\n1 0 0 0 255 0\n0 1 0 0 255 0\n3 0 1 2\n"
+    np.testing.assert_array_equal(colours_of(text(tmp_path / "v.ply", of_vertices)), [GREEN])
+    of_faces = f"{head}element face 1\n{corners}{shade}end_header\n"
+    of_faces += "0 0 0\n1 0 0\n0 1 0\n3 0 1 2 255 0 0\n"
+    np.testing.assert_array_equal(colours_of(text(tmp_path / "f.ply", of_faces)), [RED])
+    cloud = f"{head}{shade}end_header\n0 0 0 0 255 0\n1 0 0 255 0 0\n0 1 0 0 255 0\n"
+    found = colours_of(text(tmp_path / "c.ply", cloud))
+    np.testing.assert_array_equal(found, [GREEN, RED, GREEN])
+
+
+def test_a_cloud_has_the_colours_of_its_points(tmp_path: Path) -> None:
+    """Of 16 bits, or of 8 as some programs write them."""
+    for most in (65535, 255):
+        cloud = laspy.LasData(laspy.LasHeader(point_format=2, version="1.2"))
+        cloud.x, cloud.y, cloud.z = np.eye(3)
+        cloud.red, cloud.green, cloud.blue = np.array([[most, 0, most], [0, most, 0], [0, 0, 0]])
+        cloud.write(tmp_path / "a.las")
+        np.testing.assert_array_equal(colours_of(tmp_path / "a.las"), [RED, GREEN, RED])

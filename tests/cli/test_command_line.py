@@ -165,7 +165,7 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
     good, bad = map(json.loads, out.splitlines())
     assert set(good) == {
         "file", "status", "objects", "present", "restored", "kept_removed", "replaced", "dropped",
-        "voxels", "is_unit_assumed", "defects", "error", "scene",
+        "voxels", "is_unit_assumed", "defects", "notes", "error", "scene",
     }  # fmt: skip
     assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)
     assert bad["status"] == "failed"

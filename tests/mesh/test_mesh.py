@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 
 from hapticdb.mesh import UNITS, Defects, parse_in_process
 from hapticdb.mesh.clean import clean
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan
+from hapticdb.mesh.polygons import triangulated
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
 from mesh_files import COLLADA, MESH_3MF, TRIANGLE, glb_of, gltf, names, text, threemf
 
 # --- names and placements -------------------------------------------------------------------
@@ -156,7 +157,10 @@ def test_a_file_without_a_unit_takes_the_one_given(
 
 def test_a_file_with_a_unit_keeps_it(tmp_path: Path) -> None:
     plain = gltf({}, tmp_path / "a.gltf")
-    assert parse_in_process(plain, unit="mm").parts[0].bounds[1].tolist() == [1, 1, 0]
+    file = parse_in_process(plain, unit="mm")
+    assert file.parts[0].bounds[1].tolist() == [1, 1, 0]
+    assert file.notes == ("it has a unit of its own: the one that was given does not apply",)
+    assert parse_in_process(plain, unit="m").notes == ()
     resources = f'<object id="1">{MESH_3MF}</object>'
     build = '<item objectid="1" transform="1 0 0 0 1 0 0 0 1 100 0 0"/>'
     inches = threemf(tmp_path / "a.3mf", resources, build, 'unit="inch"')
@@ -273,8 +277,18 @@ def test_what_stays_is_sound_and_everything_is_accounted_for(
     assert len(np.unique(indices)) == len(kept)
 
 
-@given(st.lists(st.lists(st.integers(0, 50), max_size=7), max_size=10))
-def test_a_fan_has_two_triangles_fewer_than_corners(polygons: list[list[int]]) -> None:
-    faces, incomplete = fan(polygons)
-    assert len(faces) == sum(max(len(p) - 2, 0) for p in polygons)
-    assert incomplete == sum(len(p) < 3 for p in polygons)
+@given(
+    st.lists(st.floats(0.2, 1), min_size=3, max_size=9), st.integers(0, 8), st.sampled_from([1, -1])
+)
+def test_triangles_of_a_star_cover_it_once(radii: list[float], first: int, step: int) -> None:
+    n = len(radii)
+    angles = 2 * np.pi * np.arange(n) / n
+    ring = np.stack([np.cos(angles), np.sin(angles), np.full(n, 1e3)], axis=1)
+    ring[:, :2] *= np.array(radii)[:, None]
+    faces, incomplete = triangulated(ring, [[(first + step * i) % n for i in range(n)], [0, 1]])
+    a, b, c = (ring[faces[:, i], :2] for i in range(3))
+    turns = step * np.linalg.det(np.stack([b - a, c - a], axis=1))
+    assert (turns > -1e-6).all()
+    after = np.roll(ring, -1, axis=0)
+    assert turns.sum() == pytest.approx((ring[:, 0] * after[:, 1] - ring[:, 1] * after[:, 0]).sum())
+    assert incomplete == 1

@@ -67,6 +67,8 @@ class FileReport:
     dropped: int = 0
     """Objects replaced and removed: `ImportOptions.replace`."""
     defects: Defects = field(default_factory=Defects)
+    notes: tuple[str, ...] = ()
+    """What the file holds that was not read, or not as it is meant."""
     error: HapticDBError | None = None
     is_unit_assumed: bool = False
     """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
@@ -278,6 +280,7 @@ def ingest_file(
         replaced=n_replaced,
         dropped=n_dropped,
         defects=mesh_file.defects,
+        notes=mesh_file.notes,
         is_unit_assumed=options.unit is None and not mesh_file.names_unit,
     )
 

@@ -106,6 +106,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         "defects": vars(file.defects),
         "names_unit": file.names_unit,
         "up": file.up,
+        "notes": file.notes,
     }
     arrays = [
         array

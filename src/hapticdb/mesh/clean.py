@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
+from hapticdb.units import length_text
 
 Scalar = TypeVar("Scalar", bound=np.generic)
 
@@ -16,12 +17,17 @@ _FLAT = 1e-12
 """A triangle is degenerate when twice its area is at most this times its longest edge squared:
 rounding errors of float64 edges are smaller. A larger value also counts thin triangles."""
 
+_COARSE = 1e-3
+"""Steps between coordinates are told when they are larger than this share of a part's extent."""
+
 
 def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
     """Refuse and count geometry of the file `link` that cannot be used; the rest in metres.
 
     metres : length of the unit of a file without a unit of its own; None if none was given.
     """
+    if parsed.not_lengths is not None and metres is None:
+        raise UnreadableError(parsed.not_lengths)
     said = (parsed.metres, metres, parsed.likely_metres)
     scale = next((length for length in said if length is not None), 1.0)
     if not (np.isfinite(scale) and scale > 0):
@@ -55,7 +61,28 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
             f"it holds no usable triangle or point ({found})" if found else "it holds no triangles"
         )
     names_unit = not (parsed.metres is None and parsed.likely_metres is None)
-    return MeshFile(link, parts, total, names_unit, parsed.up)
+    notes = [_printable(note) for note in [*parsed.notes, *_coarse(parsed, scale)]]
+    if None not in {metres, parsed.metres} and metres != parsed.metres:
+        notes.append("it has a unit of its own: the one that was given does not apply")
+    return MeshFile(link, parts, total, names_unit, parsed.up, tuple(notes))
+
+
+def _coarse(parsed: Parsed, scale: float) -> list[str]:
+    """Say where numbers of 32 bits are too far apart for the geometry that they place."""
+    found = []
+    for placement in {p.shape: p for p in reversed(parsed.placements)}.values():
+        vertices = parsed.shapes[placement.shape].vertices
+        if vertices.dtype != np.float32 or not len(vertices):
+            continue
+        low, high = vertices.min(axis=0), vertices.max(axis=0)
+        farthest = max(-low.min(), high.max())
+        step = float(np.spacing(np.float32(farthest)))
+        if step > _COARSE * float((high - low).max()):
+            found.append(
+                f"'{placement.name}' lies {length_text(farthest * scale)} from the origin, where "
+                f"its 32-bit numbers are {length_text(step * scale)} apart: details are lost"
+            )
+    return found[:1] + ([f"{len(found) - 1} more parts, likewise"] if len(found) > 1 else [])
 
 
 def _checked(

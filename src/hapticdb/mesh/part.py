@@ -138,6 +138,8 @@ class MeshFile:
     """Whether the file names the unit of its lengths."""
     up: str | None = None
     """Axis that points up, x, y or z; None if neither the format nor the file says it."""
+    notes: tuple[str, ...] = ()
+    """What the file holds that is not read, or not as it is meant; a line each."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:

@@ -63,6 +63,8 @@ class Parsed:
     defects: Defects = field(default_factory=Defects)
     likely_metres: float | None = None
     up: str | None = None
+    notes: list[str] = field(default_factory=list)
+    not_lengths: str | None = None
 
 
 class NameBudget:
@@ -101,25 +103,6 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
             return np.fromstring(text, dtype=dtype, sep=" ")
         except (DeprecationWarning, ValueError):
             raise UnreadableError("it holds a word where a number should be") from None
-
-
-def fan(polygons: Sequence[Sequence[int]]) -> tuple[NDArray[np.int64], int]:
-    """Triangles (F, 3) fanned from polygons' first corners, and how many polygons had under 3."""
-    by_size: dict[int, list[Sequence[int]]] = {}
-    for polygon in polygons:
-        by_size.setdefault(len(polygon), []).append(polygon)
-    pieces = [np.empty((0, 3), dtype=np.int64)]
-    for size, alike in by_size.items():
-        if size >= 3:
-            pieces.append(fan_of_equal(np.array(alike, dtype=np.int64)))
-    return np.concatenate(pieces), sum(len(p) for size, p in by_size.items() if size < 3)
-
-
-def fan_of_equal(polygons: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Triangles (P (k - 2), 3) of polygons (P, k), k >= 3."""
-    corners = np.arange(1, polygons.shape[1] - 1)
-    first = np.broadcast_to(polygons[:, :1], (len(polygons), len(corners)))
-    return np.stack([first, polygons[:, corners], polygons[:, corners + 1]], axis=2).reshape(-1, 3)
 
 
 def walk(

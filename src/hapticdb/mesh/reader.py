@@ -243,7 +243,8 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
         vertices, faces, colours = geometries[n]
         placed = np.array(transform)
         parts.append(Part(name, vertices, faces, placed, Defects(**defects), shared[n], colours))
-    return MeshFile(link, parts, Defects(**head["defects"]), head["names_unit"], head["up"])
+    said = (head["names_unit"], head["up"], tuple(head["notes"]))
+    return MeshFile(link, parts, Defects(**head["defects"]), *said)
 
 
 def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:

@@ -181,7 +181,8 @@ class PointShell:
             shell = cls._from_triangles(triangles, points, spacing, seed, inset, file.link)
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
-        return replace(shell, defects=file.defects.describe())
+        found = "; ".join(filter(None, [file.defects.describe(), *file.notes]))
+        return replace(shell, defects=found)
 
     @classmethod
     def from_mesh(

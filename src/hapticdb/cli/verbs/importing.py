@@ -207,6 +207,7 @@ def _record(report: "FileReport") -> dict[str, object]:
         "voxels": sum(obj.voxels for obj in report.added),
         "is_unit_assumed": report.is_unit_assumed,
         "defects": report.defects.as_dict(),
+        "notes": list(report.notes),
         "error": None if report.error is None else str(report.error),
     }
 
@@ -239,3 +240,5 @@ def _say(file: str, report: "FileReport") -> None:
         render.say("  it names no unit, so its numbers are taken as metres; --unit gives another")
     if report.defects:
         render.say(f"  found in the file: {report.defects.describe()}")
+    for note in report.notes:
+        render.say(f"  note: {note}")

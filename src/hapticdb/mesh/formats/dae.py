@@ -1,11 +1,16 @@
 """COLLADA through pycollada: one part for each placed geometry, named along its nodes.
 
 This module walks the nodes itself: trimesh's loader loses their names and copies the geometry for
-every placement. pycollada keeps numbers as float32.
+every placement. pycollada rounds positions to float32 and makes 0 of those that are NaN, loses a
+geometry with holes or for one piece of an unknown kind, and stops at a damaged light. So the text
+is prepared for it, and positions are read from the text.
 """
 
+import io
+from collections import Counter
 from pathlib import Path
 from typing import Any
+from xml.etree import ElementTree as ET
 
 import collada
 import numpy as np
@@ -13,18 +18,31 @@ from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import Colours, joined, rgba
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, fan, walk
+from hapticdb.mesh.polygons import triangulated
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
+from hapticdb.mesh.text import recoded
 
 _Palette = dict[str, tuple[float, ...]]
 """Colours and opacity, 0 to 1, by the symbol that triangles name."""
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 
 
+_NO_SHAPE = ("library_lights", "library_cameras", "library_animations", "library_physics_models")
+_PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons", "lines"}
+_OF_A_MESH = _PIECES | {"source", "vertices", "extra"}
+_INSTANCES = ("instance_geometry", "instance_controller", "instance_node")
+
+
 def read(path: Path) -> Parsed:
     """Parts of the document's scene, in its unit and with its axes."""
-    # A missing texture or an unknown effect must not lose the geometry.
-    lenient = [collada.common.DaeUnsupportedError, collada.common.DaeBrokenRefError]
-    document = collada.Collada(str(path), ignore=lenient)
+    try:
+        root = ET.fromstring(recoded(path.read_bytes()))  # noqa: S314 - expat stops entities that multiply
+    except ET.ParseError as error:
+        raise UnreadableError(f"its XML is damaged or cut short: {error}") from None
+    if not root.tag.endswith("COLLADA"):
+        raise UnreadableError("it is no COLLADA file: its first element is not 'COLLADA'")
+    left_out = _prepare(root)
+    document = collada.Collada(io.BytesIO(ET.tostring(root)), ignore=[collada.common.DaeError])
     if document.scene is None:
         raise UnreadableError("it has no scene")
     shapes: dict[tuple[str, ...], int] = {}
@@ -45,7 +63,74 @@ def read(path: Path) -> Parsed:
         placements,
         metres=1.0 if unit is None else float(unit),
         up=_UP_AXES.get(str(getattr(document.assetInfo, "upaxis", None))),
+        notes=[*left_out, *_notes(root, document)],
     )
+
+
+def _tag(element: ET.Element) -> str:
+    """Name of an element without its namespace."""
+    return element.tag.rpartition("}")[2]
+
+
+def _prepare(root: ET.Element) -> list[str]:
+    """Take out what pycollada fails at and no surface needs; returns what is told about that."""
+    for library in [child for child in root if _tag(child) in _NO_SHAPE]:
+        root.remove(library)
+    strange: Counter[str] = Counter()
+    for mesh in root.iter():
+        if _tag(mesh) == "node":
+            for child in [c for c in mesh if _tag(c) in {"instance_light", "instance_camera"}]:
+                mesh.remove(child)
+        if _tag(mesh) != "mesh":
+            continue
+        for piece in list(mesh):
+            if _tag(piece) not in _OF_A_MESH:
+                strange[_tag(piece)] += 1
+                mesh.remove(piece)
+            elif _tag(piece) == "polygons":
+                _join_holes(piece)
+    return [f"{n} pieces of the kind '{kind}' are not read" for kind, n in strange.items()]
+
+
+def _join_holes(polygons: ET.Element) -> None:
+    """Write a polygon and its holes as one row of corners, with the lengths of the rows."""
+    for holed in [child for child in polygons if _tag(child) == "ph"]:
+        rows = [(row.text or "").split() for row in holed if _tag(row) in "ph"]
+        joined = ET.SubElement(
+            polygons, holed.tag[:-2] + "p", rows=" ".join(str(len(r)) for r in rows)
+        )
+        joined.text = " ".join(word for row in rows for word in row)
+        polygons.remove(holed)
+
+
+def _notes(root: ET.Element, document: Any) -> list[str]:  # noqa: ANN401 - untyped library
+    """Say what of the file did not become parts, or not in the place that it has when it moves."""
+    meshes = [one for one in root.iter() if _tag(one) == "geometry"]
+    lost = [one for one in meshes if one.get("id") not in document.geometries]
+    wanted = [one for one in root.iter() if _tag(one) in _INSTANCES]
+    missing = sum(one.get("url", "")[1:] not in _known(document) for one in wanted)
+    posed = Counter(type(one).__name__.lower() for one in document.controllers)
+    others = len(document.scenes) - 1
+    return [
+        *([f"{len(lost)} of its {len(meshes)} geometries cannot be read"] if lost else []),
+        *(
+            [f"{missing} of its {len(wanted)} placements refer to what is not there"]
+            if missing
+            else []
+        ),
+        *(
+            f"{n} geometries have a {kind}: they are read in their rest pose"
+            for kind, n in posed.items()
+        ),
+        *([f"{others} more scenes are not read"] if others > 0 else []),
+    ]
+
+
+def _known(document: Any) -> set[str]:  # noqa: ANN401 - untyped library
+    """Ids that a node can refer to."""
+    nodes = [one.get("id", "") for one in document.xmlnode.getroot().iter() if _tag(one) == "node"]
+    read_things = [*document.geometries, *document.controllers]
+    return {str(one.id) for one in read_things} | set(nodes)
 
 
 def _links(nodes: list[Any]) -> list[tuple[Any, NDArray[np.float64]]]:
@@ -53,10 +138,24 @@ def _links(nodes: list[Any]) -> list[tuple[Any, NDArray[np.float64]]]:
     found = []
     for node in nodes:
         if isinstance(node, collada.scene.NodeNode):
-            found.append((node.node, np.asarray(node.node.matrix, dtype=np.float64)))
+            found.append((node.node, _placed(node.node)))
         elif isinstance(node, collada.scene.Node):
-            found.append((node, np.asarray(node.matrix, dtype=np.float64)))
+            found.append((node, _placed(node)))
     return found
+
+
+def _placed(node: Any) -> NDArray[np.float64]:  # noqa: ANN401 - untyped library
+    """Transform (4, 4) of a node; pycollada rounds where it is far away."""
+    whole = np.eye(4)
+    for step in node.transforms:
+        one = np.asarray(step.matrix, dtype=np.float64).copy()
+        values = numbers(step.xmlnode.text or "", np.float64)
+        if isinstance(step, collada.scene.MatrixTransform):
+            one = values.reshape(4, 4).astype(np.float64)
+        elif isinstance(step, collada.scene.TranslateTransform):
+            one[:3, 3] = values
+        whole @= one
+    return whole
 
 
 def _children(node: Any) -> list[tuple[Any, NDArray[np.float64]]]:  # noqa: ANN401 - untyped library
@@ -90,34 +189,54 @@ def _palette(bindings: list[Any]) -> _Palette:
 
 def _shape(geometry: Any, palette: _Palette) -> Shape:  # noqa: ANN401 - untyped library
     """Triangles of a geometry's primitives; lines have no surface."""
-    vertices: list[NDArray[np.generic]] = []
+    vertices: dict[str, tuple[int, NDArray[np.float64]]] = {}
     faces: list[NDArray[np.int64]] = []
     painted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = incomplete = 0
     for primitive in geometry.primitives:
-        found, n_short = _faces(primitive)
-        if found is None or primitive.vertex is None:
+        if isinstance(primitive, collada.lineset.LineSet) or primitive.vertex is None:
             unsupported += 1
             continue
+        source = primitive.sources["VERTEX"][0][4]
+        if source.id not in vertices:
+            vertices[source.id] = n_vertices, _positions(source)
+            n_vertices += len(vertices[source.id][1])
+        offset, corners = vertices[source.id]
+        found, n_short = _faces(primitive, corners)
         incomplete += n_short
-        inside = (found >= 0) & (found < len(primitive.vertex))
-        faces.append(np.where(inside, found + n_vertices, -1))
+        inside = (found >= 0) & (found < len(corners))
+        faces.append(np.where(inside, found + offset, -1))
         colour = palette.get(str(primitive.material))
         painted.append((None if colour is None else rgba(colour), len(found)))
-        vertices.append(primitive.vertex)
-        n_vertices += len(primitive.vertex)
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
     if not faces:
         return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
-    return Shape(np.concatenate(vertices), np.concatenate(faces), defects, joined(painted))
+    whole = np.concatenate([piece for _, piece in vertices.values()])
+    return Shape(whole, np.concatenate(faces), defects, joined(painted))
 
 
-def _faces(primitive: Any) -> tuple[NDArray[np.int64] | None, int]:  # noqa: ANN401 - untyped library
-    """Corners (F, 3) of a primitive, and how many polygons had fewer than three; None for lines."""
+def _positions(source: Any) -> NDArray[np.float64]:  # noqa: ANN401 - untyped library
+    """Positions (V, 3) as the file's text has them."""
+    text = next(child.text or "" for child in source.xmlnode if _tag(child) == "float_array")
+    found = np.asarray(numbers(text, np.float64), dtype=np.float64)
+    return found.reshape(-1, len(source.components))[:, :3]
+
+
+def _faces(
+    primitive: Any,  # noqa: ANN401 - untyped library
+    corners: NDArray[np.float64],
+) -> tuple[NDArray[np.int64], int]:
+    """Triangles (F, 3) of a primitive, and how many polygons had fewer than three corners."""
+    index = np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1)
     if isinstance(primitive, collada.triangleset.TriangleSet):
-        return np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1, 3), 0
-    if isinstance(primitive, collada.polylist.Polylist):
-        index = np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1)
-        ends = np.cumsum(np.asarray(primitive.vcounts, dtype=np.int64))
-        return fan([polygon.tolist() for polygon in np.split(index, ends[:-1])])
-    return None, 0
+        return index.reshape(-1, 3), 0
+    ends = np.cumsum(np.asarray(primitive.vcounts, dtype=np.int64))
+    polygons = [polygon.tolist() for polygon in np.split(index, ends[:-1])]
+    holes = {}
+    rows = [one for one in primitive.xmlnode if _tag(one) == "p"]
+    for number, row in enumerate(rows):
+        if "rows" in row.attrib:
+            lengths = np.array(row.get("rows").split(), dtype=np.int64)
+            per_corner = max(int(lengths.sum()) // max(len(polygons[number]), 1), 1)
+            holes[number] = (np.cumsum(lengths[:-1]) // per_corner).tolist()
+    return triangulated(corners, polygons, holes)

@@ -1,23 +1,29 @@
 """OFF, text: one part named after the file."""
 
+import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, fan, numbers, placed_once
+from hapticdb.mesh.polygons import triangulated
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.text import text_of
 
-_KEYWORDS = {"OFF", "COFF", "NOFF", "CNOFF", "STOFF", "STCOFF", "STNOFF", "STCNOFF"}
+_KEYWORD = re.compile(r"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
+"""Also where the counts follow it without a space, as in the files of ModelNet40."""
 
 
 def read(path: Path) -> Parsed:
-    """Faces of an OFF file, polygons fanned into triangles."""
-    text = path.read_bytes().decode("utf-8", "replace")
+    """Faces of an OFF file, polygons cut into triangles."""
+    text = text_of(path.read_bytes())
     lines = [line.split("#", 1)[0].strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
-    keyword, _, counts = lines[0].partition(" ") if lines else ("", "", "")
-    if keyword.upper() not in _KEYWORDS:
+    keyword = _KEYWORD.match(lines[0]) if lines else None
+    if keyword is None:
         raise UnreadableError("it is no OFF file: its first word is none of OFF, COFF, NOFF")
+    counts = lines[0][keyword.end() :]
     body = lines[1:] if counts.strip() else lines[2:]
     header = numbers(counts if counts.strip() else " ".join(lines[1:2]), np.int64)
     if header.size < 2 or int(header.min()) < 0:
@@ -33,11 +39,13 @@ def read(path: Path) -> Parsed:
     vertices = numbers(coordinates, np.float64)
     if vertices.size != 3 * n_vertices:
         raise UnreadableError("a vertex has fewer than three coordinates")
+    vertices = vertices.reshape(-1, 3)
     polygons = [_polygon(line) for line in body[n_vertices : n_vertices + n_faces]]
-    faces, incomplete = fan(polygons)
-    return placed_once(
-        [(path.stem, Shape(vertices.reshape(-1, 3), faces, Defects(incomplete=incomplete)))]
-    )
+    faces, incomplete = triangulated(vertices, polygons)
+    parsed = placed_once([(path.stem, Shape(vertices, faces, Defects(incomplete=incomplete)))])
+    extra = len(body) - n_vertices - n_faces
+    told = f"{extra:,} lines behind the last face are passed over"
+    return replace(parsed, notes=[told] if extra else [])
 
 
 def _polygon(line: str) -> list[int]:

@@ -5,16 +5,20 @@ error, and takes the word 'solid' in the name after 'endsolid' for the start of 
 """
 
 import re
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hapticdb.mesh.part import Defects
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.text import recoded, text_of
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 _HEADER = 84
-_BORDER = re.compile(r"^[ \t]*(end[ \t]*solid|solid)\b[ \t]*(.*)$", re.MULTILINE | re.IGNORECASE)
+_BORDER = re.compile(r"^[ \t]*(end[ \t]*solid|solid\b)[ \t]*(.*)$", re.MULTILINE | re.IGNORECASE)
+_NO_COUNT = {0, 0xFFFFFFFF}
+"""Counts of programs that write the header before they know the number of triangles."""
+_LOOP = re.compile(r"\bouter\s*loop\b", re.IGNORECASE)
 _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
@@ -25,41 +29,78 @@ def read(path: Path) -> Parsed:
     n_bytes = _HEADER + n_facets * _FACET.itemsize
     # A binary file's free header may start with 'solid', so its length decides first.
     if len(content) == n_bytes and len(content) >= _HEADER:
-        return placed_once([(path.stem, _binary(content, n_facets))])
-    if content[:512].lstrip()[:5].lower() == b"solid":
-        return _text(content.decode("utf-8", "replace"), path.stem)
-    if n_facets > 0 and n_bytes < len(content):  # trailing bytes, which some exporters write
-        return placed_once([(path.stem, _binary(content, n_facets))])
+        return placed_once([(path.stem, _binary(content, 0, n_facets))])
+    plain = recoded(content)
+    if plain[:512].lstrip()[:5].lower() == b"solid":
+        return _text(text_of(plain), path.stem)
     if len(content) < _HEADER:
         raise UnreadableError("it is no STL file: neither a 'solid' nor a binary header")
+    n_behind, rest = divmod(len(content) - _HEADER, _FACET.itemsize)
+    if n_facets in _NO_COUNT and n_behind and not rest:
+        parsed = placed_once([(path.stem, _binary(content, 0, n_behind))])
+        told = f"its header counts {n_facets:,} triangles, and {n_behind:,} follow: all are read"
+        return replace(parsed, notes=[told])
+    if n_facets > 0 and n_bytes < len(content):
+        return _joined(content, path.stem)
     raise UnreadableError(
         f"it is no STL file or cut short: {len(content):,} bytes where its header promises "
         f"{n_facets:,} triangles ({n_bytes:,} bytes)"
     )
 
 
-def _binary(content: bytes, n_facets: int) -> Shape:
-    """Triangles of a binary file."""
-    facets = np.frombuffer(content, dtype=_FACET, count=n_facets, offset=_HEADER)
+def _joined(content: bytes, stem: str) -> Parsed:
+    """Binary files one behind the other, and the bytes that some exporters write at the end."""
+    solids: list[tuple[str, Shape]] = []
+    at = 0
+    while at + _HEADER <= len(content):
+        n_facets = int.from_bytes(content[at + 80 : at + _HEADER], "little")
+        end = at + _HEADER + n_facets * _FACET.itemsize
+        if not n_facets or end > len(content):
+            break
+        solids.append((stem, _binary(content, at, n_facets)))
+        at = end
+    told = f"{len(content) - at:,} bytes behind the last triangle are passed over"
+    return replace(placed_once(solids), notes=[told] if at < len(content) else [])
+
+
+def _binary(content: bytes, at: int, n_facets: int) -> Shape:
+    """Triangles behind the binary header at byte `at`."""
+    facets = np.frombuffer(content, dtype=_FACET, count=n_facets, offset=at + _HEADER)
     corners = facets["corners"].reshape(-1, 3)
     return Shape(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
 def _text(text: str, stem: str) -> Parsed:
-    """Solids of a text file."""
+    """Solids of a text file. Where files were joined, 'endsolid a' and 'solid b' may be one line.
+
+    Triangles behind a line with 'endsolid' are a solid, too; a line with 'solid' may be doubled.
+    """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     borders = list(_BORDER.finditer(text))
+    ends = [*(border.start() for border in borders[1:]), len(text)]
+    is_end = [border[1].lower() != "solid" for border in borders]
     solids: list[tuple[str, Shape]] = []
-    for n, border in enumerate(borders):
-        if border[1].lower() != "solid":
-            continue
-        name = border[2].strip() or stem
-        if n + 1 == len(borders) or borders[n + 1][1].lower() == "solid":
-            raise UnreadableError(f"it is cut short: solid '{name}' has no end")
-        chunk = text[border.end() : borders[n + 1].start()]
-        corners = numbers(" ".join(_VERTEX.findall(chunk)), np.float64)
-        if corners.size % 9:
-            raise UnreadableError(f"a facet of solid '{name}' has fewer than three corners")
-        faces = np.arange(corners.size // 3, dtype=np.int64).reshape(-1, 3)
-        solids.append((name, Shape(corners.reshape(-1, 3), faces)))
-    return placed_once(solids, Defects())
+    name = ""
+    for n, (border, end) in enumerate(zip(borders, ends, strict=True)):
+        rest = border[2].strip()
+        if is_end[n]:
+            behind = rest.removeprefix(name).strip()
+            rest = behind[5:].strip() if behind[:5].lower() == "solid" else ""
+        name = rest
+        shape = _facets(text[border.end() : end], name or stem)
+        is_closed = n + 1 < len(borders) and is_end[n + 1]
+        must_be = len(shape.vertices) > 0 or not (is_end[n] or n + 1 < len(borders))
+        if must_be and not is_closed:
+            raise UnreadableError(f"it is cut short: solid '{name or stem}' has no end")
+        if must_be or (is_closed and not is_end[n]):
+            solids.append((name or stem, shape))
+    return placed_once(solids)
+
+
+def _facets(chunk: str, name: str) -> Shape:
+    """Triangles of one solid."""
+    corners = numbers(" ".join(_VERTEX.findall(chunk)), np.float64)
+    if corners.size != 9 * len(_LOOP.findall(chunk)):
+        raise UnreadableError(f"a facet of solid '{name}' has other than three corners")
+    faces = np.arange(corners.size // 3, dtype=np.int64).reshape(-1, 3)
+    return Shape(corners.reshape(-1, 3), faces)

@@ -6,6 +6,7 @@ refuses the whole file for one face out of range.
 """
 
 import re
+from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
@@ -16,24 +17,27 @@ from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.raw import (
-    Parsed,
-    Shape,
-    UnreadableError,
-    fan,
-    fan_of_equal,
-    numbers,
-    placed_once,
-)
+from hapticdb.mesh.polygons import triangulated, triangulated_equal
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.text import text_of
 
 _TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
 _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
-_NUMBERS = {"v", "f"}
+_FACE = {"f", "fo"}
+_NUMBERS = {"v", *_FACE}
+# Lines that say how surfaces look, or belong to curves, which `_NO_SURFACE` counts.
+_NO_SHAPE = {
+    "", "vt", "vn", "vp", "s", "mg", "usemap", "maplib", "bevel", "c_interp",
+    "d_interp", "lod", "shadow_obj", "trace_obj", "cstype", "deg", "bmat", "step", "parm", "trim",
+    "hole", "scrv", "sp", "end", "con", "ctech", "stech",
+}  # fmt: skip
 _OUTSIDE = -1
 _WITH_COLOUR = 6
 """Numbers of a vertex with a colour."""
 MOST_BYTES = 16 << 20
 """Of a file of materials. A larger value reads larger ones, and takes more memory."""
+_MOST_WORDS = 3
+"""Words of unknown lines that are told."""
 
 
 @dataclass
@@ -49,10 +53,11 @@ class _Group:
 
 def read(path: Path) -> Parsed:
     """Objects and groups of an OBJ file; if there are none, one part named after the file."""
-    text = path.read_bytes().decode("utf-8", "replace")
+    text = text_of(path.read_bytes())
     vertex_lines: list[str] = []
     groups: dict[tuple[str, str], _Group] = {}
     libraries: list[str] = []
+    strange: Counter[str] = Counter()
     key, material = ("", ""), ""
     for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
@@ -60,7 +65,7 @@ def read(path: Path) -> Parsed:
             rest = rest.partition("#")[0]
         if word == "v":
             vertex_lines.append(rest)
-        elif word == "f":
+        elif word in _FACE:
             group = groups.setdefault(key, _Group())
             group.lines.append(rest)
             group.n_before.append(len(vertex_lines))
@@ -75,13 +80,18 @@ def read(path: Path) -> Parsed:
             libraries.append(rest.strip())
         elif word in _NO_SURFACE:
             groups.setdefault(key, _Group()).unsupported += 1
+        elif word not in _NO_SHAPE and word[0] != "#":
+            strange[word] += 1
     vertices = _vertices(vertex_lines)
     palette = {name: colour for file in libraries for name, colour in _materials(path, file)}
     painted = _painted(vertex_lines)
-    return placed_once(
+    parsed = placed_once(
         ("/".join(filter(None, names)) or path.stem, _coloured(group, vertices, palette, painted))
         for names, group in groups.items()
     )
+    told = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
+    lines = f"{strange.total():,} lines begin with unknown words and are passed over: {told}"
+    return replace(parsed, notes=[lines] if strange else [])
 
 
 def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:
@@ -90,7 +100,7 @@ def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:
     if "/" in name or not file.is_file() or file.stat().st_size > MOST_BYTES:
         return
     material, values = None, np.ones(4)
-    for line in [*file.read_text("utf-8", "replace").splitlines(), "newmtl"]:
+    for line in [*text_of(file.read_bytes()).splitlines(), "newmtl"]:
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
         with suppress(UnreadableError, ValueError):
             if word == "newmtl":
@@ -161,13 +171,12 @@ def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
     size = sizes.pop() if len(sizes) == 1 else 0
     # The fast path: all polygons have one size and no index is negative.
     if size >= 3 and "-" not in corners:
-        polygons = np.asarray(numbers(corners, np.int64), dtype=np.int64).reshape(-1, size) - 1
-        faces, incomplete = fan_of_equal(polygons), 0
+        equal = np.asarray(numbers(corners, np.int64), dtype=np.int64).reshape(-1, size) - 1
+        faces, incomplete = triangulated_equal(vertices, equal), 0
     else:
         lines = corners.split("\n") if group.lines else []
-        faces, incomplete = fan(
-            [_polygon(line, n) for line, n in zip(lines, group.n_before, strict=True)]
-        )
+        polygons = [_polygon(line, n) for line, n in zip(lines, group.n_before, strict=True)]
+        faces, incomplete = triangulated(vertices, polygons)
     return Shape(vertices, faces, Defects(incomplete=incomplete, unsupported=group.unsupported))
 
 

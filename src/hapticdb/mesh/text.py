@@ -1,0 +1,42 @@
+"""Text of files in any of the encodings that programs write: UTF-8, UTF-16, GB18030, Latin-1."""
+
+import codecs
+import re
+
+_MARKS = (
+    (codecs.BOM_UTF8, "utf-8-sig"),
+    (codecs.BOM_UTF32_LE, "utf-32"),
+    (codecs.BOM_UTF32_BE, "utf-32"),
+    (codecs.BOM_UTF16_LE, "utf-16"),
+    (codecs.BOM_UTF16_BE, "utf-16"),
+)
+_SAMPLE = 64
+"""Bytes that tell UTF-16 without a mark."""
+_NOT_ASCII = re.compile(rb"[\x80-\xff]+")
+_COMMON = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe])+")
+"""Common Chinese characters in GB18030: in words of Latin-1 few such pairs of bytes stand alone."""
+
+
+def recoded(content: bytes) -> bytes:
+    """Content without a byte order mark, in UTF-8 if it was UTF-16 or UTF-32."""
+    for mark, name in _MARKS:
+        if content.startswith(mark):
+            return content.decode(name, "replace").encode()
+    head = content[:_SAMPLE]
+    for name, zeros, letters in (("utf-16-le", head[1::2], head[::2]),
+                                 ("utf-16-be", head[::2], head[1::2])):  # fmt: skip
+        if len(head) > 3 and not any(zeros) and all(letters):
+            return content.decode(name, "replace").encode()
+    return content
+
+
+def text_of(content: bytes) -> str:
+    """Text of a file; bytes that are not UTF-8 are GB18030 if they look so, else Windows-1252."""
+    plain = recoded(content)
+    try:
+        return plain.decode()
+    except UnicodeDecodeError:
+        pass
+    words = _NOT_ASCII.findall(plain)
+    is_chinese = sum(_COMMON.fullmatch(word) is not None for word in words) * 2 > len(words)
+    return plain.decode("gb18030" if is_chinese else "cp1252", "replace")

@@ -1,0 +1,218 @@
+"""Files of the kinds that people report about programs like this one, each read rightly or told.
+
+Areas, volumes and bounds follow from the shapes that the files were written to hold.
+"""
+
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+
+from hapticdb.mesh import MeshFile, parse_in_process
+from mesh_files import COLLADA, cause, names, text
+
+
+class Reads(NamedTuple):
+    """Expected content: names, area (m^2), volume (m^3), least and greatest corner, notes."""
+
+    names: list[str]
+    area: float
+    volume: float
+    low: tuple[float, float, float]
+    high: tuple[float, float, float]
+    note: str = ""
+
+
+HALF = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+TENTH = ((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))
+
+EXPECTED: dict[str, Reads | str] = {
+    "b01_bom_v_first.obj": Reads(["b01_bom_v_first"], 6, 1, *HALF),
+    "b04_cat_no_newline.stl": Reads(
+        ["inlet", "outlet", "walls"], 18, 3, (-0.5, -0.5, -0.5), (10.5, 0.5, 0.5)
+    ),
+    "b07_openscad_dup.stl": Reads(["OpenSCAD_Model"], 6, 1, *HALF),
+    "c1_both.obj": Reads(["solid", "pin"], 6.06, 1.001, *HALF),
+    "c1_tool.obj": Reads(["tool"], 0.06, 0.001, (-0.05, -0.05, -0.05), (0.05, 0.05, 0.05)),
+    "c2_U_peg.obj": Reads(["U", "peg"], 14 + 16 + 0.96, 7.064, (0, 0, 0), (3, 3, 1)),
+    "d02_light_incomplete.dae": Reads(["part"], 6, 1, *HALF),
+    "d03_color_comma.dae": Reads(["part"], 6, 1, *HALF),
+    "d07_polygon_hole.dae": Reads(["part"], 12, 0, (-2, -2, 0), (2, 2, 0)),
+    "o01_concave_U.obj": Reads(["U"], 7, 0, (0, 0, 0), (3, 3, 0)),
+    "o04_utf16.obj": Reads(["box"], 6, 1, *HALF),
+    "o06_latin1.obj": Reads(["Träger"], 6, 1, *HALF),
+    "o12_modelnet_header.off": Reads(["o12_modelnet_header"], 0.24, 0.008, *TENTH),
+    "t01_bom.stl": Reads(["box"], 6, 1, *HALF),
+    "t08_count0.stl": Reads(["t08_count0"], 6, 1, *HALF, "counts 0 triangles, and 12 follow"),
+}
+
+
+def area_and_volume(file: MeshFile) -> tuple[float, float]:
+    """Area and enclosed volume of all triangles."""
+    area = volume = 0.0
+    for part in file.parts:
+        corners = part.triangles()
+        corners = corners - part.bounds[0]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area += float(np.linalg.norm(normals, axis=1).sum()) / 2
+        volume += float(np.einsum("ij,ij", corners[:, 0], normals)) / 6
+    return area, volume
+
+
+@pytest.mark.parametrize("name", EXPECTED)
+def test_a_reported_file_reads_rightly_or_is_told(test_data: Path | None, name: str) -> None:
+    if test_data is None:
+        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no reported files to read")
+    path, expected = test_data / "reports" / name, EXPECTED[name]
+    if isinstance(expected, str):
+        assert expected in cause(path)
+        return
+    file = parse_in_process(path)
+    assert names(file) == expected.names
+    np.testing.assert_allclose(area_and_volume(file), expected[1:3], rtol=1e-3, atol=1e-12)
+    np.testing.assert_allclose(file.bounds, np.array(expected[3:5]), rtol=1e-6, atol=1e-6)
+    assert bool(file.notes) == bool(expected.note)
+    assert expected.note in "; ".join(file.notes)
+
+
+# --- the same kinds in the other formats ------------------------------------------------------
+
+FACET = (
+    "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+)
+FLAT_U = "0 0 0\n3 0 0\n3 3 0\n2 3 0\n2 1 0\n1 1 0\n1 3 0\n0 3 0\n"
+PLY_U = (
+    "element vertex 8\nproperty float x\nproperty float y\nproperty float z\nelement face 2\n"
+    "property list uchar int vertex_indices\nend_header\n"
+)
+
+
+@pytest.mark.parametrize("first", range(8))
+@pytest.mark.parametrize("step", [1, -1])
+def test_a_concave_polygon_is_cut_whichever_corner_is_first(
+    tmp_path: Path, first: int, step: int
+) -> None:
+    ring = [(first + step * n) % 8 for n in range(8)]
+    lines = "".join(f"v {line}\n" for line in FLAT_U.splitlines())
+    path = text(tmp_path / "u.obj", lines + "f " + " ".join(str(n + 1) for n in ring) + "\n")
+    corners = parse_in_process(path).parts[0].triangles()
+    up = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2]
+    assert up.sum() == pytest.approx(14 * step)
+    assert np.abs(up).sum() == pytest.approx(14)
+
+
+def test_concave_polygons_beside_triangles_in_off_and_ply(tmp_path: Path) -> None:
+    faces = "8 0 1 2 3 4 5 6 7\n3 0 1 2\n"
+    corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype=np.float32)
+    rows = np.array([8, *range(8)], "<i4"), np.array([3, 0, 1, 2], "<i4")
+    binary = b"".join(bytes([int(row[0])]) + row[1:].tobytes() for row in rows)
+    head = f"ply\nformat binary_little_endian 1.0\n{PLY_U}".encode()
+    (tmp_path / "binary.ply").write_bytes(head + corners.tobytes() + binary)
+    text(tmp_path / "text.ply", f"ply\nformat ascii 1.0\n{PLY_U}{FLAT_U}{faces}")
+    text(tmp_path / "u.off", f"OFF 8 2 0\n{FLAT_U}{faces}")
+    for name in ("binary.ply", "text.ply", "u.off"):
+        assert area_and_volume(parse_in_process(tmp_path / name))[0] == pytest.approx(7 + 4.5)
+
+
+def test_triangle_strips_of_a_ply_are_read_and_other_elements_told(tmp_path: Path) -> None:
+    head = PLY_U.replace(
+        "element face 2", "element edge 1\nproperty int vertex1\nelement tristrips 1"
+    )
+    content = f"ply\nformat ascii 1.0\n{head}{FLAT_U}7\n8 0 1 7 2 -1 4 5 6\n"
+    file = parse_in_process(text(tmp_path / "strip.ply", content))
+    assert len(file.parts[0].triangles()) == 3
+    assert "1 elements of the kind 'edge'" in file.notes[0]
+
+
+@pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
+def test_text_is_read_in_every_unicode(tmp_path: Path, encoding: str) -> None:
+    contents = {
+        "a.obj": "o Öse\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n",
+        "a.off": "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n",
+        "a.ply": f"ply\nformat ascii 1.0\n{PLY_U}{FLAT_U}3 0 1 5\n0\n",
+        "a.stl": f"solid Öse\n{FACET}endsolid Öse\n",
+    }
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content.encode(encoding))
+        file = parse_in_process(tmp_path / name)
+        assert area_and_volume(file)[0] == pytest.approx(1.5 if name == "a.ply" else 0.5)
+        assert names(file)[0] in {"a", "Öse"}
+
+
+@pytest.mark.parametrize(("name", "encoding"), [("Größe", "latin-1"), ("左前轮 支架", "gb18030")])
+def test_names_that_are_not_utf_8_are_read(tmp_path: Path, name: str, encoding: str) -> None:
+    content = f"o {name}\nv 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n".encode(encoding)
+    (tmp_path / "a.obj").write_bytes(content)
+    assert names(parse_in_process(tmp_path / "a.obj")) == [name]
+
+
+def test_lines_that_are_passed_over_are_counted(tmp_path: Path) -> None:
+    path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nfo 1 2 3\ncall b.obj\ncall c.obj\n")
+    assert (
+        "2 lines begin with unknown words and are passed over: 'call' 2"
+        in parse_in_process(path).notes
+    )
+    path = text(tmp_path / "a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 2 1\n")
+    assert "1 lines behind the last face are passed over" in parse_in_process(path).notes
+
+
+def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
+    for name, joined in {
+        "unnamed": f"solid\n{FACET}endsolidsolid two\n{FACET}endsolid two\n",
+        "same words": f"solid a solid\n{FACET}endsolid a solidsolid two\n{FACET}endsolid two\n",
+        "no second head": f"solid a\n{FACET}endsolid a\n{FACET}endsolid b\n",
+    }.items():
+        assert len(parse_in_process(text(tmp_path / f"{name}.stl", joined)).parts) == 2
+    one = b"\0" * 80 + (1).to_bytes(4, "little") + np.arange(12, dtype="<f4").tobytes() + b"\0\0"
+    (tmp_path / "binary.stl").write_bytes(one + one + b"tail")
+    file = parse_in_process(tmp_path / "binary.stl")
+    assert names(file) == ["binary", "binary #2"]
+    assert "4 bytes behind the last triangle" in file.notes[0]
+    square = FACET.replace("endloop", "vertex 1 1 0\nendloop")
+    path = text(tmp_path / "square.stl", f"solid a\n{square * 3}endsolid a\n")
+    assert "other than three corners" in cause(path)
+
+
+def test_coordinates_too_far_away_for_their_numbers_are_told(tmp_path: Path) -> None:
+    corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype=np.float64) + 5e6
+    face = b"\x08" + np.arange(8, dtype="<i4").tobytes()
+    for kind, code, n_told in (("float", "<f4", 1), ("double", "<f8", 0)):
+        head = PLY_U.replace("face 2", "face 1").replace("float", kind)
+        content = f"ply\nformat binary_little_endian 1.0\n{head}".encode()
+        (tmp_path / "far.ply").write_bytes(content + corners.astype(code).tobytes() + face)
+        file = parse_in_process(tmp_path / "far.ply")
+        assert len(file.notes) == n_told
+        assert area_and_volume(file)[0] == pytest.approx(7)
+
+
+def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
+    far = COLLADA.replace("0 0 0 1 0 0 1 1 0\n0 1 0", "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0")
+    far = far.replace("<translate>100 0 0", "<translate>400000000.25 0 0")
+    file = parse_in_process(text(tmp_path / "far.dae", far))
+    np.testing.assert_allclose(file.bounds[:, 0], [14000000.0025, 14000000.0225], rtol=1e-15)
+    assert not file.notes
+
+
+def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
+    strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
+    spline = "<geometry id='s'><spline/></geometry></library_geometries>"
+    gone = "<instance_geometry url='#gone'/><instance_light url='#sun'/></node></node>"
+    content = COLLADA.replace("</mesh>", strange).replace("</library_geometries>", spline)
+    path = text(tmp_path / "odd.dae", content.replace("</node></node>", gone))
+    file = parse_in_process(path)
+    assert len(file.parts[0].triangles()) == 4
+    assert file.notes == (
+        "1 pieces of the kind 'linestrips' are not read",
+        "1 of its 2 geometries cannot be read",
+        "1 of its 2 placements refer to what is not there",
+    )
+
+
+def test_strips_and_fans_of_a_collada_file_are_read(tmp_path: Path) -> None:
+    for kind in ("tristrips", "trifans"):
+        corners = "0 1 3 2" if kind == "tristrips" else "0 1 2 3"
+        content = COLLADA.replace("<triangles", f"<{kind}").replace("</triangles", f"</{kind}")
+        content = content.replace("<p>0 1 2</p></tri", f"<p>{corners}</p></tri")
+        file = parse_in_process(text(tmp_path / f"{kind}.dae", content))
+        assert area_and_volume(file)[0] == pytest.approx(4 * 2.5e-4)

@@ -41,6 +41,11 @@ class RecordedScene:
         self.nodes[name] = RecordedNode(self, name, **props)
         return self.nodes[name]
 
+    def add_point_cloud(self, name: str, points: Any, colours: Any, **props: Any) -> RecordedNode:
+        props |= {"points": points, "colors": np.asarray(colours), "vertices": None}
+        self.nodes[name] = RecordedNode(self, name, **props)
+        return self.nodes[name]
+
     def add_frame(self, name: str, **props: Any) -> RecordedNode:
         self.nodes[name] = RecordedNode(self, name, vertices=None, **props)
         return self.nodes[name]

@@ -5,17 +5,19 @@ from typing import Any, cast
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
+from assemblies import small_options
 from children import until
 from hapticdb.mesh import read_file
-from hapticdb.page.colours import MARKED
+from hapticdb.page.colours import MARKED, Colour
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
-from hapticdb.page.scene.nodes import Member
+from hapticdb.page.scene.nodes import Member, Sight
 from hapticdb.page.scene.reading import ShapeReader
 from hapticdb.store.base import Object
 from recorded_scene import RecordedScene, are_same, drawn, write_parts
@@ -43,6 +45,11 @@ class Shown:
         return np.concatenate([np.empty((0, 3, 3)), *(self.triangles[i] for i in sorted(ids))])
 
 
+def marked_by(marks: dict[int, Colour]) -> Sight:
+    """Sees the objects that have a mark, in its colour."""
+    return lambda member: marks.get(member.id)
+
+
 @pytest.fixture(scope="module")
 def path(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return write_parts(tmp_path_factory.mktemp("parts"))
@@ -56,6 +63,44 @@ def shown(path: Path) -> Shown:
 def test_boxes_come_first_and_then_every_triangle_once(shown: Shown) -> None:
     assert shown.n_boxes == 12 * len(shown.objects)
     assert are_same(drawn(shown.scene), shown.of(set(shown.triangles)))
+
+
+def test_parts_have_the_file_s_colours_and_glass_is_seen_through(
+    tmp_path: Path, path: Path
+) -> None:
+    nodes = [vars(node) for node in Shown(path).scene.nodes.values()]
+    red = np.array([200, 40, 40])  # light, as in the file
+    assert sum(bool((np.abs(node["batched_colors"] - red) < 2).all()) for node in nodes) == 1
+    box = trimesh.creation.box((0.1, 0.1, 0.1))
+    box.visual.face_colors = [[200, 40, 40, 255]] * 8 + [[40, 40, 200, 64]] * 4
+    box.export(tmp_path / "box.ply")
+    hapticdb.import_files(tmp_path / "box.db", [tmp_path / "box.ply"], small_options())
+    two = Shown(tmp_path / "box.db")
+    assert are_same(drawn(two.scene), two.of({1}))
+    nodes = [vars(node) for node in two.scene.nodes.values()]
+    found = sorted((len(node["faces"]), node["opacity"]) for node in nodes)
+    assert found == [(4, pytest.approx(64 / 255)), (8, None)]
+
+
+def test_a_cloud_is_points_by_height_or_in_its_own_colours(tmp_path: Path) -> None:
+    """Hidden it is gone, marked it has the colour of what is marked."""
+    points = np.random.default_rng(1).uniform(0.0, 1.0, (500, 3))
+    for colours in (None, np.tile(np.array([[9, 99, 199, 255]], dtype=np.uint8), (500, 1))):
+        trimesh.PointCloud(points, colors=colours).export(tmp_path / "cloud.ply")
+        hapticdb.import_files(tmp_path / f"{colours is None}.db", [tmp_path / "cloud.ply"])
+        shown = Shown(tmp_path / f"{colours is None}.db")
+        (node,) = map(vars, shown.scene.nodes.values())
+        found = np.sort(node["points"] + node["position"], axis=0)
+        np.testing.assert_allclose(found, np.sort(points, axis=0), atol=1e-6)
+        shades = len(np.unique(node["colors"], axis=0))
+        assert shades == 1 if colours is not None else shades > 100
+        own, marks = RecordedScene(), {1: MARKED}
+        shown.contents.watch("one", Audience(cast("Any", own)), marked_by(marks))
+        (node,) = map(vars, own.nodes.values())
+        np.testing.assert_array_equal(node["colors"], MARKED)
+        marks.clear()
+        shown.contents.see("one", [1])
+        assert not any("points" in vars(node) for node in own.nodes.values())
 
 
 def test_equal_parts_are_one_node_and_a_mirrored_one_is_drawn_too(shown: Shown) -> None:

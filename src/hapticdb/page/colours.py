@@ -1,6 +1,7 @@
 """Colours of the page: of tools, arrows, contacts and objects."""
 
 import colorsys
+from typing import cast
 from zlib import crc32
 
 import numpy as np
@@ -10,6 +11,8 @@ from hapticdb.store.base import Object
 
 Colour = tuple[int, int, int]
 """Red, green and blue as a screen shows them (sRGB), 0 to 255."""
+Rgba = tuple[int, int, int, int]
+"""A colour and an opacity, 0 to 255."""
 
 FORCE: Colour = (235, 104, 20)
 """Force: its arrow and its plot."""
@@ -22,14 +25,20 @@ HELD: Colour = (250, 176, 5)
 GOLDEN = 0.61803398875
 """Part of the circle of hues from one number to the next: neighbours in number differ most."""
 FAMILIES: tuple[Colour, ...] = (
-    (91, 141, 184), (208, 122, 91), (127, 168, 105), (142, 124, 184), (217, 179, 108),
-    (79, 150, 148), (192, 108, 132), (138, 147, 158), (176, 150, 110), (106, 132, 168),
-    (150, 178, 130), (196, 148, 130),
+    (158, 181, 207), (216, 181, 160), (174, 198, 164), (188, 178, 208), (221, 206, 168),
+    (160, 194, 191), (211, 175, 187), (184, 190, 198), (200, 187, 165), (168, 181, 203),
+    (187, 205, 177), (210, 188, 178),
 )  # fmt: skip
 """Colours of sub-assemblies. More colours tell more sub-assemblies apart, and leave more nodes
 where parts are merged, because a node has one colour."""
 SHADES = (1.0, 0.86)
 """Brightness of the objects of one sub-assembly, in turns by name. More shades: as `FAMILIES`."""
+MOST_COLOURS = 32
+"""Colours of one shape that are drawn. More: finer steps, and more nodes."""
+HEIGHTS: tuple[Colour, ...] = (
+    (62, 84, 122), (74, 128, 140), (122, 162, 120), (206, 184, 126), (238, 226, 204),
+)  # fmt: skip
+"""Colours of a cloud without its own, from low to high."""
 MARKED: Colour = (255, 170, 0)
 """Colour of what is highlighted."""
 
@@ -80,6 +89,32 @@ def colour_of(obj: Object) -> Colour:
     shade = SHADES[_number(rest or obj.digest[::-1]) % len(SHADES)]
     red, green, blue = (round(shade * channel) for channel in family)
     return red, green, blue
+
+
+def few(colours: NDArray[np.uint8] | None) -> tuple[list[Rgba], NDArray[np.int64]]:
+    """At most `MOST_COLOURS` colours, and the number in them of each of the given ones (n, 4)."""
+    if colours is None or not len(colours):
+        return [], np.empty(0, dtype=np.int64)
+    palette, number = np.unique(colours, axis=0, return_inverse=True)
+    number = number.reshape(-1)
+    if len(palette) > MOST_COLOURS:
+        from PIL import Image  # noqa: PLC0415 - extra `view`
+
+        octree = Image.Quantize.FASTOCTREE
+        picture = Image.fromarray(palette[None], "RGBA").quantize(MOST_COLOURS, octree)
+        drawn = np.asarray(picture.convert("RGBA"))[0]
+        palette, near = np.unique(drawn, axis=0, return_inverse=True)
+        number = near.reshape(-1)[number]
+    return [cast("Rgba", tuple(colour)) for colour in palette.tolist()], number
+
+
+def by_height(heights: NDArray[np.float64]) -> NDArray[np.uint8]:
+    """Colours (n, 3) of heights (n,): from the lowest to the highest of 98 in 100 points."""
+    low, high = np.percentile(heights, [1, 99])
+    share = (heights - low) / max(float(high - low), 1e-12) * (len(HEIGHTS) - 1)
+    steps, shades = np.arange(len(HEIGHTS)), np.array(HEIGHTS)
+    channels = [np.interp(share, steps, shades[:, channel]) for channel in range(3)]
+    return np.stack(channels, axis=1).astype(np.uint8)
 
 
 def _number(text: str) -> int:

@@ -1,6 +1,6 @@
 """All objects of the scene, the nodes that draw them, and the audiences that see them."""
 
-from collections.abc import Callable, Hashable, Iterable, Sequence
+from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from itertools import count
 from threading import RLock
 
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.page.colours import colour_of
-from hapticdb.page.scene.drawings import Audience, Drawing
+from hapticdb.page.scene.drawings import Audience, Drawing, Sprinkle
 from hapticdb.page.scene.nodes import BatchNode, Member, Node, Sight, gathered
 from hapticdb.page.scene.picking import Struck, Targets
 from hapticdb.page.scene.rigid import taken_apart
@@ -38,7 +38,7 @@ class Contents:
         self._audiences: dict[Hashable, tuple[Audience, Sight]] = {
             ALL: (audience, lambda member: member.colour)
         }
-        self._shown: dict[str, dict[str, Drawing]] = {}
+        self._shown: dict[str, Mapping[str, Drawing | Sprinkle]] = {}
         self._stale: dict[str, Node] = {}
         self._numbers = count()
         self._loose: set[int] = set()
@@ -97,6 +97,8 @@ class Contents:
                 moved = motion(read.transform, self._preview.get(read.id, now.transform))
                 member.shape, member.pose = shape, moved @ pose
                 member.box = shape.bounds(member.pose)
+                if shape.colour is not None:
+                    member.colour = shape.colour[:3]
                 self._leave(read.id)
                 members.append(member)
             self._settle(gathered(members, self._name))

@@ -1,22 +1,23 @@
 """What a node of the browser's scene shows, and the nodes of one audience kept in step with it.
 
-Everything is a batch: one geometry at one or more places, each with a colour and a size. An
+Triangles are batches: one geometry at one or more places, each with a colour and a size. An
 audience is all browsers together or one of them; a node of one browser hides the shared node of its
 name there.
 """
 
 from collections.abc import Callable, Hashable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.page.colours import sent
+from hapticdb.page.colours import Colour, sent
 from hapticdb.page.scene.facets import Facets
+from hapticdb.page.scene.shapes import Dots
 
 if TYPE_CHECKING:
-    from viser import BatchedMeshHandle, SceneApi, SceneNodeHandle
+    from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
 LEAST_SIMPLIFIED = 64
 """Vertices from which the browser makes coarser copies of a shape for a distant eye. A larger value
@@ -61,20 +62,44 @@ class Drawing:
     colours: NDArray[np.uint8]
 
     @property
-    def is_blank(self) -> bool:
-        """Whether nothing of it is seen."""
-        return not self.sizes.any()
+    def key(self) -> Hashable:
+        """Equal for equal triangles."""
+        return self.geometry.key
 
-    def equals(self, other: "Drawing") -> bool:
+    def equals(self, other: "Drawing | Sprinkle") -> bool:
         """Whether both show the same."""
-        return self.geometry.key == other.geometry.key and all(
-            np.array_equal(a, b)
-            for a, b in (
-                (self.sizes, other.sizes),
-                (self.colours, other.colours),
-                (self.positions, other.positions),
-                (self.wxyzs, other.wxyzs),
+        return (
+            isinstance(other, Drawing)
+            and self.key == other.key
+            and all(
+                np.array_equal(a, b)
+                for a, b in (
+                    (self.sizes, other.sizes),
+                    (self.colours, other.colours),
+                    (self.positions, other.positions),
+                    (self.wxyzs, other.wxyzs),
+                )
             )
+        )
+
+
+@dataclass(frozen=True, eq=False)
+class Sprinkle:
+    """A node of points: wxyz (4,), position (3,) metres; colour : of all, None for their own."""
+
+    key: Hashable
+    dots: Dots
+    wxyz: NDArray[np.float64]
+    position: NDArray[np.float64]
+    colour: Colour | None
+
+    def equals(self, other: "Drawing | Sprinkle") -> bool:
+        """Whether both show the same."""
+        return (
+            isinstance(other, Sprinkle)
+            and (self.key, self.colour) == (other.key, other.colour)
+            and np.array_equal(self.position, other.position)
+            and np.array_equal(self.wxyz, other.wxyz)
         )
 
 
@@ -83,7 +108,7 @@ class Audience:
 
     def __init__(self, scene: "SceneApi") -> None:
         self._scene = scene
-        self._meshes: dict[str, tuple[Hashable, BatchedMeshHandle]] = {}
+        self._meshes: dict[str, tuple[Hashable, BatchedMeshHandle | PointCloudHandle]] = {}
         self._blanks: dict[str, SceneNodeHandle] = {}
         self.bytes_sent = 0
         """Bytes of all arrays of nodes, before compression."""
@@ -93,16 +118,21 @@ class Audience:
         """Names of its nodes."""
         return self._meshes.keys() | self._blanks.keys()
 
-    def put(self, name: str, drawing: Drawing) -> None:
-        """Make a node show a drawing; the triangles are sent only if they are others."""
+    def put(self, name: str, drawing: Drawing | Sprinkle) -> None:
+        """Make a node show a drawing; triangles or points are sent only if they are others."""
         blank = self._blanks.pop(name, None)
         if blank is not None:
             blank.remove()
         there = self._meshes.get(name)
-        if there is None or there[0] != drawing.geometry.key:
-            self._meshes[name] = (drawing.geometry.key, self._added(name, drawing))
+        if there is None or there[0] != drawing.key:
+            self._meshes[name] = (drawing.key, self._added(name, drawing))
             return
         mesh = there[1]
+        if isinstance(drawing, Sprinkle):
+            mesh.wxyz, mesh.position = drawing.wxyz, drawing.position
+            shades = drawing.dots.colours if drawing.colour is None else np.array(drawing.colour)
+            cast("PointCloudHandle", mesh).colors = shades.astype(np.uint8)
+            return
         colours = sent(drawing.colours)
         for prop, value in (
             ("batched_positions", drawing.positions.astype(np.float32)),
@@ -114,7 +144,11 @@ class Audience:
                 setattr(mesh, prop, value)
                 self.bytes_sent += value.nbytes
 
-    def _added(self, name: str, drawing: Drawing) -> "BatchedMeshHandle":
+    def _added(
+        self, name: str, drawing: Drawing | Sprinkle
+    ) -> "BatchedMeshHandle | PointCloudHandle":
+        if isinstance(drawing, Sprinkle):
+            return self._sprinkled(name, drawing)
         vertices, faces = drawing.geometry.make()
         self.bytes_sent += vertices.nbytes + faces.nbytes + 31 * len(drawing.positions)
         return self._scene.add_batched_meshes_simple(
@@ -130,6 +164,21 @@ class Audience:
             side="double",
             cast_shadow=False,
             receive_shadow=False,
+        )
+
+    def _sprinkled(self, name: str, drawing: Sprinkle) -> "PointCloudHandle":
+        points, colours, size = drawing.dots
+        self.bytes_sent += points.nbytes + colours.nbytes
+        return self._scene.add_point_cloud(
+            name,
+            points,
+            colours if drawing.colour is None else drawing.colour,
+            point_size=size,
+            point_shape="circle",
+            point_shading="flat",
+            precision="float32",
+            wxyz=drawing.wxyz,
+            position=drawing.position,
         )
 
     def blank(self, name: str) -> None:

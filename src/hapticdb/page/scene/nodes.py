@@ -1,16 +1,17 @@
 """Objects gathered into few nodes: batches of one shape, and merged shapes of one colour."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
+from functools import partial
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.page.colours import Colour
-from hapticdb.page.scene.drawings import Drawing, Geometry
+from hapticdb.page.colours import Colour, Rgba
+from hapticdb.page.scene.drawings import Drawing, Geometry, Sprinkle
 from hapticdb.page.scene.facets import Facets, cube
-from hapticdb.page.scene.shapes import PartShape
+from hapticdb.page.scene.shapes import Dots, PartShape, Piece
 from hapticdb.poses import quaternion_of
 
 LEAST_SAVED = 2_000
@@ -21,6 +22,7 @@ MOST_MERGED = 24_000
 and sends more bytes when one object of the node is hidden, marked or moved."""
 BOX_OPACITY = 0.3
 """Opacity of the boxes of objects whose shape is being read."""
+_OPAQUE = 255
 _UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
@@ -58,7 +60,7 @@ class Node(Protocol):
     def is_cheap_to_move(self) -> bool:
         """Whether a moved object sends few bytes."""
 
-    def drawings(self, sight: Sight) -> dict[str, Drawing]:
+    def drawings(self, sight: Sight) -> Mapping[str, Drawing | Sprinkle]:
         """What an audience sees of it, by names of nodes; nodes without a drawing are gone."""
 
 
@@ -71,10 +73,14 @@ class BatchNode:
         self._slots = list(members)
         """Its members; one that has left is not seen, and keeps its place."""
         self._is_boxes = shape is None
-        if shape is None:
-            self._geometry = Geometry("box", _cube32, 0.87, BOX_OPACITY)
-        else:
-            self._geometry = Geometry(shape.serial, lambda: shape.drawn, shape.radius)
+        self._geometries: list[tuple[Rgba | None, Geometry]] = [
+            (None, Geometry("box", _cube32, 0.87, BOX_OPACITY))
+        ]
+        if shape is not None:
+            self._geometries = [
+                (piece.colour, _geometry_of((shape.serial, n), piece, shape.radius))
+                for n, piece in enumerate(shape.pieces)
+            ]
         self._poses = np.tile(np.eye(4), (len(members), 1, 1))
         self._edges = np.ones((len(members), 3))
 
@@ -87,7 +93,7 @@ class BatchNode:
         return self._is_boxes or len(self._slots) <= 256
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
-        """Its only node; hidden objects have size 0."""
+        """A node for each colour of the shape; hidden objects have size 0."""
         colours = [sight(one) if one.id in self.members else None for one in self._slots]
         is_seen = np.array([colour is not None for colour in colours], dtype=np.float64)
         for slot, member in enumerate(self._slots):
@@ -98,14 +104,53 @@ class BatchNode:
                 self._edges[slot] = np.maximum(member.box[1] - member.box[0], 1e-9)
             else:
                 self._poses[slot] = member.pose
-        drawing = Drawing(
-            self._geometry,
-            quaternion_of(self._poses[:, :3, :3]),
-            self._poses[:, :3, 3].copy(),
-            is_seen[:, None] * self._edges if self._is_boxes else is_seen,
-            np.array([colour or (0, 0, 0) for colour in colours], dtype=np.uint8),
-        )
-        return {} if drawing.is_blank else {self.name: drawing}
+        if not is_seen.any():
+            return {}
+        wxyzs, positions = quaternion_of(self._poses[:, :3, :3]), self._poses[:, :3, 3].copy()
+        sizes = is_seen[:, None] * self._edges if self._is_boxes else is_seen
+        found = {}
+        for n, (painted, geometry) in enumerate(self._geometries):
+            shades = [
+                painted[:3] if painted and colour == member.colour else colour or (0, 0, 0)
+                for colour, member in zip(colours, self._slots, strict=True)
+            ]
+            found[f"{self.name}-{n}" if n else self.name] = Drawing(
+                geometry, wxyzs, positions, sizes, np.array(shades, dtype=np.uint8)
+            )
+        return found
+
+
+class _CloudNode:
+    """A cloud at its place, as points."""
+
+    def __init__(self, name: str, member: Member, shape: PartShape, dots: Dots) -> None:
+        self.name = name
+        self.members = {member.id: member}
+        self._serial, self._dots = shape.serial, dots
+
+    @property
+    def is_cheap_to_move(self) -> bool:
+        """Whether a moved object sends few bytes."""
+        return True
+
+    def drawings(self, sight: Sight) -> dict[str, Sprinkle]:
+        """Its only node."""
+        (member,) = self.members.values()
+        colour = sight(member)
+        if colour is None:
+            return {}
+        wxyz, at = quaternion_of(member.pose[None, :3, :3])[0], member.pose[:3, 3].copy()
+        own = None if colour == member.colour else colour
+        return {self.name: Sprinkle(self._serial, self._dots, wxyz, at, own)}
+
+
+def _geometry_of(key: Hashable, piece: Piece, radius: float) -> Geometry:
+    """A piece of a shape, see-through as its colour is."""
+    return Geometry(key, lambda: piece.facets, radius, _opacity(piece.colour))
+
+
+def _opacity(colour: Rgba | None) -> float | None:
+    return None if colour is None or colour[3] == _OPAQUE else colour[3] / _OPAQUE
 
 
 def _cube32() -> Facets:
@@ -114,9 +159,9 @@ def _cube32() -> Facets:
 
 
 class _MergedNode:
-    """Different shapes of one colour at their places, as one geometry.
+    """Different shapes, mostly of one colour, at their places, as one geometry.
 
-    Objects that an audience sees in another colour are drawn by nodes beside it, one a colour. If
+    Pieces that an audience sees in another colour are drawn by nodes beside it, one a colour. If
     one is hidden, marked or moved, the rest is merged anew.
     """
 
@@ -134,38 +179,43 @@ class _MergedNode:
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
         """Its node, and one for each other colour."""
-        of_colour: dict[tuple[str, Colour], list[Member]] = {}
+        of_colour: dict[tuple[str, Rgba], list[tuple[Member, int]]] = {}
         for member in self.members.values():
             colour = sight(member)
-            if colour is not None:
-                own = colour == member.colour
-                name = self.name if own else f"{self.name}-{bytes(colour).hex()}"
-                of_colour.setdefault((name, colour), []).append(member)
+            if colour is None or member.shape is None:
+                continue
+            for n, piece in enumerate(member.shape.pieces):
+                shade = (*colour, _OPAQUE if piece.colour is None else piece.colour[3])
+                if piece.colour is not None and colour == member.colour:
+                    shade = piece.colour
+                own = shade == (*member.colour, _OPAQUE)
+                name = self.name if own else f"{self.name}-{bytes(shade).hex()}"
+                of_colour.setdefault((name, shade), []).append((member, n))
         return {name: self._drawing(some, colour) for (name, colour), some in of_colour.items()}
 
-    def _drawing(self, members: list[Member], colour: Colour) -> Drawing:
+    def _drawing(self, pieces: list[tuple[Member, int]], colour: Rgba) -> Drawing:
         key = tuple(
-            (member.id, member.shape and member.shape.serial, member.pose.tobytes())
-            for member in members
+            (member.id, member.shape and member.shape.serial, n, member.pose.tobytes())
+            for member, n in pieces
         )
         radius = float(np.linalg.norm(self._high - self._low)) / 2
-        geometry = Geometry(key, lambda: merged(members, self._center), radius)
+        make = partial(merged, pieces, self._center)
         return Drawing(
-            geometry,
+            Geometry(key, make, radius, _opacity(colour)),
             _UNTURNED[None],
             self._center[None],
             np.ones(1),
-            np.array([colour], dtype=np.uint8),
+            np.array([colour[:3]], dtype=np.uint8),
         )
 
 
-def merged(members: Sequence[Member], center: NDArray[np.float64]) -> Facets:
-    """All triangles of members with shapes, at their places, metres from a centre (3,)."""
+def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) -> Facets:
+    """Pieces of members' shapes, by their numbers, at their places, metres from a centre (3,)."""
     vertices, faces, n_vertices = [], [], 0
-    for member in members:
+    for member, n in pieces:
         if member.shape is None:
             continue
-        drawn = member.shape.drawn
+        drawn = member.shape.pieces[n].facets
         turn, at = member.pose[:3, :3], member.pose[:3, 3] - center
         vertices.append((drawn.vertices @ turn.T + at).astype(np.float32))
         faces.append(drawn.faces + np.uint32(n_vertices))
@@ -186,6 +236,9 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
     for same in of_shape.values():
         shape = same[0].shape
         if shape is None:
+            continue
+        if shape.dots is not None:
+            nodes.extend(_CloudNode(names(), one, shape, shape.dots) for one in same)
             continue
         saved = (len(same) - 1) * shape.n_triangles
         if saved >= LEAST_SAVED or shape.n_triangles > MOST_MERGED:

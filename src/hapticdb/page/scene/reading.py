@@ -12,9 +12,11 @@ from numpy.typing import NDArray
 from hapticdb.errors import HapticDBError
 from hapticdb.ingest.geometry import found_parts
 from hapticdb.mesh import Part
-from hapticdb.page.scene.facets import Facets
+from hapticdb.page.colours import by_height
+from hapticdb.page.scene.facets import Facets, block_facets, coarsened
 from hapticdb.page.scene.rigid import taken_apart
-from hapticdb.page.scene.shapes import PartShape, draw_each
+from hapticdb.page.scene.shapes import Dots, PartShape, draw_each
+from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.store.connect import open_store
 
@@ -25,6 +27,15 @@ SHOW_EVERY_S = 0.5
 shows them later."""
 SHOW_TRIANGLES = 1_000_000
 """Triangles after which the shapes read so far are shown."""
+
+
+MOST_DOTS = 600_000
+"""Points of a cloud that are drawn. A larger value shows more detail, and sends 15 bytes each."""
+CUBES = 1024
+"""Cubes along a cloud's longest edge that tell rays where its points are, before `MOST_BLOCKS`."""
+MOST_BLOCKS = 6_000
+"""Cubes that stand for voxels of an object without a surface, or, for rays, for a cloud's points.
+A larger value shows more detail, and sends about 100 bytes more for each cube."""
 
 
 class ShapeReader:
@@ -83,7 +94,7 @@ class ShapeReader:
                         self._show_drawn(ready)
                         ready, shown, n_triangles = [], monotonic(), 0
                     digest = obj.digest
-                    if part is not None and not part.is_cloud:
+                    if part is not None:
                         ready.append(self._shaped(obj, part))
                         n_triangles += ready[-1][1].n_triangles
                         del left[obj.id]
@@ -93,21 +104,43 @@ class ShapeReader:
         self._lost(list(left.values()))
 
     def _show_drawn(self, ready: Sequence[ShapedObject]) -> None:
-        draw_each({shape.serial: shape for _, shape, _ in ready}.values())
+        draw_each({shape.serial: shape for _, shape, _ in ready if not shape.dots}.values())
         self._show(ready)
 
     def _shaped(self, obj: Object, part: Part) -> ShapedObject:
         """The object's shape, which equal parts of equal stretch share, and its pose."""
         placed = taken_apart(obj.transform)
+        if part.faces is None:
+            cloud = _cloud(obj, part)
+            return obj, cloud, centred(np.eye(4), cloud)
         key = (obj.digest, placed.key)
         shape = self._shapes.get(key)
         if shape is None:
-            faces = part.faces if part.faces is not None else np.empty((0, 3), dtype=np.int64)
+            faces = part.faces
             if np.linalg.det(placed.stretch) < 0:
                 faces = faces[:, ::-1]
-            shape = PartShape(Facets(part.vertices @ placed.stretch.T, faces))
+            shape = PartShape(Facets(part.vertices @ placed.stretch.T, faces), part.colours)
             self._shapes[key] = shape
         return obj, shape, centred(placed.pose, shape)
+
+
+def _cloud(obj: Object, part: Part) -> PartShape:
+    """Points of a cloud at its place, at most `MOST_DOTS` of them, in its colours or by height."""
+    points, colours = part.world_points(), part.colours
+    if len(points) > MOST_DOTS:
+        some = np.random.default_rng(0).permutation(len(points))[:MOST_DOTS]
+        points, colours = points[some], None if colours is None else colours[some]
+    low, size = points.min(axis=0), max(float(np.ptp(points, axis=0).max()), 1e-9)
+    steps = np.unique(np.floor((points - low) * (CUBES / size)).astype(np.int64), axis=0)
+    vertices, faces = block_facets(coarsened(steps, MOST_BLOCKS))
+    shape = PartShape(Facets(vertices * (size / CUBES) + low, faces))
+    edges = np.sort(np.ptp(points, axis=0))
+    shape.dots = Dots(
+        (points - shape.center).astype(np.float32),
+        by_height(points[:, up_axis([obj])]) if colours is None else colours[:, :3],
+        float(np.sqrt(edges[2] * max(edges[1], edges[2] / 100) / len(points))),
+    )
+    return shape
 
 
 def centred(pose: NDArray[np.float64], shape: PartShape) -> NDArray[np.float64]:

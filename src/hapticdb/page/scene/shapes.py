@@ -3,11 +3,12 @@
 from collections.abc import Iterable
 from functools import cache, cached_property
 from itertools import count
-from typing import cast
+from typing import NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.page.colours import Rgba, few
 from hapticdb.page.scene.facets import Facets, sharpened_each
 
 _EMBREE_SIZE = 100.0
@@ -17,10 +18,33 @@ are millimetres or kilometres."""
 _SERIALS = count()
 
 
-class PartShape:
-    """Triangles of one or more objects, metres, in a frame about their own centre."""
+class Piece(NamedTuple):
+    """Triangles of one colour, as they are drawn; without a colour they take the object's."""
 
-    def __init__(self, facets: Facets) -> None:
+    colour: Rgba | None
+    facets: Facets
+
+
+class Dots(NamedTuple):
+    """Points of a cloud as they are drawn.
+
+    points (n, 3) float32, metres, about the shape's centre; colours (n, 3) uint8, sRGB; size : of a
+    point, metres.
+    """
+
+    points: NDArray[np.float32]
+    colours: NDArray[np.uint8]
+    size: float
+
+
+class PartShape:
+    """Triangles of one or more objects, metres, in a frame about their own centre.
+
+    colours (F, 4) uint8 : the file's, of each triangle. A cloud is drawn as `dots`; its triangles
+    are cubes that hold its points, for rays.
+    """
+
+    def __init__(self, facets: Facets, colours: NDArray[np.uint8] | None = None) -> None:
         self.serial = next(_SERIALS)
         """A number that no other shape of this process has."""
         low, high = facets.vertices.min(axis=0), facets.vertices.max(axis=0)
@@ -31,6 +55,8 @@ class PartShape:
         self.facets = Facets(facets.vertices - self.center, facets.faces)
         self.split: Facets | None = None
         """`drawn`, once it is made."""
+        self.dots: Dots | None = None
+        self._palette, self._number = few(colours)
 
     @property
     def n_triangles(self) -> int:
@@ -48,6 +74,26 @@ class PartShape:
         if self.split is None:
             draw_each([self])
         return cast("Facets", self.split)
+
+    @property
+    def colour(self) -> Rgba | None:
+        """The file's colour of most of its triangles; None without one."""
+        if not self._palette:
+            return None
+        return self._palette[int(np.bincount(self._number).argmax())]
+
+    @cached_property
+    def pieces(self) -> list[Piece]:
+        """Its triangles as they are drawn, by colour."""
+        if len(self._palette) <= 1:
+            return [Piece(self.colour, self.drawn)]
+        vertices, faces = self.drawn
+        found = []
+        for number, colour in enumerate(self._palette):
+            used, corners = np.unique(faces[self._number == number], return_inverse=True)
+            own = corners.reshape(-1, 3).astype(np.uint32)
+            found.append(Piece(colour, Facets(vertices[used], own)))
+        return found
 
     def bounds(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """Lower and upper corner (2, 3) of a box that holds it at a pose, metres, world frame."""

@@ -16,18 +16,15 @@ from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
 from hapticdb.page.scene.following import Followed, Follower
 from hapticdb.page.scene.names import Branch, found_ids, tree_of
-from hapticdb.page.scene.reading import ShapedObject, ShapeReader, centred
+from hapticdb.page.scene.reading import MOST_BLOCKS, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
-from hapticdb.page.scene.surroundings import add_surroundings
+from hapticdb.page.scene.surroundings import add_shadow, add_surroundings
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
     from viser import ViserServer
 
-MOST_BLOCKS = 6_000
-"""Cubes that stand for an object without a surface; more voxels are drawn as larger cubes.
-A larger value shows more detail, and sends about 100 bytes more for each cube."""
 ENDS_WITHIN_S = 10.0
 """Seconds that `SceneView.close` waits for each of its threads."""
 
@@ -35,9 +32,9 @@ ENDS_WITHIN_S = 10.0
 class SceneView:
     """Shows the objects of an environment in all browsers of a viser server, and follows edits.
 
-    Boxes are shown at once, then the objects' surfaces as they are read, then the voxels, as
-    blocks, of point clouds and of objects without a surface in the database. All methods may be
-    called from any thread. It is a context manager, which closes it.
+    Boxes are shown at once, then the objects' surfaces and points as they are read, then, as
+    blocks, the voxels of objects without a surface in the database. All methods may be called from
+    any thread. It is a context manager, which closes it.
 
     The server's scene below ``/parts``, its ground, light, background and first view are this
     view's. HapticDBError if the environment cannot be opened or read.
@@ -153,11 +150,12 @@ class SceneView:
         )
 
     def _add_surroundings(self) -> None:
-        box = self.contents.box()
+        objects, box = self.contents.records.values(), self.contents.box()
         if not self._is_surrounded and box is not None:
             self._is_surrounded = True
-            self.up = up_axis(self.contents.records.values())
+            self.up = up_axis(objects)
             add_surroundings(self._server, box, self.up)
+            add_shadow(self._server.scene, np.array([obj.bounds for obj in objects]), self.up)
 
     def _show_shapes(self, found: Sequence[ShapedObject]) -> None:
         with self._server.atomic():

@@ -3,14 +3,17 @@
 Areas, volumes and bounds follow from the shapes that the files were written to hold.
 """
 
+import base64
+import json
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
 
 from hapticdb.mesh import MeshFile, parse_in_process
-from mesh_files import COLLADA, cause, names, text
+from mesh_files import COLLADA, TRIANGLE, cause, gltf, names, text
 
 
 class Reads(NamedTuple):
@@ -39,6 +42,28 @@ EXPECTED: dict[str, Reads | str] = {
     "d02_light_incomplete.dae": Reads(["part"], 6, 1, *HALF),
     "d03_color_comma.dae": Reads(["part"], 6, 1, *HALF),
     "d07_polygon_hole.dae": Reads(["part"], 12, 0, (-2, -2, 0), (2, 2, 0)),
+    "g01_gpu_instancing.glb": Reads(
+        ["plate", "bolts", "bolts #2", "bolts #3"], 34.32, 1.624, (-2, -0.55, -2), (2, 0.1, 2)
+    ),
+    "g02_morph_weight.glb": Reads(["lid"], 0.24, 0.008, (-0.1, 0.9, -0.1), (0.1, 1.1, 0.1)),
+    # A corner of the box is drawn out to (0.5, 0.5, 0.5).
+    "g04_sparse.glb": Reads(["box"], 0.524674, 0.016, (-0.1, -0.1, -0.1), (0.5, 0.5, 0.5)),
+    "g05_quantized_normalized.glb": Reads(["box"], 0.24, 0.008, *TENTH),
+    "g07_two_scenes.glb": Reads(["in_scene_0"], 0.24, 0.008, *TENTH, "2 nodes with a mesh are not"),
+    "g11_fan.glb": Reads(["a"], 3.24, 0.008 + 3 * 0.4 / 3, (-1, -1, -0.1), (1, 1, 0.3)),
+    "g16_mm.glb": Reads(["box"], 240000, 8e6, (-100, -100, -100), (100, 100, 100)),
+    "g24_numbers_as_names.glb": Reads(["3", "1", "2"], 0.72, 0.024, TENTH[0], (1.1, 0.1, 0.1)),
+    "g25_slash.glb": Reads(
+        ["A/pin", "A/pin #2", "1/2 bolt"],
+        0.72,
+        0.024,
+        TENTH[0],
+        (2.1, 0.1, 0.1),
+        "2 names hold '/'",
+    ),
+    "g26_hidden.glb": Reads(
+        ["shown", "hidden"], 0.48, 0.016, TENTH[0], (1.1, 0.1, 0.1), "1 nodes are hidden in it"
+    ),
     "o01_concave_U.obj": Reads(["U"], 7, 0, (0, 0, 0), (3, 3, 0)),
     "o04_utf16.obj": Reads(["box"], 6, 1, *HALF),
     "o06_latin1.obj": Reads(["Träger"], 6, 1, *HALF),
@@ -216,3 +241,78 @@ def test_strips_and_fans_of_a_collada_file_are_read(tmp_path: Path) -> None:
         content = content.replace("<p>0 1 2</p></tri", f"<p>{corners}</p></tri")
         file = parse_in_process(text(tmp_path / f"{kind}.dae", content))
         assert area_and_volume(file)[0] == pytest.approx(4 * 2.5e-4)
+
+
+def with_arrays(path: Path, tree: dict[str, Any], *arrays: NDArray[Any], **extra: object) -> Path:
+    """A glTF file of one triangle with more accessors, from number 2 on; `extra` goes into each."""
+    whole = json.loads(gltf(tree, path).read_text())
+    kinds = {"f4": 5126, "u1": 5121, "i2": 5122, "u2": 5123}
+    shapes = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+    for array in arrays:
+        n = len(whole["buffers"])
+        uri = "data:;base64," + base64.b64encode(array.tobytes()).decode()
+        whole["buffers"].append({"byteLength": array.nbytes, "uri": uri})
+        whole["bufferViews"].append({"buffer": n, "byteLength": array.nbytes})
+        kind, shape = kinds[array.dtype.str[1:]], shapes[array.shape[1]]
+        view = {"bufferView": len(whole["bufferViews"]) - 1, "componentType": kind, "type": shape}
+        whole["accessors"].append(view | {"count": len(array)} | extra)
+    path.write_text(json.dumps(whole))
+    return path
+
+
+def test_a_skin_places_a_mesh_where_its_joints_are(tmp_path: Path) -> None:
+    joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype=np.uint8)
+    weights = np.array([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype="<f4")
+    bind = np.stack([np.eye(4), np.eye(4)])
+    bind[1, :3, 3] = [-5, 0, 0]
+    inverse = bind.transpose(0, 2, 1).reshape(2, 16).astype("<f4")
+    attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}
+    tree = {
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1}]}],
+        "nodes": [
+            {"mesh": 0, "skin": 0, "name": "arm", "translation": [9, 9, 9]},
+            {"name": "root", "translation": [0, 0, 2], "children": [2]},
+            {"name": "tip", "translation": [5, 4, 0]},
+        ],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}],
+        "scenes": [{"nodes": [0, 1]}],
+    }
+    path = with_arrays(tmp_path / "skin.gltf", tree, joints, weights, inverse)
+    moved = TRIANGLE + np.array([[0, 2, 2], [0, 4, 2], [0, 4, 2]])
+    np.testing.assert_allclose(parse_in_process(path).parts[0].triangles()[0], moved, atol=1e-6)
+    outside = tree | {"scenes": [{"nodes": [0]}]}
+    path = with_arrays(tmp_path / "lost.gltf", outside, joints, weights, inverse)
+    assert "a joint of its skin 0 is not in its scene" in cause(path)
+
+
+def test_a_nodes_weights_replace_its_meshs(tmp_path: Path) -> None:
+    target = np.array([[0, 0, 1]] * 3, dtype="<f4")
+    piece = {"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 2}]}
+    nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "weights": [0.25]}]
+    tree = {"meshes": [{"primitives": [piece], "weights": [2]}], "nodes": nodes}
+    path = with_arrays(tmp_path / "a.gltf", tree | {"scenes": [{"nodes": [0, 1]}]}, target)
+    assert [part.bounds[0, 2] for part in parse_in_process(path).parts] == [2.0, 0.25]
+
+
+def test_instances_turn_and_scale_within_their_node(tmp_path: Path) -> None:
+    turned = np.array([[0, 0, 23170, 23170]], dtype="<i2")  # a quarter turn about z, normalized
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"ROTATION": 2}}}
+    tree = {"nodes": [{"mesh": 0, "translation": [1, 0, 0], "extensions": extension}]}
+    path = with_arrays(tmp_path / "a.gltf", tree, turned, normalized=True)
+    corners = parse_in_process(path).parts[0].triangles()[0]
+    np.testing.assert_allclose(corners, [[1, 0, 0], [1, 1, 0], [0, 0, 0]], atol=1e-4)
+
+
+def test_extensions_that_are_not_read_are_counted_or_refused(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0, "extensions": {"KHR_implicit_shapes": {}, "KHR_xmp_json_ld": {}}}] * 2
+    tree: dict[str, Any] = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
+    file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
+    assert file.notes == ("its extension KHR_implicit_shapes, used 2 times, is not read",)
+    tree["extensionsRequired"] = ["KHR_implicit_shapes"]
+    assert "requires the glTF extension KHR_implicit" in cause(gltf(tree, tmp_path / "b.gltf"))
+
+
+def test_a_packed_mesh_with_a_plain_copy_is_read(tmp_path: Path) -> None:
+    piece = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {}}}
+    path = gltf({"meshes": [{"primitives": [piece]}]}, tmp_path / "a.gltf")
+    assert area_and_volume(parse_in_process(path))[0] == pytest.approx(0.5)

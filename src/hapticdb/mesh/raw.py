@@ -85,6 +85,11 @@ class NameBudget:
         return name
 
 
+def slash_note(n: int) -> str:
+    """Say that so many names hold what separates levels."""
+    return f"{n} names hold '/', which also separates a part's name from those above it"
+
+
 def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:
     """Contents of a file without placements: each shape once, with the identity as transform."""
     pairs = list(named)

@@ -123,6 +123,8 @@ class Accessors:
             raise UnreadableError(f"it is damaged: {what} has an unknown 'type'")
         dtype, width = np.dtype(_TYPES[kind]), _WIDTHS[shape]
         count = whole(accessor.get("count"), f"the 'count' of {what}")
+        if isinstance(accessor.get("sparse"), dict):
+            return self._sparse(accessor, np.zeros((count, width), dtype), what)
         if "bufferView" not in accessor:
             raise UnreadableError(f"{what} has no buffer view: packed numbers are not read")
         view = item(self._views, accessor["bufferView"], "buffer view")
@@ -137,7 +139,21 @@ class Accessors:
             )
         if not count:
             return np.empty((0, width), dtype)
-        return np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize))
+        rows = np.ndarray((count, width), dtype, content, start, (stride, dtype.itemsize))
+        return _normal(rows) if accessor.get("normalized") else rows
+
+    def _sparse(
+        self, accessor: dict[str, Any], found: NDArray[Any], what: str
+    ) -> NDArray[np.generic]:
+        """Numbers of an accessor that lists those that differ from others; `found` : zeros."""
+        sparse = accessor["sparse"]
+        plain = accessor | {"sparse": None, "normalized": False}
+        if "bufferView" in accessor:
+            found[:] = self._made(plain, what)
+        rows = {"count": sparse.get("count"), "type": "SCALAR"} | sparse["indices"]
+        values = plain | {"byteOffset": 0, "count": sparse.get("count")} | sparse["values"]
+        found[self._made(rows, what)[:, 0]] = self._made(values, what)
+        return _normal(found) if accessor.get("normalized") else found
 
     def _view(self, view: dict[str, Any]) -> memoryview:
         number = whole(view.get("buffer"), "the 'buffer' of a buffer view")
@@ -181,6 +197,13 @@ class Accessors:
         if n >= len(self._chunks):
             raise UnreadableError(f"it is damaged or cut short: it holds no buffer {number}")
         return self._chunks[n]
+
+
+def _normal(whole_numbers: NDArray[Any]) -> NDArray[Any]:
+    """Fractions, -1 to 1 or 0 to 1, that whole numbers stand for; others as they are."""
+    if whole_numbers.dtype.kind == "f":
+        return whole_numbers
+    return np.maximum(whole_numbers / np.iinfo(whole_numbers.dtype).max, -1.0)
 
 
 def _bytes_of(file: Path) -> bytes:

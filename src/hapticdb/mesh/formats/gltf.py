@@ -7,6 +7,7 @@ does not read the numbers, either.
 
 import json
 import struct
+from collections import Counter
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,17 +24,36 @@ from hapticdb.mesh.formats.accessors import (
     whole,
 )
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, of_light, rgba
+from hapticdb.mesh.formats.posing import (
+    INSTANCING,
+    Pose,
+    instances,
+    joints_of,
+    parent_from_node,
+    pose_of,
+    positions,
+)
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, walk
-from hapticdb.poses import rotation_of
+from hapticdb.mesh.polygons import fan, strip
+from hapticdb.mesh.raw import (
+    NameBudget,
+    Parsed,
+    Placement,
+    Shape,
+    UnreadableError,
+    slash_note,
+    walk,
+)
 
 _MAGIC = b"glTF"
 _Materials = list[NDArray[np.float64] | None]
-_POINTS, _TRIANGLES, _STRIP = 0, 4, 5
-# Extensions that do not change geometry; a file that requires another extension is refused.
+_POINTS, _TRIANGLES, _STRIP, _FAN = 0, 4, 5, 6
+# Extensions that are read or do not change geometry; a file that requires another one is refused.
 _HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp",
     "KHR_animation_", "KHR_node_", "KHR_mesh_quantization", "AGI_", "CESIUM_", "EXT_mesh_features",
+    "EXT_lights_", "EXT_instance_features", "EXT_structural_metadata", "EXT_mesh_manifold",
+    INSTANCING,
 )  # fmt: skip
 
 
@@ -44,17 +64,48 @@ def read(path: Path) -> Parsed:
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
     _refuse_unreadable(tree, accessors)
-    meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
-    placements, empty = _placements(tree, meshes)
-    used = sorted({placement.shape for placement in placements})
-    number = {mesh: i for i, mesh in enumerate(used)}
+    placements, poses, worlds, empty = _placements(tree, accessors)
+    joints: dict[int | None, NDArray[np.float64]] = {
+        pose.skin: joints_of(tree, pose.skin, worlds, accessors)
+        for pose in poses
+        if pose.skin is not None
+    }
     return Parsed(
-        shapes=[_shape(meshes[mesh], mesh, accessors, materials) for mesh in used],
-        placements=[Placement(p.name, number[p.shape], p.world_from_part) for p in placements],
+        shapes=_shapes(tree, poses, joints, accessors),
+        placements=placements,
         metres=1.0,
         defects=Defects(empty=empty),
         up=_up_axis(tree),
+        notes=_notes(tree, worlds),
     )
+
+
+def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]]) -> list[str]:
+    """Say what is left out of the scene or not read, and what the file hides."""
+    nodes = objects_of(tree, "nodes")
+    outside = sum("mesh" in node for n, node in enumerate(nodes) if n not in worlds)
+    found: Counter[str] = Counter()
+    hidden = 0
+    waiting: list[Any] = [tree]
+    while waiting:
+        one = waiting.pop()
+        if isinstance(one, dict) and isinstance(extensions := one.get("extensions"), dict):
+            found.update(extensions.keys())
+            hidden += (extensions.get("KHR_node_visibility") or {}).get("visible") is False
+        if isinstance(one, (dict, list)):
+            waiting += one.values() if isinstance(one, dict) else one
+    slashed = sum("/" in _name(nodes[n], n) for n in worlds)
+    unread = {name: n for name, n in found.items() if not name.startswith(_HARMLESS)}
+    return [
+        *(
+            [f"{outside} nodes with a mesh are not in its scene and are left out"]
+            if outside
+            else []
+        ),
+        *([slash_note(slashed)] if slashed else []),
+        *([f"{hidden} nodes are hidden in it, and come in like any other"] if hidden else []),
+        *(f"its extension {name}, used {n} times, is not read" for name, n in unread.items()),
+    ]
 
 
 def _up_axis(tree: dict[str, Any]) -> str:
@@ -116,33 +167,51 @@ def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
                 raise UnreadableError(f"it is damaged: its mesh {number} has no 'attributes'")
             if attributes.get("POSITION") is None:
                 continue
-            accessor = accessors.entry(attributes["POSITION"])
-            if "KHR_draco_mesh_compression" in (piece.get("extensions") or {}):
-                raise UnreadableError("its meshes are packed with Draco, which is not read")
-            if "sparse" in accessor or accessor.get("normalized"):
-                raise UnreadableError("its positions are sparse or normalized, which is not read")
+            accessors.entry(attributes["POSITION"])
 
 
-def _shape(mesh: dict[str, Any], number: int, accessors: Accessors, materials: _Materials) -> Shape:
+def _shapes(
+    tree: dict[str, Any],
+    poses: list[Pose],
+    joints: dict[int | None, NDArray[np.float64]],
+    accessors: Accessors,
+) -> list[Shape]:
+    """Shapes of meshes in their poses."""
+    meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
+    return [
+        _shape(meshes[pose.mesh], pose, joints.get(pose.skin), accessors, materials)
+        for pose in poses
+    ]
+
+
+def _shape(
+    mesh: dict[str, Any],
+    pose: Pose,
+    joints: NDArray[np.float64] | None,
+    accessors: Accessors,
+    materials: _Materials,
+) -> Shape:
     """One shape from a mesh's pieces; vertices that pieces share are kept once."""
-    vertices: dict[int, NDArray[np.generic]] = {}
-    offsets: dict[int, int] = {}
+    vertices: dict[object, NDArray[np.generic]] = {}
+    offsets: dict[object, int] = {}
     faces: list[NDArray[np.int64]] = []
     points: list[NDArray[np.generic]] = []
     painted: list[tuple[Colours | None, int]] = []
     dotted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = 0
-    for piece in mesh["primitives"]:
+    for number, piece in enumerate(mesh["primitives"]):
         mode = piece.get("mode", _TRIANGLES)
-        if mode not in (_POINTS, _TRIANGLES, _STRIP):
+        if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
             unsupported += 1
             continue
         position = piece.get("attributes", {}).get("POSITION")
         if position is None:
-            raise UnreadableError(f"it is damaged: a piece of its mesh {number} has no positions")
-        corners = accessors.array(position)
-        if corners.shape[1] != 3:
-            raise UnreadableError("its vertices do not have three coordinates each")
+            raise UnreadableError(
+                f"it is damaged: a piece of its mesh {pose.mesh} has no positions"
+            )
+        corners = positions(piece, pose, joints, accessors)
+        if "targets" in piece or joints is not None:
+            position = f"piece {number}"
         if mode == _POINTS:
             points.append(corners)
             each = np.repeat(np.arange(len(corners))[:, None], 3, axis=1)
@@ -152,7 +221,7 @@ def _shape(mesh: dict[str, Any], number: int, accessors: Accessors, materials: _
             offsets[position], vertices[position] = n_vertices, corners
             n_vertices += len(corners)
         # An index outside its own piece must not reach into the next piece's vertices.
-        found = _corners(piece, mode, len(corners), accessors, number)
+        found = _corners(piece, mode, len(corners), accessors, pose.mesh)
         inside = (found >= 0) & (found < len(corners))
         faces.append(np.where(inside, found + offsets[position], -1))
         painted.append((_paint(piece, found, accessors, materials), len(found)))
@@ -222,21 +291,23 @@ def _corners(
         flat = np.ascontiguousarray(listed).reshape(-1).astype(np.int64)
     else:
         flat = np.arange(n_vertices, dtype=np.int64)
-    if mode == _STRIP:
-        strip = np.stack([flat[:-2], flat[1:-1], flat[2:]], axis=1)
-        strip[1::2] = strip[1::2, ::-1]  # every other triangle of a strip is wound the other way
-        return strip
+    if mode != _TRIANGLES:
+        return strip(flat) if mode == _STRIP else fan(flat)
     if flat.size % 3:
         raise UnreadableError(f"it is damaged: mesh {number} ends within a triangle")
     return flat.reshape(-1, 3)
 
 
-def _placements(tree: dict[str, Any], meshes: list[dict[str, Any]]) -> tuple[list[Placement], int]:
-    """Placed meshes of the default scene, and how many nodes hold nothing at all."""
-    nodes = objects_of(tree, "nodes")
-    links = [_parent_from_node(node) for node in nodes]
+def _placements(
+    tree: dict[str, Any], accessors: Accessors
+) -> tuple[list[Placement], list[Pose], dict[int, NDArray[np.float64]], int]:
+    """What the default scene places: shapes, their poses, its nodes, and how many hold nothing."""
+    nodes, meshes = objects_of(tree, "nodes"), objects_of(tree, "meshes")
+    links = [parent_from_node(node) for node in nodes]
     budget = NameBudget()
     placements: list[Placement] = []
+    poses: dict[Pose, int] = {}
+    worlds: dict[int, NDArray[np.float64]] = {}
     empty = 0
 
     def below(number: int) -> list[tuple[int, NDArray[np.float64]]]:
@@ -244,6 +315,7 @@ def _placements(tree: dict[str, Any], meshes: list[dict[str, Any]]) -> tuple[lis
 
     for path, world_from_node in walk(((i, links[i]) for i in _roots(tree, nodes)), below):
         node = nodes[path[-1]]
+        worlds[path[-1]] = world_from_node
         if "mesh" in node:
             mesh = whole(node["mesh"], "the 'mesh' of a node")
             if mesh >= len(meshes):
@@ -251,10 +323,15 @@ def _placements(tree: dict[str, Any], meshes: list[dict[str, Any]]) -> tuple[lis
             names = [_name(nodes[i], i) for i in path]
             if "name" not in node and meshes[mesh].get("name"):
                 names[-1] = str(meshes[mesh]["name"])
-            placements.append(Placement(budget.joined(names), mesh, world_from_node))
+            pose = pose_of(node, mesh, meshes[mesh])
+            shape = poses.setdefault(pose, len(poses))
+            for node_from_part in instances(node, accessors):
+                # A skin's joints say where the mesh is, whatever its node says.
+                world = np.eye(4) if pose.skin is not None else world_from_node @ node_from_part
+                placements.append(Placement(budget.joined(names), shape, world))
         elif not node.get("children") and "camera" not in node and "extensions" not in node:
             empty += 1
-    return placements, empty
+    return placements, [*poses], worlds, empty
 
 
 def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
@@ -280,20 +357,3 @@ def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
 def _name(node: dict[str, Any], number: int) -> str:
     """Name of a node, or its number if it has no name."""
     return str(node.get("name") or number)
-
-
-def _parent_from_node(node: dict[str, Any]) -> NDArray[np.float64]:
-    """Transform (4, 4) of a node: its matrix, or T R S."""
-    if "matrix" in node:
-        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
-    transform = np.eye(4)
-    if "rotation" in node:
-        xyzw = np.array(node["rotation"], dtype=np.float64).reshape(4)
-        length = np.linalg.norm(xyzw)
-        if length != 0:
-            transform[:3, :3] = rotation_of(np.roll(xyzw / length, 1))[0]
-    if "scale" in node:
-        transform[:3, :3] *= np.array(node["scale"], dtype=np.float64).reshape(3)
-    if "translation" in node:
-        transform[:3, 3] = np.array(node["translation"], dtype=np.float64).reshape(3)
-    return transform

@@ -28,6 +28,7 @@ class Reads(NamedTuple):
 
 
 HALF = ((-0.5, -0.5, -0.5), (0.5, 0.5, 0.5))
+BOX_3MF = ((-0.005, -0.005, -0.005), (0.005, 0.005, 0.005))
 TENTH = ((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1))
 
 EXPECTED: dict[str, Reads | str] = {
@@ -63,6 +64,22 @@ EXPECTED: dict[str, Reads | str] = {
     ),
     "g26_hidden.glb": Reads(
         ["shown", "hidden"], 0.48, 0.016, TENTH[0], (1.1, 0.1, 0.1), "1 nodes are hidden in it"
+    ),
+    "m01_item_path.3mf": Reads(["a", "b"], 0.0012, 2e-6, BOX_3MF[0], (0.035, 0.005, 0.005)),
+    "m02_root_elsewhere.3mf": Reads(["a"], 0.0006, 1e-6, *BOX_3MF),
+    "m04_mesh_plus_beams.3mf": Reads(
+        ["strut"], 0.0006, 1e-6, *BOX_3MF, "its extension beamlattice is not read"
+    ),
+    "m05_slices_lowres.3mf": Reads(
+        ["ball"], 0.0006, 1e-6, *BOX_3MF, "its extension slice is not read"
+    ),
+    "m07_support_other.3mf": Reads(
+        ["part", "tower"],
+        0.0012,
+        2e-6,
+        BOX_3MF[0],
+        (0.035, 0.005, 0.005),
+        "1 objects are of the type support",
     ),
     "o01_concave_U.obj": Reads(["U"], 7, 0, (0, 0, 0), (3, 3, 0)),
     "o04_utf16.obj": Reads(["box"], 6, 1, *HALF),

@@ -56,7 +56,7 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
         else:
             total += defects or Defects(empty=1)
     if not parts:
-        found = total.describe()
+        found = ", ".join(filter(None, [total.describe(), *map(_printable, parsed.notes)]))
         raise UnreadableError(
             f"it holds no usable triangle or point ({found})" if found else "it holds no triangles"
         )

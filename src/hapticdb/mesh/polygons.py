@@ -6,7 +6,6 @@ A polygon becomes a fan where that is right; mapbox_earcut cuts the others (deci
 from collections.abc import Mapping, Sequence
 from itertools import pairwise
 
-import mapbox_earcut
 import numpy as np
 from numpy.typing import NDArray
 
@@ -91,6 +90,8 @@ def _are_folded(vertices: NDArray[np.generic], polygons: Faces) -> NDArray[np.bo
 
 def _cut(vertices: NDArray[np.generic], polygon: Faces, starts: Sequence[int]) -> Faces:
     """Triangles of one polygon (k,), whose holes begin at `starts`, in its mean plane."""
+    import mapbox_earcut  # noqa: PLC0415 - few files need it
+
     as_fan = _fans(polygon[None])
     if not ((polygon >= 0) & (polygon < len(vertices))).all():
         return as_fan

@@ -5,9 +5,13 @@ nested assemblies lose instances, and keeps one of two build items of the same p
 """
 
 import array
+import re
 import zipfile
+from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
+from urllib.parse import unquote
+from xml.etree import ElementTree as ET
 from xml.parsers import expat
 
 import numpy as np
@@ -28,6 +32,10 @@ _PIECE = 1 << 20
 _UNPACKED, _INFLATION = 32 << 20, 40
 """Bytes that models may unpack to: so many, plus so many for each byte of the file. Sound meshes
 unpack to five to eight times their size. Larger values let a damaged file take more memory."""
+_MOST_KINDS = 3
+"""Kinds of elements that are told of an extension."""
+_HARMLESS = re.compile("/(material|production|trianglesets)/")
+_EXTENSION = re.compile(r"/([^/]+)/\d{4}/\d{2}$")
 Key = tuple[str, str]
 """An object: the model file inside the archive, and its id there."""
 Link = tuple[Key, NDArray[np.float64]]
@@ -59,6 +67,25 @@ class _Model:
     """Numbers of colours by model file, group and place in the group."""
     packed: int = 0
     unpacked: int = 0
+    types: Counter[str] = field(default_factory=Counter)
+    """Numbers of objects that are no models, by their types."""
+    unread: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
+    """Numbers of elements that are not read, by extension and name."""
+
+    def links(self) -> list[Link]:
+        """All that the build and components place."""
+        return [*self.items, *(c for thing in self.objects.values() for c in thing.components)]
+
+    def notes(self) -> list[str]:
+        """Say what is not read, or not as it is meant."""
+        told = [
+            f"{n} objects are of the type {kind}, and come in like any other"
+            for kind, n in self.types.items()
+        ]
+        for extension, elements in self.unread.items():
+            most = ", ".join(f"{n} {kind}" for kind, n in elements.most_common(_MOST_KINDS))
+            told.append(f"its extension {extension} is not read: {most}")
+        return told
 
 
 def read(path: Path) -> Parsed:
@@ -79,28 +106,40 @@ def read(path: Path) -> Parsed:
         number = shapes.setdefault(keys[-1], len(shapes))
         placements.append(Placement(budget.joined(names), number, world_from_object))
     read_shapes = [_shape(model.objects[key], model.colours) for key in shapes]
-    return Parsed(read_shapes, placements, model.metres, up="z")
+    return Parsed(read_shapes, placements, model.metres, up="z", notes=model.notes())
+
+
+def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
+    """Name of the root model: the archive's relationships say it, or it is the usual one."""
+    usual = "3d/3dmodel.model"
+    name = members.get("_rels/.rels")
+    if name is None or archive.getinfo(name).file_size > _PIECE:
+        return usual
+    try:
+        links = ET.fromstring(archive.read(name))  # noqa: S314 - expat stops entities that multiply
+    except ET.ParseError:
+        return usual
+    targets = [one.get("Target", "") for one in links if one.get("Type", "").endswith("/3dmodel")]
+    return unquote(targets[0]).lower().strip("/") if targets else usual
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
     """Root model, and the models that hold its components."""
     members = {name.lower().strip("/"): name for name in archive.namelist()}
-    root = next((name for name in members if name.endswith("3d/3dmodel.model")), None)
-    if root is None:
-        raise UnreadableError("it is no 3MF file: no 3D/3dmodel.model in it")
+    root = _root(archive, members)
+    if root not in members:
+        raise UnreadableError(f"it is no 3MF file: no {root} in it")
     model = _Model(packed=n_bytes)
     waiting, seen = [root], {root}
     while waiting:
         member = waiting.pop()
         _read_model(archive, members[member], member, model, is_root=member == root)
-        referred = {key[0] for thing in model.objects.values() for key, _ in thing.components}
-        for name in sorted(referred - seen):
+        for name in sorted({key[0] for key, _ in model.links()} - seen):
             if name not in members:
                 raise UnreadableError(f"it refers to {name}, which is not in the archive")
             waiting.append(name)
             seen.add(name)
-    links = [*model.items, *(c for thing in model.objects.values() for c in thing.components)]
-    for key, _ in links:
+    for key, _ in model.links():
         if key not in model.objects:
             raise UnreadableError(f"it places object {key[1]}, which is not defined")
     return model
@@ -113,11 +152,16 @@ def _read_model(
     parser = expat.ParserCreate(namespace_separator=" ")
     parser.buffer_text = True
     thing, own, group, n_group = _Object(""), -1, "", 0
+    core: str | None = None  # namespace of the first element
 
     def start(tag: str, attributes: dict[str, str]) -> None:
-        nonlocal thing, own, group, n_group
-        kind = tag.rpartition(" ")[2]
-        if kind == "vertex":
+        nonlocal thing, own, group, n_group, core
+        space, _, kind = tag.rpartition(" ")
+        core = space if core is None else core
+        if space != core and not _HARMLESS.search(space):
+            extension = _EXTENSION.search(space)
+            model.unread[extension[1] if extension else space][kind] += 1
+        elif kind == "vertex":
             x, y, z = attributes["x"], attributes["y"], attributes["z"]
             thing.corners.extend((float(x), float(y), float(z)))
         elif kind == "triangle":
@@ -134,6 +178,8 @@ def _read_model(
             number = attributes["id"]
             thing = _Object(attributes.get("name") or f"object {number}")
             model.objects[member, number] = thing
+            if (of_type := attributes.get("type", "model")) != "model":
+                model.types[of_type] += 1
             thing.group = attributes.get("pid", "")
             own = model.number_of.get((member, thing.group, attributes.get("pindex", "0")), -1)
         elif kind in {"basematerials", "colorgroup"}:

@@ -81,10 +81,10 @@ pins:
 	rm -rf .venv-pins
 	$(PYTHON) -m venv .venv-pins
 	.venv-pins/bin/pip install --upgrade "pip>=25.1"
-	.venv-pins/bin/pip install .
+	.venv-pins/bin/pip install ".[view]"
 	head -1 requirements/user.txt > .venv-pins/user.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb >> .venv-pins/user.txt
-	.venv-pins/bin/pip install ".[step,pointcloud,postgres,view,extract]" --group dev
+	.venv-pins/bin/pip install ".[step,pointcloud,postgres,extract]" --group dev
 	head -1 requirements/dev.txt > .venv-pins/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
 	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/

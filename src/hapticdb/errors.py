@@ -30,6 +30,24 @@ Every message is one line: what is wrong, where, and what to do next. If a built
 class is a subclass of it, too.
 """
 
+import os
+import sys
+from pathlib import Path
+
+
+def pip_line(extra: str) -> str:
+    """Give the command that installs what an extra needs, into this Python's environment."""
+    from importlib.metadata import requires  # noqa: PLC0415 - 30 ms, and only for an error
+
+    packages = [
+        f"'{name.strip()}'"
+        for name, _, condition in (line.partition(";") for line in requires("hapticdb") or ())
+        if f"extra == '{extra}'" in condition.replace('"', "'")
+    ]
+    is_found = sys.prefix in {sys.base_prefix, os.environ.get("VIRTUAL_ENV")}
+    pip = "pip" if is_found else os.path.relpath(Path(sys.prefix, "bin", "pip"))
+    return f"{pip} install {' '.join(packages)}"
+
 
 class HapticDBError(Exception):
     """Root of all errors that hapticdb raises on purpose."""

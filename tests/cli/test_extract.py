@@ -137,4 +137,4 @@ def test_wrong_arguments_of_an_order_are_refused(
     refused(run("extract", scene, "box0", "--disassemble", "--keep", "nut"), "--keep: no object")
     refused(run("extract", scene, "box0", "--animation", "a.gif"), ".html")
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    refused(run("extract", scene, "box0", "--animation", "a.html"), "hapticdb[view]")
+    refused(run("extract", scene, "box0", "--animation", "a.html"), "'viser")

@@ -160,5 +160,5 @@ def test_an_interrupt_leaves_no_child(
 
 def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
-    with pytest.raises(MissingExtraError, match=r"pip install 'hapticdb\[step\]'"):
+    with pytest.raises(MissingExtraError, match=r"pip install 'cascadio"):
         read_file(text(tmp_path / "a.STEP", "ISO-10303-21;"))

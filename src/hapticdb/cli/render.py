@@ -3,10 +3,13 @@
 import json
 import os
 import re
+import shlex
+import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
 
 from hapticdb.cli import columns
@@ -46,6 +49,12 @@ def noting_warnings() -> Iterator[None]:
     with warnings.catch_warnings():
         warnings.showwarning = lambda message, *_, **__: note(str(message))
         yield
+
+
+def program() -> str:
+    """Give this program as a person can type it: by its name, or by the path that it was run by."""
+    run = sys.argv[0]
+    return "hapticdb" if shutil.which("hapticdb") == str(Path(run).absolute()) else shlex.quote(run)
 
 
 def say(text: str = "") -> None:

@@ -21,6 +21,7 @@ from hapticdb.errors import (
     HapticDBError,
     MissingExtraError,
     UsageError,
+    pip_line,
 )
 from hapticdb.store.urls import redact
 
@@ -111,7 +112,7 @@ def open_websocket(address: _ServerAddress, patience: float) -> "ClientConnectio
         from websockets.sync.client import connect  # noqa: PLC0415 - an extra
     except ImportError:
         raise MissingExtraError(
-            "the package websockets is missing: pip install 'hapticdb[client]'"
+            f"the package websockets is missing: {pip_line('client')}"
         ) from None
     quiet = logging.getLogger("hapticdb.client.websockets")
     quiet.setLevel(logging.CRITICAL)  # every failure is raised, or is `ContactProxy.error`

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import MissingExtraError
+from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.realtime.processes import MessageSender, receive_from_parent
 
 Floats = NDArray[np.float64]
@@ -51,7 +51,7 @@ def plan(request: PlanRequest, sender: MessageSender) -> None:
     except ImportError as error:
         raise MissingExtraError(
             "to turn a part or to go round corners, the search needs the planner OMPL: "
-            "pip install 'hapticdb[extract]'"
+            f"{pip_line('extract')}"
         ) from error
     sender.send("path", _Search(request, sender).path())
 

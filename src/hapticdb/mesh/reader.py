@@ -18,7 +18,7 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import FileError, MissingExtraError
+from hapticdb.errors import FileError, MissingExtraError, pip_line
 from hapticdb.mesh.clean import read_only
 from hapticdb.mesh.parse import READERS, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
@@ -144,9 +144,7 @@ def _require_extra(reader: str, suffix: str) -> None:
     """Raise an error that names a missing extra, before a child fails without it."""
     extra, modules = _EXTRAS.get(reader, ("", ()))
     if any(importlib.util.find_spec(module) is None for module in modules):
-        raise MissingExtraError(
-            f"{suffix} files need an extra; install it with: pip install 'hapticdb[{extra}]'"
-        )
+        raise MissingExtraError(f"{suffix} files need more packages: {pip_line(extra)}")
 
 
 def _one_line(path: str | os.PathLike[str], cause: object) -> str:

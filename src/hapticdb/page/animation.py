@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
-from hapticdb.errors import FileError, MissingExtraError
+from hapticdb.errors import FileError, MissingExtraError, pip_line
 from hapticdb.extraction.problem import corners_of
 from hapticdb.extraction.result import Extraction
 from hapticdb.ingest.geometry import found_parts
@@ -58,7 +58,7 @@ class _Move(NamedTuple):
 def check_view() -> None:
     """Refuse in one line where what writes the page is not installed: MissingExtraError."""
     if importlib.util.find_spec("viser") is None:
-        raise MissingExtraError("an animation needs the extra 'view': pip install 'hapticdb[view]'")
+        raise MissingExtraError(f"an animation needs more packages: {pip_line('view')}")
 
 
 def animate(

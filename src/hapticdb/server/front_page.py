@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from starlette.requests import ClientDisconnect, Request
 from starlette.responses import HTMLResponse, PlainTextResponse, RedirectResponse, Response
 
-from hapticdb.errors import MissingExtraError
+from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.server.access import Access
 from hapticdb.server.limits import Limits, TokenBucket
 
@@ -56,9 +56,7 @@ def client_page(title: str) -> ClientPage:
     """
     spec = importlib.util.find_spec("viser")
     if spec is None or spec.origin is None:
-        raise MissingExtraError(
-            "the browser view needs the extra 'view': pip install 'hapticdb[view]'"
-        )
+        raise MissingExtraError(f"the browser view needs more packages: {pip_line('view')}")
     text = (Path(spec.origin).parent / "client" / "build" / "index.html").read_text("utf-8")
     loader = LOADER.search(text)
     if loader is None or TITLE not in text:

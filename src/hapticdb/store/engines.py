@@ -16,7 +16,7 @@ from importlib import import_module
 from importlib.metadata import entry_points
 from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 
-from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.urls import redact, scheme_of
@@ -138,7 +138,7 @@ class _BuiltIn(NamedTuple):
 
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
-POSTGRES = _BuiltIn("hapticdb.store.postgres.engine", "psycopg", "hapticdb[postgres]")
+POSTGRES = _BuiltIn("hapticdb.store.postgres.engine", "psycopg", "postgres")
 BUILT_IN = {
     FILE_SCHEME: _BuiltIn("hapticdb.store.sqlite.engine"),
     "postgresql": POSTGRES,
@@ -167,7 +167,7 @@ def engine_of(url: Url) -> Engine:
         except ImportError as error:  # the driver is missing, or does not find its own library
             raise MissingExtraError(
                 f"{redact(os.fspath(url))} needs {built_in.driver}: install it with "
-                f"pip install '{built_in.extra}'"
+                f"{pip_line(built_in.extra)}"
             ) from error
     return cast("Engine", import_module(built_in.module).ENGINE)
 

@@ -100,10 +100,10 @@ HELP = """Search a path on which parts come out, judged by a sweep of their surf
 
 The parts that WORDS choose move together as one rigid body. Straight pulls are
 tried first: along the axes, away from contacts and along them, at random; with
---screw then screw motions. If none leads out, a planner (OMPL, pip install
-'hapticdb[extract]') searches a path round corners and with turns. A part is out
-when its bounding sphere is clear of the box of all that stands, or at --out. With
---to, a way to a pose is searched instead.
+--screw then screw motions. If none leads out, a planner (OMPL, pip install ompl)
+searches a path round corners and with turns. A part is out when its bounding
+sphere is clear of the box of all that stands, or at --out. With --to, a way to a
+pose is searched instead.
 
 The path is written by --path as displacements from the present place, as
 'hapticdb sweep --part' takes them. The same seed gives the same path, unless
@@ -120,7 +120,7 @@ own: --path out.csv writes out-1.csv and so on. The order may be longer than
 necessary.
 
 --animation writes a page for any browser, with all that it needs in one file (pip
-install 'hapticdb[view]').
+install viser).
 
 The exit code is 0 when it comes out or slides, 3 when it is not decided, 1 when no
 path is found.

@@ -91,7 +91,7 @@ def demo(
     draw(picture, scene, comparison)
     render.say(f"picture: {picture}")
     url = quote(redact(scene.imported[0].url))
-    render.say(f"see it and feel it in a browser: hapticdb view {url}")
+    render.say(f"see it and feel it in a browser: {render.program()} view {url}")
     if comparison.disagreed:
         raise typer.Exit(1)
 

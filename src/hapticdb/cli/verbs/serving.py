@@ -11,7 +11,7 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.options import UrlArgument
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:
     from hapticdb.server.access import Role
@@ -155,9 +155,7 @@ def _check_extra() -> None:
     missing = [name for name in ("viser", "starlette", "uvicorn", "prometheus_client")
                if find_spec(name) is None]  # fmt: skip
     if missing:
-        raise MissingExtraError(
-            f"{', '.join(missing)} not found: pip install 'hapticdb[view]' adds the browser view"
-        )
+        raise MissingExtraError(f"the browser view needs {', '.join(missing)}: {pip_line('view')}")
 
 
 def _serving(

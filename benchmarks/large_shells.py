@@ -27,14 +27,12 @@ import page_tables
 import records
 from awake import awake
 from hapticdb import DistanceField, GridOptions, ImportOptions, PointShell, TangentPlane
-from hapticdb.kernels.large.budget import feel_within
+from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.resident.cells import RESULTS
-from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.sleepers import counts_of
 from hapticdb.resident.table import CellTable
 
 Floats = NDArray[np.float64]
@@ -125,31 +123,25 @@ def measure(
         wrenches = {(felt[name].wrenches + 0.0).tobytes() for name in ways if name != "budget"}
         if len(wrenches) != 1:
             raise SystemExit("the wrenches differ")
-        out, counts = np.zeros((1, RESULTS)), counts_of(1)
+        out = np.zeros((1, RESULTS))
         looked: list[int] = []
         with table.reading() as row, awake():
 
-            def plain(one: ResidentFrames) -> Callable[[Floats], object]:
-                return lambda pose: feel_kernel(
-                    one.cells, row, one.clusters, pose, residency.place, one.law, one.hits,
-                    one.missed, out,
-                )  # fmt: skip
+            def frame_of(one: ResidentFrames) -> Callable[[Floats], object]:
+                counts, sleeps = one.asleep.counts, len(one.asleep.sleepers.boxes) > 0
 
-            def asleep(one: ResidentFrames) -> Callable[[Floats], object]:
                 def frame(pose: Floats) -> None:
                     counts[:] = 0
-                    feel_within(
+                    feel_kernel(
                         one.cells, row, one.clusters, pose, residency.place, one.law, one.hits,
-                        one.missed, out, one.sleepers, one.budget, counts,
+                        one.missed, out, one.asleep,
                     )  # fmt: skip
-                    looked.append(int(counts[0, LOOKED_AT]) + int(counts[0, LEFT_OUT]))
+                    if sleeps:
+                        looked.append(int(counts[0, LOOKED_AT]) + int(counts[0, LEFT_OUT]))
 
                 return frame
 
-            frames = {
-                name: plain(one) if one.sleepers is None else asleep(one)
-                for name, one in ways.items()
-            }
+            frames = {name: frame_of(one) for name, one in ways.items()}
             least: dict[str, Floats] = {}
             for _ in range(rounds):
                 for name, frame in frames.items():
@@ -186,7 +178,7 @@ def _within_budget(whole: FeltFrames, part: FeltFrames) -> dict[str, Any]:
 
 def bytes_of(frames: ResidentFrames) -> int:
     """Memory of a shell's arrays, bytes."""
-    arrays = [*frames.clusters, *(frames.sleepers or ()), frames.hits]
+    arrays = [*frames.clusters, *frames.asleep.sleepers, frames.hits]
     return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
 

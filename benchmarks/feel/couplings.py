@@ -17,7 +17,7 @@ from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.handle import Handle
-from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.held import clusters_of
 
 Floats = NDArray[np.float64]
 

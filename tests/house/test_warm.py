@@ -112,9 +112,7 @@ def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     assert set(found) == set(NAMES)
     assert {name: both for name, both in found.items() if both[0] != both[1]} == {}
     several = {name for name, (_, declared) in found.items() if len(declared) > 1}
-    assert several == {
-        "query.refining.refine_kernel", "resident.feeling.feel_kernel", "large.budget.feel_within",
-    }  # fmt: skip
+    assert several == {"query.refining.refine_kernel", "large.budget.feel_kernel"}
 
 
 def test_a_purpose_names_entries_that_exist() -> None:
@@ -130,7 +128,6 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("import", "import a.db s/car.glb --bits 7"),
     ("touch", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
     ("feel", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --record a.hdbrec"),
-    ("large", "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --budget-points 9"),
     ("replay", "replay a.hdbrec a.db"),
     ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
     ("extract", "extract a.db 12 --motions 0 --out 100"),

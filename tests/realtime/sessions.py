@@ -15,7 +15,7 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
 from hapticdb.recording.replay import touching
-from hapticdb.resident.frames import LARGE_FROM
+from hapticdb.resident.held import LARGE_FROM
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.kernels.large.sleeping import Sleepers
+from hapticdb.kernels.large.budget import Asleep
 from hapticdb.kernels.records import MOST_MISSED, SERVO
 from hapticdb.kernels.resident import cells as resident
 from hapticdb.kernels.resident.cell_table import publish
@@ -19,7 +19,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.drive import DirectDrive, SmoothDrive
 from hapticdb.realtime.session import Session
 from hapticdb.recording.frame import State
-from hapticdb.resident.frames import clusters_of
+from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS
 from hapticdb.testing import floor_voxels
@@ -53,12 +53,11 @@ class Scene:
     cells: resident.Cells
     row: int
     clusters: resident.Clusters
+    asleep: Asleep
     servo: NDArray[np.void]
     pose: NDArray[np.float64]
     missed: NDArray[np.int64]
     place: resident.Place
-    sleepers: Sleepers | None = None
-    budget: int = 300
 
 
 @pytest.mark.parametrize("is_smooth", [False, True])
@@ -72,7 +71,8 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         servo["hand"]["quaternion"][0] = 1.0
         place = resident.Place(0.0, 0.0, 0.0, 0.01, 64.0)
         missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        scene = Scene(table.cells, row, clusters_of(sphere, 0.01), servo, np.eye(4), missed, place)
+        tool = held_tool(sphere, 0.01)
+        scene = Scene(table.cells, row, *tool, servo, np.eye(4), missed, place)
         drive: DirectDrive | SmoothDrive
         if is_smooth:
             spring = Coupling().settled(SCRIPTED, 500.0, 1.0, 0.024).spring()

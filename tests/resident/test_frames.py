@@ -10,7 +10,8 @@ from hypothesis import strategies as st
 from hapticdb import PointShell
 from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
-from hapticdb.resident.frames import RUN, ResidentFrames
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.held import RUN
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout

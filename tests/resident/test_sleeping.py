@@ -220,8 +220,7 @@ def test_no_sleeping_point_comes_near_a_voxel(
         poses = walk(30, seed, float(rng.choice([1e-4, 2e-3])), 0.12)
         frames.feel(poses)  # so that every cell is there
         frames.feel(poses)
-        kept = frames.sleepers
-        assert kept is not None
+        kept = frames.asleep.sleepers
         placed = shell.points @ poses[-1, :3, :3].T + poses[-1, :3, 3]
         places = (placed - env.grid.origin) / env.grid.voxel_size
         inside = np.zeros(len(shell), dtype=bool)

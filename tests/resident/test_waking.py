@@ -117,8 +117,7 @@ def test_clusters_far_from_a_changed_cell_sleep_on(tmp_path: Path, law: str) -> 
         pose = np.eye(4)[None]
         pose[:, 1:3, 3] = -0.04
         expect_same(sleeping, flat, pose)
-        kept = sleeping.sleepers
-        assert kept is not None
+        kept = sleeping.asleep.sleepers
         asleep = int((kept.run_rests[:, 3] >= 0.0).sum())
         assert asleep > 100
         furthest = made.cells[-1:]
@@ -142,8 +141,7 @@ def test_all_clusters_wake_when_changes_were_lost(tmp_path: Path) -> None:
         made.residency.refresh()
         made.load(made.cells)
         expect_same(sleeping, flat, pose)
-        kept = sleeping.sleepers
-        assert kept is not None
+        kept = sleeping.asleep.sleepers
         asleep = int((kept.run_rests[:, 3] >= 0.0).sum())
         made.place(62)
         made.residency.refresh()

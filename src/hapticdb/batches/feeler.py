@@ -12,9 +12,9 @@ from hapticdb.batches.order import order_of
 from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
 from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
 from hapticdb.errors import ConnectionLostError, UsageError
+from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.law import reads_distances
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
-from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
@@ -301,7 +301,7 @@ class Feeler:
         def work(memory: ThreadMemory, one: slice) -> None:
             feel_kernel(
                 cells, memory.row, memory.clusters, poses[one], place, law, memory.met,
-                memory.missed, out[one],
+                memory.missed, out[one], self._frames.asleep,
             )  # fmt: skip
 
         self._threads.run(work, len(poses))

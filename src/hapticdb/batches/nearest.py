@@ -8,7 +8,8 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.resident import clearance, first_hits
 from hapticdb.kernels.resident import nearest as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
-from hapticdb.resident.frames import SMALL, ResidentFrames, spheres_of
+from hapticdb.resident.frames import SMALL, ResidentFrames
+from hapticdb.resident.held import spheres_of
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -18,17 +18,6 @@ def compile_for(tool: str, purpose: str) -> None:
     render.compile_kernels(purpose)
 
 
-def compile_for_large(shell: "PointShell", budget_points: int | None) -> None:
-    """Compile the kernels of sleeping clusters if frames of the tool need them, and say so.
-
-    Only large tools and those with a budget do, so it takes the tool's shell to know.
-    """
-    from hapticdb.resident.frames import sleeps_by_itself
-
-    if sleeps_by_itself(shell, budget_points):
-        render.compile_kernels("large")
-
-
 def shell_of(
     tool: str,
     unit: str | None,

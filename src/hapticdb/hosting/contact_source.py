@@ -50,7 +50,7 @@ from hapticdb.protocol.contacts import (
 from hapticdb.realtime.coupling import Coupling, radius_of
 from hapticdb.realtime.drive import prepare_follower
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.resident.frames import clusters_of, sleeps_by_itself
+from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import HEARTBEAT
 
 Floats = NDArray[np.float64]
@@ -99,10 +99,9 @@ class ContactSource:
         self._spring = coupling.spring()._replace(damping=0.0)  # the client damps at its own rate
         self._cells, self._shell = cells, replace(shell, surface=None)
         self._place = Place(*cells.grid.origin, size, float(cells.grid.side))
-        sleeps = sleeps_by_itself(shell, None)
-        self._clusters = clusters_of(shell, size)
+        self._clusters, asleep = held_tool(shell, size)
         self._servo, self._follower = np.zeros((), SERVO), np.zeros((), FOLLOWER)
-        prepare_follower(self._follower, len(shell), len(shell) if sleeps else None)
+        prepare_follower(self._follower, len(shell), asleep)
         self._field = np.zeros((FIELD_ROWS, len(shell)))
         self._met = np.zeros((MET_ROWS, len(shell)), dtype=np.int64)
         self._missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)

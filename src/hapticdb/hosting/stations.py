@@ -27,8 +27,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.drive import prepare_follower
-from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
-from hapticdb.resident.sleepers import counts_of, sleepers_of
+from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CONTROL_WORDS, HEARTBEAT, MOST_READERS, CellTable
 
 
@@ -133,10 +132,9 @@ class Stations:
     def _write_tool(self, n: int, request: SeatRequest) -> None:
         """Make the tool's arrays, and write their addresses."""
         grid, station = request.grid, self._stations[n : n + 1]
-        sleeps = sleeps_by_itself(request.shell, None)
-        clusters = clusters_of(request.shell, grid.voxel_size, RUN if sleeps else None)
+        clusters, asleep = held_tool(request.shell, grid.voxel_size)
         n_points = len(request.shell)
-        prepare_follower(self._followers[n, ...], n_points, n_points if sleeps else None)
+        prepare_follower(self._followers[n, ...], n_points, asleep)
         met = np.zeros((HOSTED_ROWS, n_points), dtype=np.int64)
         field = np.zeros((FIELD_ROWS, n_points))
         arrays = {
@@ -149,18 +147,16 @@ class Stations:
         station["n_spheres"], station["n_groups"] = len(clusters.spheres), len(clusters.groups)
         station["place"] = (*grid.origin, grid.voxel_size, float(grid.side))
         self._arrays[n] = tuple(arrays.values())
-        if sleeps:
-            self._write_sleepers(n, Asleep(sleepers_of(clusters, None), n_points, counts_of(1)))
+        self._write_sleepers(n, asleep)
 
     def _write_sleepers(self, n: int, asleep: Asleep) -> None:
-        """Write the addresses of what frames of a large tool keep."""
+        """Write the addresses of what may sleep of a tool."""
         station, sleepers = self._stations[n : n + 1], asleep.sleepers
         sleeping = station["sleeping"]
         for name, array in sleepers._asdict().items():
             sleeping[name] = array.ctypes.data
         sleeping["counts"], sleeping["budget"] = asleep.counts.ctypes.data, asleep.budget
         sleeping["n_blocks"], sleeping["n_chosen"] = len(sleepers.boxes), len(sleepers.indices)
-        station["is_large"] = 1
         self._asleep[n] = asleep
 
     def _write_cells(self, n: int, table: CellTable) -> None:

@@ -34,8 +34,7 @@ ENTRIES = {
     "surfaces.voxelize": "voxelize_kernel",
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
-    "resident.feeling": "feel_kernel bounding_spheres",
-    "large.budget": "feel_within",
+    "large.budget": "feel_kernel",
     "query.refining": (
         "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
         "depths_of_hits"
@@ -53,6 +52,7 @@ ENTRIES = {
     "triangles.piercing": "piercing_kernel",
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
+    "resident.feeling": "bounding_spheres",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
     "surfaces.sampling": "eliminate_kernel",
     "hand.direct": "render",
@@ -67,7 +67,6 @@ ENTRIES = {
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "resident.feeling": "hand.quasistatic",
     "large.budget": "hand.quasistatic",
     "proxy.linearize": "hand.quasistatic",
     "hosting.loop": "hand.quasistatic",
@@ -117,7 +116,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "feel": (
         *_SHELL,
         *_RESIDENT,
-        "resident.feeling.feel_kernel",
+        "large.*",
         "hand.direct.*",
         "hand.quasistatic.*",
         "hand.servo.*",
@@ -126,12 +125,12 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "rigid.*",
     ),
     "host": (*_RESIDENT, "hosting.*"),
-    "replay": (*_RESIDENT, "resident.feeling.*", "rigid.poses_of"),
+    "replay": (*_RESIDENT, "large.*", "rigid.poses_of"),
     "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
     "extract": (
         *_SHELL,
         *_RESIDENT,
-        "resident.feeling.*",
+        "large.*",
         "resident.first_hits.*",
         "triangles.*",
         "surfaces.nearest.*",
@@ -141,7 +140,6 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     ),
     "proxies": (*_RESIDENT, "hand.quasistatic.*", "hand.servo.*", "proxy.linearize.*", "rigid.*"),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
-    "large": (*_RESIDENT, "large.budget.*"),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

@@ -369,7 +369,6 @@ STATION: Layout = _record(
         ("is_running", "<i8"),  # all other fields are complete
         ("seat", "<i8"),  # row of the board
         ("reader", "<i8"),  # row of the table of cells
-        ("is_large", "<i8"),  # clusters of the tool sleep, or it has a budget of points
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
         *((name, "<i8") for name in ("used", "payload", "near", "session")),

@@ -21,7 +21,8 @@ from hapticdb.kernels.hand.near_points import (
     NEAR_ROWS,
     U,
 )
-from hapticdb.kernels.large.sleeping import LEFT_OUT, Sleepers
+from hapticdb.kernels.large.budget import Asleep, feel_kernel
+from hapticdb.kernels.large.sleeping import LEFT_OUT
 from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, RESULTS, pose_numbers
 from hapticdb.kernels.resident.cells import (
     FELT_REVISION,
@@ -33,8 +34,6 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import ForceLaw
-from hapticdb.resident.frames import feel_at
-from hapticdb.resident.sleepers import counts_of
 
 MERGES_FROM = 4096
 """Near points of the quasi-static coupling from which one contact stands for several. Larger:
@@ -44,15 +43,12 @@ Indices = NDArray[np.int64]
 Record = NDArray[np.void]
 
 
-def prepare_follower(follower: Record, n_points: int, budget: int | None) -> None:
-    """Let the quasi-static coupling of a tool merge broad contacts.
-
-    budget : most points that a look takes, of a tool whose clusters sleep; None for other tools.
-    """
+def prepare_follower(follower: Record, n_points: int, asleep: Asleep) -> None:
+    """Let the quasi-static coupling of a tool merge broad contacts, and keep to its budget."""
     follower["merges_from"] = MERGES_FROM
-    if budget is not None:
+    if len(asleep.sleepers.boxes):
         follower["is_large"] = True
-        follower["most_looked"] = budget if budget < n_points else 0
+        follower["most_looked"] = asleep.budget if asleep.budget < n_points else 0
 
 
 class _DriveInputs(Protocol):
@@ -65,10 +61,8 @@ class _DriveInputs(Protocol):
     servo: Record
     missed: NDArray[np.int64]
     pose: Floats
-    sleepers: Sleepers | None
-    """Of a large tool, or one with a budget of points; None: every run is tested in each frame."""
-    budget: int
-    """Most points near something that a frame looks at."""
+    asleep: Asleep
+    """What of the tool sleeps, and its budget of points."""
 
 
 class _Drive:
@@ -84,7 +78,6 @@ class _Drive:
         self.radius = radius
         self._scene, self._cells, self._law = scene, cells, law.for_kernels
         self._hits = np.empty(len(scene.clusters.points), dtype=np.int64)
-        self._counts = counts_of(1)
         self._tool, self._sent = scene.servo["tool"], scene.servo["sent"]
         self._tool_before = self._tool.copy()
         self._left_out = self._sent["left_out"]
@@ -98,11 +91,13 @@ class _Drive:
         the budget left out.
         """
         scene = self._scene
-        feel_at(
+        counts = scene.asleep.counts
+        counts[:] = 0
+        feel_kernel(
             self._cells, scene.row, scene.clusters, poses, scene.place, self._law, self._hits,
-            missed, out, scene.sleepers, scene.budget, self._counts,
+            missed, out, scene.asleep,
         )  # fmt: skip
-        return int(self._counts[0, LEFT_OUT])
+        return int(counts[0, LEFT_OUT])
 
     def remember(self) -> None:
         """Store the state, so that `step_back` can return to it."""
@@ -184,8 +179,7 @@ class SmoothDrive(_Drive):
         self._missed_here = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         self._felt_here = np.zeros((1, RESULTS))
         self._felt, self._unknown = self._tool["felt"], self._sent["unknown"]
-        is_awake = scene.sleepers is None
-        prepare_follower(self._follower, n_points, None if is_awake else scene.budget)
+        prepare_follower(self._follower, n_points, scene.asleep)
 
     def step(self, dt: float) -> None:
         """Advance the tool by a period `dt` (s); `sent` then has the wrench for the device."""

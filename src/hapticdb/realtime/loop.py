@@ -40,8 +40,7 @@ from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import RUN, clusters_of, sleeps_by_itself
-from hapticdb.resident.sleepers import sleepers_of
+from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import HEARTBEAT, LOST, STOP, CellTable
 
 EMPTY_SECONDS = 2.0
@@ -107,11 +106,9 @@ class Loop:
         self.cells, self.row = self.table.cells, request.row
         grid = request.grid
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        n_points, budget = len(request.shell), request.budget_points
-        sleeps = sleeps_by_itself(request.shell, budget)
-        self.clusters = clusters_of(request.shell, grid.voxel_size, RUN if sleeps else None)
-        self.sleepers = sleepers_of(self.clusters, budget) if sleeps else None
-        self.budget = min(budget or n_points, n_points)
+        self.clusters, self.asleep = held_tool(
+            request.shell, grid.voxel_size, request.budget_points
+        )
         self.servo = np.zeros((), SERVO)
         self.tool, self.hand = self.servo["tool"], self.servo["hand"]
         self.sent = views_of(self.servo["sent"])

@@ -25,7 +25,6 @@ from hapticdb.realtime.resident_cells import ResidentCells, start_error, without
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import sleeps_by_itself
 from hapticdb.resident.table import anonymous_memory
 
 Policy = Literal["hold", "wait"]
@@ -206,10 +205,7 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = ["feel"]
-        if sleeps_by_itself(self.shell, self.budget_points):
-            purposes.append("large")
-        compile_missing(entries_for(*purposes))  # here, so that the loop does not compile
+        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())
@@ -238,7 +234,7 @@ class Session:
             budget_points=self.budget_points,
         )
         self._process = Process(
-            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory], purposes
+            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory], ["feel"]
         )
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:

@@ -10,13 +10,12 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import GridError, UsageError
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, is_smooth
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.frames import ResidentFrames, sleeps_by_itself
+from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.store.filtering import Filter
@@ -127,12 +126,9 @@ def resident(
     Raises `UsageError` if the environment is in lexicographic order, which has no cells, or if the
     law is by distances and an object has none.
     """
-    sleeps = sleeps_by_itself(shell, budget_points)
-    if sleeps:
-        compile_missing(entries_for("large"))
     with CellTable.create(distances=is_smooth(law)) as table:
         residency = Residency(environment.store, table, exclude, where=where)
-        frames = ResidentFrames(residency, shell, law, sleeps=sleeps, budget_points=budget_points)
+        frames = ResidentFrames(residency, shell, law, sleeps=None, budget_points=budget_points)
         try:
             yield frames.wrenches
         finally:

@@ -7,39 +7,29 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.large import budget as budgets
-from hapticdb.kernels.large import sleeping
-from hapticdb.kernels.large.sleeping import Sleepers
+from hapticdb.kernels.large.budget import feel_kernel
+from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
-    GROUP,
     HITS,
     LISTED,
     RESULTS,
-    SCRATCH_ROWS,
     UNKNOWN,
     UNKNOWNS,
     WRENCH,
-    Cells,
     Clusters,
-    Place,
 )
-from hapticdb.kernels.resident.feeling import bounding_spheres, feel_kernel
 from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
+from hapticdb.resident.held import counts_of, held_tool
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.sleepers import counts_of, sleepers_of
 
-RUN = 64
-"""Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
-FLAT_RUN = 512
-"""Points that are transformed at once without clusters: as many as a processor's L1 cache holds."""
 LEAST_FOUND = 1 << 16
 """Least number of entries of the hash table of cells that poses meet. A larger table has fewer
 collisions and takes longer to clear."""
@@ -47,9 +37,6 @@ SMALL = 16.0
 """Greatest radius of a run, voxels, for which the search for cells uses the run's middle instead of
 its points. A larger value looks up fewer places and fetches more cells that no point meets."""
 
-LARGE_FROM = 4096
-"""Points from which clusters of a session's tool sleep: one block of 64 runs of 64 points. A
-smaller tool has no block to skip at once. Results are the same: a larger value only costs time."""
 MOST_ROUNDS = 4096
 """Most times that a frame beyond its budget is repeated because cells beside it were unknown."""
 
@@ -74,44 +61,6 @@ class FeltFrames(NamedTuple):
     deepest: Floats
     looked_at: NDArray[np.int64]
     left_out: NDArray[np.int64]
-
-
-def sleeps_by_itself(shell: PointShell, budget: int | None) -> bool:
-    """Whether clusters of a session's tool sleep: it is large, or has a budget of points."""
-    return len(shell) >= LARGE_FROM or budget is not None
-
-
-def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
-    """Prepare a shell for frames: points with normals, and bounding spheres of clusters.
-
-    Parameters
-    ----------
-    shell : PointShell
-        Its points may have any order. Clusters skip most points if neighbours by index are
-        neighbours in space, as in shells made from files.
-    voxel_size : float
-        Metres. A sphere is larger by a thousandth of a voxel, which is more than rounding errors.
-    run : int or None
-        Points of a cluster, 0 for no clusters; 64 unless given, 0 for small shells.
-    """
-    if run is None:
-        run = RUN if len(shell) > RUN else 0
-    points = np.hstack([shell.points, shell.normals])
-    spheres, groups = spheres_of(points, voxel_size, run)
-    run = run or min(len(points), FLAT_RUN)
-    columns = np.array(shell.points.T, order="C")  # a view of one point would be read-only
-    scratch = np.empty((SCRATCH_ROWS, run))
-    return Clusters(points, np.array(shell.center), spheres, groups, run, columns, scratch)
-
-
-def spheres_of(points: Floats, voxel_size: float, run: int) -> tuple[Floats, Floats]:
-    """Bounding spheres of runs of points (N, 6), and of groups of runs, as `Clusters` has them."""
-    spheres = np.empty((-(-len(points) // run) if run else 0, 4))
-    groups = np.empty((-(-len(spheres) // GROUP), 4))
-    if run:
-        bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
-        bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
-    return spheres, groups
 
 
 class Surroundings(NamedTuple):
@@ -158,26 +107,6 @@ def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Su
     return Surroundings(places, reach, clusters.run, first)
 
 
-def feel_at(
-    cells: Cells, row: int, clusters: Clusters, poses: Floats, place: Place, law: object,
-    hits: NDArray[np.int64], missed: NDArray[np.int64], out: Floats, sleepers: Sleepers | None,
-    budget: int, counts: NDArray[np.int64],
-) -> int:  # fmt: skip
-    """Compute the frames at poses (M, 4, 4) -> how many are done: the others are not rigid.
-
-    The parameters are those of `kernels.large.budget.feel_within`. Without `sleepers` all runs are
-    tested, and `counts` stays as it is.
-    """
-    if sleepers is None:
-        return int(feel_kernel(cells, row, clusters, poses, place, law, hits, missed, out))
-    counts[:] = 0
-    return int(
-        budgets.feel_within(
-            cells, row, clusters, poses, place, law, hits, missed, out, sleepers, budget, counts
-        )
-    )
-
-
 class ResidentFrames:
     """Frames of one shell. Each frame waits until its cells are resident, so all are exact.
 
@@ -190,10 +119,10 @@ class ResidentFrames:
     law : ForceLaw or None
         Force law; the tangent plane with 1000 N/m unless given.
     run : int or None
-        As for `clusters_of`.
-    sleeps : bool
+        As for `held_tool`.
+    sleeps : bool or None
         Whether clusters far from everything are not looked at while they stay there. The results
-        are the same, bit for bit; large shells are felt sooner.
+        are the same, bit for bit; large shells are felt sooner. None: those of a large shell.
     budget_points : int or None
         Most points near something that a frame looks at; then clusters sleep. A frame with more
         looks at one in 2, 4, 8 ... of them. `FeltFrames.left_out` counts the others.
@@ -211,7 +140,7 @@ class ResidentFrames:
         law: ForceLaw | None = None,
         *,
         run: int | None = None,
-        sleeps: bool = False,
+        sleeps: bool | None = False,
         budget_points: int | None = None,
     ) -> None:
         self.residency = residency
@@ -228,10 +157,7 @@ class ResidentFrames:
             self.cells = table.cells.without_distances()
         size = residency.grid.voxel_size
         budget_points = checked_budget(budget_points)
-        sleeps = sleeps or budget_points is not None
-        self.clusters = clusters_of(shell, size, run or RUN if sleeps else run)
-        self.sleepers = sleepers_of(self.clusters, budget_points) if sleeps else None
-        self.budget = min(budget_points or len(shell), len(shell))
+        self.clusters, self.asleep = held_tool(shell, size, budget_points, sleeps=sleeps, run=run)
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
@@ -252,7 +178,8 @@ class ResidentFrames:
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
         counts = counts_of(len(matrices))
-        counts[:, sleeping.LOOKED_AT] = len(self.shell)
+        if not len(self.asleep.sleepers.boxes):
+            counts[:, LOOKED_AT] = len(self.shell)
         done = 0
         while done < len(matrices):
             n_poses = self.fetch(matrices[done:])
@@ -264,8 +191,8 @@ class ResidentFrames:
             out[:, CONTACTS].astype(np.int64),
             out[:, UNKNOWNS].astype(np.int64),
             out[:, DEEPEST],
-            counts[:, sleeping.LOOKED_AT],
-            counts[:, sleeping.LEFT_OUT],
+            counts[:, LOOKED_AT],
+            counts[:, LEFT_OUT],
         )
 
     def collides(
@@ -320,15 +247,18 @@ class ResidentFrames:
     ) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
-        feel = self._feel_within_budget if self.budget < len(self.shell) else self._feel
+        has_budget = self.asleep.budget < len(self.shell)
+        feel = self._feel_within_budget if has_budget else self._feel
         done = feel(poses[part], out[part], counts[part])
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")
 
     def _feel(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
-        return feel_at(
-            self.cells, self._row, self.clusters, poses, self.residency.place, self.law, self.hits,
-            self.missed, out, self.sleepers, self.budget, counts,
+        return int(
+            feel_kernel(
+                self.cells, self._row, self.clusters, poses, self.residency.place, self.law,
+                self.hits, self.missed, out, self.asleep._replace(counts=counts),
+            )
         )  # fmt: skip
 
     def _feel_within_budget(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:

@@ -24,7 +24,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import compile_for, compile_for_large, shell_of
+from hapticdb.cli.tools import compile_for, shell_of
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 
@@ -200,7 +200,7 @@ def feel(
     compile_for(tool, "feel")
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         chosen, coupling = force.law_and_coupling(cells)
-        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells), budget_points)
+        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
             law=chosen, coupling=coupling, budget_points=budget_points, processor=processor,
@@ -216,16 +216,13 @@ def feel(
 
 
 def _shell(
-    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float,
-    budget_points: int | None,
+    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float
 ) -> "PointShell":  # fmt: skip
-    """Make the tool's shell, drawn inward by `inset` metres, and compile what its size needs."""
+    """Make the tool's shell, drawn inward by `inset` metres."""
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     seed = None if is_for_hand_alone else seed
-    shell = shell_of(tool, unit, points, seed, inset=inset)
-    compile_for_large(shell, budget_points)
-    return shell
+    return shell_of(tool, unit, points, seed, inset=inset)
 
 
 def _recording_limit(record: str | None, limit: str | None, *, is_continued: bool) -> int:

@@ -8,7 +8,6 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.csv_files import FRAME_COLUMNS, STDOUT, open_csv, rows_of_frames
 from hapticdb.cli.options import CsvOption, JsonOption
-from hapticdb.cli.tools import compile_for_large
 
 if TYPE_CHECKING:
     from hapticdb.recording.file import Recording
@@ -89,8 +88,6 @@ def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "
         place = url
     with hapticdb.open(place, read_only=True) as env:
         render.compile_kernels("replay")
-        if env.grid.is_hierarchical:
-            compile_for_large(session.header.shell, session.header.budget_points)
         return hapticdb.replay(session, env, until_damage=until_damage)
 
 

@@ -48,8 +48,13 @@ from hapticdb.kernels.records import (
     STATION,
     TOLD,
 )
-from hapticdb.kernels.resident.cells import UNKNOWNS, begin_frame, end_frame
-from hapticdb.kernels.resident.feeling import frame_of
+from hapticdb.kernels.resident.cells import (
+    FELT_REVISION,
+    READER_STRIDE,
+    UNKNOWNS,
+    begin_frame,
+    end_frame,
+)
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import moved, pose_of_quaternion, transform_of, turned
 
@@ -81,21 +86,19 @@ def _place_tool(tool, pose):
 def _feel_again(station, cells, shell, place, poses, met, missed, felts, servo):
     """Compute the law's frame at the tool's pose, for a recording; into tool.felt."""
     tool, sent, law = servo.tool, servo.sent, DistanceFieldLaw(station.stiffness)
+    asleep = asleep_of(station)
+    if asleep.sleepers.boxes.shape[0] > 0:
+        asleep.counts[0, LOOKED_AT] = asleep.counts[0, LEFT_OUT] = 0
     which = begin_frame(cells, station.reader)
-    if station.is_large:
-        asleep = asleep_of(station)
-        counts = asleep.counts
-        counts[0, LOOKED_AT] = counts[0, LEFT_OUT] = 0
-        felt_asleep(
-            cells, which, shell, poses[0], place, law, met[FELT], missed, asleep.sleepers,
-            asleep.budget, counts[0], felts[0],
-        )  # fmt: skip
-        sent.left_out = max(sent.left_out, counts[0, LEFT_OUT])
-    else:
-        frame_of(law, cells, which, shell, poses[0], place, met[FELT], missed, felts[0])
+    felt_asleep(
+        cells, which, shell, poses[0], place, law, met[FELT], missed, asleep, np.int64(0), felts[0]
+    )
     end_frame(cells, station.reader)
+    if asleep.sleepers.boxes.shape[0] > 0:
+        sent.left_out = max(sent.left_out, asleep.counts[0, LEFT_OUT])
     for n in range(RESULTS):
         tool.felt[n] = felts[0, n]
+    sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
     sent.unknown += np.int64(felts[0, UNKNOWNS])
 
 

@@ -86,7 +86,7 @@ def tool_of(station):
 
 @maker
 def asleep_of(station):
-    """Sleeping clusters of a session with a large tool, with its budget and counts."""
+    """What of a session's tool may sleep; a small one has no blocks."""
     at, n_runs = station.sleeping, station.n_spheres
     sleepers = Sleepers(
         array_at(at.boxes, (at.n_blocks, RADIUS + 1), np.float64),

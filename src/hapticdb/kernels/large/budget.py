@@ -13,7 +13,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, entry, leaf
+from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS2, entry, fields_of, leaf
 from hapticdb.kernels.field.law import DISTANCE_FIELD
 from hapticdb.kernels.large.sleeping import (
     LEFT_OUT,
@@ -48,15 +48,19 @@ from hapticdb.kernels.rigid import is_rigid, transform_of
 
 
 class Asleep(NamedTuple):
-    """Frames with sleeping clusters.
+    """What of a shell may sleep: nothing if `sleepers` has no blocks.
 
-    budget: most points near something that a frame looks at; counts (1, COUNTS) int64 takes the
-    greatest numbers of a period: see `sleeping.LOOKED_AT`.
+    budget: most points near something that a frame looks at; counts (M, COUNTS) int64 keeps the
+    greatest numbers of each pose, or (1, COUNTS) those of all: see `sleeping.LOOKED_AT`. Where
+    nothing sleeps, no budget holds and `counts` stays as it is.
     """
 
     sleepers: Sleepers
     budget: int
     counts: NDArray[np.int64]
+
+
+ASLEEP = fields_of(Asleep, SLEEPERS, INT, INTS2)
 
 
 @leaf
@@ -84,59 +88,62 @@ def _runs_beside_unknown(cells, which, shell, listed, count, transform, place, m
 
 
 @leaf
-def felt_asleep(cells, which, shell, pose, place, law, met, missed, sleepers, budget, counts, out):
-    """`feeling.felt` with sleeping clusters and a budget of points.
+def felt_asleep(cells, which, shell, pose, place, law, met, missed, asleep, counted, out):
+    """`feeling.felt` with what sleeps of the shell, and its budget of points.
 
-    counts (COUNTS,) keeps the greatest numbers (`sleeping.LOOKED_AT`).
+    counted: the row of `Asleep.counts` of this frame.
     """
     points, center, _, _, run, columns, scratch = shell
+    sleepers, budget, counts = asleep
     listed, skips, nothing = sleepers.listed, sleepers.skips, sleepers.nothing
     chosen, chosen_columns, indices = sleepers.chosen, sleepers.columns, sleepers.indices
     transform = transform_of(pose)
-    count = list_near_runs(cells, which, shell, sleepers, transform, place, law)
-    n_near = points_listed(listed, count, run, points.shape[0])
-    n_looked = n_near
-    part = Clusters(points, center, nothing, skips, run, columns, scratch)
-    if n_near <= budget:
-        skip_between(listed, count, skips)
-    else:
-        n_looked = choose_points(
-            listed, count, points, columns, run, budget, chosen, chosen_columns, indices
-        )
-        part = Clusters(chosen[:n_looked], center, nothing, nothing, run, chosen_columns, scratch)
+    count = n_near = n_looked = np.int64(0)
+    part, is_beyond = shell, False
+    if sleepers.boxes.shape[0] > 0:
+        count = list_near_runs(cells, which, shell, sleepers, transform, place, law)
+        n_near = n_looked = points_listed(listed, count, run, points.shape[0])
+        is_beyond = n_near > budget
+        part = Clusters(points, center, nothing, skips, run, columns, scratch)
+        if is_beyond:
+            n_looked = choose_points(
+                listed, count, points, columns, run, budget, chosen, chosen_columns, indices
+            )
+            part = Clusters(
+                chosen[:n_looked], center, nothing, nothing, run, chosen_columns, scratch
+            )
+        else:
+            skip_between(listed, count, skips)
+        counts[counted, LOOKED_AT] = max(counts[counted, LOOKED_AT], n_looked)
+        counts[counted, LEFT_OUT] = max(counts[counted, LEFT_OUT], n_near - n_looked)
     frame_of(law, cells, which, part, pose, place, met, missed, out)
-    if n_near > budget:
+    if is_beyond:
         for hit in range(np.int64(out[HITS])):
             met[hit] = indices[met[hit]]
         out[UNKNOWNS] += _runs_beside_unknown(
             cells, which, shell, listed, count, transform, place, felt_margin(law), missed
         )
-    counts[LOOKED_AT] = max(counts[LOOKED_AT], n_looked)
-    counts[LEFT_OUT] = max(counts[LEFT_OUT], n_near - n_looked)
 
 
 @entry(
-    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2, SLEEPERS, INT, INTS2,
+    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2, ASLEEP,
     also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
 )  # fmt: skip
-def feel_within(
-    cells, reader, shell, poses, place, law, met, missed, out, sleepers, budget, counts
-):
-    """`feeling.feel_kernel` with sleeping clusters, at most `budget` points a frame.
+def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out, asleep):
+    """`feeling.felt` at poses (M, 4, 4) into out (M, RESULTS); met, missed: of the last frame.
 
-    Where there are more points near something than the budget, a frame looks at one of each 2, 4,
-    8 ... of them, so that every cluster keeps its share (`sleeping.choose_points`). Then out (M,
-    RESULTS) counts runs beside unknown cells as unknown points, and `missed` lists the cells.
-    counts (M, COUNTS) int64 keeps the greatest numbers of each pose, or (1, COUNTS) those of all.
-    Returns the number of poses done.
+    Where there are more points near something than the budget of a shell that sleeps, a frame looks
+    at one of each 2, 4, 8 ... of them, so that every cluster keeps its share
+    (`sleeping.choose_points`). Then out counts runs beside unknown cells as unknown points, and
+    `missed` lists the cells. Returns the number of poses done: fewer than M when one is not rigid.
     """
+    last = asleep.counts.shape[0] - 1
     for n in range(poses.shape[0]):
         if not is_rigid(poses[n]):
             return n
         which = begin_frame(cells, reader)
         felt_asleep(
-            cells, which, shell, poses[n], place, law, met, missed, sleepers, budget,
-            counts[min(n, counts.shape[0] - 1)], out[n],
-        )  # fmt: skip
+            cells, which, shell, poses[n], place, law, met, missed, asleep, min(n, last), out[n]
+        )
         end_frame(cells, reader)
     return poses.shape[0]

@@ -4,10 +4,9 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS2, FLOATS3, INT, INTS, chosen_by_type, entry, leaf
-from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, chosen_by_type, entry, leaf
+from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.law import (
-    TANGENT_PLANE,
     TangentPlaneLaw,
     accumulate,
     average_into,
@@ -19,28 +18,22 @@ from hapticdb.kernels.law import (
 )
 from hapticdb.kernels.query.contact import center_of
 from hapticdb.kernels.resident.cells import (
-    CELLS,
-    CELLS_WITH_DISTANCES,
-    CLUSTERS,
     CONTACTS,
     DEEPEST,
     HITS,
     LISTED,
-    PLACE,
     UNKNOWN,
     UNKNOWNS,
-    begin_frame,
     bit_in,
     brick_bit,
     cell_key,
     column_of,
-    end_frame,
     enter_cell,
 )
 from hapticdb.kernels.resident.distance_frames import felt_by_distance
 from hapticdb.kernels.resident.plane_frames import felt_by_plane
 from hapticdb.kernels.resident.runs import free_runs, place_run
-from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
+from hapticdb.kernels.rigid import moved, transform_of, turned
 
 
 @leaf
@@ -137,24 +130,6 @@ def _frame_of(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are un
 
 
 frame_of = chosen_by_type(_frame_of)
-
-
-@entry(
-    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2,
-    also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
-)  # fmt: skip
-def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
-    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met and missed are those of the last frame.
-
-    Returns the number of poses done: fewer than M when one is not rigid.
-    """
-    for n in range(poses.shape[0]):
-        if not is_rigid(poses[n]):
-            return n
-        which = begin_frame(cells, reader)
-        frame_of(law, cells, which, shell, poses[n], place, met, missed, out[n])
-        end_frame(cells, reader)
-    return poses.shape[0]
 
 
 @entry(FLOATS2, INT, FLOAT, FLOATS2)

@@ -10,7 +10,7 @@ import laspy
 import numpy as np
 import pytest
 import trimesh
-from laspy.vlrs.known import WktCoordinateSystemVlr
+from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 
 import hapticdb
 from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
@@ -20,7 +20,12 @@ from hapticdb.store.base import scene_bounds
 from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
-PROJECTED = 'PROJCS["somewhere",GEOGCS["g",UNIT["degree",0.0174532925199433]],UNIT["{}",{}]]'
+DEGREES = (
+    'GEOGCS["g",DATUM["d",SPHEROID["e",6378137,298.257]],PRIMEM["Greenwich",0],'
+    'UNIT["degree",0.0174532925199433]]'
+)
+PROJECTED = f'PROJCS["p",{DEGREES},PROJECTION["Transverse_Mercator"],UNIT["{{}}",{{}}]]'
+HEIGHTS = 'VERT_CS["v",VERT_DATUM["d",2005],UNIT["foot",0.3048],AXIS["Up",UP]]'
 
 
 def cloud(path: Path, wkt: str = "") -> Path:
@@ -71,7 +76,7 @@ def test_an_empty_scene_has_no_extent(run: Run, tmp_path: Path) -> None:
 def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str) -> None:
     made: dict[str, Callable[[Path], Path]] = {"a.las": cloud, "a.stl": stl, "a.glb": boxes}
     file = made[name](tmp_path / name)
-    told = "it names no unit, so its numbers are taken as metres; --unit gives another"
+    told = "its unit is not known: its numbers are taken as metres; --unit gives another"
     is_told = name != "a.glb"
     assert (told in run("import", "a.db", file, "--bits", 6)[1]) == is_told
     assert told not in run("import", "b.db", file, "--bits", 6, "--unit", "m")[1]
@@ -80,24 +85,55 @@ def test_an_import_says_when_it_took_metres(run: Run, tmp_path: Path, name: str)
 
 
 @pytest.mark.parametrize(
-    ("wkt", "unit", "metres", "names_unit"),
+    ("wkt", "unit", "metres", "names_unit", "note"),
     [
-        ("", None, 1.0, False),
-        ("", "ft", 0.3048, False),
-        (PROJECTED.format("US survey foot", 0.304800609601219), None, FEET, True),
-        (PROJECTED.format("US survey foot", 0.304800609601219), "m", 1.0, True),
-        ('COMPD_CS["c",' + PROJECTED.format("metre", 1) + ',VERT_CS["v",UNIT["foot",0.3048]]]',
-         None, 1.0, True),
-        ('GEOGCS["g",UNIT["degree",0.0174532925199433]]', None, 1.0, False),
-        (PROJECTED.format("broken", "1e999"), None, 1.0, False),
+        ("", None, 1.0, False, ""),
+        ("", "ft", 0.3048, False, ""),
+        (PROJECTED.format("US survey foot", 0.304800609601219), None, FEET, True, ""),
+        (PROJECTED.format("US survey foot", 0.304800609601219), "m", 1.0, True, ""),
+        (f'COMPD_CS["c",{PROJECTED.format("metre", 1)},{HEIGHTS}]', None, 1.0, True,
+         "its heights are in units of 0.3048 m, its positions of 1 m"),
+        (DEGREES, "m", 1.0, False, ""),
+        (PROJECTED.format("broken", "1e999"), None, 1.0, False, "cannot be read"),
+        ('PROJCS["cut",', None, 1.0, False, "the unit of its reference system cannot be read"),
     ],
 )  # fmt: skip
 def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
-    tmp_path: Path, wkt: str, unit: str | None, metres: float, names_unit: bool
+    tmp_path: Path, wkt: str, unit: str | None, metres: float, names_unit: bool, note: str
 ) -> None:
     file = read_file(cloud(tmp_path / "a.las", wkt), unit=unit)
+    assert note in "; ".join(file.notes)
+    assert bool(note) == bool(file.notes)
+    assert file.bounds[:, 2].max() <= 100 * (0.3048 if "heights" in note else metres)
     assert file.bounds[1, 0] - file.bounds[0, 0] == pytest.approx(100 * metres)
     assert file.names_unit == names_unit
+
+
+def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> None:
+    with pytest.raises(hapticdb.errors.FileError, match=r"degrees \(g\), which are no lengths"):
+        read_file(cloud(tmp_path / "a.las", DEGREES))
+
+
+@pytest.mark.parametrize(
+    ("keys", "rise"),
+    [
+        ({1024: 1, 3072: 2263}, 1.0),
+        ({1024: 1, 3072: 32618, 3076: 9003}, 1.0),
+        ({1024: 1, 3072: 2263, 4099: 9001}, 1 / FEET),
+        ({1024: 1, 3072: 2263, 4096: 5703}, 1 / FEET),
+    ],
+)
+def test_geotiff_keys_name_a_unit_by_its_code_or_that_of_a_system(
+    tmp_path: Path, keys: dict[int, int], rise: float
+) -> None:
+    las = laspy.read(cloud(tmp_path / "a.las"))
+    record = GeoKeyDirectoryVlr()
+    record.geo_keys_header.number_of_keys = len(keys)
+    record.geo_keys = [GeoKeyEntryStruct(key, 0, 1, value) for key, value in keys.items()]
+    las.header.vlrs.append(record)
+    las.write(tmp_path / "b.las")
+    plain, read = (read_file(tmp_path / name, unit=None).bounds[1] for name in ("a.las", "b.las"))
+    np.testing.assert_allclose(read, plain * FEET * np.array([1, 1, rise]), rtol=1e-6)
 
 
 @pytest.mark.parametrize(

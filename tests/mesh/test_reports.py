@@ -65,6 +65,22 @@ EXPECTED: dict[str, Reads | str] = {
     "g26_hidden.glb": Reads(
         ["shown", "hidden"], 0.48, 0.016, TENTH[0], (1.1, 0.1, 0.1), "1 nodes are hidden in it"
     ),
+    "l01_epsg2263_only.las": Reads(
+        ["l01_epsg2263_only"],
+        0,
+        0,
+        (609601.21920, 304800.60960, 30.480061),
+        (609631.69926, 304831.08966, 45.720091),
+    ),
+    "l02_compound_m_ftUS.las": Reads(
+        ["l02_compound_m_ftUS"],
+        0,
+        0,
+        (2e6, 1e6, 30.480061),
+        (2000100, 1000100, 45.720091),
+        "its heights are in units of 0.304801 m, its positions of 1 m",
+    ),
+    "l06_lonlat.las": "its coordinates are degrees (WGS 84), which are no lengths",
     "m01_item_path.3mf": Reads(["a", "b"], 0.0012, 2e-6, BOX_3MF[0], (0.035, 0.005, 0.005)),
     "m02_root_elsewhere.3mf": Reads(["a"], 0.0006, 1e-6, *BOX_3MF),
     "m04_mesh_plus_beams.3mf": Reads(

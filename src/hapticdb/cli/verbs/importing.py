@@ -237,7 +237,7 @@ def _say(file: str, report: "FileReport") -> None:
         line += f"; {render.counted(report.kept_removed, 'removed part')} left out"
     render.say(line)
     if report.is_unit_assumed:
-        render.say("  it names no unit, so its numbers are taken as metres; --unit gives another")
+        render.say("  its unit is not known: its numbers are taken as metres; --unit gives another")
     if report.defects:
         render.say(f"  found in the file: {report.defects.describe()}")
     for note in report.notes:

@@ -1,10 +1,9 @@
 """LAS and LAZ through laspy: one point cloud named after the file."""
 
-import re
 import struct
-from collections.abc import Iterable
 from dataclasses import replace
 from pathlib import Path
+from typing import NamedTuple
 
 import laspy
 import lazrs
@@ -15,11 +14,15 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
 
-_MODEL, _LINEAR_UNIT = 1024, 3076
-_PROJECTED = 1
-_CODES = {9001: 1.0, 9002: 0.3048, 9003: 1200.0 / 3937.0}
-"""Metres of a projected system's unit of length, by its code in a GeoTIFF key."""
-_WKT_UNIT = re.compile(r'(?:LENGTH)?UNIT\["[^"]*",\s*([0-9.eE+-]+)')
+_MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
+"""Numbers of GeoTIFF keys."""
+_GEOGRAPHIC = 2
+_LEAST = 1e-3
+"""Shortest unit, metres, that a reference system is believed to have; the longest is 1 / this."""
+_NO_LENGTHS = (
+    "which are no lengths: project it to a system in metres, for instance with PDAL's "
+    "filters.reprojection, or name the unit (--unit) if its system is wrong"
+)
 _COLOURS = ("red", "green", "blue")
 _BYTE = 255
 _HEADER = 227
@@ -46,7 +49,7 @@ def read(path: Path) -> Parsed:
         promised = reader.header.point_count
         _check_chunks(reader.header)
         _check_layers(path, reader.header)
-        unit = _unit_of(reader.header.vlrs)
+        lengths = _lengths(reader.header)
         least, most = _POINTS_AT_ONCE
         for points in reader.chunk_iterator(min(most, max(least, path.stat().st_size))):
             if not len(points):
@@ -62,8 +65,12 @@ def read(path: Path) -> Parsed:
             f"it is cut short: its header promises {promised:,} points, {found:,} are there"
         )
     whole = np.concatenate(pieces) if pieces else np.empty((0, 3))
+    whole[:, 2] *= lengths.rise
     parsed = placed_once([(path.stem, Shape(whole, None, colours=_screen(painted)))])
-    return replace(parsed, likely_metres=unit, up="z")
+    return replace(
+        parsed, likely_metres=lengths.metres, up="z", notes=[*lengths.notes],
+        not_lengths=lengths.not_lengths,
+    )  # fmt: skip
 
 
 def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
@@ -77,30 +84,53 @@ def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
     return colours
 
 
-def _unit_of(records: Iterable[object]) -> float | None:
-    """Metres of the unit that the file's projected reference system names, or None."""
-    for record in records:
-        if isinstance(record, GeoKeyDirectoryVlr):
-            keys = {key.id: key.value_offset for key in record.geo_keys}
-            if keys.get(_MODEL) == _PROJECTED:
-                return _CODES.get(keys.get(_LINEAR_UNIT, 0))
-        if isinstance(record, WktCoordinateSystemVlr):
-            return _unit_of_wkt(record.string)
-    return None
+class _Lengths(NamedTuple):
+    """What a file's reference system says of its numbers.
+
+    metres : of their unit, None if unknown; rise : how much longer that of heights is; notes : what
+    is told; not_lengths : why they are no lengths.
+    """
+
+    metres: float | None = None
+    rise: float = 1.0
+    notes: tuple[str, ...] = ()
+    not_lengths: str | None = None
 
 
-def _unit_of_wkt(text: str) -> float | None:
-    """Metres of a projected system's unit in well-known text: the last unit, after angle units."""
-    start = max(text.find("PROJCS["), text.find("PROJCRS["))
-    if start < 0:
-        return None
-    end = min(i for i in (text.find("VERT", start), len(text)) if i >= 0)
-    found = _WKT_UNIT.findall(text, start, end)
+def _lengths(header: laspy.LasHeader) -> _Lengths:
+    """Lengths by the reference system that the file's records name."""
+    records = [*header.vlrs, *(header.evlrs or ())]
+    directories = [one.geo_keys for one in records if isinstance(one, GeoKeyDirectoryVlr)]
+    keys = {key.id: key.value_offset for one in directories for key in one}
+    if not keys and not any(isinstance(one, WktCoordinateSystemVlr) for one in records):
+        return _Lengths()
+    from pyproj import CRS  # noqa: PLC0415 - only files with such a record need it
+    from pyproj.database import get_units_map  # noqa: PLC0415
+    from pyproj.exceptions import CRSError  # noqa: PLC0415
+
     try:
-        metres = float(found[-1])
-    except (IndexError, ValueError):
-        return None
-    return metres if 1e-3 <= metres <= 1e3 else None
+        system = header.parse_crs()
+        vertical = CRS.from_epsg(keys[_VERTICAL_SYSTEM]) if _VERTICAL_SYSTEM in keys else None
+    except CRSError:
+        system = vertical = None
+    if (system is not None and system.is_geographic) or keys.get(_MODEL) == _GEOGRAPHIC:
+        name = "" if system is None else f" ({system.name})"
+        return _Lengths(not_lengths=f"its coordinates are degrees{name}, {_NO_LENGTHS}")
+    by_code = {
+        int(unit.code): float(unit.conv_factor)
+        for unit in get_units_map(auth_name="EPSG", category="linear").values()
+    }
+    axes = [] if system is None else system.axis_info
+    metres = by_code.get(
+        keys.get(_LINEAR_UNIT, 0), axes[0].unit_conversion_factor if axes else None
+    )
+    if metres is None or not _LEAST <= metres <= 1 / _LEAST:
+        return _Lengths(notes=("the unit of its reference system cannot be read",))
+    heights = [*axes[2:3], *([] if vertical is None else vertical.axis_info[:1])]
+    height = heights[-1].unit_conversion_factor if heights else metres
+    height = by_code.get(keys.get(_VERTICAL_UNIT, 0), height)
+    told = f"its heights are in units of {height:.6g} m, its positions of {metres:.6g} m"
+    return _Lengths(metres, height / metres, (told,) if height != metres else ())
 
 
 def _check_chunks(header: laspy.LasHeader) -> None:

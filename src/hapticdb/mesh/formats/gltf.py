@@ -59,7 +59,11 @@ _HARMLESS = (
 
 def read(path: Path) -> Parsed:
     """Parts of the file's default scene, in metres."""
-    content = path.read_bytes()
+    return parsed(path.read_bytes(), path)
+
+
+def parsed(content: bytes, path: Path) -> Parsed:
+    """Parts of a file's content; files that it refers to are beside `path`."""
     tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)

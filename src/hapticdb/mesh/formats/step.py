@@ -1,13 +1,23 @@
 """STEP through cascadio (OpenCASCADE): tessellated to GLB, in metres, names kept."""
 
-import tempfile
+import re
 from dataclasses import replace
 from pathlib import Path
 
 import cascadio
+import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.mesh.formats import gltf
-from hapticdb.mesh.raw import Parsed, UnreadableError
+from hapticdb.mesh.raw import Parsed, Placement, UnreadableError
+from hapticdb.mesh.text import text_of
+from hapticdb.units import UNITS
+
+_POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
+_FINE = 1e-5
+"""Steps between positions of 32 bits that do no harm, as a share of the extent."""
+_SAME = 1e-5
+"""Relative difference up to which a length is that of a known unit."""
 
 
 def read(path: Path) -> Parsed:
@@ -16,11 +26,73 @@ def read(path: Path) -> Parsed:
     The chord error is cascadio's default: 0.01 of the file's unit, or 0.5 rad between neighbouring
     triangles, whichever is coarser on that face.
     """
-    if b"ISO-10303-21" not in path.read_bytes()[:1024]:
+    content = path.read_bytes()
+    if b"ISO-10303-21" not in content[:1024]:
         raise UnreadableError("it is no STEP file: 'ISO-10303-21' does not stand at its start")
-    with tempfile.TemporaryDirectory(prefix="hapticdb-step-") as folder:
-        glb = Path(folder) / "tessellated.glb"
-        cascadio.step_to_glb(str(path), str(glb))
-        if not glb.is_file() or glb.stat().st_size == 0:
-            raise UnreadableError("OpenCASCADE finds nothing in it that it can tessellate")
-        return replace(gltf.read(glb), up=None)  # the solids keep their axes, whatever they mean
+    text = text_of(content)
+    found = _tessellated(text, path)
+    return _nearer(found, text, path) if _is_coarse(found) else found
+
+
+def _tessellated(text: str, path: Path) -> Parsed:
+    glb = cascadio.load(text.encode(), "step")
+    if not glb:
+        raise UnreadableError("OpenCASCADE finds nothing in it that it can tessellate")
+    # The solids keep their axes, whatever they mean.
+    return replace(gltf.parsed(glb, path.with_suffix(".glb")), up=None)
+
+
+def _is_coarse(found: Parsed) -> bool:
+    """Whether a shape lies so far from its origin that cascadio's 32 bits round it."""
+    for shape in found.shapes:
+        if len(shape.vertices):
+            low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
+            farthest = max(-low.min(), high.max())
+            if np.spacing(np.float32(farthest)) > _FINE * (high - low).max():
+                return True
+    return False
+
+
+def _nearer(found: Parsed, text: str, path: Path) -> Parsed:
+    """Tessellate anew around the middle of the file's points, and place the result where it was.
+
+    One vector is taken from all points that are far away. That moves all solids by this vector,
+    unless an assembly brings far ones near; so the result is compared with the first one.
+    """
+    points = [_numbers(match[2]) for match in _POINT.finditer(text)]
+    middle = np.median([point for point in points if len(point) == 3] or np.zeros((1, 3)), axis=0)
+
+    def moved(match: re.Match[str]) -> str:
+        point = _numbers(match[2])
+        if len(point) != 3 or np.linalg.norm(point - middle) > np.linalg.norm(point):
+            return match[0]
+        return match[1] + ",".join(map(repr, (point - middle).tolist()))
+
+    near = _tessellated(_POINT.sub(moved, text), path)
+    before, after = _corners(found), _corners(near)
+    step = np.spacing(np.float32(np.abs(before).max()))
+    along = np.abs(middle).argmax()
+    length = (before - after)[0, along] / middle[along] if middle[along] else 0.0
+    metres = next((unit for unit in UNITS.values() if abs(length - unit) <= _SAME * unit), 0.0)
+    if before.shape != after.shape or np.abs(before - after - metres * middle).max() > 4 * step:
+        return found  # `clean` tells what is lost
+    offset = np.eye(4)
+    offset[:3, 3] = metres * middle
+    placements = [
+        Placement(one.name, one.shape, offset @ one.world_from_part) for one in near.placements
+    ]
+    return replace(near, placements=placements)
+
+
+def _numbers(text: str) -> NDArray[np.float64]:
+    return np.array([float(word) for word in text.split(",")])
+
+
+def _corners(found: Parsed) -> NDArray[np.float64]:
+    """Least and greatest position of each placed shape, one below the other."""
+    corners = []
+    for one in found.placements:
+        vertices = np.asarray(found.shapes[one.shape].vertices, dtype=np.float64)
+        placed = vertices @ one.world_from_part[:3, :3].T + one.world_from_part[:3, 3]
+        corners += [placed.min(axis=0), placed.max(axis=0)]
+    return np.array(corners)

@@ -61,6 +61,9 @@ def test_poses_come_back_from_a_file(
         b"x,y,z,qw,qx,qy,qz\r1,2,3,1,0,0,0\r",
         b" X , Y,Z,QW,QX,QY,QZ\n\n 1, 2 ,3,1,0,0,0\n\n\n",
         b"time,qw,qx,qy,qz,x,y,z\n9,1,0,0,0,1,2,3\n",
+        b"x;y;z;qw;qx;qy;qz\n1,0;2;3;1;0,0;0;0\n",
+        b"x\ty\tz\tqw\tqx\tqy\tqz\n1\t2\t3\t1\t0\t0\t0\n",
+        "x;y;z;qw;qx;qy;qz\n1;2;3;1;0;0;0\n".encode("utf-16"),
         b'"x","y","z","qw","qx","qy","qz"\n"1","2","3","1","0","0","0"',
     ],
 )

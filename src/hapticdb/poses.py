@@ -5,6 +5,7 @@ The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order. Other columns
 pose.
 """
 
+import codecs
 import csv
 import io
 import math
@@ -160,7 +161,8 @@ def _read_text(path: Path) -> str:
     if not content.strip():
         raise FileError(f"{path} is empty; {_HINT}")
     try:
-        text = content.decode("utf-8-sig")
+        is_utf_16 = content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE))
+        text = content.decode("utf-16" if is_utf_16 else "utf-8-sig")
     except UnicodeDecodeError:
         text = "\0"
     if "\0" in text:
@@ -173,7 +175,12 @@ def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
 
     There is an eighth column if the header names the `optional` one.
     """
-    reader = csv.reader(io.StringIO(_read_text(path), newline=""), strict=True)
+    text = _read_text(path)
+    head = text.lstrip().split("\n", 1)[0]
+    sign = next((sign for sign in ";\t" if sign in head and "," not in head), ",")
+    if sign != ",":  # as spreadsheets write it where a comma stands before decimals
+        text = text.replace(",", ".")
+    reader = csv.reader(io.StringIO(text, newline=""), delimiter=sign, strict=True)
     places: dict[str, int] = {}
     rows: list[list[float]] = []
     try:

@@ -78,3 +78,18 @@ def test_what_chooses_nothing_is_one_line(run: Run, scene: Path, word: str) -> N
     refused(run("move", scene, word, "--translate", "0,0,0"), "WORDS: no object")
     refused(run("remove", scene, word), "WORDS: no object")
     assert ids_in(scene) == [1, 2, 3]
+
+
+def test_a_number_is_an_id_or_else_a_name_and_a_verb_says_which(run: Run, tmp_path: Path) -> None:
+    corners = "".join(f"v {x} 0 {y}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
+    faces = "".join(f"o {name}\nf 1 2 3\n" for name in ("2", "4711", "body", "9"))
+    (tmp_path / "numbers.obj").write_text(corners + faces)
+    run("import", "n.db", "numbers.obj", "--bits", 4, "--no-distances")
+    out, err = run("remove", "n.db", "2")[1:]
+    assert "removed 2 (4711)" in out
+    assert "2 is taken as an id; 'name=2' is a name" in err
+    out, err = run("remove", "n.db", "9")[1:]
+    assert "removed 4 (9)" in out
+    assert "9 is taken as a name: no object has this id" in err
+    assert run("remove", "n.db", "name=2", "3")[1:] == ("removed 1 (2)\nremoved 3 (body)\n", "")
+    refused(run("remove", "n.db", "5"), "WORDS: no object 5")

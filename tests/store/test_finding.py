@@ -70,6 +70,8 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
         (["left,right"], [10]),
         (["left?right"], [10]),
         (["[7]"], [11]),
+        (["name=7"], [11]),
+        (["name=Body/door"], [6, 7]),
         (["hood,tyre,7"], [1, 3, 5, 7]),
         (["[t-z]*,hood"], [1, 2, 3, 4, 5]),
     ],

@@ -1,6 +1,7 @@
 """Objects that the words of an option choose: ids, names, patterns, attributes."""
 
 from collections.abc import Iterable
+from contextlib import suppress
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -22,12 +23,37 @@ class Felt(NamedTuple):
 
 def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Object]":
     """Objects that the words of an option choose, ordered by id; the error names the option."""
+    return _found(env, as_named(env, words, option), option)
+
+
+def _found(env: "Environment", words: list[str], option: str) -> "list[Object]":
     from hapticdb.errors import ObjectNotFoundError
 
     try:
         return env.find(*words)
     except ObjectNotFoundError as error:
         raise ObjectNotFoundError(f"{option}: {error}") from None
+
+
+def as_named(env: "Environment", words: Iterable[str], option: str) -> list[str]:
+    """Words with a number as a name where no object has that id; says how numbers are taken."""
+    from hapticdb.cli import render
+    from hapticdb.errors import ObjectNotFoundError
+    from hapticdb.store.finding import NAME
+
+    taken = []
+    for word in words:
+        named: set[int] = set()
+        if word.isdecimal():
+            with suppress(ObjectNotFoundError):
+                named = {obj.id for obj in env.find(NAME + word)} - {int(word)}
+        is_name = named and all(obj.id != int(word) for obj in env.objects())
+        if is_name:
+            render.note(f"{option}: {word} is taken as a name: no object has this id")
+        elif named:
+            render.note(f"{option}: {word} is taken as an id; '{NAME}{word}' is a name")
+        taken.append(NAME + word if is_name else word)
+    return taken
 
 
 def ids_of(env: "Environment", words: Iterable[str] | None, option: str) -> list[int]:
@@ -42,9 +68,10 @@ def felt_objects(
     parts: Iterable[int] = (),
 ) -> Felt:
     """Check the words of --where and --exclude; parts : ids of what moves, which is not felt."""
-    words, more = list(where or ()), list(exclude or ())
-    chosen(env, words, "--where")
-    chosen(env, more, "--exclude")
+    words = as_named(env, where or (), "--where")
+    more = as_named(env, exclude or (), "--exclude")
+    _found(env, words, "--where")
+    _found(env, more, "--exclude")
     left_out: list[int | str] = [*parts, *more]
     if not words and not left_out:
         return Felt([], [], [])

@@ -14,6 +14,8 @@ from hapticdb.store.refusals import no_object
 MOST_IDS = 1 << 63
 """All ids lie below this value: they are signed 64-bit integers in the databases."""
 
+NAME = "name="
+"""Before a word that is a name though it could be an id or something else."""
 
 Words = Iterable[int | str]
 """Ids, names, patterns and ``attribute=value``, as `find_objects` reads them."""
@@ -33,8 +35,8 @@ def find_objects(store: Store, words: Words) -> list[Object]:
         compared with every element of the path, one with ``/`` with the path from its beginning.
         If the match is a sub-assembly, everything below it is chosen. A text that is exactly a name
         is no pattern. A text that fits no name, but has ``=``, is ``attribute=value``: see
-        `hapticdb.store.attributes.having_attribute`. A text with commas is several words, unless it
-        chooses something as a whole.
+        `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name, too. A text with commas
+        is several words, unless it chooses something as a whole.
 
     Raises
     ------
@@ -112,7 +114,10 @@ class Listing:
         ]
 
     def _fitting(self, word: str) -> list[Object]:
-        return _named_like(self._objects, word) or having_attribute(self._objects, word)
+        found = _named_like(self._objects, word) or having_attribute(self._objects, word)
+        if not found and word.startswith(NAME):
+            return _named_like(self._objects, word.removeprefix(NAME))
+        return found
 
 
 def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:

@@ -173,7 +173,8 @@ def objects(
     In a pattern * stands for anything, ? for one character, [ab] for a or b;
     case counts. attribute=value chooses the objects that have that attribute; the
     value may be a pattern, and outer.inner=value names one inside another. A word
-    with = that fits the name of an object chooses that name.
+    with = that fits the name of an object chooses that name. A number is an id, or
+    a name where no object has that id; name=3 is a name.
 
     Example: hapticdb objects car.db
 

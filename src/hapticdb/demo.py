@@ -20,11 +20,11 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import GridError, UsageError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
 from hapticdb.query.frame import Strategy
 from hapticdb.query.touches import Touch
+from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import beside, name_of, redact
@@ -158,7 +158,7 @@ def prepare(
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    compile_missing(entries_for("import", "touch"))
+    make_ready("import", "touch")
     shell = PointShell.from_file(files.wrench, points)
     imported = []
     first = beside(home / "demo", "car") if url is None else beside(url, f"{name_of(url)}_demo_car")

@@ -38,7 +38,7 @@ FLOORS: list[set[str]] = [
     {"query"},
     {"pointshell", "mesh", "poses"},
     {"store"},
-    {"grid"},
+    {"grid", "ready"},
     {"kernels"},
     {"protocol", "units"},
     {"errors", "interrupting"},

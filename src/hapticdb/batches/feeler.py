@@ -19,6 +19,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
 from hapticdb.query.law import ForceLaw
+from hapticdb.ready import make_ready
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
@@ -62,6 +63,7 @@ class Feeler:
         jobs: int | None = None,
     ) -> None:
         n_jobs = available_jobs(jobs)
+        make_ready("replay")
         self.shell = shell
         self.law = law
         self._store = store

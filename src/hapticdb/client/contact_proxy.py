@@ -22,9 +22,9 @@ from hapticdb.client.proxy_force import ForceState, ProxyForce
 from hapticdb.devices.profiles import HAND_STIFFNESS
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import ConnectionLostError, HapticDBError, UsageError
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.records import HAND, pose_numbers
 from hapticdb.protocol.contacts import HandState, ProxyTerms, ProxyWish
+from hapticdb.ready import make_ready
 from hapticdb.realtime.handle import Handle
 
 Floats = NDArray[np.float64]
@@ -104,7 +104,7 @@ class ContactProxy:
     ) -> None:
         if damping is not None and not 0.0 <= damping < math.inf:
             raise UsageError(f"a damping of {damping} N s/m: give 0 or more")
-        compile_missing(entries_for("proxy"))
+        make_ready("proxy")
         self.handle = handle or Handle()
         scale = self.handle.scale
         self._wish = ProxyWish(

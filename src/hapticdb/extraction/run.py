@@ -23,6 +23,7 @@ from hapticdb.extraction.problem import Exit, Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut
 from hapticdb.extraction.screws import unscrewed
+from hapticdb.ready import make_ready
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
@@ -152,6 +153,7 @@ def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
 
 def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
+    make_ready("extract")
     leaving = Exit(
         problem.box[0],
         problem.box[1],

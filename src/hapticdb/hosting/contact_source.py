@@ -16,7 +16,6 @@ from numpy.typing import NDArray
 
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.errors import UsageError
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.hand import quasistatic, servo
 from hapticdb.kernels.hand.device_spring import contact_stiffness
@@ -47,6 +46,7 @@ from hapticdb.protocol.contacts import (
     ProxyTerms,
     ProxyWish,
 )
+from hapticdb.ready import make_ready
 from hapticdb.realtime.coupling import Coupling, radius_of
 from hapticdb.realtime.drive import prepare_follower
 from hapticdb.realtime.resident_cells import ResidentCells
@@ -87,7 +87,7 @@ class ContactSource:
                 "contact proxies need distances to surfaces, which this environment lacks: import "
                 "it again with --distances"
             )
-        compile_missing(entries_for("proxies"))
+        make_ready("proxies")
         size = cells.grid.voxel_size
         radius = radius_of(shell, size)
         coupling = Coupling(

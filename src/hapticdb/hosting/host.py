@@ -23,11 +23,11 @@ from hapticdb.hosting.running import Running
 from hapticdb.hosting.stations import SeatRequest
 from hapticdb.hosting.tables import SharedTables, Words
 from hapticdb.hosting.workers import Workers
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
 from hapticdb.query.law import SMOOTH
+from hapticdb.ready import make_ready
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.recording.header import Header
@@ -136,7 +136,7 @@ class SessionHost:
             raise UsageError(
                 f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
             )
-        compile_missing(entries_for("host"))  # here, so that no worker compiles
+        make_ready("host")  # here, so that no worker compiles
         felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():

@@ -9,10 +9,14 @@ from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError
 from hapticdb.kernels.compiling import Compiled, compile_missing, entries_for, missing
+from hapticdb.ready import seconds_of
 from hapticdb.realtime.processes import MessageSender, Process, parent_is_gone
 
 LOOKED_EVERY = 0.2
 """Seconds from one look for the server's end to the next. Larger: compiling ends later."""
+
+NICE = 10
+"""Of the processes that compile: the page is drawn first. Larger: it waits less for them."""
 
 
 class Preparation:
@@ -38,8 +42,10 @@ class Preparation:
                 self._is_done = True
 
     def _compile(self, loop: asyncio.AbstractEventLoop) -> None:
-        if not missing(entries_for(*self._purposes)):
+        names = missing(entries_for(*self._purposes))
+        if not names:
             return
+        over = time.monotonic() + seconds_of(names)
         with Process("hapticdb.hosting.preparing:work", self._purposes, ()) as process:
             while not self._is_ending.is_set():
                 message = process.receive(LOOKED_EVERY)
@@ -47,7 +53,8 @@ class Preparation:
                     if message.word == "done":
                         return
                     now: Compiled = message.content
-                    text = f"preparing the hand: {now.done} of {now.total} kernels ..."
+                    left = f"about {max(over - time.monotonic(), 3.0):.0f} s left"
+                    text = f"compiling what the hand needs, once: {now.done} of {now.total}, {left}"
                     loop.call_soon_threadsafe(self._tell, text)
                 elif process.wait(0.0):
                     raise HapticDBError("the process that compiles kernels ended too early")
@@ -60,6 +67,7 @@ class Preparation:
 def work(purposes: tuple[str, ...], sender: MessageSender) -> None:
     """Compile what is missing; the work of the process, which ends with the server."""
     threading.Thread(target=_end_with_parent, daemon=True).start()
+    os.nice(NICE)
     compile_missing(entries_for(*purposes), lambda now: sender.send("compiled", now))
     sender.send("done")
 

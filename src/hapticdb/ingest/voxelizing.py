@@ -18,6 +18,7 @@ from hapticdb.kernels.surfaces import distances as kernels
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.mesh import MeshFile, Part
 from hapticdb.mesh.child import bytes_available
+from hapticdb.ready import make_ready
 from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, Store
 
 Item = TypeVar("Item")
@@ -60,6 +61,7 @@ def rows_of_part(
 
     Raises `FileError` if this would take more memory than the machine has left.
     """
+    make_ready("import")
     what = f"part {part.name!r}"
     voxels_alone = _VOXELS_SHARE if distances else 1.0
     if part.is_cloud:

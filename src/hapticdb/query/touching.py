@@ -12,6 +12,7 @@ from hapticdb.query.frame import Answer, HapticQuery, Strategy
 from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.query.touches import Touch
+from hapticdb.ready import make_ready
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import Filter
 
@@ -59,6 +60,7 @@ class Touching:
         law: ForceLaw | None,
     ) -> Touch:
         """Compute one frame."""
+        make_ready("touch")
         answer = _twice(lambda: self._answer(shell, pose, strategy, maxgap, felt, law))
         self.known.check_words(felt)
         self.known.check_answer(answer.ids)

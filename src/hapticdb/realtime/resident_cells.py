@@ -9,7 +9,7 @@ from typing import NamedTuple, Self
 
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.ready import make_ready
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
@@ -133,7 +133,7 @@ class ResidentCells:
         self.filter = Filter(where, exclude)
         prepare(FETCH, PURPOSES)  # while the environment is read
         self.grid, has_distances = self._read_environment(distances)
-        compile_missing(entries_for(*PURPOSES))  # now: two processes would each compile them
+        make_ready(*PURPOSES)  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(

@@ -11,10 +11,10 @@ import numpy as np
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
+from hapticdb.ready import make_ready
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand
@@ -205,7 +205,7 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        compile_missing(entries_for("feel"))  # here, so that the loop does not compile
+        make_ready("feel")  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())

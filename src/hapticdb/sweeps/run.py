@@ -20,6 +20,7 @@ from hapticdb.pointshell.moving import MovingSurface, tree_of
 from hapticdb.pointshell.orientation import orient
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
+from hapticdb.ready import make_ready
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import FollowedContact, follow
@@ -90,6 +91,7 @@ def sweep(
         If a word chooses no object; if an object's surface is not in the database.
     """
     asked = _asked(contact, limit, seconds, profile=profile, progress=progress)
+    make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, _center_of(tool, about))
     if proportions is None:

@@ -10,6 +10,7 @@ import zipfile
 from collections import Counter, defaultdict
 from dataclasses import dataclass, field
 from pathlib import Path
+from typing import IO
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 from xml.parsers import expat
@@ -198,20 +199,24 @@ def _read_model(
     parser.StartDoctypeDeclHandler = _refuse_doctype
     if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
         raise UnreadableError("its model is packed by another method than deflate: save it anew")
-    # Parsed as a stream, without a tree, so memory is in proportion to the geometry.
     with archive.open(name) as stream:
-        try:
-            while piece := stream.read(_PIECE):
-                model.unpacked += len(piece)
-                if model.unpacked > _UNPACKED + _INFLATION * model.packed:
-                    raise UnreadableError(
-                        f"its models unpack to more than {_UNPACKED >> 20} MiB and {_INFLATION} "
-                        "times its size: save it with less compression"
-                    )
-                parser.Parse(piece)
-            parser.Parse(b"", True)  # noqa: FBT003 - the parser's own
-        except expat.ExpatError as error:
-            raise UnreadableError(f"its model is damaged or cut short: {error}") from None
+        _parse(parser, stream, model)
+
+
+def _parse(parser: expat.XMLParserType, stream: IO[bytes], model: _Model) -> None:
+    """Parse a model as a stream, without a tree: memory is in proportion to the geometry."""
+    try:
+        while piece := stream.read(_PIECE):
+            model.unpacked += len(piece)
+            if model.unpacked > _UNPACKED + _INFLATION * model.packed:
+                raise UnreadableError(
+                    f"its models unpack to more than {_UNPACKED >> 20} MiB and {_INFLATION} "
+                    "times its size: save it with less compression"
+                )
+            parser.Parse(piece)
+        parser.Parse(b"", True)  # noqa: FBT003 - the parser's own
+    except expat.ExpatError as error:
+        raise UnreadableError(f"its model is damaged or cut short: {error}") from None
 
 
 def _refuse_doctype(*_: object) -> None:

@@ -1,0 +1,42 @@
+"""Kernels compiled before the library's first call of them, with a line that says so."""
+
+import os
+import sys
+from collections.abc import Collection
+from threading import Lock
+
+from hapticdb.kernels.compiling import compile_missing, entries_for, missing
+
+SECONDS = {"hand.quasistatic.advance": 25.0, "hosting.loop.run": 8.0}
+"""Seconds that the longest kernels compile, of one processor; the others take `SHORT` each."""
+SHORT = 1.2
+
+
+def seconds_of(names: Collection[str]) -> float:
+    """Seconds that entries take to compile on this machine's processors, roughly."""
+    each = [SECONDS.get(name, SHORT) for name in names]
+    return max(sum(each) / min(os.cpu_count() or 1, len(each)), *each)
+
+
+_READY: set[str] = set()
+_COMPILING = Lock()
+
+
+def make_ready(*purposes: str) -> None:
+    """Compile what those purposes call and this machine has not compiled yet, side by side.
+
+    purposes : as `hapticdb.kernels.compiling.PURPOSES` names them. Once a process; a line on
+    standard error says what it waits for.
+    """
+    if _READY.issuperset(purposes):
+        return
+    with _COMPILING:
+        names = missing(entries_for(*purposes))
+        if names:
+            sys.stderr.write(
+                f"hapticdb: compiling {len(names)} kernels, once on this machine: about "
+                f"{seconds_of(names):.0f} s ...\n"
+            )
+            sys.stderr.flush()
+            compile_missing(names)
+        _READY.update(purposes)

@@ -69,6 +69,9 @@ CRAFTED = {
     "a surface cut short": "INSERT INTO surface SELECT digest, x'00' FROM object WHERE id = 2",
     "another surface": f"INSERT INTO surface SELECT digest, x'{BALL}' FROM object WHERE id = 2",
     "a view for the surfaces": VIEW.format("surface"),
+    "a pair of one": (
+        "INSERT INTO pair VALUES (2, 2, 'apart', 0, 0, 0, 0, 0, 0, 0, 0, 'new', 1, '', NULL, NULL)"
+    ),
 }
 OF_BRICKS = {
     "an empty brick": "UPDATE brick SET occupancy = zeroblob(64) WHERE id = 2",

@@ -39,6 +39,7 @@ from hapticdb.store.base import (
     touched_ranges,
 )
 from hapticdb.store.believed import distances_crc, rows_crc
+from hapticdb.store.pairs import PairRow
 from hapticdb.store.refusals import (
     check_distances,
     check_unwritten,
@@ -57,10 +58,12 @@ class State:
         changes: tuple[Change, ...] = (),
         removed: frozenset[tuple[str, str]] = frozenset(),
         surfaces: Mapping[str, bytes] | None = None,
+        pairs: Mapping[tuple[int, int], PairRow] | None = None,
     ) -> None:
         self.objects = objects
         self.changes = changes
         self.removed = removed
+        self.pairs = pairs or {}
         held = {obj.digest for obj, _ in objects.values()}
         self.surfaces = {name: one for name, one in (surfaces or {}).items() if name in held}
 
@@ -252,7 +255,9 @@ class MemoryStore:
         with self._contents.write_lock:
             state = self._newest()
             held = {digest: surface} | state.surfaces
-            self._contents.state = State(state.objects, state.changes, state.removed, held)
+            self._contents.state = State(
+                state.objects, state.changes, state.removed, held, state.pairs
+            )
 
     def want_distances(self) -> None:
         self._check_writable()
@@ -311,7 +316,34 @@ class MemoryStore:
         ranges = touched_ranges(self.grid, self.layout, touched)
         change = Change(revision, action, object_id, ranges)
         self._contents.state = State(
-            objects, (*state.changes, change), frozenset(removed), surfaces
+            objects, (*state.changes, change), frozenset(removed), surfaces, state.pairs
+        )
+
+    # -- pairs -------------------------------------------------------------------------------
+
+    def pairs(self) -> list[PairRow]:
+        return sorted(self._state().pairs.values())
+
+    def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
+        with self._contents.write_lock:
+            held = dict(self._newest().pairs)
+            for row in rows:
+                old = held.get(row[:2], row)
+                if row.revision >= old.revision:
+                    held[row[:2]] = row._replace(because=old.because, shapes=old.shapes)
+            self._keep({key: row for key, row in held.items() if key not in gone})
+
+    def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
+        with self._contents.write_lock:
+            held = dict(self._newest().pairs)
+            if (a, b) in held:
+                held[a, b] = held[a, b]._replace(because=because, shapes=shapes)
+            self._keep(held)
+
+    def _keep(self, pairs: Mapping[tuple[int, int], PairRow]) -> None:
+        state = self._contents.state
+        self._contents.state = State(
+            state.objects, state.changes, state.removed, state.surfaces, pairs
         )
 
     # -- statistics --------------------------------------------------------------------------

@@ -144,6 +144,10 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
             report.add(finding)
         for finding in _surface_findings(store, objects, report):
             report.add(finding)
+        try:
+            store.pairs()
+        except DamagedError as error:
+            report.add(_cause(error))
 
 
 # -- the log of changes --------------------------------------------------------------------------

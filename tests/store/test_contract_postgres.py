@@ -100,7 +100,7 @@ def test_an_environment_of_format_2_is_read_as_it_is_and_brought_up_to_date_by_i
     name = parse(url).environment
     for what in ("TABLE {0}.removed", "FUNCTION {0}.note_removed", "FUNCTION {0}.removed_parts"):
         admin.execute(f"DROP {what.format(name)} CASCADE")
-    admin.execute(f"DROP TABLE {name}.band, {name}.surface")
+    admin.execute(f"DROP TABLE {name}.band, {name}.surface, {name}.pair")
     admin.execute(f"DROP INDEX {name}.object_digest")
     admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
     admin.execute(f"UPDATE {name}.environment SET format = 2")

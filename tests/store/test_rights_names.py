@@ -68,7 +68,7 @@ def test_rights_from_before_a_table_hold_for_it(
     create_store(url, GRID).close()
     grant(url, role, right)
     name = parse(url).environment
-    admin.execute(f"DROP TABLE {name}.band, {name}.surface")
+    admin.execute(f"DROP TABLE {name}.band, {name}.surface, {name}.pair")
     admin.execute(f"DROP INDEX {name}.object_digest")
     admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
     admin.execute(f"UPDATE {name}.environment SET format = 3")

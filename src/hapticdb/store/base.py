@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
+from hapticdb.store.pairs import KeepsPairs
 
 Layout = Literal["voxel", "brick"]
 Table = Literal["voxel", "brick", "band"]
@@ -249,10 +250,7 @@ class Freshness(NamedTuple):
 
 
 class Size(NamedTuple):
-    """How large the tables are; bytes of the whole database, its write-ahead log included.
-
-    surface_bytes : of the packed surfaces alone.
-    """
+    """How large the tables are; bytes of the whole database with its log; of surfaces, packed."""
 
     rows: int
     bytes: int
@@ -392,7 +390,9 @@ class _IsChecked(Protocol):
         """
 
 
-class Store(_ReadsRows, _ReadsObjects, _WritesObjects, _KeepsStatistics, _IsChecked, Protocol):
+class Store(
+    _ReadsRows, _ReadsObjects, _WritesObjects, KeepsPairs, _KeepsStatistics, _IsChecked, Protocol
+):
     """An opened environment. Methods take and return whole batches.
 
     A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed

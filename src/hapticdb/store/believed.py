@@ -28,6 +28,7 @@ from hapticdb.store.base import (
     Object,
     Rows,
 )
+from hapticdb.store.pairs import KINDS, STATUSES, PairRow
 
 KEY_END = 1 << 63
 """One above the largest count or key that an int64 holds."""
@@ -40,8 +41,8 @@ ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
 TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
 """Tables that every environment has, in every format."""
-BAND, SURFACE = "band", "surface"
-"""Tables of distances and of surfaces, which an environment has since formats 4 and 6."""
+BAND, SURFACE, PAIR = "band", "surface", "pair"
+"""Tables of distances, surfaces and pairs, which an environment has since formats 4, 6 and 7."""
 Floats = NDArray[np.float64]
 
 
@@ -150,7 +151,7 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
             raise damaged(url, f"no such table: {name}")
         if kind != "table":
             raise damaged(url, f"{name} is a {kind} and no table")
-    for name in (BAND, SURFACE):
+    for name in (BAND, SURFACE, PAIR):
         if kinds.get(name, "table") != "table":
             raise damaged(url, f"{name} is a {kinds[name]} and no table")
 
@@ -215,6 +216,25 @@ def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
             raise damaged(url, f"surface {digest!s:.40}: its digest is no text, or it is no bytes")
         found[digest] = geometry
     return found
+
+
+def pair_of(url: str, row: Sequence[Any]) -> PairRow:
+    """Read a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
+    a, b, kind, at_least, at_most, *place, status, revision, setting, because, shapes = row
+    numbers = (at_least, *place, *(() if at_most is None else (at_most,)))
+    texts = (setting, *(text for text in (because, shapes) if text is not None))
+    if not (
+        all(map(_is_count, (a, b, revision)))
+        and a < b
+        and kind in KINDS
+        and status in STATUSES
+        and all(map(_is_finite, numbers))
+        and all(isinstance(text, str) for text in texts)
+    ):
+        raise damaged(url, f"pair {a!s:.40}, {b!s:.40}: it holds what no search for clashes writes")
+    return PairRow(
+        a, b, kind, at_least, at_most, tuple(place), status, revision, setting, because, shapes
+    )
 
 
 def digests_of(url: str, rows: Iterable[Sequence[Any]]) -> set[str]:

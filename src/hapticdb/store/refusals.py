@@ -4,6 +4,7 @@ from hapticdb.errors import (
     ConflictError,
     EnvironmentExistsError,
     ObjectNotFoundError,
+    ReadOnlyError,
     UsageError,
 )
 from hapticdb.store.base import Layout, Object
@@ -20,6 +21,14 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
     """Build the error for a part that the environment holds already."""
     return EnvironmentExistsError(
         f"{record.name} of {record.link} is in {url} already; remove it first"
+    )
+
+
+def older_format(url: str) -> ReadOnlyError:
+    """Build the error for a write into a table that only the environment's owner can make."""
+    return ReadOnlyError(
+        f"{url} has an older format: its owner has to open it once to write, and it is brought up "
+        "to date"
     )
 
 

@@ -31,6 +31,8 @@ STEPS = (
     Step("shards", readers_need_it=False),
     # without it no object has a surface
     Step("surfaces", readers_need_it=False),
+    # without it no pair is kept
+    Step("pairs", readers_need_it=False),
 )
 FORMAT_VERSION = len(STEPS)
 Dialect = Mapping[str, tuple[str, ...]]

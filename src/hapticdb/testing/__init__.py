@@ -23,6 +23,7 @@ from hapticdb.testing.distances import DistancesContract
 from hapticdb.testing.engines import ENGINE_CAPABILITIES, EngineContract
 from hapticdb.testing.lifecycle import LifecycleContract
 from hapticdb.testing.objects import ObjectsContract
+from hapticdb.testing.pairs import PairsContract
 from hapticdb.testing.rows import RowsContract
 from hapticdb.testing.scenes import (
     KINDS,
@@ -56,6 +57,7 @@ class StoreContract(
     ObjectsContract,
     DistancesContract,
     SurfacesContract,
+    PairsContract,
     LifecycleContract,
     StatisticsContract,
     WatchContract,

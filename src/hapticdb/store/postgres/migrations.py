@@ -229,6 +229,30 @@ SURFACES = (
     _granted_as_on_brick("surface"),
 )
 
+PAIRS = (
+    """
+CREATE TABLE pair (
+  a        bigint NOT NULL,
+  b        bigint NOT NULL,
+  kind     text NOT NULL,
+  at_least double precision NOT NULL,
+  at_most  double precision,
+  a_x      double precision NOT NULL,
+  a_y      double precision NOT NULL,
+  a_z      double precision NOT NULL,
+  b_x      double precision NOT NULL,
+  b_y      double precision NOT NULL,
+  b_z      double precision NOT NULL,
+  status   text NOT NULL,
+  revision bigint NOT NULL,
+  setting  text NOT NULL,
+  because  text,
+  shapes   text,
+  PRIMARY KEY (a, b)
+)""",
+    _granted_as_on_brick("pair"),
+)
+
 MIGRATIONS: Dialect = {
     "tables": (
         ENVIRONMENT,
@@ -247,4 +271,5 @@ MIGRATIONS: Dialect = {
     "distances": DISTANCES,
     "shards": (),
     "surfaces": SURFACES,
+    "pairs": PAIRS,
 }

@@ -33,7 +33,7 @@ EDITOR = (
     *TOUCHER,
     (
         "GRANT INSERT, UPDATE, DELETE ON {schema}.object, {schema}.voxel, {schema}.brick,"
-        " {schema}.band, {schema}.surface TO {role}"
+        " {schema}.band, {schema}.surface, {schema}.pair TO {role}"
     ),
     "GRANT INSERT ON {schema}.change TO {role}",  # no UPDATE: rows of the log stay
     "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",

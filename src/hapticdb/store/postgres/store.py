@@ -8,6 +8,7 @@ from hapticdb.store.engines import Lag
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.loading import Loading
+from hapticdb.store.postgres.tables.pairs import PostgresPairs
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.tables.statistics import PostgresStatistics
 from hapticdb.store.postgres.tables.writing import PostgresWriter
@@ -62,6 +63,9 @@ class PostgresStore:
         writer = PostgresWriter(connection, self.grid, self.layout, reader, loading)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
         self.add_surface, self._write_wish = writer.add_surface, writer.want_distances
+        kept = PostgresPairs(connection, reader)
+        self.pairs, self.put_pairs = kept.pairs, kept.put_pairs
+        self.accept_pair = kept.accept_pair
         known = PostgresStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

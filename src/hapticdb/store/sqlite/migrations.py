@@ -121,6 +121,29 @@ CREATE TABLE surface (
     "CREATE INDEX object_digest ON object (digest)",
 )
 
+PAIRS = (
+    """
+CREATE TABLE pair (
+  a        INTEGER NOT NULL,
+  b        INTEGER NOT NULL,
+  kind     TEXT NOT NULL,
+  at_least REAL NOT NULL,
+  at_most  REAL,
+  a_x      REAL NOT NULL,
+  a_y      REAL NOT NULL,
+  a_z      REAL NOT NULL,
+  b_x      REAL NOT NULL,
+  b_y      REAL NOT NULL,
+  b_z      REAL NOT NULL,
+  status   TEXT NOT NULL,
+  revision INTEGER NOT NULL,
+  setting  TEXT NOT NULL,
+  because  TEXT,
+  shapes   TEXT,
+  PRIMARY KEY (a, b)
+) STRICT, WITHOUT ROWID""",
+)
+
 MIGRATIONS: Dialect = {
     "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, CHANGE, QUANTILE, COST),
     "lineage": LINEAGE,
@@ -128,4 +151,5 @@ MIGRATIONS: Dialect = {
     "distances": DISTANCES,
     "shards": (),
     "surfaces": SURFACES,
+    "pairs": PAIRS,
 }

@@ -12,6 +12,7 @@ from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.connection import FileConnection
+from hapticdb.store.sqlite.tables.pairs import SQLitePairs
 from hapticdb.store.sqlite.tables.reading import SQLiteReader, read_environment
 from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
@@ -45,6 +46,9 @@ class SQLiteStore:
         writer = SQLiteWriter(connection, self.grid, self.layout, reader)
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
         self.add_surface, self._write_wish = writer.add_surface, writer.want_distances
+        kept = SQLitePairs(connection, reader)
+        self.pairs, self.put_pairs = kept.pairs, kept.put_pairs
+        self.accept_pair = kept.accept_pair
         known = SQLiteStatistics(connection, self.layout, reader)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs

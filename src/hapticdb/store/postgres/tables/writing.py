@@ -6,7 +6,6 @@ from typing import Any, TypeVar
 import numpy as np
 from psycopg import errors
 
-from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.store import believed
 from hapticdb.store.base import Covering, Keys, Layout, Object, Rows, Table, touched_ranges
@@ -16,7 +15,7 @@ from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
-from hapticdb.store.refusals import check_unwritten, present_already
+from hapticdb.store.refusals import check_unwritten, older_format, present_already
 
 Result = TypeVar("Result")
 
@@ -127,10 +126,7 @@ class PostgresWriter:
             self._put_surface(digest, surface)
 
         if not self._reader.has_table(believed.SURFACE):
-            raise ReadOnlyError(
-                f"{self._connection.shown} has an older format: its owner has to open it once to "
-                "write, and it is brought up to date"
-            )
+            raise older_format(self._connection.shown)
         self._connection.write(work)
 
     def want_distances(self) -> None:

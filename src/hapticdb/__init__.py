@@ -17,6 +17,9 @@ if TYPE_CHECKING:
     from hapticdb.batches.result import TouchBatch as TouchBatch
     from hapticdb.check import CheckReport as CheckReport
     from hapticdb.check import check_environment as check_environment
+    from hapticdb.clashes.result import Clashes as Clashes
+    from hapticdb.clashes.run import accept_clash as accept_clash
+    from hapticdb.clashes.run import find_clashes as find_clashes
     from hapticdb.difference import Difference as Difference
     from hapticdb.difference import diff_environments as diff_environments
     from hapticdb.environment import Environment as Environment
@@ -69,6 +72,8 @@ _HOMES = {
     "batches.feeler": "Feeler",
     "batches.result": "ClearanceBatch TouchBatch",
     "check": "CheckReport check_environment",
+    "clashes.result": "Clashes",
+    "clashes.run": "accept_clash find_clashes",
     "difference": "Difference diff_environments",
     "environment": "Environment create open",
     "errors": "HapticDBError",

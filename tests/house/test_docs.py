@@ -30,7 +30,13 @@ def blocks(kind: str, page: str = "README.md") -> list[str]:
 
 @pytest.mark.long
 @pytest.mark.parametrize(
-    "pages", [("README.md", "docs/query.md"), ("docs/realtime.md",), ("docs/paths.md",)]
+    "pages",
+    [
+        ("README.md", "docs/query.md"),
+        ("docs/realtime.md",),
+        ("docs/paths.md",),
+        ("docs/clashes.md",),
+    ],
 )
 def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -> None:
     """All shell blocks in one session of the shell, then all Python blocks in one of Python."""

@@ -14,6 +14,8 @@ from itertools import takewhile
 from hapticdb import interrupting
 from hapticdb.cli import render
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
+from hapticdb.cli.verbs.clashing import HELP as CLASHES_HELP
+from hapticdb.cli.verbs.clashing import clashes
 from hapticdb.cli.verbs.editing import move, remove
 from hapticdb.cli.verbs.extracting import HELP as EXTRACT_HELP
 from hapticdb.cli.verbs.extracting import extract
@@ -47,6 +49,7 @@ VERBS: dict[Callable[..., None], str] = {
     serve: "Let others see and feel, in browsers and with devices.",
     replay: "Compute a recorded session's wrenches again.",
     sweep: "Say whether a tool or part comes out along a path.",
+    clashes: "Say which parts meet, and which are near.",
     extract: "Search a path on which parts come out.",
     move: "Place an object anew.",
     remove: "Remove objects.",
@@ -64,7 +67,7 @@ VERBS: dict[Callable[..., None], str] = {
 """The verbs, and the line about each in the list of verbs."""
 HIDDEN = {sample, warm}
 """Verbs that the list leaves out: what they do, others do by themselves."""
-HELP = {sweep: SWEEP_HELP, extract: EXTRACT_HELP}
+HELP = {clashes: CLASHES_HELP, sweep: SWEEP_HELP, extract: EXTRACT_HELP}
 """Help texts that are too long for a docstring, so that no function is over 60 lines."""
 for verb, summary in VERBS.items():
     app.command(

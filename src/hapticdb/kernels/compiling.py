@@ -126,6 +126,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     ),
     "host": (*_RESIDENT, "hosting.*"),
     "replay": (*_RESIDENT, "large.*", "rigid.poses_of"),
+    "clashes": ("surfaces.sides.*", "surfaces.nearest.*", "triangles.*", "curves.encode_kernel"),
     "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
     "extract": (
         *_SHELL,

@@ -1,0 +1,203 @@
+"""What a pair of surfaces is: apart, touching, overlapping, one inside the other, or not known.
+
+Cheap proofs come first. A distance above zero is proved by `kernels.triangles.nearest`. Surfaces
+that meet only touch if a motion frees them that moves no place by more than the contact tolerance:
+a shift, or a stretch along the axes of a part, which frees a bolt from its bore. What no motion
+frees is cut (`sweeps.cut`), and the middles of triangles are looked up in closed bodies: flush ends
+hide from a cut.
+"""
+
+from collections.abc import Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.clashes.shapes import BuiltShape
+from hapticdb.kernels.surfaces.nearest import distances_to
+from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.store.pairs import Kind
+from hapticdb.sweeps.cut import Cut, cut
+
+Floats = NDArray[np.float64]
+
+TINY = 1e-9
+"""Metres: surfaces that are farther apart do not meet."""
+SHIFT = 0.05
+"""Contact tolerances by which surfaces are shifted before they are cut: the error of a cut."""
+WAYS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
+WAYS /= np.linalg.norm(WAYS, axis=1)[:, None]
+"""Directions of the shifts that may free surfaces, beside those of their normals."""
+STRIDES = (1.05, 1.5, 2.5)
+"""Depths that a shift is tried for that frees what overlaps. More: closer bounds, slower."""
+LEAST_STRETCH = 0.01
+"""Least share to which a stretch shrinks a thin part."""
+
+
+class Judged(NamedTuple):
+    """What a pair is; places in the frame of the first surface.
+
+    at_least, at_most : metres, of the gap, or of the depth where they overlap; at_most is infinite
+    where no bound is known. on_a, on_b (3,) : the nearest places, or where they overlap most.
+    """
+
+    kind: Kind
+    at_least: float
+    at_most: float
+    on_a: Floats
+    on_b: Floats
+
+
+def judge(a: BuiltShape, b: BuiltShape, pose: Floats, within: float, contact: float) -> Judged:
+    """Judge two surfaces, the second one at a rigid pose (4, 4) in the frame of the first."""
+    near = _nearest(a, b, pose[None], within)
+    if a.is_cloud or b.is_cloud:
+        return _told("not known" if near.pairs[0, 0] >= 0 else "far", near)
+    gap = float(near.at_least[0])
+    if gap > 0.0:
+        if _is_nested(a, b, pose):
+            return _told("inside", near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose[None]))
+        if near.pairs[0, 0] < 0:
+            return _told("far", near)
+        return _told("apart" if gap > contact else "touching", near)
+    freed = _freed(a, b, pose, contact, near)
+    if freed is not None:
+        return _told(freed, near)
+    found = _cut(a, b, pose, 2.0 * contact, contact)
+    inner = _inner(a, b, pose, contact)
+    if max(found.depth, inner.depth) - SHIFT * contact <= contact:
+        return _told("touching", near)
+    return _overlap(a, b, pose, contact, near, inner)
+
+
+def _told(kind: Kind, near: Nearest) -> Judged:
+    at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
+    return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])
+
+
+def _nearest(a: BuiltShape, b: BuiltShape, poses: Floats, farthest: float = np.inf) -> Nearest:
+    return nearest(a.tree, b.tree, poses, np.full(len(poses), farthest))
+
+
+def _is_nested(a: BuiltShape, b: BuiltShape, pose: Floats) -> bool:
+    """Whether a piece of one of two surfaces that do not meet is in a closed body of the other."""
+    if b.holds((a.bodies - pose[:3, 3]) @ np.linalg.inv(pose[:3, :3]).T).any():
+        return True
+    return bool(a.holds(b.bodies @ pose[:3, :3].T + pose[:3, 3]).any())
+
+
+def _freed(
+    a: BuiltShape, b: BuiltShape, pose: Floats, contact: float, near: Nearest
+) -> Kind | None:
+    """What surfaces that meet are where a motion frees them, no place moved by more; or None.
+
+    Inside only if each motion that frees them leaves one inside the other.
+    """
+    found: Kind | None = None
+    for poses in _motions(a, b, pose, contact, near):
+        for free in np.flatnonzero(_nearest(a, b, poses, TINY).at_least > 0.0):
+            if not _is_nested(a, b, poses[free]):
+                return "touching"
+            found = "inside"
+    return found
+
+
+def _motions(
+    a: BuiltShape, b: BuiltShape, pose: Floats, contact: float, near: Nearest
+) -> Iterator[Floats]:
+    """Poses (N, 4, 4) at which no place of a or b is farther than `contact` from where it is."""
+    normals = _normals(a, b, pose, near)
+    yield _shifted(pose, contact * np.concatenate([normals, -normals]))
+    yield _shifted(pose, contact * WAYS)
+    yield pose @ _stretches(b, contact)
+    yield np.linalg.inv(_stretches(a, contact)) @ pose
+
+
+def _normals(a: BuiltShape, b: BuiltShape, pose: Floats, near: Nearest) -> Floats:
+    """Unit normals (2, 3) of the triangles that are nearest, frame of a."""
+    first, second = near.pairs[0]
+    return np.stack([_normal(a, first), pose[:3, :3] @ _normal(b, second)])
+
+
+def _shifted(pose: Floats, shifts: Floats) -> Floats:
+    """Poses (N, 4, 4), shifted by (N, 3)."""
+    poses = np.tile(pose, (len(shifts), 1, 1))
+    poses[:, :3, 3] += shifts
+    return poses
+
+
+def _normal(shape: BuiltShape, triangle: int) -> Floats:
+    """Unit normal (3,) of a triangle of the tree; zero where it has no area."""
+    first, second, third = shape.tree.corners[triangle]
+    normal = np.cross(second - first, third - first)
+    length = float(np.linalg.norm(normal))
+    return normal / length if length > 0.0 else np.zeros(3)
+
+
+def _stretches(shape: BuiltShape, contact: float) -> Floats:
+    """Maps (N, 4, 4) about a shape's middle that move no place of it by more than `contact`.
+
+    They shrink or widen it across an axis of its frame, with a shift along the axis or without, or
+    along all axes.
+    """
+    low, high = shape.box
+    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), TINY)
+    step = contact / np.sqrt(3.0)
+    maps = []
+    for sign, axis, shift in product((1.0, -1.0), (0, 1, 2, 3), (0.0, 1.0, -1.0)):
+        if axis == 3 and shift:
+            continue
+        scale = np.maximum(1.0 + sign * step / half, LEAST_STRETCH)
+        made = np.eye(4)
+        if axis < 3:
+            scale[axis] = 1.0
+            made[axis, 3] = shift * step
+        made[:3, 3] += middle - scale * middle
+        made[:3, :3] = np.diag(scale)
+        maps.append(made)
+    return np.array(maps)
+
+
+def _cut(a: BuiltShape, b: BuiltShape, pose: Floats, most: float, contact: float) -> Cut:
+    return cut(a.mesh, b.mesh, pose, most, SHIFT * contact, contact)
+
+
+def _inner(a: BuiltShape, b: BuiltShape, pose: Floats, contact: float) -> Cut:
+    """The middle of a triangle that is deepest in a closed body of the other, beyond `contact`."""
+    back = np.linalg.inv(pose)
+    deepest = Cut(0.0, np.zeros(3))
+    for one, other, there in ((a, b, back), (b, a, pose)):
+        middles = one.tree.corners.mean(axis=1) @ there[:3, :3].T + there[:3, 3]
+        low, high = other.box
+        middles = middles[((middles >= low + contact) & (middles <= high - contact)).all(axis=1)]
+        if not len(middles):
+            continue
+        middles = middles[distances_to(other.tree, middles, farthest=2.0 * contact) > contact]
+        middles = middles[other.holds(middles)] if len(middles) else middles
+        if len(middles):
+            depths = distances_to(other.tree, middles)
+            best = int(np.argmax(depths))
+            if depths[best] > deepest.depth:
+                place = middles[best] if other is a else pose[:3, :3] @ middles[best] + pose[:3, 3]
+                deepest = Cut(float(depths[best]), place)
+    return deepest
+
+
+def _overlap(
+    a: BuiltShape, b: BuiltShape, pose: Floats, contact: float, near: Nearest, inner: Cut
+) -> Judged:
+    """Measure how deep surfaces overlap that do by more than `contact`."""
+    sizes = [float(np.sort(shape.box[1] - shape.box[0])[1]) for shape in (a, b)]
+    found = _cut(a, b, pose, max(0.5 * min(sizes), 2.0 * contact), contact)
+    found = found._replace(depth=found.depth - SHIFT * contact)
+    if inner.depth > found.depth:
+        found = inner
+    normals = _normals(a, b, pose, near)
+    ways, at_most = np.concatenate([normals, -normals, WAYS]), np.inf
+    for stride in STRIDES:
+        poses = _shifted(pose, stride * found.depth * ways)
+        if (_nearest(a, b, poses, TINY).at_least > 0.0).any():
+            at_most = stride * found.depth
+            break
+    return Judged("overlapping", found.depth, at_most, found.place, found.place)

@@ -1,0 +1,88 @@
+"""Results of a search for clashes: metres, world frame."""
+
+from collections import Counter
+from dataclasses import dataclass
+from typing import Any, Literal, NamedTuple
+
+from hapticdb.store.pairs import KINDS, Kind, Status
+
+Shown = Literal[Status, "accepted", "not looked at"]
+GRAVITY: tuple[Kind, ...] = ("overlapping", "inside", "not known", "touching", "apart")
+"""Kinds that are told, the gravest first."""
+ASKED: tuple[Kind, ...] = ("overlapping",)
+"""Kinds that are looked for unless others are asked for."""
+
+
+class Clash(NamedTuple):
+    """Two objects that are near one another.
+
+    a, b : ids, the lesser one first; a_name, b_name : None of an object that is gone; kind : as
+    docs/clashes.md says; at_least, at_most : metres, of the gap, or of the depth of an overlap;
+    at_most is None where no bound is known; place : x, y, z on a, then on b; status : since the
+    last call; because : why it is accepted, or None.
+    """
+
+    a: int
+    b: int
+    a_name: str | None
+    b_name: str | None
+    kind: Kind
+    at_least: float
+    at_most: float | None
+    place: tuple[float, ...] | None
+    status: Shown
+    because: str | None = None
+
+    @property
+    def is_open(self) -> bool:
+        """Whether the pair is there, and nobody has accepted it."""
+        return self.status not in {"gone", "accepted"}
+
+    def record(self) -> dict[str, Any]:
+        """Everything by name, as `hapticdb clashes --json` prints it."""
+        return self._asdict()
+
+
+@dataclass(frozen=True)
+class Clashes:
+    """Result of a search.
+
+    pairs : the gravest first, and the deepest or nearest of each kind; measured, kept : numbers of
+    pairs of near boxes that were measured now, or were known; left : not looked at, since the time
+    was over or an object was written meanwhile; within, contact : metres; revision : of the
+    database that was read; elapsed : seconds; is_kept : whether the database keeps what was found.
+    """
+
+    pairs: tuple[Clash, ...]
+    measured: int
+    kept: int
+    left: int
+    within: float
+    contact: float
+    revision: int
+    elapsed: float
+    is_kept: bool
+
+    def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
+        """Pairs of some kinds, and what was not looked at; without accepted and gone ones."""
+        return tuple(
+            one
+            for one in self.pairs
+            if one.is_open and (one.kind in kinds or one.status == "not looked at")
+        )
+
+    def counts(self) -> dict[str, int]:
+        """How many pairs are of each kind, those that are gone left out."""
+        found = Counter(one.kind for one in self.pairs if one.status != "gone")
+        return {kind: found[kind] for kind in GRAVITY}
+
+    def statuses(self) -> dict[str, int]:
+        """How many pairs have each status."""
+        return dict(Counter(one.status for one in self.pairs))
+
+
+def gravity(one: Clash) -> tuple[int, float, int, int]:
+    """Sort key: the gravest first."""
+    size = -one.at_least if one.kind == "overlapping" else one.at_least
+    kind = GRAVITY.index(one.kind) if one.kind in GRAVITY else len(KINDS)
+    return kind, size, one.a, one.b

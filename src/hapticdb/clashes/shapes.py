@@ -1,0 +1,128 @@
+"""Shapes of objects, each built once for all objects that place it, as long as memory lasts."""
+
+from collections import OrderedDict
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import NoSurfaceError, UsageError
+from hapticdb.ingest.geometry import unpacked_part
+from hapticdb.pointshell.coverage import Interior
+from hapticdb.pointshell.moving import tree_of
+from hapticdb.pointshell.orientation import orient
+from hapticdb.store.base import Object, Store
+from hapticdb.sweeps.cut import Mesh
+
+Floats = NDArray[np.float64]
+
+RIGID = 1e-12
+"""Greatest deviation of a rotation's columns from orthonormal ones. Other placements get a shape of
+their own."""
+BYTES_OF_CORNERS = 6
+"""Bytes of a shape for each byte of its corners, with all that is built from them."""
+
+
+class BuiltShape:
+    """A surface in a frame that rigid transforms place.
+
+    tree : its triangles; a cloud's points are ones without area.
+    """
+
+    def __init__(self, triangles: Floats, *, is_cloud: bool) -> None:
+        self.tree, self.is_cloud = tree_of(triangles), is_cloud
+        self.box = self.tree.corners.min(axis=(0, 1)), self.tree.corners.max(axis=(0, 1))
+
+    @cached_property
+    def mesh(self) -> Mesh:
+        """The surface with its corners joined."""
+        return Mesh(self.tree)
+
+    @cached_property
+    def interior(self) -> Interior | None:
+        """Its inside; None where it has no closed body."""
+        try:
+            inside = Interior(orient(self.tree.corners))
+        except UsageError:  # no area
+            return None
+        return inside or None
+
+    @cached_property
+    def bodies(self) -> Floats:
+        """A corner (B, 3) of each piece that is connected."""
+        from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
+        from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
+
+        edges, count = self.mesh.edges, len(self.mesh.points)
+        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
+        labels = connected_components(links, directed=False)[1]
+        return self.mesh.points[np.unique(labels, return_index=True)[1]]
+
+    def holds(self, places: Floats) -> NDArray[np.bool_]:
+        """Whether each of places (Q, 3), its frame, is in a closed body of it."""
+        low, high = self.box
+        held = np.asarray(((places >= low) & (places <= high)).all(axis=1))
+        if held.any():
+            held[held] = self.interior is not None and self.interior.holds(places[held])
+        return held
+
+
+class Shapes:
+    """The shapes of an environment's objects, those used last kept within `budget` bytes."""
+
+    def __init__(self, store: Store, budget: int) -> None:
+        self._store, self._budget = store, budget
+        self._kept: OrderedDict[tuple[str, bytes], BuiltShape] = OrderedDict()
+        self._bytes = 0
+
+    def placed(self, obj: Object) -> tuple[BuiltShape, Floats] | None:
+        """BuiltShape of an object and its rigid placement (4, 4); None if it was written meanwhile.
+
+        Raises `NoSurfaceError` if the object's surface is not in the database.
+        """
+        linear, pose = _placement(obj.transform)
+        key = obj.digest, linear.tobytes()
+        shape = self._kept.get(key)
+        if shape is None:
+            shape = self._read(obj, linear)
+            if shape is None:
+                return None
+            self._kept[key] = shape
+            self._bytes += _bytes_of(shape)
+            while self._bytes > self._budget and len(self._kept) > 2:
+                self._bytes -= _bytes_of(self._kept.popitem(last=False)[1])
+        self._kept.move_to_end(key)
+        return shape, pose
+
+    def _read(self, obj: Object, linear: Floats) -> BuiltShape | None:
+        packed = self._store.surfaces([obj.digest]).get(obj.digest)
+        if packed is None:
+            if all(now.digest != obj.digest for now in self._store.objects() if now.id == obj.id):
+                return None
+            raise NoSurfaceError(
+                f"object {obj.id} ({obj.name}) has no surface in {self._store.url}: run "
+                f"'hapticdb upgrade {self._store.url}', which reads it from {obj.link}"
+            )
+        part = unpacked_part(self._store.url, obj, packed)
+        corners = part.vertices @ linear.T
+        if part.faces is None:
+            return BuiltShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
+        return BuiltShape(corners[part.faces], is_cloud=False)
+
+
+def _bytes_of(shape: BuiltShape) -> int:
+    return BYTES_OF_CORNERS * int(shape.tree.corners.nbytes)
+
+
+def _placement(transform: Floats) -> tuple[Floats, Floats]:
+    """A linear map (3, 3) to be built into the shape, and the rigid placement of the result."""
+    linear, pose = transform[:3, :3], np.eye(4)
+    pose[:3, 3] = transform[:3, 3]
+    scale = float(np.cbrt(np.linalg.det(linear)))
+    if scale != 0.0:
+        scale = float(np.sign(scale)) if abs(abs(scale) - 1.0) < RIGID else scale
+        rotation = linear / scale
+        if np.abs(rotation.T @ rotation - np.eye(3)).max() < RIGID:
+            pose[:3, :3] = rotation
+            return scale * np.eye(3), pose
+    return linear, pose

@@ -1,0 +1,327 @@
+"""The table of pairs: what is kept, what is measured again, and what is said of it."""
+
+import os
+import re
+import signal
+import sqlite3
+import sys
+import threading
+import time
+from collections.abc import Callable
+from contextlib import closing
+from pathlib import Path
+from urllib.parse import urlencode
+
+import numpy as np
+import psycopg
+import pytest
+import trimesh
+from psycopg import conninfo, sql
+
+import hapticdb
+from children import finished
+from hapticdb import Environment, accept_clash, find_clashes
+from hapticdb.clashes.result import Clashes
+from hapticdb.errors import UsageError
+from hapticdb.store.connect import grant
+from hapticdb.store.postgres.address import parse
+from hapticdb.transfer import copy_environment
+from servers import Place
+
+MM = 1e-3
+Found = list[tuple[object, ...]]
+
+
+def row_of_boxes(path: Path, n_boxes: int, step: float = 0.1) -> Path:
+    """An environment of cubes of 0.1 m in a row along x, `step` apart."""
+    scene = trimesh.Scene()
+    for n in range(n_boxes):
+        cube = trimesh.creation.box((0.1, 0.1, 0.1))
+        placed = trimesh.transformations.translation_matrix((step * n, 0.0, 0.0))
+        scene.add_geometry(cube, node_name=f"cube{n}", geom_name=f"cube{n}", transform=placed)
+    file = path.with_suffix(".glb")
+    file.write_bytes(scene.export(file_type="glb"))
+    grid = hapticdb.Grid(0.02, (-2.0, -2.0, -2.0), 8)
+    with hapticdb.create(path, grid, distances=False) as env:
+        env.add(file)
+    return path
+
+
+@pytest.fixture
+def path(tmp_path: Path) -> Path:
+    """Four cubes in a row, each flush with the next."""
+    return row_of_boxes(tmp_path / "row.db", 4)
+
+
+def shifted(env: Environment, object_id: int, x: float) -> None:
+    env.shift([object_id], (x, 0.0, 0.0))
+
+
+def told(found: Clashes) -> set[tuple[int, int, str, str]]:
+    return {(one.a, one.b, one.kind, one.status) for one in found.pairs}
+
+
+def test_each_call_says_what_is_new_since_the_last(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        first = find_clashes(env)
+        assert told(first) == {(n, n + 1, "touching", "new") for n in (1, 2, 3)}
+        assert (first.measured, first.kept, first.left, first.is_kept) == (3, 0, 0, True)
+        again = find_clashes(env)
+        assert {one.status for one in again.pairs} == {"same"}
+        assert (again.measured, again.kept) == (0, 3)
+        shifted(env, 1, 1.0 * MM)  # deeper into 2
+        shifted(env, 4, 0.5)  # away from 3
+        found = find_clashes(env)
+        assert told(found) == {
+            (1, 2, "overlapping", "changed"), (2, 3, "touching", "same"), (3, 4, "apart", "gone"),
+        }  # fmt: skip
+        assert found.measured == 1
+        assert [(one.a, one.b) for one in found.of()] == [(1, 2)]
+        assert (3, 4) not in {(one.a, one.b) for one in find_clashes(env).pairs}
+        env.remove(1)
+        gone = {one for one in find_clashes(env).pairs if one.status == "gone"}
+        assert {(one.a_name, one.b_name) for one in gone} == {(None, "cube1")}
+
+
+def test_words_choose_one_of_each_pair_and_leave_the_others(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        assert {one[:2] for one in find_clashes(env, of=["cube0"]).pairs} == {(1, 2)}
+        assert find_clashes(env, of=["cube1"], against=["cube1"]).pairs == ()
+        everything = find_clashes(env)
+        assert {one[:2]: one.status for one in everything.pairs} == {
+            (1, 2): "same", (2, 3): "new", (3, 4): "new",
+        }  # fmt: skip
+        found = find_clashes(env, of=["cube1"], against=["cube2", "cube3"])
+        assert told(found) == {(2, 3, "touching", "same")}
+
+
+def test_another_tolerance_measures_anew(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        shifted(env, 1, 0.2 * MM)
+        assert [one.kind for one in find_clashes(env, of=[1]).pairs] == ["overlapping"]
+        wider = find_clashes(env, of=[1], contact=0.5 * MM)
+        assert [(one.kind, one.status) for one in wider.pairs] == [("touching", "changed")]
+        assert wider.measured == 1
+
+
+def test_an_accepted_pair_stays_so_until_a_shape_changes(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        with pytest.raises(UsageError, match="run 'hapticdb clashes'"):
+            accept_clash(env, [1], [2], "a press fit")
+        shifted(env, 1, 1.0 * MM)
+        assert len(find_clashes(env).of()) == 1
+        assert len(accept_clash(env, ["cube1"], ["cube0"], "a press fit")) == 1
+        shifted(env, 1, 1.0 * MM)
+        (one,) = (one for one in find_clashes(env).pairs if one[:2] == (1, 2))
+        assert (one.status, one.because) == ("accepted", "a press fit")
+        assert find_clashes(env).of() == ()
+        shifted(env, 1, -0.5)  # it goes and comes back
+        find_clashes(env)
+        shifted(env, 1, 0.5)
+        assert find_clashes(env).of() == ()
+        env.move(1, np.diag([1.0, 1.0, 1.1, 1.0]) @ env.object(1).transform)
+        accepted = [one for one in find_clashes(env).pairs if one.status == "accepted"]
+        assert [one[:2] for one in accepted] == [(1, 2)]  # placed otherwise, the same shape
+        accept_clash(env, [1], [2], None)
+        assert len(find_clashes(env).of()) == 1
+        with pytest.raises(UsageError, match="empty reason"):
+            accept_clash(env, [1], [2], " ")
+
+
+def test_a_reader_finds_the_same_and_keeps_nothing(path: Path) -> None:
+    with hapticdb.open(path) as env, hapticdb.open(path, read_only=True) as reader:
+        found = find_clashes(reader)
+        assert not found.is_kept
+        assert env.store.pairs() == []
+        find_clashes(env)
+        assert find_clashes(reader).kept == 3
+
+
+@pytest.mark.parametrize(("within", "contact", "seconds"), [(0.0, 1e-5, 1), (1e-5, 1e-3, 1),
+    (np.inf, 1e-5, 1), (1e-3, np.nan, 1), (1e-3, 1e-5, 0.0)])  # fmt: skip
+def test_numbers_that_cannot_be_are_refused(
+    path: Path, within: float, contact: float, seconds: float
+) -> None:
+    with hapticdb.open(path) as env, pytest.raises(UsageError):
+        find_clashes(env, within=within, contact=contact, seconds=seconds)
+
+
+# -- stopped, killed, many at once -----------------------------------------------------------------
+
+
+def findings(env: Environment) -> Found:
+    """What the table says, without revisions."""
+    return [(*row[:6], row.status) for row in env.store.pairs()]
+
+
+class StopError(Exception):
+    """Stops a search from its progress."""
+
+
+def stop_after(n: int) -> Callable[[int, int], None]:
+    def progress(done: int, total: int) -> None:
+        del total
+        if done == n:
+            raise StopError
+
+    return progress
+
+
+def test_a_stopped_search_goes_on_and_says_all_that_is_new(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        with pytest.raises(StopError):
+            find_clashes(env, progress=stop_after(2))
+        found = find_clashes(env)
+        assert (found.measured, found.kept) == (1, 2)
+        assert {one.status for one in found.pairs} == {"new"}
+        assert {one.status for one in find_clashes(env).pairs} == {"same"}
+
+
+def test_what_the_time_leaves_is_told_as_not_looked_at(path: Path) -> None:
+    with hapticdb.open(path) as env:
+        found = find_clashes(env, seconds=1e-9)
+        assert found.left == 3
+        assert told(found) == {(n, n + 1, "not known", "not looked at") for n in (1, 2, 3)}
+        assert len(found.of()) == 3
+        assert find_clashes(env).left == 0
+
+
+def random_edit(env: Environment, rng: np.random.Generator, removed: list[hapticdb.Object]) -> None:
+    """Move, shift, remove or restore an object."""
+    ids = [obj.id for obj in env.objects()]
+    what = rng.integers(8)
+    if removed and what == 0:
+        env.restore(removed.pop())
+    elif what == 1 and len(ids) > 4:
+        removed.append(env.remove(int(rng.choice(ids))))
+    else:
+        pose = trimesh.transformations.random_rotation_matrix(rng.random(3))
+        pose = np.eye(4) if what < 5 else pose
+        pose[:3, 3] = np.round(rng.uniform(-0.3, 0.3, 3), 1 if what < 6 else 9)
+        env.move(int(rng.choice(ids)), pose)
+
+
+@pytest.mark.parametrize(
+    ("n_edits", "n_looks"), [(60, 6), pytest.param(1000, 50, marks=pytest.mark.long)]
+)
+def test_the_kept_table_is_bit_for_bit_that_of_a_full_run(
+    tmp_path: Path, n_edits: int, n_looks: int
+) -> None:
+    path, rng = row_of_boxes(tmp_path / "e.db", 20), np.random.default_rng(n_edits)
+    removed: list[hapticdb.Object] = []
+    with hapticdb.open(path) as env:
+        for n in range(n_edits):
+            random_edit(env, rng, removed)
+            if (n + 1) % (n_edits // n_looks):
+                continue
+            find_clashes(env)
+        kept = findings(env)
+        env.store.put_pairs([], [(row.a, row.b) for row in env.store.pairs()])
+        find_clashes(env)
+        assert [row[:6] for row in findings(env)] == [row[:6] for row in kept]
+        assert len(kept) > 10
+        assert len({row[2] for row in kept}) >= 3
+
+
+def on_server(place: Place, path: Path) -> str:
+    """The environment on a server."""
+    url = place()
+    copy_environment(path, url)
+    return url
+
+
+def test_two_at_once_make_one_table(place: Place, path: Path) -> None:
+    url = on_server(place, path)
+    errors: list[BaseException] = []
+
+    def search() -> None:
+        try:
+            with hapticdb.open(url) as env:
+                find_clashes(env, progress=lambda *_: time.sleep(0.01))
+        except BaseException as error:  # noqa: BLE001 - told below
+            errors.append(error)
+
+    searching = [threading.Thread(target=search) for _ in range(2)]
+    for one in searching:
+        one.start()
+    for one in searching:
+        one.join(60.0)
+    assert not errors
+    with hapticdb.open(url) as env, hapticdb.open(path) as alone:
+        find_clashes(alone)
+        assert findings(env) == findings(alone)
+        assert {row.status for row in env.store.pairs()} == {"same"}
+
+
+PAGE = Path(hapticdb.__file__).parents[2] / "docs" / "clashes.md"
+
+
+def test_the_questions_of_the_page_are_answered_on_each_engine(place: Place, path: Path) -> None:
+    with hapticdb.open(path) as env:
+        find_clashes(env)
+        accept_clash(env, [1], [2], "meant so")
+    answers: dict[str, list[list[tuple[object, ...]]]] = {"file": [], "server": []}
+    url = on_server(place, path)
+    with hapticdb.open(url) as env:
+        find_clashes(env)
+        accept_clash(env, [1], [2], "meant so")
+    address = parse(url)
+    questions = re.findall(r"^```sql\n(.*?)^```$", PAGE.read_text(), re.MULTILINE | re.DOTALL)
+    assert len(questions) == 5
+    with closing(sqlite3.connect(path)) as plain, psycopg.connect(address.conninfo) as server:
+        server.execute(sql.SQL("SET search_path = {}").format(sql.Identifier(address.environment)))
+        for question in questions:
+            answers["file"].append(sorted(plain.execute(question).fetchall()))
+            answers["server"].append(sorted(server.execute(question.encode()).fetchall()))
+    assert answers["file"] == answers["server"]
+    assert answers["file"][4] == [("cube0", "cube1", "meant so", True)]
+
+
+KILLED = """
+import os, signal, sys
+import hapticdb
+from hapticdb.clashes import run
+run.SECONDS_BETWEEN = -1.0  # each pair is written at once
+def progress(done, total):
+    if done == 2:
+        os.kill(os.getpid(), signal.SIGKILL)
+with hapticdb.open(sys.argv[1]) as env:
+    hapticdb.find_clashes(env, progress=progress)
+"""
+
+
+def test_what_was_found_before_a_kill_is_there(place: Place, path: Path) -> None:
+    url = on_server(place, path)
+    assert finished([sys.executable, "-c", KILLED, url]).returncode == -signal.SIGKILL
+    with hapticdb.open(url) as env, hapticdb.open(path) as alone:
+        found = find_clashes(env)
+        assert (found.measured, found.kept) == (1, 2)
+        assert {one.status for one in found.pairs} == {"new"}
+        find_clashes(alone)
+        assert findings(env) == findings(alone)
+
+
+def test_a_viewer_reads_and_an_editor_keeps(
+    place: Place, path: Path, admin: psycopg.Connection
+) -> None:
+    url = on_server(place, path)
+    role = f"clashes_{os.getpid()}"
+    admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(sql.Identifier(role), role))
+    address = parse(url)
+    known = conninfo.conninfo_to_dict(address.conninfo)
+    theirs = {**known, "user": role, "password": role, "environment": address.environment}
+    their_url = f"postgresql:///?{urlencode(theirs)}"
+    try:
+        grant(url, role, "toucher")
+        with hapticdb.open(their_url) as env:
+            found = find_clashes(env)
+            assert (len(found.pairs), found.is_kept) == (3, False)
+        grant(url, role, "editor")
+        with hapticdb.open(their_url) as env:
+            assert find_clashes(env).is_kept
+        grant(url, role, "viewer")
+        with hapticdb.open(their_url, read_only=True) as env:
+            assert find_clashes(env).kept == 3
+    finally:
+        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(role)))
+        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(role)))

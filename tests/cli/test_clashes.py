@@ -1,0 +1,71 @@
+"""The verb clashes."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import csv
+import json
+from pathlib import Path
+
+import pytest
+
+import hapticdb
+from command_line import Run, boxes, made, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb.cli.verbs.clashing import COLUMNS
+
+
+@pytest.fixture
+def meeting(scene: Path) -> Path:
+    """Three boxes of 0.1 m: the first 10 mm deep in the second, the third flush with it."""
+    with hapticdb.open(scene) as env:
+        env.shift([1], (0.11, 0.0, 0.0))
+        env.shift([3], (-0.1, 0.0, 0.0))
+    return scene
+
+
+def test_the_gravest_come_first_and_the_second_call_says_same(run: Run, meeting: Path) -> None:
+    code, out, _ = run("clashes", meeting, "--json")
+    first, second = (json.loads(line) for line in out.splitlines())
+    assert code == 1
+    assert (first["a"], first["b"], first["kind"], first["status"]) == (1, 2, "overlapping", "new")
+    assert 0.0099 < first["at_least"] < 0.0101 < first["at_most"]
+    assert (second["a"], second["b"], second["kind"]) == (2, 3, "touching")
+    code, out, _ = run("clashes", meeting)
+    assert code == 1
+    assert "overlapping" in out
+    assert "2 same" in out
+    assert "0 pairs, 2 known before" in out
+
+
+def test_an_accepted_pair_gives_exit_code_0(run: Run, meeting: Path) -> None:
+    assert run("clashes", meeting, "--of", "box2")[0] == 0
+    assert run("clashes", meeting)[0] == 1
+    code, out, _ = run("clashes", meeting, "--accept", "box0", "2", "--because", "a press fit")
+    assert (code, out.strip()) == (0, "1 pair accepted until a part changes its shape")
+    code, out, _ = run("clashes", meeting)
+    assert code == 0
+    assert "a press fit" in out
+    assert run("clashes", meeting, "--kind", "touching")[0] == 1
+    assert run("clashes", meeting, "--accept", "1", "2", "--because", "")[0] == 0
+    assert run("clashes", meeting)[0] == 1
+
+
+def test_rows_are_written_as_csv(run: Run, meeting: Path, tmp_path: Path) -> None:
+    assert run("clashes", meeting, "--csv", tmp_path / "pairs.csv", "--kind", "touching")[0] == 1
+    (row,) = csv.DictReader((tmp_path / "pairs.csv").open())
+    assert tuple(row) == COLUMNS
+    assert (row["a_name"], row["kind"], row["at_least_m"]) == ("box1", "touching", "0.0")
+
+
+def test_a_search_that_was_not_finished_gives_exit_code_3(run: Run, meeting: Path) -> None:
+    code, out, _ = run("clashes", meeting, "--seconds", "1e-9")
+    assert code == 3
+    assert "2 pairs: call again" in out
+
+
+def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
+    refused(run("clashes", meeting, "--kind", "near"), "--kind 'near'", "touching")
+    refused(run("clashes", meeting, "--within", "0"), "give lengths above 0")
+    refused(run("clashes", meeting, "--accept", "1", "2"), "--because")
+    refused(run("clashes", meeting, "--of", "wheel"), "wheel")
+    refused(run("clashes", meeting, "--json", "--csv", "-"), "standard output")
+    refused(run("clashes", "none.db"), "no environment")

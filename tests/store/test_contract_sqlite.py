@@ -2,7 +2,9 @@
 
 import itertools
 import os
+import shutil
 import sqlite3
+import subprocess
 import sys
 import zlib
 from collections.abc import Callable
@@ -260,3 +262,71 @@ def test_an_unfinished_creation_is_swept_away(tmp_path: Path) -> None:
     hapticdb.create(tmp_path / "e.db", GRID).close()
     assert not any(left.exists() for left in lefts)
     assert len(hapticdb.open(tmp_path / "e.db").objects()) == 0
+
+
+def test_a_full_disk_is_told_and_what_was_committed_stays(path: Path) -> None:
+    store = SQLiteStore.open(path)
+    driver = store._connection.driver
+    n_pages = driver.execute("PRAGMA page_count").fetchall()[0][0]
+    driver.execute(f"PRAGMA max_page_count = {n_pages}")
+
+    def fill() -> None:
+        for n in range(1000):
+            write_voxels(store, blob(9, (30, 30, 30)), f"blob {n}")
+
+    with pytest.raises(hapticdb.errors.DatabaseError, match="the disk is full"):
+        fill()
+    n_there = len(store.objects())
+    driver.execute("PRAGMA max_page_count = 1000000")
+    write_voxels(store, blob(9, (30, 30, 30)), "last")
+    assert len(store.objects()) == n_there + 1
+
+
+def test_a_limit_of_file_size_is_no_damage(tmp_path: Path) -> None:
+    program = (
+        "import resource, hapticdb\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (20000, 20000))\n"
+        "try: hapticdb.create('new.db', hapticdb.Grid(0.01, (0, 0, 0), 5))\n"
+        "except hapticdb.errors.DatabaseError as error: print(type(error).__name__, error)\n"
+    )
+    told = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, timeout=60, check=True
+    ).stdout.decode()
+    assert told.startswith("DatabaseError")
+    assert "limits of file sizes" in told
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(
+    path: Path, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+) -> None:
+    log = Path(f"{path}-wal")
+    log.touch()
+    monkeypatch.setattr(os, "access", lambda _, mode: mode != os.W_OK)
+    with closing(SQLiteStore.open(path, read_only=True)) as store:
+        assert len(store.objects()) == 1
+    with pytest.raises(hapticdb.errors.ReadOnlyError, match="hapticdb backup"):
+        SQLiteStore.open(path)
+    monkeypatch.undo()
+    backup_environment(path, tmp_path / "copy.db")
+    monkeypatch.setattr(os, "access", lambda _, mode: mode != os.W_OK)
+    other = shutil.copy(path, tmp_path / "other.db")
+    Path(f"{other}-wal").write_bytes(b"\1" * 100)
+    for read_only in (True, False):
+        with pytest.raises(hapticdb.errors.ReadOnlyError, match="copy both files"):
+            SQLiteStore.open(other, read_only=read_only)
+
+
+def test_environments_left_open_end_without_a_word(tmp_path: Path) -> None:
+    program = (
+        "import hapticdb\n"
+        "grid = hapticdb.Grid(0.01, (0, 0, 0), 5)\n"
+        "kept = [hapticdb.create(f'{n}.db', grid) for n in range(3)]\n"
+        "again = hapticdb.open('0.db', read_only=True)\n"
+        "kept.append(kept)\n"
+    )
+    ended = subprocess.run(
+        [sys.executable, "-c", program], cwd=tmp_path, capture_output=True, timeout=60, check=True
+    )
+    assert (ended.stdout, ended.stderr) == (b"", b"")
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["0.db", "1.db", "2.db"]

@@ -85,7 +85,7 @@ class FileConnection:
                 self.driver.execute(sqlite_log.RENEW_LINEAGE)
                 yield
             except BaseException:
-                self.driver.execute("ROLLBACK")
+                sqlite_file.roll_back(self.driver)
                 raise
             self.driver.execute("COMMIT")
             self.file.look(has_committed=True)

@@ -50,7 +50,10 @@ def named_errors(path: str) -> Iterator[None]:
     except apsw.FullError as error:
         raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
     except apsw.IOError as error:
-        raise DatabaseError(f"{path}: the disk does not answer ({error})") from error
+        raise DatabaseError(
+            f"{path} cannot be read or written ({error}): look at the disk, at quotas and at "
+            "limits of file sizes; what was committed is safe"
+        ) from error
     except (apsw.ConnectionClosedError, apsw.CursorClosedError) as error:
         raise DatabaseError(f"{path} has been closed: open it again") from error
     except apsw.CantOpenError as error:
@@ -220,8 +223,14 @@ def migrate(connection: apsw.Connection, version: int) -> None:
                 connection.execute(f"PRAGMA user_version = {marked * VERSION_UNIT + number}")
             connection.execute("COMMIT")
         except BaseException:
-            connection.execute("ROLLBACK")
+            roll_back(connection)
             raise
+
+
+def roll_back(connection: apsw.Connection) -> None:
+    """Undo a transaction, unless SQLite itself has done so, as when the disk is full."""
+    if connection.in_transaction:
+        connection.execute("ROLLBACK")
 
 
 def needs_immutable(path: Path) -> bool:
@@ -231,9 +240,15 @@ def needs_immutable(path: Path) -> bool:
     read the file alone, if there is no log whose pages would be missed.
     """
     real = path.resolve()
-    return not os.access(real.parent, os.W_OK) and not any(
-        Path(f"{real}{suffix}").exists() for suffix in ("-wal", "-shm")
-    )
+    if os.access(real.parent, os.W_OK) or Path(f"{real}-shm").exists():
+        return False
+    log = Path(f"{real}-wal")
+    if log.exists() and log.stat().st_size:
+        raise ReadOnlyError(
+            f"{log} holds changes that are not in {path.name} yet, and its folder cannot be "
+            "written: copy both files into one that can"
+        )
+    return True
 
 
 def _connect_to_read(path: Path) -> apsw.Connection:
@@ -248,6 +263,7 @@ def _connect_to_read(path: Path) -> apsw.Connection:
 
 def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
+        needs_immutable(path)  # or else a backup could not be made
         raise ReadOnlyError(
             f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
         )

@@ -4,9 +4,12 @@ In WAL mode SQLite does not check the path. It goes on writing into files that w
 replaced, and reports every commit as done.
 """
 
+import atexit
 import contextlib
 import os
+import sys
 import time
+import weakref
 from pathlib import Path
 
 import apsw
@@ -60,6 +63,7 @@ class OpenedFile:
             When the path leads to another file by now.
         """
         self._connection = connection
+        _OPEN.add(self)
         if is_immutable:
             self.stamp = _stamp(self._path)
         else:
@@ -126,8 +130,9 @@ class OpenedFile:
 
     def __del__(self) -> None:
         """Close if nobody has, or SQLite would write its log into whatever file is there then."""
-        with contextlib.suppress(Exception):
-            self.close()
+        if not sys.is_finalizing():  # names of modules may be gone; `_close_all` was there before
+            with contextlib.suppress(Exception):
+                self.close()
 
     def _may_fold(self) -> bool:
         """Whether the engine may write its log into the file when the connection closes."""
@@ -174,6 +179,17 @@ class OpenedFile:
             )
         self._size = status.st_size
         return status.st_dev, status.st_ino
+
+
+_OPEN: "weakref.WeakSet[OpenedFile]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close what is still open when the program ends, as long as its modules are there."""
+    for file in list(_OPEN):
+        with contextlib.suppress(Exception):
+            file.close()
 
 
 def _identity(path: str) -> Identity | None:

@@ -1,8 +1,6 @@
 """A page in one file that plays how parts come out: the scene, the paths, viser's own player."""
 
-import contextlib
 import importlib.util
-import io
 import os
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -95,14 +93,13 @@ def animate(
         If the file cannot be written.
     """
     check_view()
-    from hapticdb.page.process import new_server  # noqa: PLC0415 - the extra `view`
+    from hapticdb.page.process import new_server, stop  # noqa: PLC0415 - the extra `view`
 
     server = new_server()
     try:
         page = _recorded(server, env, steps, {*exclude}, up)
     finally:
-        with contextlib.redirect_stdout(io.StringIO()):  # it says that it has stopped
-            server.stop()
+        stop(server)
     try:
         Path(path).write_text(page, encoding="utf-8")
     except OSError as error:

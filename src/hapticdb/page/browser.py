@@ -40,8 +40,10 @@ CAP = 7.0
 LEAST_SEEN = 1e-4
 """Least motion that is drawn, as a share of the scene's diagonal, and of a turn. Larger: less is
 sent while a hand rests, and slow motions become steps."""
+PLUMB_EVERY = 0.1
+"""Seconds from one line to what lies below the hand to the next. Larger: it follows more slowly."""
 HISTORY = 300
-"""Samples of the plots, ten seconds of them. Larger: a longer time is seen, and more is sent."""
+"""Samples of the plot, ten seconds of them. Larger: a longer time is seen, and more is sent."""
 
 
 class Browser:
@@ -65,7 +67,9 @@ class Browser:
         self.session: HostedSession | None = None
         self._unfelt: list[int] = []
         self.hand = self._start()
-        self.history: deque[tuple[float, float, float]] = deque(maxlen=HISTORY)
+        self.has_moved = False
+        """Whether the person has moved the hand."""
+        self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
         self._begun: float | None = None
         self._keeps_tool: bool | None = None  # of the session to begin; None: none is wanted
         self._over: list[HostedSession] = []  # to be ended
@@ -74,6 +78,7 @@ class Browser:
         self._is_closed = False
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
+        self._plumbed_at = -np.inf
         self.drawing = HandDrawing(client, site.facts.diagonal, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
@@ -141,6 +146,7 @@ class Browser:
 
         def act(event: Event) -> None:
             self.move_hand(checks.pose_of(event.target.position, event.target.wxyz))
+            self.has_moved = True
             if event.phase == "end":
                 self.hand_moved()
 
@@ -360,13 +366,22 @@ class Browser:
         points, _ = session.contacts()
         touched = [self.site.objects[i] for i in session.touched() if i in self.site.objects]
         self.drawing.show(tool, self.hand, wrench)
+        self._plumb(now)
         self.drawing.show_contacts(
             points if one["contacts"] else points[:0], colours.of_contacts(points, touched)
         )
         self._begun = now if self._begun is None else self._begun
         force = float(np.linalg.norm(wrench[:3]))
-        self.history.append((now - self._begun, force, 1000.0 * float(one["lateness"])))
+        self.history.append((now - self._begun, force))
         self.frame_came(one, wrench, touched, now)
+
+    def _plumb(self, now: float) -> None:
+        """Draw a line from the hand to what lies below it, as a plumb hangs."""
+        if now - self._plumbed_at < PLUMB_EVERY:
+            return
+        self._plumbed_at = now
+        met = self.scene.pick(self.hand[:3], -self.site.facts.up)
+        self.drawing.plumb(self.hand[:3], None if met is None else met.point)
 
     def objects_changed(self) -> None:
         """Objects were added, moved or removed by someone; called in the database's thread."""

@@ -28,9 +28,11 @@ ARROW_BEGINS = 1e-3
 LEAST_DRAWN = 2e-4
 """Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap.
 Larger: less is sent while a hand rests."""
-HAND_GIZMO = 0.11
+HAND_GIZMO = 0.14
 """Size of the hand's gizmo, as a share of the scene's diagonal. Larger: easier to grab, and more
 is behind it."""
+PLUMB: colours.Colour = (70, 80, 95)
+"""Colour of the line from the hand to what lies below it."""
 CONTACT_SHARE = 0.004
 """Size of a contact's mark, as a share of the scene's diagonal. Larger: seen from farther away."""
 
@@ -91,6 +93,13 @@ class HandDrawing:
             "/tether", nothing, (120, 120, 130), thickness=2.0, thickness_units="screen",
             visible=False,
         )  # fmt: skip
+        self._plumb = scene.add_line_segments(
+            "/plumb", nothing, PLUMB, thickness=1.5, thickness_units="screen", visible=False
+        )
+        self._spot = scene.add_point_cloud(
+            "/spot", np.zeros((1, 3)), PLUMB, point_size=3 * CONTACT_SHARE * diagonal,
+            point_shape="circle", point_shading="flat", precision="float32", visible=False,
+        )  # fmt: skip
         self._contacts = scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), colours.FORCE, point_size=CONTACT_SHARE * diagonal,
             point_shape="circle", precision="float32", visible=False,
@@ -145,6 +154,17 @@ class HandDrawing:
                 self._contacts.points = np.asarray(points, dtype=np.float32)
                 self._contacts.colors = palette
         self._contacts.visible = is_touching
+
+    def plumb(self, hand: Floats, below: Floats | None) -> None:
+        """Draw a line from the hand to a place below it; none without a place."""
+        if below is None:
+            self._plumb.visible = self._spot.visible = False
+            return
+        with self._client.atomic():
+            ends = np.array([[hand, below]], dtype=np.float32)
+            if not (self._plumb.visible and np.array_equal(self._plumb.points, ends)):
+                self._plumb.points, self._spot.points = ends, ends[0, 1:]
+            self._plumb.visible = self._spot.visible = True
 
     def rest(self) -> None:
         """Show no force, no contact and no line."""

@@ -4,6 +4,7 @@ import contextlib
 import io
 import socket
 import time
+import warnings
 from typing import TYPE_CHECKING
 
 from hapticdb.hosting.attached import AttachedHost
@@ -42,6 +43,12 @@ def work(request: PageRequest, sender: MessageSender) -> None:
             finally:
                 site.close()
     finally:
+        stop(server)
+
+
+def stop(server: "ViserServer") -> None:
+    """Stop viser, which would print that it has stopped."""
+    with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
 
@@ -49,6 +56,8 @@ def new_server() -> "ViserServer":
     """Start viser on a free port of the loopback interface."""
     import viser  # noqa: PLC0415 - the extra `view`
 
+    # a browser may go at any moment: what is sent to it then needs no words
+    warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
     with contextlib.redirect_stdout(io.StringIO()):  # it prints a box with its own address
         return viser.ViserServer("127.0.0.1", 0, verbose=False)
 

@@ -25,6 +25,7 @@ class TabbedBrowser(Browser):
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
         super().__init__(site, client, visitor, number)
         gui = client.gui
+        self._n_waiting = -1  # parts whose shape is still read; not known yet
         tabs = gui.add_tab_group()
         with tabs.add_tab("Touch"):
             self.touch = TouchPanel(self, gui)
@@ -64,6 +65,11 @@ class TabbedBrowser(Browser):
     def tick(self, now: float) -> None:
         """Show the newest frame, of a replay, too."""
         self.record.tick(now)
+        contents = self.site.view.contents
+        waiting = contents.waiting() if self._n_waiting else 0
+        if waiting != self._n_waiting:
+            self._n_waiting = waiting
+            self.touch.show_parts(waiting, len(contents.records))
         super().tick(now)
 
     def objects_changed(self) -> None:

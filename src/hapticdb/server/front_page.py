@@ -35,6 +35,11 @@ LOADER = re.compile(
     re.DOTALL,
 )
 TITLE = "<title>Viser</title>"
+HIDING = (
+    "<style>#webgl-software-rendering,[data-dock-header] .mantine-ActionIcon-root"
+    "{display:none!important}</style>"
+)
+"""Hides viser's own settings, and its note about drawing in software."""
 
 
 class ClientPage(NamedTuple):
@@ -63,7 +68,7 @@ def client_page(title: str) -> ClientPage:
         raise MissingExtraError(
             "this version of viser has a client of an unknown form: pip install 'viser==1.1.1'"
         )
-    page = text.replace(TITLE, f"<title>{title}</title>").encode()
+    page = text.replace(TITLE, f"<title>{title}</title>{HIDING}").encode()
     return ClientPage(
         page,
         gzip.compress(page),

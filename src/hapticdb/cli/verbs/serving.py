@@ -141,7 +141,12 @@ def serve(
     def ready(port: int) -> None:
         for made, role in tokens.items() if token else ():
             print(f"{role.word:<8}{serving.address(port, made)}", flush=True)
-        if not token:
+        if token:
+            render.note(
+                "give each person one of these addresses: a viewer sees, a toucher also feels, an "
+                "editor also moves, adds and removes parts"
+            )
+        else:
             print(serving.address(port), flush=True)
         if not tokens:
             render.note("every program on this machine may edit; --token asks for a token")

@@ -1,8 +1,6 @@
-"""The tab Parts: a tree with search, what a part is, what is shown, distances, moving a part."""
+"""The tab Parts: a list with search, what a part is, what is shown, distances, moving a part."""
 
-from collections.abc import Sequence
-from dataclasses import dataclass
-from functools import partial
+from collections.abc import Iterator, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -14,6 +12,7 @@ from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.panels.moving import MovingControls
 from hapticdb.page.scene.names import Branch
+from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html, plain_name, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.units import length_text
@@ -23,23 +22,14 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-LIGHT = (226, 232, 240)
-"""Colour of the lines of the tree."""
-N_LINES = 8
-"""Lines of a page of the tree. Larger: fewer pages, and a longer panel."""
+NOTHING = "choose from the list"
+"""First line of the list."""
+MOST_LISTED = 1_000
+"""Lines of the list; a search finds the others. Larger: a browser opens the list more slowly."""
 LONGEST_SEARCH = 200
 """Letters of a search. Larger: longer texts of a client are compared with every name."""
 MOST_VOXELS = 60_000
 """Voxels that are shown of a chosen part; of a larger part, every n-th. Larger: more is sent."""
-
-
-@dataclass(frozen=True)
-class _TreeLine:
-    """One line of the tree: a sub-assembly, or an object where `branch` is None."""
-
-    label: str
-    ids: tuple[int, ...]
-    branch: Branch | None = None
 
 
 class PartsPanel:
@@ -51,24 +41,15 @@ class PartsPanel:
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._client = browser.client
-        self._opened = ""
-        self._page = 0
-        self._lines: list[_TreeLine] = []
+        self._lines: dict[str, tuple[int, ...]] = {}
         self._ends: list[Floats] = []
         self._voxels: Any = None
         guard = browser.guarded
         self._search = gui.add_text("Search", "", hint="Parts of a name, in any order.")
         self._search.on_update(guard("viewer", self._searched))
         self._where = gui.add_html("")
-        self._up = gui.add_button("Up", color="gray", visible=False)
-        self._up.on_click(guard("viewer", self._go_up))
-        self._buttons = []
-        for number in range(N_LINES):
-            button = gui.add_button(" ", color=LIGHT, visible=False)
-            button.on_click(guard("viewer", partial(self._press, number)))
-            self._buttons.append(button)
-        self._turn = gui.add_button_group("Page", ("Before", "Next"), visible=False)
-        self._turn.on_click(guard("viewer", self._turn_page))
+        self._list_of = gui.add_dropdown("Parts", (NOTHING,), initial_value=NOTHING)
+        self._list_of.on_update(guard("viewer", self._pick))
         with gui.add_folder("Chosen"):
             self._what = gui.add_html(note_html("Click a part, or choose one above."))
             self._act = gui.add_button_group("Show", ("Hide", "Isolate", "Show all"))
@@ -93,74 +74,47 @@ class PartsPanel:
         self.moving = MovingControls(browser, gui)
         self.show_objects()
 
-    # -- the tree ----------------------------------------------------------------------------
+    # -- the list ----------------------------------------------------------------------------
 
     def show_objects(self) -> None:
-        """Show the tree as the objects are now."""
+        """Show the list as the objects are now."""
         self._list()
         self._say_chosen()
 
     def _list(self) -> None:
         site = self._browser.site
-        search = self._search.value
-        if search.strip():
+        search, hidden = self._search.value.strip(), self._browser.scene.hidden
+        found: list[tuple[str, tuple[int, ...]]] = []
+        if search:
             ids = site.view.search(search[:LONGEST_SEARCH])
-            lines = [
-                _TreeLine(plain_name(site.objects[i].name), (i,)) for i in ids if i in site.objects
-            ]
-            where = f"{len(ids):,} of {len(site.objects):,} parts"
+            found += [(site.objects[i].name, (i,)) for i in ids if i in site.objects]
         else:
-            branch = _branch_at(site.view.tree(), self._opened)
-            self._opened = branch.path
-            lines = [
-                _TreeLine(f"▸ {below.name} ({below.count})", tuple(below.all_ids()), below)
-                for below in branch.branches
+            found += [
+                (f"▸ {branch.path} ({branch.count:,} parts)", tuple(branch.all_ids()))
+                for branch in _below(site.view.tree())
             ]
-            lines += [
-                _TreeLine(site.objects[i].name.rpartition("/")[2], (i,))
-                for i in branch.ids
-                if i in site.objects
-            ]
-            where = f"{branch.path or 'All parts'} · {branch.count:,}"
-        n_pages = max(1, -(-len(lines) // N_LINES))
-        self._page = min(max(self._page, 0), n_pages - 1)
-        self._lines = lines[self._page * N_LINES : (self._page + 1) * N_LINES]
-        pages = f" · page {self._page + 1} of {n_pages}" if n_pages > 1 else ""
-        self._where.content = note_html(short_name(where, 60) + pages)
-        self._up.visible = bool(self._opened) and not search.strip()
-        self._turn.visible = n_pages > 1
-        hidden = self._browser.scene.hidden
-        for button, line in zip(self._buttons, self._lines, strict=False):
-            sign = " (hidden)" if hidden.issuperset(line.ids) else ""
-            button.label = short_name(line.label) + sign
-            button.visible = True
-        for button in self._buttons[len(self._lines) :]:
-            button.visible = False
+            by_name = sorted(site.objects.values(), key=lambda obj: (obj.name, obj.id))
+            found += [(obj.name, (obj.id,)) for obj in by_name]
+        self._lines = {}
+        for name, ids_of in found[:MOST_LISTED]:
+            label = plain_name(name)
+            if label in self._lines:
+                label = f"{label} [{ids_of[0]}]"
+            self._lines[label + (" (hidden)" if hidden.issuperset(ids_of) else "")] = ids_of
+        more = f", {MOST_LISTED:,} listed" if len(found) > MOST_LISTED else ""
+        n_found = len(found) if search else len(site.objects)
+        self._where.content = note_html(f"{n_found:,} of {len(site.objects):,} parts{more}")
+        self._list_of.options = (NOTHING, *self._lines)
+        put(self._list_of, NOTHING)
 
     def _searched(self, event: "GuiEvent[Any]") -> None:
         checks.text_of(event.target.value, LONGEST_SEARCH, "a search")
-        self._page = 0
         self._list()
 
-    def _turn_page(self, event: "GuiEvent[Any]") -> None:
-        word = checks.choice_of(event.target.value, ("Before", "Next"), "a page")
-        self._page += 1 if word == "Next" else -1
-        self._list()
-
-    def _go_up(self, _: object) -> None:
-        self._opened = self._opened.rpartition("/")[0]
-        self._page = 0
-        self._list()
-
-    def _press(self, number: int, _: object) -> None:
-        if number >= len(self._lines):
-            return
-        line = self._lines[number]
-        if line.branch is not None:
-            self._opened = line.branch.path
-            self._page = 0
-            self._list()
-        self.choose(line.ids)
+    def _pick(self, event: "GuiEvent[Any]") -> None:
+        if event.client is not None and event.target.value != NOTHING:
+            label = checks.choice_of(event.target.value, tuple(self._lines), "a part")
+            self.choose(self._lines[label])
 
     # -- the chosen parts --------------------------------------------------------------------
 
@@ -317,14 +271,8 @@ class PartsPanel:
         self._distance.content = rows_html((("Distance", distance), ("Along x / y / z", along)))
 
 
-def _branch_at(root: Branch, path: str) -> Branch:
-    """Branch of a path, or the nearest one above it that is still there."""
-    found = root
-    while found.path != path:
-        below = next(
-            (b for b in found.branches if path == b.path or path.startswith(f"{b.path}/")), None
-        )
-        if below is None:
-            return found
-        found = below
-    return found
+def _below(branch: Branch) -> Iterator[Branch]:
+    """Sub-assemblies below a branch, each before what it holds."""
+    for below in branch.branches:
+        yield below
+        yield from _below(below)

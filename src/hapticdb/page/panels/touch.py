@@ -27,7 +27,9 @@ SHOWN_EVERY = 0.2
 """Seconds from one update of numbers and plots to the next. Larger: less to send, and numbers that
 are easier to read."""
 SECONDS = 10.0
-"""Seconds that the plots show."""
+"""Seconds that the plot shows."""
+HIGHEST = 8.0
+"""Top of the plot, N: above the greatest force of a hand in a browser."""
 SOFTEST, STIFFEST = 50.0, 3000.0
 """Range of the stiffness, N/m. Larger: harder surfaces, and forces that reach the cap sooner."""
 PART = "(a part)"
@@ -50,9 +52,8 @@ class TouchPanel:
         self._reading = gui.add_html(
             self._reading_html(0.0, 0.0, [], "The tool is being made ready.", is_held=may_touch)
         )
-        force = ("Force, N", "N", _css(colours.FORCE), 2, 8.0, 130)
-        late = ("Lateness of the loop, ms", "ms", "rgb(72,120,190)", 1, 2.0, 100)
-        self._force, self._late = (_plot(gui, *words, is_seen=may_touch) for words in (force, late))
+        self._force = _plot(gui, is_seen=may_touch)
+        self._waiting = gui.add_html("", visible=False)
         if may_touch:
             self._add_controls(gui)
 
@@ -152,10 +153,16 @@ class TouchPanel:
             self._waits_for = text
             self._reading.content = self._reading_html(0.0, 0.0, [], text, is_held=True)
 
+    def show_parts(self, n_waiting: int, n_parts: int) -> None:
+        """Show how many parts have come, until all have."""
+        self._waiting.visible = n_waiting > 0
+        if n_waiting:
+            self._waiting.content = note_html(f"{n_parts - n_waiting:,} of {n_parts:,} parts shown")
+
     def show(
         self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
     ) -> None:
-        """Show a frame's force and torque (6,), what it touches, and both plots."""
+        """Show a frame's force and torque (6,), what it touches, and the plot."""
         if now - self._shown_at < SHOWN_EVERY:
             return
         self._shown_at = now
@@ -169,9 +176,7 @@ class TouchPanel:
         self._reading.content = self._reading_html(force, torque, touched, trouble, is_held=True)
         history = np.array(self._browser.history)
         if len(history) > 1:
-            times, force_then, late_then = last_seconds(history).T
-            self._force.data = (times, force_then)
-            self._late.data = (times, np.minimum(late_then, 2.0))
+            self._force.data = tuple(last_seconds(history).T)
 
     def _reading_html(
         self, force: float, torque: float, touched: list[Object], trouble: str, *, is_held: bool
@@ -192,7 +197,10 @@ class TouchPanel:
         if trouble:
             said = f'<div style="color:#c4610a">{escaped(trouble)}</div>'
         elif not touched:
-            said = '<span style="opacity:0.6">Touches nothing</span>'
+            hint = (
+                "" if self._browser.has_moved else f": drag the {escaped(self._browser.tool.name)}"
+            )
+            said = f'<span style="opacity:0.6">Touches nothing{hint}</span>'
         big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums"
         small = "font-size:0.75em;opacity:0.65"
         return (
@@ -209,35 +217,32 @@ class TouchPanel:
 
 
 def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows (n, 3) of the last `SECONDS`, their times from now, and zeros where nothing was yet.
+    """Rows (n, 2) of the last `SECONDS`, their times from now, and zeros where nothing was yet.
 
     A plot always shows the range of its times, so that these are always the same.
     """
     rows = history.copy()
     rows[:, 0] -= history[-1, 0]
     rows = rows[rows[:, 0] >= -SECONDS]
-    return np.vstack([[-SECONDS, 0.0, 0.0], [rows[0, 0], 0.0, 0.0], rows])
+    return np.vstack([[-SECONDS, 0.0], [rows[0, 0], 0.0], rows])
 
 
 def _css(colour: colours.Colour) -> str:
     return f"rgb({colour[0]},{colour[1]},{colour[2]})"
 
 
-def _plot(
-    gui: "GuiApi", title: str, unit: str, stroke: str, width: int, top: float, height: int,
-    *, is_seen: bool,
-) -> "GuiUplotHandle":  # fmt: skip
-    """Add a plot of the last seconds, from 0 to `top`."""
+def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
+    """Add the plot of the force in the last seconds."""
     from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
 
     return gui.add_uplot(
         (np.array([-SECONDS, 0.0]), np.zeros(2)),
-        (Series(label="s"), Series(label=unit, stroke=stroke, width=width)),
-        title=title,
+        (Series(label="s"), Series(label="N", stroke=_css(colours.FORCE), width=2)),
+        title="Force, N",
         scales={
             "x": Scale(time=False, min=-SECONDS, max=0.0),
-            "y": Scale(auto=False, min=0.0, max=top),
+            "y": Scale(auto=False, min=0.0, max=HIGHEST),
         },
         axes=(Axis(space=60, size=32), Axis(size=40)),
-        legend=Legend(show=False), height=height, visible=is_seen,
+        legend=Legend(show=False), height=130, visible=is_seen,
     )  # fmt: skip

@@ -1,9 +1,21 @@
 """Feel a virtual environment too large for memory: haptic queries on an SQL database.
 
+The ten names to begin with; `dir(hapticdb)` lists the others:
+
+- import_files(url, files): files into an environment, which is made if it does not exist
+- open(url): an environment; create(url, grid): an empty one
+- Environment: objects(), find(), tool(), shell(), touch(), move(), remove(), clearance()
+- PointShell: a tool; env.tool(file) makes it as the verbs and the page do
+- read_poses(path): a path of a tool, (n, 4, 4), world_from_tool, metres
+- sweep(env, shell, poses): is the path free? extract(env, words): a way out
+- Session(url, shell, device): feel it in real time
+- plot(result): touches and sweeps, in a notebook
+
+Errors are in `hapticdb.errors`.
+
 >>> import hapticdb
 >>> env = hapticdb.open("car.db")                             # doctest: +SKIP
->>> shell = hapticdb.PointShell.from_file("wrench.stl")       # doctest: +SKIP
->>> env.touch(shell, pose).force                              # doctest: +SKIP
+>>> env.touch(env.tool("wrench.stl"), pose).force             # doctest: +SKIP
 """
 
 from importlib import import_module
@@ -25,7 +37,6 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment as Environment
     from hapticdb.environment import create as create
     from hapticdb.environment import open as open  # noqa: A004 - as in tarfile.open
-    from hapticdb.errors import HapticDBError as HapticDBError
     from hapticdb.extraction.disassembly.result import Disassembly as Disassembly
     from hapticdb.extraction.disassembly.run import disassemble as disassemble
     from hapticdb.extraction.result import Extraction as Extraction
@@ -37,6 +48,7 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import import_files as import_files
     from hapticdb.ingest.upgrading import UpgradeReport as UpgradeReport
     from hapticdb.ingest.upgrading import upgrade_environment as upgrade_environment
+    from hapticdb.pictures.plots import plot as plot
     from hapticdb.pointshell.shell import PointShell as PointShell
     from hapticdb.pool import Pool as Pool
     from hapticdb.poses import read_poses as read_poses
@@ -76,7 +88,6 @@ _HOMES = {
     "clashes.run": "accept_clash find_clashes",
     "difference": "Difference diff_environments",
     "environment": "Environment create open",
-    "errors": "HapticDBError",
     "extraction.disassembly.result": "Disassembly",
     "extraction.disassembly.run": "disassemble",
     "extraction.result": "Extraction",
@@ -85,6 +96,7 @@ _HOMES = {
     "grid": "Grid GridOptions",
     "ingest.files": "FileReport ImportOptions import_files",
     "ingest.upgrading": "UpgradeReport upgrade_environment",
+    "pictures.plots": "plot",
     "pointshell.shell": "PointShell",
     "pool": "Pool",
     "poses": "read_poses write_poses",

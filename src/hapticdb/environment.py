@@ -21,6 +21,7 @@ from hapticdb.query.cost_model import CostModel
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import as_id
 from hapticdb.query.grouping import Ranges, object_ranges
+from hapticdb.query.law import inset_of
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Size, Store
 from hapticdb.store.connect import create_store, open_store
@@ -137,7 +138,7 @@ class Environment(Queries):
         points: int | None = None,
         spacing: float | None = None,
         seed: int = 0,
-        inset: float = 0.0,
+        inset: float | None = None,
     ) -> PointShell:
         """Make one rigid tool from objects at their places.
 
@@ -150,7 +151,7 @@ class Environment(Queries):
         words : int or str
             As for `find`.
         points, spacing, seed, inset
-            As for `PointShell.from_file`, for all surfaces together.
+            As for `tool`, for all surfaces together.
 
         Raises
         ------
@@ -161,7 +162,37 @@ class Environment(Queries):
         UsageError
             If no word is given, or an object is a point cloud, which has no surface.
         """
-        return shell_of_objects(self._store, self.find(*words), points, spacing, seed, inset)
+        drawn = self._inset if inset is None else inset
+        return shell_of_objects(self._store, self.find(*words), points, spacing, seed, drawn)
+
+    def tool(
+        self,
+        file: str | os.PathLike[str],
+        points: int | None = None,
+        *,
+        spacing: float | None = None,
+        unit: str | None = None,
+        seed: int = 0,
+        inset: float | None = None,
+    ) -> PointShell:
+        """Make a tool of a file as the verbs and the page do.
+
+        Parameters
+        ----------
+        file, points, spacing, unit, seed
+            As for `PointShell.from_file`.
+        inset : float or None
+            How far points are drawn inward, metres. Unless given, so far that contact begins at
+            the tool's surface: 1.5 voxels where objects have distances, for the smooth law.
+        """
+        drawn = self._inset if inset is None else inset
+        return PointShell.from_file(
+            file, points, spacing=spacing, unit=unit, seed=seed, inset=drawn
+        )
+
+    @property
+    def _inset(self) -> float:
+        return inset_of(self.grid.voxel_size, "smooth" if self.has_distances else "plane")
 
     def add(
         self,

@@ -262,7 +262,7 @@ def frames_in(path: Path) -> bool:
     """Whether a recording has at least one frame."""
     try:
         return sum(map(len, Recording(path).frames(until_damage=True))) > 0
-    except hapticdb.HapticDBError:
+    except hapticdb.errors.HapticDBError:
         return False
 
 

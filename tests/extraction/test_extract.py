@@ -205,7 +205,7 @@ def test_a_planner_that_dies_is_an_error_and_no_wait(
     shadow.mkdir(parents=True)
     (shadow / "__init__.py").write_text("import os\nos.kill(os.getpid(), 9)")
     monkeypatch.syspath_prepend(str(shadow.parent))
-    with pytest.raises(hapticdb.HapticDBError, match="planner's process has ended"):
+    with pytest.raises(hapticdb.errors.HapticDBError, match="planner's process has ended"):
         found_in(enclosed(tmp_path), "block")
 
 

@@ -63,7 +63,7 @@ def import_one(database: Path, file: Path, options: ImportOptions | None = None)
     return report
 
 
-def refusal(report: FileReport, kind: type[hapticdb.HapticDBError]) -> str:
+def refusal(report: FileReport, kind: type[hapticdb.errors.HapticDBError]) -> str:
     """Message of the error of a file that was skipped."""
     assert report.status == "failed"
     assert not report.added

@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 import children
 import hapticdb
-from hapticdb import Environment, Grid, HapticDBError, PointShell
+from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import RandomHand
-from hapticdb.errors import DatabaseError
+from hapticdb.errors import DatabaseError, HapticDBError
 from hapticdb.kernels.hand import servo
 from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import cell_key

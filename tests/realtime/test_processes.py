@@ -13,8 +13,7 @@ from types import ModuleType
 import pytest
 
 from children import PATIENCE, child, finished
-from hapticdb import HapticDBError
-from hapticdb.errors import DatabaseError, UsageError
+from hapticdb.errors import DatabaseError, HapticDBError, UsageError
 from hapticdb.realtime import processes as module
 from hapticdb.realtime.processes import Message, Process
 from hapticdb.resident.table import is_alive

@@ -218,7 +218,7 @@ def test_a_cookie_that_runs_out_ends_its_browsers_connection(
 
 def test_a_page_that_cannot_start_ends_the_server_with_its_error(environment: Path) -> None:
     serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:fail")
-    with pytest.raises(hapticdb.HapticDBError, match="no such scene"), running(serving):
+    with pytest.raises(hapticdb.errors.HapticDBError, match="no such scene"), running(serving):
         pass
 
 

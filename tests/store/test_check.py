@@ -29,7 +29,7 @@ def told(ask: Callable[[], object]) -> str:
     """Text of the hapticdb error that a call raises, or "". Other errors are not caught."""
     try:
         ask()
-    except hapticdb.HapticDBError as error:
+    except hapticdb.errors.HapticDBError as error:
         return str(error)
     return ""
 

@@ -133,11 +133,11 @@ def outcome(path: Path, content: bytes, log: bytes = b"") -> tuple[bool, str]:
             Path(f"{path}{suffix}").write_bytes(part)
     try:
         is_sound = hapticdb.check_environment(path).is_sound
-    except hapticdb.HapticDBError:
+    except hapticdb.errors.HapticDBError:
         is_sound = False
     try:
         return is_sound, answers(path)
-    except hapticdb.HapticDBError as error:
+    except hapticdb.errors.HapticDBError as error:
         return is_sound, "" if "\n" not in str(error) else str(error)
 
 

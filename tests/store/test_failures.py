@@ -3,8 +3,7 @@
 import psycopg
 import pytest
 
-from hapticdb import HapticDBError
-from hapticdb.errors import ConnectionLostError, ReadOnlyError
+from hapticdb.errors import ConnectionLostError, HapticDBError, ReadOnlyError
 from hapticdb.store.postgres.connecting import failures
 
 ADVICE = "\n\tIs the server running on that host and accepting TCP/IP connections?"

@@ -4,7 +4,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.cli.tools import inset_for
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -63,9 +62,11 @@ class ForceOptions:
         return self._law_and_coupling()
 
     def inset(self, cells: "ResidentCells") -> float:
-        """How far a tool is drawn inward on those cells, metres; see `inset_for`."""
+        """How far a tool is drawn inward on those cells, metres."""
+        from hapticdb.query.law import inset_of
+
         law = self.law_name or "smooth"
-        return inset_for(cells.grid.voxel_size, law, is_conservative=self.is_conservative)
+        return 0.0 if self.is_conservative else inset_of(cells.grid.voxel_size, law)
 
     def tell_lowered(self, session: "Session") -> None:
         """Tell in one line by what a stiffness that was asked for is lowered."""

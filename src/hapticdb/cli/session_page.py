@@ -104,7 +104,7 @@ def budget_text(report: "Report") -> str:
 
 def _force_facts(report: "Report") -> Facts:
     """Law and coupling, the greatest force, and what was done to keep it stable."""
-    from hapticdb.realtime.coupling import SettledCoupling
+    from hapticdb.realtime.coupling import SettledCoupling, limit_text
 
     spring = report.coupling
     facts = [("force law", "smooth: distances to surfaces")]
@@ -115,8 +115,9 @@ def _force_facts(report: "Report") -> Facts:
         facts = [("force law", "plane: each frame's wrench goes to the device, without coupling")]
     caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
     facts.append(("at most", caps))
+    limit = limit_text(report.peak_force, spring.cap)
     peak = (
-        f"{report.peak_force:.4g} N, {report.peak_torque:.4g} N m at the device; "
+        f"{report.peak_force:.4g} N{limit}; {report.peak_torque:.4g} N m at the device; "
         f"deepest contact {length_text(report.deepest)}"
     )
     facts.append(("peak", peak))

@@ -34,9 +34,10 @@ def shell_of(
 
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
-    shell = PointShell.from_file(
-        tool, points, spacing=spacing, unit=unit, seed=seed or 0, inset=inset
-    )
+    with render.bar("sampling the tool", "points", lambda *now: now):
+        shell = PointShell.from_file(
+            tool, points, spacing=spacing, unit=unit, seed=seed or 0, inset=inset
+        )
     if shell.defects:
         render.note(f"{tool}: found in the file: {shell.defects}")
     if not shell.is_closed:
@@ -48,16 +49,6 @@ def shell_of(
             f"{length_text(deepest - inset)} late; give the mesh it was made of, if that matters"
         )
     return shell
-
-
-def inset_for(voxel_size: float, law: str, *, is_conservative: bool) -> float:
-    """Inset with which contact begins at the tool's surface, metres.
-
-    0 under the law plane, under which contact begins there anyhow, and where clearance is kept.
-    """
-    from hapticdb.kernels.field.law import ONSET
-
-    return ONSET * voxel_size if law == "smooth" and not is_conservative else 0.0
 
 
 def shell_text(shell: "PointShell") -> str:

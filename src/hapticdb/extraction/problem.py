@@ -85,7 +85,7 @@ def problem_of(
         raise UsageError(f"nothing stands in {env.url} beside what is to come out")
     shell = env.shell(
         *(obj.id for obj in parts), points=MOST_POINTS, spacing=SPACING * env.grid.voxel_size,
-        seed=seed,
+        seed=seed, inset=0.0,
     )  # fmt: skip
     outline = shell.outline
     box = np.stack([outline.min(axis=0), outline.max(axis=0)])

@@ -73,6 +73,10 @@ class FileReport:
     is_unit_assumed: bool = False
     """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
 
+    def __repr__(self) -> str:
+        what = f"{len(self.added)} objects added, {self.present} there before"
+        return f"FileReport({self.link}: {self.status}, {self.error or what})"
+
 
 @dataclass(frozen=True)
 class ImportOptions:

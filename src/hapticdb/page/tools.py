@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 
 from hapticdb import mesh
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.field.law import ONSET
 from hapticdb.pointshell.orientation import Surface
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import inset_of
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +27,7 @@ LEAST_VOXELS = 3.0
 """Least radius of a probe, voxels. Larger: probes feel smooth in coarser environments, and are
 larger there."""
 POINTS = 400
-"""Points of a tool's shell. Larger: smaller features are felt, and a frame takes longer."""
+"""Points of a probe's shell. Larger: smaller features are felt, and a frame takes longer."""
 PART_POINTS = 1500
 """Points of a part that is taken in hand; parts have more and finer edges than probes."""
 AROUND = 40
@@ -70,7 +70,7 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
     points are drawn inward by the law's onset.
     """
     radius = max(PROBE_SHARE * diagonal, LEAST_VOXELS * voxel_size)
-    inset = inset_of(voxel_size, smooth=smooth)
+    inset = inset_of(voxel_size, "smooth" if smooth else "plane")
     ball = np.linspace(-0.5 * math.pi, 0.5 * math.pi, AROUND // 2 + 1)
     peg = np.linspace(-0.5 * math.pi, 0.0, AROUND // 4 + 1)
     slim, long = 0.45 * radius, 3.2 * radius
@@ -89,7 +89,7 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
 
 def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list[HeldTool]:
     """Tools of the operator's files, named by them; FileError if one holds no readable surface."""
-    inset = inset_of(voxel_size, smooth=smooth)
+    inset = inset_of(voxel_size, "smooth" if smooth else "plane")
     found = []
     for path in map(Path, paths):
         if path.suffix.lower() == ".npz":
@@ -107,7 +107,7 @@ def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list
 
 
 def _centred_shell(path: Path, inset: float) -> PointShell:
-    return from_shell(path.stem, PointShell.from_file(path, POINTS, inset=inset)).shell
+    return from_shell(path.stem, PointShell.from_file(path, inset=inset)).shell
 
 
 def from_shell(name: str, shell: PointShell) -> HeldTool:
@@ -134,11 +134,6 @@ def middle_of(shell: PointShell) -> Floats:
     outline = shell.outline
     middle: Floats = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
     return middle
-
-
-def inset_of(voxel_size: float, *, smooth: bool) -> float:
-    """How far points of a tool are drawn inward, metres, so that contact begins at its surface."""
-    return ONSET * voxel_size if smooth else 0.0
 
 
 def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:

@@ -17,6 +17,11 @@ MOST_STIFFNESS = 1e9
 """Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
 
 
+def inset_of(voxel_size: float, law: LawName) -> float:
+    """How far a tool's points are drawn inward, metres, for contact to begin at its surface."""
+    return float(field.ONSET * voxel_size) if law == "smooth" else 0.0
+
+
 class ForceLaw(Protocol):
     """A force law: its stiffness, and its numbers for kernels."""
 

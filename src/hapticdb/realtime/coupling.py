@@ -24,6 +24,11 @@ MOST = 1e9
 """Largest number of a `Coupling`, in its unit: more than any device has."""
 
 
+def limit_text(newtons: float, cap: float) -> str:
+    """Words behind a force that the device's cap holds back; rounding keeps it below the cap."""
+    return ", at its limit" if newtons >= 0.999 * cap else ""
+
+
 @dataclass(frozen=True)
 class Coupling:
     """The spring between hand and tool; all in device units.

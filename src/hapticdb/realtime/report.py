@@ -204,6 +204,13 @@ class Report(Counts):
     database_lost: str | None
     proportions: Proportions
 
+    def __repr__(self) -> str:
+        return (
+            f"Report({self.loop.frames:,} frames in {self.loop.seconds:.3g} s, law {self.law}, "
+            f"{self.contact_frames:,} in contact, peak {self.peak_force:.4g} N, "
+            f"{self.loop.missed:,} deadlines missed)"
+        )
+
     @property
     def hit_rate(self) -> float:
         """Share of the looked-up points whose cell was resident."""

@@ -20,7 +20,7 @@ from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
 
 from hapticdb.errors import DatabaseError, HapticDBError, ProtocolError, UsageError
 from hapticdb.hosting.contact_source import RATE, ContactSource
-from hapticdb.page.tools import BUILT_IN, POINTS, built_in, inset_of
+from hapticdb.page.tools import BUILT_IN, built_in
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
     HandState,
@@ -31,6 +31,7 @@ from hapticdb.protocol.contacts import (
     unpack_wish,
 )
 from hapticdb.protocol.header import CloseCode, OtherVersionError
+from hapticdb.query.law import inset_of
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket
@@ -293,8 +294,8 @@ def _tools(files: tuple[str, ...], cells: ResidentCells) -> dict[str, PointShell
     """The operator's tools by the names of their files, in their own frames; else two probes."""
     size = cells.grid.voxel_size
     if files:
-        inset = inset_of(size, smooth=True)
-        return {Path(file).stem: PointShell.from_file(file, POINTS, inset=inset) for file in files}
+        inset = inset_of(size, "smooth")
+        return {Path(file).stem: PointShell.from_file(file, inset=inset) for file in files}
     bounds = scene_bounds(cells.first_objects)
     diagonal = 0.0 if bounds is None else float(((bounds[1] - bounds[0]) ** 2).sum() ** 0.5)
     return {tool.name: tool.shell for tool in built_in(diagonal, size, smooth=True)}

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.store.pairs import KeepsPairs
+from hapticdb.units import length_text
 
 Layout = Literal["voxel", "brick"]
 Table = Literal["voxel", "brick", "band"]
@@ -46,8 +47,7 @@ class Band(NamedTuple):
     def picked(self, which: NDArray[np.int64]) -> "Band":
         """Copies of the rows at the given places, in their order."""
         lengths, bytes_of = self.lengths[which], self.data.tobytes()
-        ends = self.ends[which].tolist()
-        pairs = zip(ends, lengths.tolist(), strict=True)
+        pairs = zip(self.ends[which].tolist(), lengths.tolist(), strict=True)
         joined = b"".join([bytes_of[end - length : end] for end, length in pairs])
         return Band(np.frombuffer(joined, np.uint8), np.cumsum(lengths))
 
@@ -171,15 +171,11 @@ class Object:
     bounds : (2, 3) float64
         Lower and upper corner, metres, world frame.
     attributes : mapping
-        Everything else, as JSON. ``unit`` is the unit that its file was read in. ``up`` is the
-        axis that points up, if the file says so: ``x``, ``y`` or ``z``.
+        The rest, as JSON: ``unit`` of its file, ``up``: the axis x, y or z that the file says.
     revision : int
         Revision of the environment that last wrote the object.
-    rows_crc : int or None
-        Checksum of its rows as they were written. None for an object that a version without
-        checksums has written.
-    distances_crc : int or None
-        Checksum of its rows of distances as they were written. None for an object without any.
+    rows_crc, distances_crc : int or None
+        Checksums of its rows, and of its rows of distances, as they were written; None without.
     surface : bytes or None
         Its packed surface. Only `Environment.remove` gives it, so that the object can be restored.
     """
@@ -195,7 +191,11 @@ class Object:
     revision: int = 0
     rows_crc: int | None = None
     distances_crc: int | None = None
-    surface: bytes | None = field(default=None, repr=False)
+    surface: bytes | None = None
+
+    def __repr__(self) -> str:
+        size = length_text(float(np.ptp(self.bounds, axis=0).max()))
+        return f"Object({self.id} {self.name!r}, {size} long, {self.voxels:,} voxels)"
 
     @property
     def has_distances(self) -> bool:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.proportions import Proportions
 from hapticdb.store.base import Object
 from hapticdb.sweeps.way import Way
+from hapticdb.units import length_text
 
 Floats = NDArray[np.float64]
 
@@ -119,6 +120,12 @@ class Swept:
     proportions: Proportions
     profile: Profile | None = None
     is_stopped: bool = False
+
+    def __repr__(self) -> str:
+        met = [obj.name for obj in (*(place.object for place in self.hits), *self.enclosed)]
+        found = f"by {', '.join(met[:3])}" if met else f"gap {length_text(self.gap.at_least)}"
+        more = f" and {len(met) - 3} more" if len(met) > 3 else ""
+        return f"Swept({self.verdict}, {found}{more}, {self.objects} objects, {self.elapsed:.2f} s)"
 
     @property
     def verdict(self) -> Verdict:

@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
 
 import typer
@@ -146,12 +147,13 @@ class _Job(NamedTuple):
 
 
 class _Told(NamedTuple):
-    """A sweep's result with its tool, and the exit code."""
+    """A sweep's result with its tool, the exit code, and the seconds that it took with the tool."""
 
     job: _Job
     shell: "PointShell"
     found: "Swept"
     code: int
+    seconds: float
 
 
 def sweep(
@@ -253,10 +255,12 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
     from hapticdb.sweeps.run import sweep as sweep_path
 
     asked, felt = job.asked, job.felt
+    began = perf_counter()
     points = DRAWN_POINTS if options.is_drawn else None
     with naming(asked.line):
         if asked.tool is None:
-            shell = env.shell(*job.parts, points=points)
+            with render.bar("sampling the parts", "points", lambda *now: now):
+                shell = env.shell(*job.parts, points=points, inset=0.0)
         else:
             shell = shell_of(asked.tool, options.tool_unit, points, None)
         fit = fitting.compare(
@@ -273,7 +277,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
     is_doubtful = bool(fit.misfits) and not options.as_given
     code = DOUBTFUL if found.is_free and is_doubtful else EXIT_CODES[found.verdict]
-    return _Told(job, shell, found, code)
+    return _Told(job, shell, found, code, perf_counter() - began)
 
 
 def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, json: bool) -> int:
@@ -348,7 +352,7 @@ def _show(told: _Told) -> None:
     if found.is_free:
         facts.append(("gap", _gap_range(found, gap_text(found))))
     looked = f"{render.counted(found.objects, 'object')} near the path, {found.looks:,} looks"
-    facts += [("looked at", looked), ("took", f"{found.elapsed:.2f} s")]
+    facts += [("looked at", looked), ("took", f"{told.seconds:.2f} s")]
     render.facts(facts)
 
 

@@ -37,7 +37,7 @@ from hapticdb.cli.options import (
     UrlArgument,
     WhereOption,
 )
-from hapticdb.cli.tools import inset_for, shell_of, shell_record, shell_text
+from hapticdb.cli.tools import shell_of, shell_record, shell_text
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -48,7 +48,7 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Misfit
     from hapticdb.query.frame import Strategy
-    from hapticdb.query.law import ForceLaw
+    from hapticdb.query.law import ForceLaw, LawName
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
@@ -104,6 +104,7 @@ def touch(
     """
     import hapticdb
     from hapticdb.poses import read_poses
+    from hapticdb.query.law import inset_of
 
     plane, smooth = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
     path = read_poses(poses, unit=path_unit or "m")
@@ -111,16 +112,15 @@ def touch(
         _output(csv, contacts_csv, json=json) as output,
         hapticdb.open(url, read_only=True) as env,
     ):
-        name = law or ("smooth" if env.has_distances else "plane")
+        name: LawName = law or ("smooth" if env.has_distances else "plane")
         chosen: ForceLaw = smooth if name == "smooth" else plane
         felt = felt_objects(env, where, exclude)
         render.compile_kernels("touch", files=[tool])
-        inset = inset_for(env.grid.voxel_size, name, is_conservative=conservative)
-        shell = shell_of(tool, tool_unit, points, seed, inset=inset)
+        reach = inset_of(env.grid.voxel_size, name)
+        shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
         fit = fitting.compare(
             env, shell, path, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
-            path_unit=path_unit, is_moving=False,
-            reach=inset_for(env.grid.voxel_size, name, is_conservative=False),
+            path_unit=path_unit, is_moving=False, reach=reach,
         )  # fmt: skip
         asked = _strategy_of(strategy, env, len(path))
         touch_at = partial(

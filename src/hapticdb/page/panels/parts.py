@@ -230,11 +230,9 @@ class PartsPanel:
     def _take_out(self, _: object) -> None:
         browser = self._browser
         obj = self._browser.only_chosen()
-        facts = browser.site.facts
-        inset = tools.inset_of(facts.voxel_size, smooth=facts.is_smooth)
 
         def shell(env: Environment) -> PointShell:
-            return env.shell(obj.id, points=tools.PART_POINTS, inset=inset)
+            return env.shell(obj.id, points=tools.PART_POINTS)
 
         def hold(found: PointShell) -> None:
             before, browser.taken = browser.taken, obj.id

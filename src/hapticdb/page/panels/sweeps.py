@@ -187,7 +187,7 @@ class _SweepJob:
     def run(self, progress: Callable[[int, int], None]) -> _SweepAnswer:
         """Sweep on a connection of its own."""
         with open_environment(self._site.url, read_only=True) as env:
-            shell = self._tool.shell if self._part is None else env.shell(self._part)
+            shell = self._tool.shell if self._part is None else env.shell(self._part, inset=0.0)
             present = [i for i in self._exclude if i in self._site.objects]
             swept = sweep(env, shell, self._path(shell), exclude=present, progress=progress)
         return _SweepAnswer(shell, swept)

@@ -17,6 +17,7 @@ from hapticdb.page.wording import (
     swatch,
     torque_text,
 )
+from hapticdb.realtime.coupling import limit_text
 from hapticdb.recording.frame import State
 from hapticdb.store.base import Object
 
@@ -203,12 +204,14 @@ class TouchPanel:
             said = f'<span style="opacity:0.6">Touches nothing{hint}</span>'
         big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums"
         small = "font-size:0.75em;opacity:0.65"
+        limit = limit_text(force, self._browser.drawing.cap)
         return (
             f'<div style="margin:4px 12px 2px"><div style="{small}">{swatch(self._browser.colour)}'
             f"{escaped(who)}</div>"
             '<div style="display:flex;gap:24px;margin:4px 0">'
             f'<div><div style="{small}">Force</div>'
-            f'<div style="{big}">{force_text(force)}</div></div>'
+            f'<div style="{big}">{force_text(force)}'
+            f'<span style="{small}">{limit}</span></div></div>'
             f'<div><div style="{small}">Torque</div>'
             f'<div style="{big}">{torque_text(torque)}</div></div></div>'
             '<div style="font-size:0.82em;min-height:3.2em">'

@@ -1,0 +1,70 @@
+"""One tool at one place feels one force by command, library and page; results say what they are."""
+
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import hapticdb
+from command_line import Run, made, poses, run, scene  # noqa: F401 - fixtures
+from hapticdb.page.tools import from_files, middle_of
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.realtime.coupling import limit_text
+
+
+def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Path) -> None:
+    path = hapticdb.read_poses(poses(scene.parent / "in.csv", (0.0, 0.0, 0.055)))
+    command = json.loads(
+        run("touch", scene, "--tool", "tool.stl", "--poses", "in.csv", "--json")[1]
+    )
+    with hapticdb.open(scene) as env:
+        assert env.has_distances
+        tool = env.tool("tool.stl")
+        library = env.touch(tool, path[0])
+        (held,) = from_files(["tool.stl"], env.grid.voxel_size, smooth=env.has_distances)
+        centred = path[0].copy()
+        centred[:3, 3] += middle_of(tool)
+        page = env.touch(held.shell, centred)
+        above = np.eye(4)
+        above[2, 3] = 0.072
+        before = [env.touch(one, above) for one in (tool, PointShell.from_file("tool.stl"))]
+        part, drawn = env.shell(1, inset=0.0), env.shell(1)
+    assert np.linalg.norm(library.force) > 1.0
+    assert command["force"] == library.force.tolist()
+    np.testing.assert_allclose(page.force, library.force, rtol=1e-9, atol=1e-9)
+    assert not before[0].force.any()
+    assert before[1].force.any()  # with points on the surface, contact begins before it
+    assert drawn.inset.max() > part.inset.max() == 0.0
+
+
+@pytest.mark.parametrize(("newtons", "words"), [(7.0, ", at its limit"), (6.9, "")])
+def test_a_force_at_the_devices_cap_is_told(newtons: float, words: str) -> None:
+    assert limit_text(newtons, 7.0) == words
+
+
+def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> None:
+    with hapticdb.open(scene) as env:
+        tool = env.tool("tool.stl")
+        path = hapticdb.read_poses("path.csv")
+        swept = hapticdb.sweep(env, tool, path[:2], profile=True)
+        felt = env.touch(tool, poses=path)
+        touch = env.touch(tool, path[0])
+        obj = env.object(2)
+    assert repr(obj) == "Object(2 'box1', 0.1 m long, 488 voxels)"
+    for result in (swept, felt, touch, obj):
+        assert len(repr(result).splitlines()) == 1
+        assert len(repr(result)) < 200
+    assert hapticdb.plot(felt).get_xlabel() == "pose"
+    assert "mm" in hapticdb.plot(touch).get_ylabel()
+    assert hapticdb.plot(swept).get_title() == swept.verdict
+
+
+def test_help_begins_with_the_names_that_matter() -> None:
+    first = str(hapticdb.__doc__).split("Errors")[0]
+    for name in ("import_files", "open", "create", "Environment", "PointShell", "read_poses",
+                 "sweep", "extract", "Session", "plot"):  # fmt: skip
+        assert name in first
+        assert hasattr(hapticdb, name)

@@ -1,6 +1,7 @@
 """Result of the haptic query: what a tool felt at one pose."""
 
 from collections.abc import Mapping
+from html import escape
 
 import numpy as np
 from numpy.typing import NDArray
@@ -85,6 +86,13 @@ class Touch:
     def pairs(self) -> NDArray[np.int64]:
         """Every hit with every object in its voxel, (P, 2): index of the point, id."""
         return self._answer.pairs()
+
+    def _repr_html_(self) -> str:
+        """Force, torque and what is touched, for notebooks."""
+        rows = "".join(
+            f"<tr><td>{one.id}</td><td>{escape(one.name)}</td></tr>" for one in self.objects
+        )
+        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
 
     def __repr__(self) -> str:
         x, y, z = self.force

@@ -1,6 +1,7 @@
 """Results of a sweep, decided on surfaces: metres and fractions of the path."""
 
 from dataclasses import dataclass
+from html import escape
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -126,6 +127,14 @@ class Swept:
         found = f"by {', '.join(met[:3])}" if met else f"gap {length_text(self.gap.at_least)}"
         more = f" and {len(met) - 3} more" if len(met) > 3 else ""
         return f"Swept({self.verdict}, {found}{more}, {self.objects} objects, {self.elapsed:.2f} s)"
+
+    def _repr_html_(self) -> str:
+        """Table of what is hit, for notebooks."""
+        rows = "".join(
+            f"<tr><td>{escape(one.object.name)}</td><td>at {one.fraction:.2%} of the path</td></tr>"
+            for one in self.hits
+        )
+        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
 
     @property
     def verdict(self) -> Verdict:

@@ -112,6 +112,10 @@ def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
 def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.FileError, match=r"degrees \(g\), which are no lengths"):
         read_file(cloud(tmp_path / "a.las", DEGREES))
+    las = laspy.read(tmp_path / "a.las")
+    las.x = las.x + 5e5  # some files name such a system and have metres
+    las.write(tmp_path / "b.las")
+    assert "which its numbers are not" in read_file(tmp_path / "b.las").notes[0]
 
 
 @pytest.mark.parametrize(

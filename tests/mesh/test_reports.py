@@ -244,6 +244,11 @@ def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
     file = parse_in_process(tmp_path / "binary.stl")
     assert names(file) == ["binary", "binary #2"]
     assert "4 bytes behind the last triangle" in file.notes[0]
+    named = b"solid " + one[6:]  # a binary header may say so
+    (tmp_path / "named.stl").write_bytes(named + named)
+    assert names(parse_in_process(tmp_path / "named.stl")) == ["named", "named #2"]
+    path = text(tmp_path / "more.stl", f"solid a\n{FACET}endsolid a\nand more\n")
+    assert parse_in_process(path).notes == ("1 lines begin with unknown words and are passed over",)
     square = FACET.replace("endloop", "vertex 1 1 0\nendloop")
     path = text(tmp_path / "square.stl", f"solid a\n{square * 3}endsolid a\n")
     assert "other than three corners" in cause(path)

@@ -17,6 +17,7 @@ from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
 """Numbers of GeoTIFF keys."""
 _GEOGRAPHIC = 2
+_FULL_TURN = 360.0
 _LEAST = 1e-3
 """Shortest unit, metres, that a reference system is believed to have; the longest is 1 / this."""
 _NO_LENGTHS = (
@@ -115,6 +116,8 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
         system = vertical = None
     if (system is not None and system.is_geographic) or keys.get(_MODEL) == _GEOGRAPHIC:
         name = "" if system is None else f" ({system.name})"
+        if np.abs([header.mins[:2], header.maxs[:2]]).max() > _FULL_TURN:
+            return _Lengths(notes=(f"its system{name} is of degrees, which its numbers are not",))
         return _Lengths(not_lengths=f"its coordinates are degrees{name}, {_NO_LENGTHS}")
     by_code = {
         int(unit.code): float(unit.conv_factor)

@@ -18,6 +18,10 @@ _HEADER = 84
 _BORDER = re.compile(r"^[ \t]*(end[ \t]*solid|solid\b)[ \t]*(.*)$", re.MULTILINE | re.IGNORECASE)
 _NO_COUNT = {0, 0xFFFFFFFF}
 """Counts of programs that write the header before they know the number of triangles."""
+_STRANGE = re.compile(
+    r"^[ \t]*(?!(?:end[ \t]*)?(?:solid|facet|loop)|outer\b|vertex\b|color\b)\S",
+    re.MULTILINE | re.IGNORECASE,
+)
 _LOOP = re.compile(r"\bouter\s*loop\b", re.IGNORECASE)
 _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
@@ -31,7 +35,8 @@ def read(path: Path) -> Parsed:
     if len(content) == n_bytes and len(content) >= _HEADER:
         return placed_once([(path.stem, _binary(content, 0, n_facets))])
     plain = recoded(content)
-    if plain[:512].lstrip()[:5].lower() == b"solid":
+    head = plain[:512].lstrip().lower()
+    if head.startswith(b"solid") and b"\0" not in head:
         return _text(text_of(plain), path.stem)
     if len(content) < _HEADER:
         raise UnreadableError("it is no STL file: neither a 'solid' nor a binary header")
@@ -94,7 +99,9 @@ def _text(text: str, stem: str) -> Parsed:
             raise UnreadableError(f"it is cut short: solid '{name or stem}' has no end")
         if must_be or (is_closed and not is_end[n]):
             solids.append((name or stem, shape))
-    return placed_once(solids)
+    n_strange = len(_STRANGE.findall(text))
+    told = f"{n_strange:,} lines begin with unknown words and are passed over"
+    return replace(placed_once(solids), notes=[told] if n_strange else [])
 
 
 def _facets(chunk: str, name: str) -> Shape:

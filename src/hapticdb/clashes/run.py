@@ -20,6 +20,7 @@ from hapticdb.clashes.result import Clash, Clashes, gravity
 from hapticdb.clashes.shapes import Shapes
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
+from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Store
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import PairRow, Status
@@ -83,6 +84,7 @@ def find_clashes(
         )
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"a search of {seconds} seconds: give more than 0")
+    make_ready("clashes")
     began = time.monotonic()
     until = np.inf if seconds is None else began + seconds
     asked = _Asked(within, contact, tuple(of), tuple(against), until, budget, progress)

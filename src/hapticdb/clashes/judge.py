@@ -31,8 +31,6 @@ WAYS /= np.linalg.norm(WAYS, axis=1)[:, None]
 """Directions of the shifts that may free surfaces, beside those of their normals."""
 STRIDES = (1.05, 1.5, 2.5)
 """Depths that a shift is tried for that frees what overlaps. More: closer bounds, slower."""
-LEAST_STRETCH = 0.01
-"""Least share to which a stretch shrinks a thin part."""
 
 
 class Judged(NamedTuple):
@@ -110,8 +108,8 @@ def _motions(
     normals = _normals(a, b, pose, near)
     yield _shifted(pose, contact * np.concatenate([normals, -normals]))
     yield _shifted(pose, contact * WAYS)
-    yield pose @ _stretches(b, contact)
-    yield np.linalg.inv(_stretches(a, contact)) @ pose
+    yield pose @ b.stretches(contact)
+    yield np.linalg.inv(a.stretches(contact)) @ pose
 
 
 def _normals(a: BuiltShape, b: BuiltShape, pose: Floats, near: Nearest) -> Floats:
@@ -133,30 +131,6 @@ def _normal(shape: BuiltShape, triangle: int) -> Floats:
     normal = np.cross(second - first, third - first)
     length = float(np.linalg.norm(normal))
     return normal / length if length > 0.0 else np.zeros(3)
-
-
-def _stretches(shape: BuiltShape, contact: float) -> Floats:
-    """Maps (N, 4, 4) about a shape's middle that move no place of it by more than `contact`.
-
-    They shrink or widen it across an axis of its frame, with a shift along the axis or without, or
-    along all axes.
-    """
-    low, high = shape.box
-    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), TINY)
-    step = contact / np.sqrt(3.0)
-    maps = []
-    for sign, axis, shift in product((1.0, -1.0), (0, 1, 2, 3), (0.0, 1.0, -1.0)):
-        if axis == 3 and shift:
-            continue
-        scale = np.maximum(1.0 + sign * step / half, LEAST_STRETCH)
-        made = np.eye(4)
-        if axis < 3:
-            scale[axis] = 1.0
-            made[axis, 3] = shift * step
-        made[:3, 3] += middle - scale * middle
-        made[:3, :3] = np.diag(scale)
-        maps.append(made)
-    return np.array(maps)
 
 
 def _cut(a: BuiltShape, b: BuiltShape, pose: Floats, most: float, contact: float) -> Cut:

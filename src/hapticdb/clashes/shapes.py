@@ -2,12 +2,14 @@
 
 from collections import OrderedDict
 from functools import cached_property
+from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import NoSurfaceError, UsageError
 from hapticdb.ingest.geometry import unpacked_part
+from hapticdb.kernels.triangles.parting import components
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.moving import tree_of
 from hapticdb.pointshell.orientation import orient
@@ -19,6 +21,10 @@ Floats = NDArray[np.float64]
 RIGID = 1e-12
 """Greatest deviation of a rotation's columns from orthonormal ones. Other placements get a shape of
 their own."""
+LEAST_STRETCH = 0.01
+"""Least share to which a stretch shrinks a thin part."""
+THIN = 1e-9
+"""Metres: least half of a box's edge that is stretched."""
 BYTES_OF_CORNERS = 6
 """Bytes of a shape for each byte of its corners, with all that is built from them."""
 
@@ -31,6 +37,7 @@ class BuiltShape:
 
     def __init__(self, triangles: Floats, *, is_cloud: bool) -> None:
         self.tree, self.is_cloud = tree_of(triangles), is_cloud
+        self._stretches: dict[float, Floats] = {}
         self.box = self.tree.corners.min(axis=(0, 1)), self.tree.corners.max(axis=(0, 1))
 
     @cached_property
@@ -50,13 +57,14 @@ class BuiltShape:
     @cached_property
     def bodies(self) -> Floats:
         """A corner (B, 3) of each piece that is connected."""
-        from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
-        from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
+        pieces = components(self.mesh.edges, len(self.mesh.points))
+        return self.mesh.points[np.unique(pieces)]
 
-        edges, count = self.mesh.edges, len(self.mesh.points)
-        links = coo_array((np.ones(len(edges)), (edges[:, 0], edges[:, 1])), shape=(count, count))
-        labels = connected_components(links, directed=False)[1]
-        return self.mesh.points[np.unique(labels, return_index=True)[1]]
+    def stretches(self, contact: float) -> Floats:
+        """Maps (N, 4, 4) that move no place of it by more than `contact`, built once for each."""
+        if contact not in self._stretches:
+            self._stretches[contact] = _stretches(*self.box, contact)
+        return self._stretches[contact]
 
     def holds(self, places: Floats) -> NDArray[np.bool_]:
         """Whether each of places (Q, 3), its frame, is in a closed body of it."""
@@ -74,14 +82,17 @@ class Shapes:
         self._store, self._budget = store, budget
         self._kept: OrderedDict[tuple[str, bytes], BuiltShape] = OrderedDict()
         self._bytes = 0
+        self._placements: dict[int, tuple[tuple[str, bytes], Floats, Floats]] = {}
 
     def placed(self, obj: Object) -> tuple[BuiltShape, Floats] | None:
         """BuiltShape of an object and its rigid placement (4, 4); None if it was written meanwhile.
 
         Raises `NoSurfaceError` if the object's surface is not in the database.
         """
-        linear, pose = _placement(obj.transform)
-        key = obj.digest, linear.tobytes()
+        if obj.id not in self._placements:
+            linear, pose = _placement(obj.transform)
+            self._placements[obj.id] = (obj.digest, linear.tobytes()), linear, pose
+        key, linear, pose = self._placements[obj.id]
         shape = self._kept.get(key)
         if shape is None:
             shape = self._read(obj, linear)
@@ -108,6 +119,29 @@ class Shapes:
         if part.faces is None:
             return BuiltShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
         return BuiltShape(corners[part.faces], is_cloud=False)
+
+
+def _stretches(low: Floats, high: Floats, contact: float) -> Floats:
+    """Maps (N, 4, 4) about the middle of a box that move no place in it by more than `contact`.
+
+    They shrink or widen it across an axis of its frame, with a shift along the axis or without, or
+    along all axes.
+    """
+    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), THIN)
+    step = contact / np.sqrt(3.0)
+    maps = []
+    for sign, axis, shift in product((1.0, -1.0), (0, 1, 2, 3), (0.0, 1.0, -1.0)):
+        if axis == 3 and shift:
+            continue
+        scale = np.maximum(1.0 + sign * step / half, LEAST_STRETCH)
+        made = np.eye(4)
+        if axis < 3:
+            scale[axis] = 1.0
+            made[axis, 3] = shift * step
+        made[:3, 3] += middle - scale * middle
+        made[:3, :3] = np.diag(scale)
+        maps.append(made)
+    return np.array(maps)
 
 
 def _bytes_of(shape: BuiltShape) -> int:

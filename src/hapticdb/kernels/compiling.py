@@ -50,6 +50,7 @@ ENTRIES = {
     "surfaces.nearest": "distances_kernel",
     "triangles.nearest": "nearest_kernel",
     "triangles.piercing": "piercing_kernel",
+    "triangles.parting": "components_kernel depths_kernel",
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
     "resident.feeling": "bounding_spheres",

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.surfaces.sides import TriangleTree
+from hapticdb.kernels.triangles.parting import components, depths_of
 from hapticdb.kernels.triangles.piercing import piercing
 
 Floats = NDArray[np.float64]
@@ -34,16 +35,12 @@ Ints = NDArray[np.int64]
 
 JOIN = 1e-6
 """Share of a surface's diagonal up to which corners are one, and places of an edge, too."""
-PLACES = np.array([0.0, 0.25, 0.5, 0.75, 1.0])
-"""Places of a part of an edge whose distance is measured. More: deeper cuts of curved surfaces."""
 WAYS = np.array([(0.61, 0.53, 0.59), (-0.57, 0.62, -0.54), (0.52, -0.58, -0.63)])
 """Ways by which a surface is shifted, about 1 long and along no likely plane. More: flush surfaces
 are told from cuts more often."""
 SPOTS = 3
 """Places that each place in a triangle is paired with, to find a spot between them. More: deeper
 cuts of curved surfaces."""
-CHUNK = 256
-"""Corners of a piece that are measured together, until one is far enough."""
 
 
 class Mesh:
@@ -123,9 +120,6 @@ def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float) -> Cut:
 
 def _deepest(mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float) -> Cut:
     """The deepest of all curves: at each the lesser of what either surface gets through."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
-
     own, at_own = mine.crossings()
     other, at_other = theirs.crossings()
     pairs = np.concatenate([own, other[:, ::-1]])  # triangles that cross: of one, of the other
@@ -134,8 +128,9 @@ def _deepest(mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: f
     _, pair = np.unique(pairs, axis=0, return_inverse=True)
     pair = pair.reshape(-1)
     size = n_all + (int(pair.max()) + 1 if len(pair) else 0)
-    links = coo_array((np.ones(len(place)), (place, n_all + pair)), shape=(size, size))
-    n_curves, curve = connected_components(links, directed=False)
+    links = np.stack([place, n_all + pair], axis=1)
+    _, curve = np.unique(components(links, size), return_inverse=True)
+    n_curves = int(curve.max()) + 1
     through = [np.full(n_curves, -1.0), np.full(n_curves, -1.0)]
     depths = mine.depths(most), theirs.depths(most)
     for deepest, values, curves in zip(
@@ -227,88 +222,6 @@ class _Parted:
 
     def depths(self, most: float) -> Floats:
         """How far (P,) the surface gets through at each place."""
-        if not len(self.shares):
-            return self.shares
-        pieces = self._pieces()
-        cut_edges, first = np.unique(self.edges, return_index=True)
-        n_cuts = np.diff(np.append(first, len(self.shares)))
-        # an edge of n places has n + 1 parts; part k of all is before place k - (edges before it)
-        starts = np.concatenate([[0], np.cumsum(n_cuts + 1)])
-        begins, ends = (
-            np.insert(self.shares, first, 0.0),
-            np.insert(self.shares, first + n_cuts, 1.0),
+        return depths_of(
+            self._points, self._edges, self.edges, self.shares, self._other.tree, self._pose, most
         )
-        owner = np.repeat(np.arange(len(cut_edges)), n_cuts + 1)
-        far = self._parts_far(cut_edges[owner], begins, ends, most)
-        is_end = np.zeros((2, len(owner)), dtype=bool)
-        is_end[0, starts[:-1]] = is_end[1, starts[1:] - 1] = True
-        corners = self._edges[cut_edges[owner]]
-        piece = np.where(is_end[0], pieces[corners[:, 0]], pieces[corners[:, 1]])
-        inner = np.flatnonzero(~is_end.any(axis=0))
-        piece[inner] = pieces.max() + 1 + np.arange(len(inner))
-        piece_far = np.zeros(int(piece.max()) + 1)
-        np.maximum.at(piece_far, piece, far)
-        self._extend(piece_far, pieces, np.unique(piece[is_end.any(axis=0)]), most)
-        before = np.flatnonzero(~is_end[1])
-        beside = np.where(
-            piece[before] == piece[before + 1],
-            np.minimum(far[before], far[before + 1]),
-            np.minimum(piece_far[piece[before]], piece_far[piece[before + 1]]),
-        )
-        return np.maximum(beside, _beyond(piece, piece_far, owner, before))
-
-    def _pieces(self) -> Ints:
-        """Piece (V,) of each point: what edges that are not gone through connect."""
-        from scipy.sparse import coo_array  # noqa: PLC0415 - a third of a second
-        from scipy.sparse.csgraph import connected_components  # noqa: PLC0415 - likewise
-
-        is_whole = np.ones(len(self._edges), dtype=bool)
-        is_whole[self.edges] = False
-        kept = self._edges[is_whole]
-        count = len(self._points)
-        links = coo_array((np.ones(len(kept)), (kept[:, 0], kept[:, 1])), shape=(count, count))
-        return np.asarray(connected_components(links, directed=False)[1], dtype=np.int64)
-
-    def _far(self, places: Floats, most: float) -> Floats:
-        """Distances (n,) of places (n, 3) from the other surface, up to `most`."""
-        moved = places @ self._pose[:3, :3].T + self._pose[:3, 3]
-        return distances_to(self._other.tree, moved, 0.0, most)
-
-    def _parts_far(self, edges: Ints, begins: Floats, ends: Floats, most: float) -> Floats:
-        """Greatest distances (n,) on parts of edges (n,), from share to share."""
-        corners = self._points[self._edges[edges]]
-        shares = begins[:, None] + PLACES * (ends - begins)[:, None]
-        places = corners[:, :1] + shares[..., None] * (corners[:, 1:] - corners[:, :1])
-        far = self._far(places.reshape(-1, 3), most)
-        return np.asarray(far.reshape(-1, len(PLACES)).max(axis=1))
-
-    def _extend(self, piece_far: Floats, pieces: Ints, asked: Ints, most: float) -> None:
-        """Measure points of the pieces asked for, in place, until each is far enough or all are."""
-        order = np.argsort(pieces, kind="stable")
-        starts = np.searchsorted(pieces[order], asked)
-        ends = np.searchsorted(pieces[order], asked, side="right")
-        for number, start, end in zip(asked.tolist(), starts.tolist(), ends.tolist(), strict=True):
-            for at in range(start, end, CHUNK):
-                if piece_far[number] >= most:
-                    break
-                points = self._points[order[at : min(at + CHUNK, end)]]
-                piece_far[number] = max(piece_far[number], float(self._far(points, most).max()))
-
-
-def _beyond(piece: Ints, piece_far: Floats, owner: Ints, before: Ints) -> Floats:
-    """Lesser of the farthest pieces (P,) on both sides of each place along its edge.
-
-    Zero where both are one piece. piece, owner (Q,) : of each part; before (P,) : the part before
-    each place.
-    """
-    best = np.stack([np.arange(len(piece)), np.arange(len(piece))])  # to the left, to the right
-    for side, step in ((0, 1), (1, -1)):
-        order = range(1, len(piece)) if step == 1 else range(len(piece) - 2, -1, -1)
-        for k in order:
-            last = k - step
-            if owner[last] == owner[k]:
-                known = best[side, last]
-                if piece_far[piece[known]] >= piece_far[piece[k]]:
-                    best[side, k] = known
-    left, right = piece[best[0, before]], piece[best[1, before + 1]]
-    return np.where(left == right, 0.0, np.minimum(piece_far[left], piece_far[right]))

@@ -75,6 +75,43 @@ def is_flat(corners, n, x, y, z, nx, ny, nz, flat):
     return True
 
 
+@leaf
+def distance_at(tree, place, own, normal, flat, enough, farthest, waiting, squares):
+    """Distance of a place (x, y, z); normal (x, y, z), the others as for `distances_kernel`."""
+    x, y, z = place
+    boxes, spans = tree.boxes, tree.spans
+    first_leaf = boxes.shape[0] // 2
+    n_triangles = tree.corners.shape[0]
+    best = farthest * farthest
+    waiting[0], squares[0] = 0, _square_to_box(boxes, np.int64(0), x, y, z)
+    top = 1
+    while top > 0 and best > enough * enough:
+        top -= 1
+        node = waiting[top]
+        if not squares[top] < best or spans[node, 0] == spans[node, 1] == own:
+            continue
+        if node < first_leaf:
+            near, far = 2 * node + 1, 2 * node + 2
+            here = _square_to_box(boxes, near, x, y, z)
+            there = _square_to_box(boxes, far, x, y, z)
+            if there < here:
+                near, far, here, there = far, near, there, here
+            waiting[top], squares[top] = far, there
+            waiting[top + 1], squares[top + 1] = near, here
+            top += 2
+            continue
+        start = (node - first_leaf) * LEAF_SIZE
+        for n in range(start, min(start + LEAF_SIZE, n_triangles)):
+            if tree.bodies[n] == own:
+                continue
+            if flat >= 0.0 and is_flat(
+                tree.corners, n, x, y, z, normal[0], normal[1], normal[2], flat
+            ):
+                continue
+            best = min(best, _square_to_triangle(tree.corners, n, x, y, z))
+    return np.sqrt(best)
+
+
 @entry(TREE, FLOATS2, INTS, FLOATS2, FLOAT, FLOAT, FLOAT, FLOATS)
 def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
     """Distance out (Q,) of each of places (Q, 3) to the nearest triangle.
@@ -86,39 +123,10 @@ def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
     """
     waiting = np.empty(STACK, dtype=np.int64)
     squares = np.empty(STACK)
-    boxes, spans = tree.boxes, tree.spans
-    first_leaf = boxes.shape[0] // 2
-    n_triangles = tree.corners.shape[0]
     for q in range(places.shape[0]):
-        x, y, z = places[q, 0], places[q, 1], places[q, 2]
-        best = farthest * farthest
-        waiting[0], squares[0] = 0, _square_to_box(boxes, np.int64(0), x, y, z)
-        top = 1
-        while top > 0 and best > enough * enough:
-            top -= 1
-            node = waiting[top]
-            if not squares[top] < best or spans[node, 0] == spans[node, 1] == own[q]:
-                continue
-            if node < first_leaf:
-                near, far = 2 * node + 1, 2 * node + 2
-                here = _square_to_box(boxes, near, x, y, z)
-                there = _square_to_box(boxes, far, x, y, z)
-                if there < here:
-                    near, far, here, there = far, near, there, here
-                waiting[top], squares[top] = far, there
-                waiting[top + 1], squares[top + 1] = near, here
-                top += 2
-                continue
-            start = (node - first_leaf) * LEAF_SIZE
-            for n in range(start, min(start + LEAF_SIZE, n_triangles)):
-                if tree.bodies[n] == own[q]:
-                    continue
-                if flat >= 0.0 and is_flat(
-                    tree.corners, n, x, y, z, normals[q, 0], normals[q, 1], normals[q, 2], flat
-                ):
-                    continue
-                best = min(best, _square_to_triangle(tree.corners, n, x, y, z))
-        out[q] = np.sqrt(best)
+        place = (places[q, 0], places[q, 1], places[q, 2])
+        normal = (normals[q, 0], normals[q, 1], normals[q, 2])
+        out[q] = distance_at(tree, place, own[q], normal, flat, enough, farthest, waiting, squares)
 
 
 def distances_to(

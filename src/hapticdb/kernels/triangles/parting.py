@@ -1,0 +1,184 @@
+"""Pieces into which a surface is parted by another one, and how far each gets from it.
+
+A surface is points, and edges between them. Places on some of its edges are where it goes through
+the other surface; `sweeps.cut` says what a depth is.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INTS, INTS2, entry, leaf
+from hapticdb.kernels.surfaces.nearest import distance_at
+from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+SAMPLES = 4
+"""Steps in which a part of an edge is measured. More: deeper cuts of curved surfaces."""
+
+
+@leaf
+def _root(parents, node):
+    """Root of a node; the path to it is halved."""
+    while parents[node] != node:
+        parents[node] = parents[parents[node]]
+        node = parents[node]
+    return node
+
+
+@leaf
+def _join(parents, one, other):
+    """Make two nodes one component, whose root is its least node."""
+    one, other = _root(parents, one), _root(parents, other)
+    if one < other:
+        parents[other] = one
+    elif other < one:
+        parents[one] = other
+
+
+@entry(INTS2, INTS)
+def components_kernel(links, parents):
+    """Find the least node, parents (V,), of the component of each node that links (N, 2) connect.
+
+    parents begins as 0 .. V - 1.
+    """
+    for n in range(links.shape[0]):
+        _join(parents, links[n, 0], links[n, 1])
+    for node in range(parents.shape[0]):
+        parents[node] = _root(parents, node)
+
+
+@leaf
+def _far(tree, pose, x, y, z, enough, most, waiting, squares):
+    """Distance of a place, moved by a pose (4, 4), from the other surface, up to `most`.
+
+    Where it is `enough` or less, it is that of some triangle.
+    """
+    place = (
+        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
+        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
+        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
+    )
+    return distance_at(
+        tree, place, np.int64(-1), (0.0, 0.0, 0.0), -1.0, enough, most, waiting, squares
+    )
+
+
+@leaf
+def _part_far(points, edges, edge, begin, end, tree, pose, most, waiting, squares):
+    """Greatest distance on a part of an edge, from share to share."""
+    a, b = edges[edge, 0], edges[edge, 1]
+    found = 0.0
+    for k in range(SAMPLES + 1):
+        share = begin + (end - begin) * k / SAMPLES
+        x = points[a, 0] + share * (points[b, 0] - points[a, 0])
+        y = points[a, 1] + share * (points[b, 1] - points[a, 1])
+        z = points[a, 2] + share * (points[b, 2] - points[a, 2])
+        found = max(found, _far(tree, pose, x, y, z, found, most, waiting, squares))
+    return found
+
+
+@leaf
+def _measure_parts(
+    points, edges, cuts, shares, tree, pose, most, pieces, parts, far, waiting, squares
+):
+    """Measure the parts of edges between places, far (2 P,), and note the piece of each, parts."""
+    n_points, n_places, n_parts = points.shape[0], cuts.shape[0], 0
+    for p in range(n_places):
+        is_first = p == 0 or cuts[p - 1] != cuts[p]
+        is_last = p + 1 == n_places or cuts[p + 1] != cuts[p]
+        if is_first:
+            far[n_parts] = _part_far(
+                points, edges, cuts[p], 0.0, shares[p], tree, pose, most, waiting, squares
+            )
+            parts[n_parts] = pieces[edges[cuts[p], 0]]
+            n_parts += 1
+        end = 1.0 if is_last else shares[p + 1]
+        far[n_parts] = _part_far(
+            points, edges, cuts[p], shares[p], end, tree, pose, most, waiting, squares
+        )
+        parts[n_parts] = pieces[edges[cuts[p], 1]] if is_last else n_points + n_parts
+        n_parts += 1
+    return n_parts
+
+
+@leaf
+def _through(parts, far, piece_far, at, k, n_parts):
+    """How far the surface gets through at the place after part at + k of an edge of n_parts."""
+    before, after = parts[at + k], parts[at + k + 1]
+    beside = min(piece_far[before], piece_far[after])
+    if before == after:
+        beside = min(far[at + k], far[at + k + 1])
+    left, right = before, after  # the farthest pieces on both sides
+    for n in range(at + k - 1, at - 1, -1):
+        if piece_far[parts[n]] >= piece_far[left]:
+            left = parts[n]
+    for n in range(at + k + 2, at + n_parts):
+        if piece_far[parts[n]] >= piece_far[right]:
+            right = parts[n]
+    if left == right:
+        return beside
+    return max(beside, min(piece_far[left], piece_far[right]))
+
+
+@entry(FLOATS2, INTS2, INTS, FLOATS, TREE, FLOATS2, FLOAT, INTS, FLOATS)
+def depths_kernel(points, edges, cuts, shares, tree, pose, most, parents, out):
+    """Find how far out (P,) a surface gets through another one at each place, up to `most`.
+
+    points (V, 3), edges (E, 2): the surface; cuts (P,), shares (P,): edge of each place and share
+    of the edge, ascending by both; pose (4, 4) leads into the tree's frame. parents (V,) begins as
+    0 .. V - 1; afterwards the piece of each point.
+    """
+    n_points, n_places = points.shape[0], cuts.shape[0]
+    p = 0
+    for e in range(edges.shape[0]):
+        while p < n_places and cuts[p] < e:
+            p += 1
+        if p == n_places or cuts[p] != e:
+            _join(parents, edges[e, 0], edges[e, 1])
+    for v in range(n_points):
+        parents[v] = _root(parents, v)
+    parts, far = np.empty(2 * n_places, dtype=np.int64), np.empty(2 * n_places)
+    piece_far = np.full(n_points + 2 * n_places, -1.0)
+    waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
+    n_parts = _measure_parts(
+        points, edges, cuts, shares, tree, pose, most, parents, parts, far, waiting, squares
+    )
+    for n in range(n_parts):
+        piece_far[parts[n]] = max(piece_far[parts[n]], far[n])
+    for v in range(n_points):
+        known = piece_far[parents[v]]
+        if 0.0 <= known < most:
+            x, y, z = points[v, 0], points[v, 1], points[v, 2]
+            found = _far(tree, pose, x, y, z, known, most, waiting, squares)
+            piece_far[parents[v]] = max(known, found)
+    first, at = 0, 0
+    while first < n_places:
+        last = first
+        while last + 1 < n_places and cuts[last + 1] == cuts[first]:
+            last += 1
+        for k in range(last - first + 1):
+            out[first + k] = _through(parts, far, piece_far, at, k, last - first + 2)
+        at += last - first + 2
+        first = last + 1
+
+
+def depths_of(
+    points: Floats, edges: Ints, cuts: Ints, shares: Floats, tree: TriangleTree, pose: Floats,
+    most: float,
+) -> Floats:  # fmt: skip
+    """How far (P,) a surface gets through at each place, as `depths_kernel` says."""
+    out = np.empty(len(cuts))
+    depths_kernel(
+        np.ascontiguousarray(points), np.ascontiguousarray(edges), cuts, shares, tree,
+        np.ascontiguousarray(pose), float(most), np.arange(len(points)), out,
+    )  # fmt: skip
+    return out
+
+
+def components(links: Ints, count: int) -> Ints:
+    """Component (count,) of each node that links (N, 2) connect, named by its least node."""
+    parents = np.arange(count)
+    components_kernel(np.ascontiguousarray(links), parents)
+    return parents

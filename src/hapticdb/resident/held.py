@@ -23,7 +23,7 @@ smaller tool has no block to skip at once. Results are the same: a larger value 
 Floats = NDArray[np.float64]
 
 
-class HeldTool(NamedTuple):
+class PreparedTool(NamedTuple):
     """clusters : the points and bounding spheres; asleep : what sleeps, and the budget."""
 
     clusters: Clusters
@@ -37,7 +37,7 @@ def held_tool(
     *,
     sleeps: bool | None = None,
     run: int | None = None,
-) -> HeldTool:
+) -> PreparedTool:
     """Prepare a shell for frames; all of it is awake.
 
     Parameters
@@ -53,7 +53,7 @@ def held_tool(
     n_points = len(shell)
     clusters = clusters_of(shell, voxel_size, run or RUN if sleeps else run)
     sleepers = _sleepers_of(clusters.spheres if sleeps else clusters.spheres[:0], budget, n_points)
-    return HeldTool(clusters, Asleep(sleepers, min(budget or n_points, n_points), counts_of(1)))
+    return PreparedTool(clusters, Asleep(sleepers, min(budget or n_points, n_points), counts_of(1)))
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:

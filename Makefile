@@ -39,7 +39,7 @@ lint: $(READY)
 
 types: $(READY)
 	$(BIN)/mypy
-	$(BIN)/mypy benchmarks
+	$(BIN)/mypy benchmarks examples
 
 # The measurements behind docs/; ARGS=--quick for a first look, into results-quick/. Real assemblies are read
 # from the folder that HAPTICDB_TEST_DATA names; without it the sample car stands in for them.
@@ -88,7 +88,7 @@ pins:
 	.venv-pins/bin/pip install ".[view]"
 	head -1 requirements/user.txt > .venv-pins/user.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb >> .venv-pins/user.txt
-	.venv-pins/bin/pip install ".[step,pointcloud,postgres,extract]" --group dev
+	.venv-pins/bin/pip install ".[step,pointcloud,postgres,extract,parquet]" --group dev
 	head -1 requirements/dev.txt > .venv-pins/dev.txt
 	.venv-pins/bin/pip freeze --exclude hapticdb | grep -vxFf .venv-pins/user.txt >> .venv-pins/dev.txt
 	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/

@@ -34,7 +34,7 @@ def table(head: Sequence[str], rows: Iterable[Sequence[str]]) -> str:
 
 
 def us_text(value: float | None) -> str:
-    """Microseconds to two or three digits; a dash where too few frames were measured."""
+    """A number, mostly microseconds, to two or three digits; a dash where none was measured."""
     if value is None:
         return NONE
     if value >= 99.5:
@@ -158,6 +158,33 @@ def batch_ratios(results: Results) -> str:
     return table([*head, "all threads"], [[*place, *row] for place, row in rows.items()])
 
 
+def gpu_frames(results: Results) -> str:
+    """Times of a frame on a GPU, pose in and wrench out, and on one processor."""
+    rows = [
+        [
+            f"{one['points']:,}",
+            *(f"{one['gpu'][share]:.2f}" for share in ("p50_ms", "p99_ms")),
+            us_text(one["one_processor"]["p50_ms"]),
+        ]
+        for one in results["gpu"]["frames"]
+    ]
+    return table(["points", "p50, ms", "p99, ms", "one processor, p50, ms"], rows)
+
+
+def gpu_batches(results: Results) -> str:
+    """Millions of poses a second on a GPU, beside all processors, and Warp's mesh queries."""
+    columns = ("touch", "launches", "processors", "clearance_gpu", "clearance_processors")
+    warp = results["gpu"]["warp"]
+    rows = []
+    for one in results["gpu"]["batches"]:
+        rates = [one[f"{name}_poses_per_s"] for name in columns]
+        for at, reach in ((3, "2.5"), (6, "32")):
+            rates.insert(at, warp[f"{one['situation']}_within_{reach}_voxels_poses_per_s"])
+        rows.append([one["situation"], *(us_text(1e-6 * rate) for rate in rates)])
+    head = ["tool is", "touch", "results not kept", "processors", "Warp within 2.5 voxels"]
+    return table([*head, "how far", "processors", "Warp within 32 voxels"], rows)
+
+
 def ways_out(results: Results) -> str:
     """Answer and lengths of each question; what blocks first where no way was found."""
     rows = []
@@ -208,6 +235,8 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "edits": edits,
         "large-shells": large_shells,
         "batch-ratios": batch_ratios,
+        "gpu-frames": gpu_frames,
+        "gpu-batches": gpu_batches,
         "ways-out": ways_out,
         "contact-proxies": contact_proxies,
         "feel": lambda results: table_of(results["feel"]["cells"]),

@@ -11,7 +11,7 @@ def modules() -> list[Path]:
 
 
 def python_files() -> list[Path]:
-    folders = ("src", "tests", "benchmarks")
+    folders = ("src", "tests", "benchmarks", "examples")
     return sorted(path for folder in folders for path in (ROOT / folder).rglob("*.py"))
 
 

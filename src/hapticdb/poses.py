@@ -114,6 +114,24 @@ def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.f
     return poses
 
 
+def map_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) `world_from_tool`, metres, of a .npy file that is mapped into memory.
+
+    Raises `FileError` if the file cannot be read, or holds something else.
+    """
+    try:
+        found = np.load(path, mmap_mode="r")
+    except OSError as error:
+        raise FileError(f"{path}: {error.strerror or 'no .npy file'}") from None
+    except ValueError as error:
+        raise FileError(f"{path}: no .npy file of numbers: {error}") from None
+    if getattr(found, "shape", ())[1:] != (4, 4) or found.ndim != 3 or found.dtype != np.float64:
+        raise FileError(f"{path}: give an array of float64 of the shape (M, 4, 4)")
+    if not len(found):
+        raise FileError(f"{path}: it has no pose")
+    return found  # type: ignore[no-any-return]
+
+
 def read_timed_poses(
     path: str | os.PathLike[str],
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:

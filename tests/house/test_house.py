@@ -202,7 +202,7 @@ def committed_texts() -> Iterator[tuple[str, str]]:
         asked = finished(listing, cwd=ROOT, check=True)
         paths = [ROOT / name for name in asked.stdout.split("\0") if name]
     else:  # a source distribution
-        folders = ("src", "tests", "benchmarks", "docs", "requirements")
+        folders = ("src", "tests", "benchmarks", "examples", "docs", "requirements")
         paths = [p for folder in folders for p in (ROOT / folder).rglob("*")]
         paths += ROOT.glob("*.*")
     for path in paths:

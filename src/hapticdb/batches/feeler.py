@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator
 from functools import partial
-from typing import Self, TypeVar
+from typing import TYPE_CHECKING, Literal, Self, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -26,6 +26,9 @@ from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import Filter
 
+if TYPE_CHECKING:
+    from hapticdb.batches.on_gpu import GpuFrames
+
 PIECE_CHUNKS = 32
 """Chunks of poses, for each thread, in a piece: cells are fetched between pieces, and `progress` is
 called. A larger value takes more memory and fetches more cells by one statement."""
@@ -35,6 +38,8 @@ Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
 PoseCallback = Callable[[int, int], None]
 """Called after each piece with the poses done and their total."""
+BatchDevice = Literal["cpu", "cuda"]
+"""What computes: the processors, or a graphics processor."""
 _Answer = TypeVar("_Answer")
 
 
@@ -61,7 +66,10 @@ class Feeler:
         law: ForceLaw,
         budget_bytes: int | None = None,
         jobs: int | None = None,
+        device: BatchDevice = "cpu",
     ) -> None:
+        if device not in get_args(BatchDevice):
+            raise UsageError(f"device {device!r}: choose 'cpu' or 'cuda'")
         n_jobs = available_jobs(jobs)
         make_ready("replay")
         self.shell = shell
@@ -73,6 +81,7 @@ class Feeler:
         self._checked_revision: int | None = None
         self._known_revision: int | None = None
         self._query = HapticQuery(store, QueryFigures(store).both)
+        self._gpu: GpuFrames | None = None
         has_distances = reads_distances(law.for_kernels)
         budget = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
         self._table = CellTable.create(budget, distances=has_distances)
@@ -80,6 +89,10 @@ class Feeler:
             self._residency = Residency(store, self._table, felt.exclude, where=felt.where)
             self._frames = ResidentFrames(self._residency, shell, law)
             self._threads = BatchThreads(self._frames, n_jobs)
+            if device == "cuda":
+                from hapticdb.batches import on_gpu  # noqa: PLC0415 - loads numba.cuda
+
+                self._gpu = on_gpu.GpuFrames(self._frames)
         except BaseException:
             self._table.close()
             raise
@@ -102,6 +115,8 @@ class Feeler:
         if self._is_closed:
             return
         self._is_closed = True
+        if self._gpu is not None:
+            self._gpu.close()
         self._threads.close()
         self._frames.close()
         self._table.close()
@@ -120,6 +135,9 @@ class Feeler:
         self, poses: ArrayLike, *, objects: bool = False, progress: PoseCallback | None = None
     ) -> TouchBatch:
         """Force and torque at many poses; bit for bit those of `Environment.touch` at each pose.
+
+        On a GPU each point is felt by the same law, but the sum over the points has another order,
+        and multiplications may be fused with additions. It repeats bit for bit.
 
         Parameters
         ----------
@@ -141,7 +159,7 @@ class Feeler:
             If a word of `where` or `exclude` chooses no object.
         """
         places = as_poses(poses)
-        order = order_of(places, self.shell.center, self._residency.grid)
+        order = self._order_of(places)
         return self._at_one_revision(lambda: self._touch(places, order, objects, progress))
 
     def clearance(
@@ -171,7 +189,7 @@ class Feeler:
         limit = reach_of(reach, size)
         places = as_poses(poses)
         order = order_of(places, self.shell.center, self._residency.grid)
-        search = NearestSearch(self._frames, self._threads, limit / size)
+        search = self._search(limit / size)
 
         def searched() -> ClearanceBatch:
             found = ClearanceBatch(len(places), float(limit), self.shell.cover)
@@ -206,6 +224,8 @@ class Feeler:
         UsageError, ObjectNotFoundError
             As for `touch`.
         """
+        if self._gpu is not None:
+            return self.touch(poses, progress=progress).hits > 0
         places = as_poses(poses)
         order = order_of(places, self.shell.center, self._residency.grid)
         search = partial(first_hits_at, self._frames, self._threads)
@@ -264,19 +284,18 @@ class Feeler:
         felt = TouchBatch(len(places), self.law)
         felt.revision = self._residency.revision
         ids: list[list[int]] = [[] for _ in places] if objects else []
+        if self._gpu is not None:
+            self._gpu.touch(places, felt, progress)
+            if objects:
+                self._name(places, np.arange(len(places)), felt, ids)
         for chosen in self._pieces(order, progress):
-            poses = places[chosen]
-            out = self._feel(poses)
+            out = self._feel(places[chosen])
             felt.forces[chosen] = out[:, WRENCH : WRENCH + 3]
             felt.torques[chosen] = out[:, WRENCH + 3 : WRENCH + 6]
             felt.hits[chosen], felt.n_contacts[chosen] = out[:, HITS], out[:, CONTACTS]
             felt.deepest[chosen] = out[:, DEEPEST]
             if objects:
-                is_felt = (out[:, HITS] > 0) | (out[:, CONTACTS] > 0)
-                for n, found in zip(
-                    chosen[is_felt].tolist(), self._ids_at(poses[is_felt]), strict=True
-                ):
-                    ids[n] = found
+                self._name(places, chosen, felt, ids)
         if objects:
             offsets = np.cumsum([0, *map(len, ids)])
             flat = np.array([one for found in ids for one in found], dtype=np.int64)
@@ -308,11 +327,27 @@ class Feeler:
 
         self._threads.run(work, len(poses))
 
-    def _ids_at(self, poses: Floats) -> Iterator[list[int]]:
-        """Ids of the objects at each of poses, as a touch names them."""
+    def _name(self, places: Floats, chosen: Ints, felt: TouchBatch, ids: list[list[int]]) -> None:
+        """Enter the ids of the objects at the chosen poses, as a touch names them."""
+        touching = chosen[(felt.hits[chosen] > 0) | (felt.n_contacts[chosen] > 0)]
         exclude = self._residency.exclude
-        for answer in self._query.run_many(self.shell, poses, exclude, self.law):
-            yield answer.ids
+        answers = self._query.run_many(self.shell, places[touching], exclude, self.law)
+        for n, answer in zip(touching.tolist(), answers, strict=True):
+            ids[n] = answer.ids
+
+    def _search(self, reach: float) -> NearestSearch:
+        """Search of the nearest voxels within a reach, voxels."""
+        if self._gpu is None:
+            return NearestSearch(self._frames, self._threads, reach)
+        from hapticdb.batches.on_gpu import GpuNearest  # noqa: PLC0415 - loads numba.cuda
+
+        return GpuNearest(self._frames, self._threads, reach, self._gpu)
+
+    def _order_of(self, places: Floats) -> Ints:
+        """Order in which the processors compute poses; the GPU takes them as they come."""
+        if self._gpu is not None:
+            return np.empty(0, dtype=np.int64)
+        return order_of(places, self.shell.center, self._residency.grid)
 
 
 def reach_of(reach: float | None, voxel_size: float) -> float:

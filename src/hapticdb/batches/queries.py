@@ -18,7 +18,7 @@ from hapticdb.store.filtering import Filter, FiltersOfWords
 from hapticdb.store.finding import Words
 
 if TYPE_CHECKING:
-    from hapticdb.batches.feeler import Feeler, PoseCallback
+    from hapticdb.batches.feeler import BatchDevice, Feeler, PoseCallback
     from hapticdb.batches.result import ClearanceBatch, TouchBatch
 
 
@@ -53,6 +53,7 @@ class Queries:
         exclude: Words = (),
         law: ForceLaw | LawName | None = None,
         objects: bool = False,
+        device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> "TouchBatch": ...
 
@@ -68,6 +69,7 @@ class Queries:
         maxgap: int = DEFAULT_MAXGAP,
         law: ForceLaw | LawName | None = None,
         objects: bool = False,
+        device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> "Touch | TouchBatch":
         """Force and torque that the environment exerts on the tool at one pose, or at many.
@@ -79,9 +81,8 @@ class Queries:
         pose : (4, 4) array
             world_from_tool, rigid, metres. A `Touch` is returned.
         poses : (B, 4, 4) array
-            Many of them instead, for a `TouchBatch`, the same bit for bit. All processors compute,
-            on cells in memory; `feeler` keeps these, and sets the memory and the threads.
-        objects, progress : for many poses, as for `Feeler.touch`
+            Many of them instead, for a `TouchBatch`, the same bit for bit, by all processors.
+        objects, progress, device : for many poses, as for `Feeler.touch` and `feeler`
         strategy : str
             For one pose, form of the query: ``statement``, ``array``, ``points``, ``maxgap``,
             ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else
@@ -114,7 +115,7 @@ class Queries:
             return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
         if strategy != "auto":
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
-        with self.feeler(shell, where=where, exclude=exclude, law=law) as feeler:
+        with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
             return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
 
     def collides(
@@ -124,6 +125,7 @@ class Queries:
         *,
         where: Words = (),
         exclude: Words = (),
+        device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> NDArray[np.bool_]:
         """Whether the tool hits anything at many poses, (B,): `touch` has hits there.
@@ -134,6 +136,8 @@ class Queries:
             world_from_tool, rigid, metres, in any order.
         shell, where, exclude
             As for `touch`.
+        device
+            As for `feeler`.
         progress
             As for `Feeler.touch`.
 
@@ -142,7 +146,7 @@ class Queries:
         UsageError, ObjectNotFoundError
             As for `touch`.
         """
-        with self.feeler(shell, where=where, exclude=exclude, law=PLANE) as feeler:
+        with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.collides(poses, progress=progress)
 
     def clearance(
@@ -154,6 +158,7 @@ class Queries:
         where: Words = (),
         exclude: Words = (),
         exact: bool = False,
+        device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> "ClearanceBatch":
         """Distance from the shell's points to the nearest occupied voxel at many poses.
@@ -169,6 +174,8 @@ class Queries:
             Greatest distance that is searched, metres; 32 voxels unless given.
         shell, where, exclude
             As for `touch`.
+        device
+            As for `feeler`; what is `exact` is computed by the processors alone.
         progress
             As for `Feeler.clearance`.
 
@@ -187,7 +194,7 @@ class Queries:
             with self._store.snapshot():
                 felt = Filter(where, exclude).felt(self._store.objects(), self._store.url)
                 return exact_clearance(self._store, felt, shell, as_poses(poses), limit, progress)
-        with self.feeler(shell, where=where, exclude=exclude, law=PLANE) as feeler:
+        with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.clearance(poses, reach, progress=progress)
 
     def feeler(
@@ -199,6 +206,7 @@ class Queries:
         law: ForceLaw | LawName | None = None,
         budget_bytes: int | None = None,
         jobs: int | None = None,
+        device: "BatchDevice" = "cpu",
     ) -> "Feeler":
         """Make a tool that keeps cells in memory from one batch of poses to the next.
 
@@ -210,9 +218,14 @@ class Queries:
             Memory for cells, never exceeded; 256 MiB unless given.
         jobs : int or None
             Threads; one for each processor unless given.
+        device : {"cpu", "cuda"}
+            What computes: the processors, or a GPU of NVIDIA with the extra ``gpu``. The cells are
+            in the GPU's memory, too, then.
 
         Raises
         ------
+        MissingExtraError
+            If there is no GPU that numba can use.
         UsageError
             If the environment is in lexicographic order, which has no cells; if the budget is too
             small, or larger than this machine's memory; if objects lack what the law reads.
@@ -221,4 +234,4 @@ class Queries:
 
         felt = self._filters.of(where, exclude)
         chosen = self._touching.law_now(as_law(law))
-        return Feeler(self._store, shell, felt, chosen, budget_bytes, jobs)
+        return Feeler(self._store, shell, felt, chosen, budget_bytes, jobs, device)

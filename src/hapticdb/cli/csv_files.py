@@ -95,18 +95,23 @@ def open_csv(target: str | None, option: str, columns: Sequence[str]) -> Iterato
         yield made
         made.begin()
     else:
-        yield from _in_a_file(Path(target), option, columns)
+        with (
+            new_file(Path(target), option) as part,
+            part.open("x", encoding="utf-8", newline="") as stream,
+        ):
+            made = CsvWriter(stream, columns)
+            yield made
+            made.begin()
 
 
-def _in_a_file(target: Path, option: str, columns: Sequence[str]) -> Iterator[CsvWriter]:
+@contextmanager
+def new_file(target: Path, option: str) -> Iterator[Path]:
+    """Path to write to, which becomes the target at the end. After an error no file is left."""
     if not target.name or os.path.lexists(target):
         raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
-        with part.open("x", encoding="utf-8", newline="") as stream:
-            made = CsvWriter(stream, columns)
-            yield made
-            made.begin()
+        yield part
         part.replace(target)
     except BrokenPipeError:  # of standard output
         raise

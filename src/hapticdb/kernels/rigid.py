@@ -6,8 +6,6 @@ vector: its axis times its angle in radians.
 
 import math
 
-import numpy as np
-
 from hapticdb.kernels._jit import FLOATS2, FLOATS3, entry, inlined, leaf
 
 
@@ -16,7 +14,7 @@ def is_rigid(pose):
     """Whether a (4, 4) matrix is finite, a rotation to 1e-6, and has the last row 0 0 0 1."""
     for a in range(4):
         for b in range(4):
-            if not np.isfinite(pose[a, b]):
+            if not math.isfinite(pose[a, b]):
                 return False
     for b in range(3):
         if pose[3, b] != 0.0:

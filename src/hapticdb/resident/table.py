@@ -76,6 +76,7 @@ def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
         _Field("words", np.uint32, (n_slots, kernels.CELL_WORDS)),
         _Field("masks", np.uint64, (n_slots,)),
         _Field("used", np.uint8, (n_slots,)),
+        _Field("filled", np.int64, (n_slots,)),
         *(distances if has_distances else []),
     ]
 
@@ -133,6 +134,8 @@ class CellTable:
         The arrays that frames read; see `hapticdb.kernels.resident.cells`.
     desk : Desk
         Messages between sessions and the fetching process.
+    filled : (slots,) int64
+        Version of the directory in which each slot's cell appeared, for copies of the table.
     descriptor : int
         File descriptor of the memory, for a process to inherit.
     has_distances : bool
@@ -159,6 +162,7 @@ class CellTable:
             at += -(-views[name].nbytes // _PAGE) * _PAGE
         self.cells = kernels.Cells(**{n: views[n] for n in kernels.Cells._fields if n in views})  # type: ignore[arg-type]
         self.desk = Desk(**{n: views[n] for n in Desk._fields})  # type: ignore[arg-type]
+        self.filled: NDArray[np.int64] = views["filled"]  # type: ignore[assignment]
 
     @classmethod
     def create(cls, budget_bytes: int = DEFAULT_BUDGET, *, distances: bool = False) -> "CellTable":

@@ -98,6 +98,7 @@ class CellWriter:
     """
 
     def __init__(self, table: CellTable) -> None:
+        self._filled = table.filled
         self.slots = CellSlots(table)
         self.empty = EmptyCells(table.capacity // 2 - table.n_slots)
         self.directory = CellDirectory(table)
@@ -154,6 +155,7 @@ class CellWriter:
         new_empty = read.cells[~is_filled].tolist()
         forgotten = self.empty.forget_for(len(new_empty), urgent)
         self.slots.fill(read.slots[is_filled], read.cells[is_filled])
+        self._filled[read.slots[is_filled]] = self.directory.version + 1
         self.empty.add(new_empty)
         change = DirectoryChange(np.concatenate([leaving, forgotten]), read.cells, read.slots)
         self.directory.publish(change, revision)

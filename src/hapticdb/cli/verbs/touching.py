@@ -5,7 +5,8 @@ from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from functools import partial
-from typing import TYPE_CHECKING, Annotated
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 
@@ -20,6 +21,7 @@ from hapticdb.cli.csv_files import (
     row_of_pose,
     rows_of_contacts,
 )
+from hapticdb.cli.felt_files import columns_of, open_felt
 from hapticdb.cli.options import (
     ConservativeOption,
     CsvOption,
@@ -28,12 +30,12 @@ from hapticdb.cli.options import (
     LawOption,
     PathUnitOption,
     PointsOption,
-    PosesOption,
     SeedOption,
     StiffnessOption,
     StrategyName,
     ToolOption,
     ToolUnitOption,
+    UnitName,
     UrlArgument,
     WhereOption,
 )
@@ -44,6 +46,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hapticdb.batches.feeler import Feeler
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Misfit
@@ -54,6 +57,10 @@ if TYPE_CHECKING:
 
 MOST_TOUCHED = 8
 """Objects in the table of those that were touched in most frames."""
+PIECE = 1 << 18
+"""Poses of a batch that are felt, and written, at once: 60 MB. A larger value takes more memory."""
+MOST_COMPARED = 10_000
+"""Poses of a batch whose places are compared with the scene's. Larger: a stray pose is seen."""
 FEW_POSES = 500
 """Poses of a path below which it does not pay to measure the database's costs.
 
@@ -67,6 +74,24 @@ MaxgapOption = Annotated[
         metavar="KEYS", help="Widest gap that the strategy maxgap reads across, in voxel keys."
     ),
 ]
+TouchPosesOption = Annotated[
+    str,
+    typer.Option(
+        metavar="FILE",
+        help="Poses x,y,z,qw,qx,qy,qz with a header, or with --out a .npy of (M, 4, 4) matrices.",
+    ),
+]
+OutOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE",
+        help="Feel all poses as a batch, and write a table to a new file: .parquet or .npz.",
+    ),
+]
+OnOption = Annotated[
+    Literal["cpu", "cuda"],
+    typer.Option(help="With --out, what computes: the processors, or a GPU of NVIDIA."),
+]
 ContactsCsvOption = Annotated[
     str | None,
     typer.Option(
@@ -79,7 +104,7 @@ def touch(
     url: UrlArgument,
     *,
     tool: ToolOption,
-    poses: PosesOption,
+    poses: TouchPosesOption,
     tool_unit: ToolUnitOption = None,
     path_unit: PathUnitOption = None,
     points: PointsOption = None,
@@ -93,6 +118,8 @@ def touch(
     stiffness: StiffnessOption = 1000.0,
     csv: CsvOption = None,
     contacts_csv: ContactsCsvOption = None,
+    out: OutOption = None,
+    on: OnOption = "cpu",
     json: JsonOption = False,
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
@@ -103,29 +130,30 @@ def touch(
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
-    from hapticdb.poses import read_poses
     from hapticdb.query.law import inset_of
 
     plane, smooth = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
-    path = read_poses(poses, unit=path_unit or "m")
-    with (
-        _output(csv, contacts_csv, json=json) as output,
-        hapticdb.open(url, read_only=True) as env,
-    ):
+    path, opened = _path_of(poses, path_unit, out, on), partial(hapticdb.open, url, read_only=True)
+    with _output(csv, contacts_csv, out, json=json) as output, opened() as env:
         name: LawName = law or ("smooth" if env.has_distances else "plane")
         chosen: ForceLaw = smooth if name == "smooth" else plane
         felt = felt_objects(env, where, exclude)
-        render.compile_kernels("touch", files=[tool])
+        render.compile_kernels("shell", "touch" if out is None else "replay", files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
         fit = fitting.compare(
-            env, shell, path, exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
-            path_unit=path_unit, is_moving=False, reach=reach,
+            env, shell, path if out is None else _some_of(path), exclude=felt.left_out,
+            tool=tool, tool_unit=tool_unit, path_unit=path_unit, is_moving=False, reach=reach,
         )  # fmt: skip
-        asked = _strategy_of(strategy, env, len(path))
+        if out is not None:
+            feeler = env.feeler(
+                shell, where=felt.where, exclude=felt.exclude, law=chosen, device=on
+            )
+            _touch_into(Path(out), feeler, path)
+            return
         touch_at = partial(
-            env.touch, shell, strategy=asked, where=felt.where, exclude=felt.exclude,
-            maxgap=maxgap, law=chosen,
+            env.touch, shell, strategy=_strategy_of(strategy, env, len(path)), where=felt.where,
+            exclude=felt.exclude, maxgap=maxgap, law=chosen,
         )  # fmt: skip
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
@@ -133,9 +161,50 @@ def touch(
     output.finish(shell)
 
 
+def _path_of(
+    poses: str, unit: "UnitName | None", out: str | None, on: str
+) -> "NDArray[np.float64]":
+    """Poses of a CSV file, or of a .npy file for a batch; refuses what only a batch takes."""
+    from hapticdb.poses import map_poses, read_poses
+
+    if on != "cpu" and out is None:
+        raise UsageError(f"--on {on}: give --out, too")
+    if not poses.lower().endswith(".npy"):
+        return read_poses(poses, unit=unit or "m")
+    if out is None or unit not in {None, "m"}:
+        raise UsageError(f"--poses {poses}: a .npy file is for --out, and in metres")
+    return map_poses(poses)
+
+
+def _some_of(path: "NDArray[np.float64]") -> "NDArray[np.float64]":
+    """Poses all along a path, at most about twice `MOST_COMPARED`."""
+    return path[:: max(1, len(path) // MOST_COMPARED)]
+
+
+def _touch_into(out: Path, feeler: "Feeler", path: "NDArray[np.float64]") -> None:
+    """Feel a path piece by piece, into a file."""
+    import numpy as np
+
+    n_touching = 0
+    with feeler, open_felt(out) as write:
+        for first in range(0, len(path), PIECE):
+            felt = feeler.touch(np.asarray(path[first : first + PIECE]))
+            write(columns_of(first, felt))
+            n_touching += int(np.count_nonzero(felt.n_contacts))
+    render.facts([
+        ("shell", shell_text(feeler.shell)),
+        ("poses", f"{len(path):,}: {n_touching:,} in contact"),
+        ("results", str(out)),
+    ])  # fmt: skip
+
+
 @contextmanager
-def _output(csv: str | None, contacts_csv: str | None, *, json: bool) -> "Iterator[_Output]":
+def _output(
+    csv: str | None, contacts_csv: str | None, out: str | None, *, json: bool
+) -> "Iterator[_Output]":
     """Open the files that the options name; at most one result goes to standard output."""
+    if out is not None and (csv or contacts_csv or json):
+        raise UsageError("--out: leave out --csv, --contacts-csv and --json")
     to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
     if sum(to_stdout) > 1:
         raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")

@@ -25,10 +25,12 @@ import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, fields_of, inlined, leaf
 from hapticdb.kernels.field.lattice import (
+    CELL_SIDE,
     HALF_WIDTH,
     ROW_SIDE,
     STEPS,
     VOXELS_A_STEP,
+    cell_place,
     row_place,
     trilinear,
 )
@@ -117,6 +119,32 @@ def _least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
     )
 
 
+def _least_of_slot(law, payload, slot, x, y, z):  # noqa: ARG001
+    """U at a point of a slot's cell, in voxels from the grid's origin."""
+    return _least_of_cell(
+        payload, slot, x, y, z, np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32
+    )
+
+
+@inlined
+def _least_of_cell(payload, slot, x, y, z, i, j, k):
+    """U at a point in, or under 1/2 voxel beside, the cell whose first voxel is (i, j, k)."""
+    x0, y0, z0 = math.floor(x - 0.5), math.floor(y - 0.5), math.floor(z - 0.5)
+    at = cell_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
+    q000 = min(np.int64(payload[slot, at]), STEPS)
+    q001 = min(np.int64(payload[slot, at + 1]), STEPS)
+    q010 = min(np.int64(payload[slot, at + CELL_SIDE]), STEPS)
+    q011 = min(np.int64(payload[slot, at + CELL_SIDE + 1]), STEPS)
+    at += CELL_SIDE * CELL_SIDE
+    q100 = min(np.int64(payload[slot, at]), STEPS)
+    q101 = min(np.int64(payload[slot, at + 1]), STEPS)
+    q110 = min(np.int64(payload[slot, at + CELL_SIDE]), STEPS)
+    q111 = min(np.int64(payload[slot, at + CELL_SIDE + 1]), STEPS)
+    return VOXELS_A_STEP * trilinear(
+        q000, q001, q010, q011, q100, q101, q110, q111, x - 0.5 - x0, y - 0.5 - y0, z - 0.5 - z0
+    )
+
+
 @leaf
 def depth_and_weight(sample, size):
     """Depth below the onset in metres, negative above it, and the weight in the average."""
@@ -143,6 +171,15 @@ def _share_of_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample
     return agreement(sample, ahead)
 
 
+def _share_of_slot(law, payload, slot, x, y, z, nx, ny, nz, sample):  # noqa: ARG001
+    """How far the normal agrees with the distances of a slot's cell, 0 to 1."""
+    ahead = _least_of_cell(
+        payload, slot, x + AHEAD * nx, y + AHEAD * ny, z + AHEAD * nz,
+        np.int64(x) & -32, np.int64(y) & -32, np.int64(z) & -32,
+    )  # fmt: skip
+    return agreement(sample, ahead)
+
+
 def _reach_of(law):  # noqa: ARG001
     """Distance up to which a point counts, voxels."""
     return REACH
@@ -160,6 +197,8 @@ define(
         reach=_reach_of,
         felt_within=_felt_within_of,
         sample_rows=_least_of_rows,
+        sample_slot=_least_of_slot,
         share_rows=_share_of_rows,
+        share_slot=_share_of_slot,
     ),
 )

@@ -1,0 +1,297 @@
+"""Frames and batches on a graphics processor, beside the processors of the same machine.
+
+    python benchmarks/on_gpu.py --prepare FOLDER    # anywhere: a scene, a tool and poses
+    python benchmarks/on_gpu.py --scene FOLDER      # where a GPU is: results/gpu.json
+
+It checks first that both feel the same: equal counts, sums within 1e-12, and each answer repeated
+bit for bit. Then it times frames, pose in and wrench out, of 300 to 10^7 points, and poses a second
+of 300 points that are far from everything, within a few voxels, or touching. Cells are resident.
+"""
+
+import argparse
+import os
+import time
+from importlib.metadata import version
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numba import cuda
+from numpy.typing import NDArray
+
+import hapticdb
+import records
+from batches import EXTENT, MODEL, poses_by_situation
+from hapticdb import Environment, GridOptions, ImportOptions, PointShell
+from hapticdb.batches.feeler import Feeler
+from hapticdb.batches.on_gpu import GpuFrames
+from hapticdb.ingest.geometry import parts_of
+from hapticdb.kernels.compiling import compile_missing, entries_for
+from hapticdb.kernels.resident.cells import RESULTS
+from hapticdb.poses import read_poses
+from hapticdb.resident.held import counts_of
+from hapticdb.sample import write_sample
+from slide_paths import write_along
+
+Floats = NDArray[np.float64]
+BITS = 10
+"""Of the grid on each axis."""
+BASE = 100_000
+"""Points of the shell that larger ones are made of, by points around its own."""
+SIZES = (300, BASE, 1_000_000, 10_000_000)
+FEW = 300
+MOST_POSES = 20_000
+"""Poses of each situation; batches repeat them."""
+BATCH = 1_000_000
+"""Poses of a batch on the GPU; the processors get `MOST_POSES`."""
+TABLE = 2 << 30
+"""Bytes for cells."""
+BOUND = 1e-12
+"""Largest difference of the sums, relative to the largest of all poses."""
+PACKAGES = ("numpy", "numba", "numba-cuda")
+REPEATS = 1000
+"""Frames whose times are sorted."""
+SEARCHES = ("resident.first_hits.find_first_hits", "resident.clearance.cells_near")
+LAUNCHES = 64
+PATIENCE = 5.0
+"""Seconds of the processors' frames of one shell, at most about."""
+
+
+def prepare(folder: Path, bits: int, most: int) -> None:
+    """Write scene.db, the tool's shells, and poses of each situation."""
+    real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), MODEL)
+    sample = write_sample(folder)
+    car = real if real.is_file() else sample.car
+    url = folder / "scene.db"
+    hapticdb.import_files(
+        str(url), [car], ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT))
+    )
+    tool, path = sample.wrench, sample.path
+    if real.is_file():
+        tool, path = write_along(folder / "along", url, 400)
+    few, many = (PointShell.from_file(tool, points=n) for n in (FEW, BASE))
+    few.save(folder / "few.npz")
+    many.save(folder / "many.npz")
+    with hapticdb.open(url, read_only=True) as env:
+        found = poses_by_situation(env, few, read_poses(path), most)
+    np.savez_compressed(folder / "poses.npz", **found)  # type: ignore[arg-type]
+
+
+def larger(shell: PointShell, n_points: int, spread: float) -> PointShell:
+    """A shell of so many points: those of a shell, each with others around it."""
+    if n_points <= len(shell):
+        return shell
+    times = n_points // len(shell)
+    around = np.random.default_rng(3).normal(size=(n_points, 3)) * spread
+    points = np.repeat(shell.points, times, axis=0) + around
+    return PointShell(points, np.repeat(shell.normals, times, axis=0), shell.center)
+
+
+def percentiles(seconds: list[float]) -> dict[str, float]:
+    """Milliseconds: p50, p99, worst."""
+    p50, p99 = 1e3 * np.percentile(seconds, [50, 99])
+    return {"p50_ms": p50, "p99_ms": p99, "worst_ms": 1e3 * max(seconds), "frames": len(seconds)}
+
+
+def results_of(gpu: GpuFrames, poses: Floats) -> Floats:
+    """Results (B, RESULTS) of frames on the GPU, in the order of the processor's."""
+    return np.concatenate([
+        np.hstack([found.forces, found.torques, np.stack(found[2:], axis=1)])
+        for _, found in gpu.run(poses)
+    ])  # fmt: skip
+
+
+def on_processor(feeler: Feeler, poses: Floats) -> Floats:
+    """The same of frames on the processor, in one thread."""
+    frames, out = feeler._frames, np.zeros((len(poses), RESULTS))  # noqa: SLF001 - measured
+    frames._feel(poses, out, counts_of(len(poses)))  # noqa: SLF001
+    return out
+
+
+def compared(feeler: Feeler, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:
+    """How far both are apart at poses, relative to the largest, and whether the GPU repeats."""
+    ours, theirs = results_of(gpu, poses), on_processor(feeler, poses)
+    again = np.concatenate([results_of(gpu, poses[n : n + 1]) for n in range(min(len(poses), 64))])
+
+    def apart(part: slice) -> float:
+        largest = np.abs(theirs[:, part]).max(initial=0.0)
+        return float(np.abs(ours[:, part] - theirs[:, part]).max(initial=0.0) / (largest or 1.0))
+
+    return {
+        "poses": len(poses),
+        "force": apart(slice(0, 3)),
+        "torque": apart(slice(3, 6)),
+        "deepest": apart(slice(9, 10)),
+        "counts_equal": float((ours[:, 6:9] == theirs[:, 6:9]).all(axis=1).mean()),
+        "repeats": bool((again == ours[: len(again)]).all()),
+        "unknown": int(ours[:, 8].sum()),
+    }
+
+
+def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
+    """Check frames of one shell, and time them one by one on both."""
+    gpu = feeler._gpu  # noqa: SLF001 - measured
+    assert gpu is not None
+    n_points = len(feeler.shell)
+    feeler.touch(poses)  # fetches the cells
+    some = poses[: max(2, min(len(poses), 10_000_000 // n_points))]
+    equality = compared(feeler, gpu, some)
+    equality["one_by_one"] = bool((results_of(gpu, some) == [gpu.feel(one) for one in some]).all())
+    times: list[float] = []
+    for n in range(repeats):
+        one = poses[n % len(poses)]
+        began = time.perf_counter()
+        gpu.feel(one)
+        times.append(time.perf_counter() - began)
+    cpu: list[float] = []
+    while sum(cpu) < PATIENCE and len(cpu) < repeats:
+        one = poses[len(cpu) % len(poses)][None]
+        began = time.perf_counter()
+        on_processor(feeler, one)
+        cpu.append(time.perf_counter() - began)
+    found = {"points": n_points, "equal": equality, "gpu": percentiles(times)}
+    return found | {"kernel_ms": kernel_time(gpu, poses[0]), "one_processor": percentiles(cpu)}
+
+
+def kernel_time(gpu: GpuFrames, pose: Floats) -> float:
+    """Milliseconds of a frame's kernel alone, or of its launch if that takes longer."""
+    gpu.feel(pose)
+    stream = gpu._stream  # noqa: SLF001 - measured
+    begin, end = cuda.event(), cuda.event()
+    begin.record(stream)
+    for _ in range(LAUNCHES):
+        gpu._one(  # noqa: SLF001
+            gpu._frames.law, gpu._frames.residency.place, gpu._shell,  # noqa: SLF001
+            tuple(pose[:3].ravel().tolist()), *gpu.mirror.arrays, gpu._sums, gpu._end, gpu._out,  # noqa: SLF001
+        )  # fmt: skip
+    end.record(stream)
+    end.synchronize()
+    return float(cuda.event_elapsed_time(begin, end) / LAUNCHES)
+
+
+def batches_of(
+    on_gpu: Feeler, on_cpu: Feeler, poses: Floats, size: int, situation: str
+) -> dict[str, Any]:
+    """Poses a second, as a caller gets them, and of the launches alone."""
+    gpu = on_gpu._gpu  # noqa: SLF001 - measured
+    assert gpu is not None
+    many = np.resize(poses, (size, 4, 4))
+    on_gpu.touch(poses)
+    on_cpu.touch(poses)
+    equality = compared(on_gpu, gpu, poses[:2000])
+    found = {"situation": situation, "poses": size, "equal": equality}
+    rates: dict[str, list[float]] = {"touch": [], "launches": [], "processors": []}
+    for _ in range(3):
+        began = time.perf_counter()
+        felt = on_gpu.touch(many)
+        rates["touch"].append(size / (time.perf_counter() - began))
+        began = time.perf_counter()
+        for _part, _found in gpu.run(many):
+            pass
+        rates["launches"].append(size / (time.perf_counter() - began))
+        began = time.perf_counter()
+        on_cpu.touch(poses)
+        rates["processors"].append(len(poses) / (time.perf_counter() - began))
+    found["touching"] = float((felt.n_contacts > 0).mean())
+    return found | {f"{name}_poses_per_s": float(np.median(all_)) for name, all_ in rates.items()}
+
+
+def clearance_of(on_gpu: Feeler, on_cpu: Feeler, poses: Floats) -> dict[str, Any]:
+    """Poses a second whose distance is told, and how far both answers are apart."""
+    rates: dict[str, float] = {}
+    found = []
+    for name, feeler in (("gpu", on_gpu), ("processors", on_cpu)):
+        feeler.clearance(poses)  # fetches the cells
+        began = time.perf_counter()
+        found.append(feeler.clearance(poses).distances)
+        rates[f"clearance_{name}_poses_per_s"] = len(poses) / (time.perf_counter() - began)
+    apart = float(np.abs(found[0] - found[1]).max() / on_cpu._residency.grid.voxel_size)  # noqa: SLF001
+    return rates | {"clearance_apart_voxels": apart}
+
+
+def by_triangles(
+    env: Environment, shell: PointShell, situations: dict[str, Floats], batch: int
+) -> dict[str, Any]:
+    """Poses a second of Warp's mesh queries: the nearest triangle within what the law feels."""
+    try:
+        from warp_peer import WarpMesh  # noqa: PLC0415 - may not be installed
+    except ImportError as error:
+        return {"note": f"Warp was not measured: {error}"}
+    parts = parts_of(env.store, env.objects())
+    triangles = np.concatenate([part.surface() for _, part in parts])
+    mesh = WarpMesh(triangles, shell.points)
+    found: dict[str, Any] = {"triangles": len(triangles)}
+    for reach in (2.5, 32.0):
+        for situation, poses in situations.items():
+            many = np.resize(poses, (batch, 4, 4))
+            times = []
+            for _ in range(3):
+                began = time.perf_counter()
+                mesh.distances(many, reach * env.grid.voxel_size)
+                times.append(time.perf_counter() - began)
+            found[f"{situation}_within_{reach:g}_voxels_poses_per_s"] = batch / float(
+                np.median(times)
+            )
+    return found
+
+
+def measure(folder: Path, sizes: tuple[int, ...], batch: int, repeats: int) -> dict[str, Any]:
+    """Measure all; results as records for JSON."""
+    began = time.perf_counter()
+    compile_missing([*entries_for("replay"), "resident.nearest.find_nearest", *SEARCHES])
+    print(f"compiled after {time.perf_counter() - began:.0f} s", flush=True)
+    few, many = PointShell.load(folder / "few.npz"), PointShell.load(folder / "many.npz")
+    situations = dict(np.load(folder / "poses.npz"))
+    frames, batches = [], []
+    name = getattr(cuda.current_context().device, "name", "none: simulated")
+    with hapticdb.open(folder / "scene.db", read_only=True) as env:
+        with (
+            env.feeler(few, budget_bytes=TABLE, device="cuda") as on_gpu,
+            env.feeler(few, budget_bytes=TABLE) as on_cpu,
+        ):
+            for situation, poses in situations.items():
+                found = batches_of(on_gpu, on_cpu, poses, batch, situation)
+                batches.append(found | clearance_of(on_gpu, on_cpu, poses))
+                print(batches[-1], flush=True)
+        triangles = by_triangles(env, few, situations, min(batch, 200_000))
+        print(triangles, flush=True)
+        spread = 0.3 * env.grid.voxel_size
+        for n_points in sizes:
+            shell = few if n_points == len(few) else larger(many, n_points, spread)
+            with env.feeler(shell, budget_bytes=TABLE, device="cuda") as feeler:
+                touching = np.ascontiguousarray(situations["touching"][:64])
+                frames.append(frames_of(feeler, touching, repeats))
+            print(frames[-1], flush=True)
+    about = {
+        "card": name.decode() if isinstance(name, bytes) else str(name),
+        "machine": records.machine(),
+        "versions": {
+            package: version(package)
+            for package in PACKAGES
+            if find_spec(package.replace("-", "_"))
+        },
+        "memory_for_cells": TABLE,
+    }
+    return about | {"frames": frames, "batches": batches, "warp": triangles}
+
+
+def main() -> None:
+    """Prepare, or measure."""
+    parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
+    parser.add_argument("--prepare", type=Path, help="write scene, tool and poses to a folder")
+    parser.add_argument("--scene", type=Path, help="measure with what was prepared")
+    parser.add_argument("--out", type=Path, default=Path("results"))
+    parser.add_argument("--quick", action="store_true", help="a small scene, few frames")
+    given = parser.parse_args()
+    if given.prepare is not None:
+        given.prepare.mkdir(parents=True, exist_ok=True)
+        prepare(given.prepare, 7 if given.quick else BITS, 50 if given.quick else MOST_POSES)
+    if given.scene is not None:
+        sizes, batch = (SIZES[:1], 20) if given.quick else (SIZES, BATCH)
+        found = measure(given.scene, sizes, batch, 3 if given.quick else REPEATS)
+        records.write(given.out, {"gpu": found})
+
+
+if __name__ == "__main__":
+    main()

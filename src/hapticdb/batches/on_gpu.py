@@ -1,0 +1,301 @@
+"""Batches of poses on a graphics processor: copies are under way beside kernels."""
+
+from collections.abc import Callable, Iterator
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import config, cuda
+from numpy.typing import NDArray
+
+from hapticdb.batches.nearest import NearestSearch
+from hapticdb.batches.order import order_of
+from hapticdb.batches.result import TouchBatch
+from hapticdb.batches.threads import BatchThreads
+from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.kernels import rigid
+from hapticdb.kernels.gpu import frames as kernels
+from hapticdb.kernels.gpu import nearest as searches
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.mirror import CellMirror
+
+PIECE_POINTS = 1 << 25
+"""Points placed by one launch. A larger value makes fewer launches, and takes more memory."""
+PIECE_POSES = 1 << 16
+"""Most poses of one launch, 14 MB with their results. Larger: likewise."""
+LANES = 2
+"""Launches under way: while one computes, poses and results of the other are copied."""
+MOST_BLOCKS = 1 << 13
+"""Most blocks of a launch; each takes several poses if there are more."""
+COPIERS = 4
+"""Threads that copy poses and results between the caller's memory and the GPU's."""
+LEAST_COPIED = 1 << 12
+"""Poses that a thread copies at once, at least: fewer are done before it begins."""
+config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a frame of a small tool needs few blocks, and no warning
+
+Floats = NDArray[np.float64]
+
+
+def check_gpu() -> None:
+    """Refuse where numba finds no GPU."""
+    if not cuda.is_available():
+        raise MissingExtraError(
+            "device 'cuda': numba finds no GPU that it can use; it takes one of NVIDIA with its "
+            "driver, and pip install 'hapticdb[gpu]'"
+        )
+
+
+class RawFrames(NamedTuple):
+    """Results of n poses: forces, torques (n, 3), and (n,) of each of the others."""
+
+    forces: Floats
+    torques: Floats
+    hits: Floats
+    contacts: Floats
+    unknown: Floats
+    deepest: Floats
+
+
+class GpuNearest(NearestSearch):
+    """The same search on the GPU, whose table is that of the processors' frames.
+
+    Parameters
+    ----------
+    frames, threads, reach
+        As for `NearestSearch`.
+    gpu : GpuFrames
+        Frames of the same shell.
+    """
+
+    def __init__(
+        self, frames: ResidentFrames, threads: BatchThreads, reach: float, gpu: "GpuFrames"
+    ) -> None:
+        super().__init__(frames, threads, reach)
+        self._gpu = gpu
+
+    def search(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
+        """As `NearestSearch.search`; a pose whose cells do not fit together is searched there."""
+        squares, points = self._gpu.nearest(poses, self._reach)
+        left = np.flatnonzero(points == searches.UNDECIDED)
+        while len(left):
+            self._fetch(poses[left], 0)
+            squares[left], points[left] = self._gpu.nearest(poses[left], self._reach)
+            is_left = points[left] == searches.UNDECIDED
+            if is_left[0]:
+                one = left[:1]
+                distance, points[one] = super().search(poses[one])
+                squares[one] = distance**2
+                is_left[0] = False
+            left = left[is_left]
+        return np.sqrt(squares), points
+
+
+class _Lane:
+    """Memory for one launch, here and on the GPU, and the stream in which it runs."""
+
+    def __init__(self, n_poses: int, shares: int) -> None:
+        self.stream = cuda.stream()
+        self.part = slice(0, 0)
+        self.poses = cuda.pinned_array((n_poses, 4, 4), np.float64)
+        self.out = cuda.pinned_array(n_poses * RESULTS, np.float64)
+        self.on_gpu = (
+            cuda.device_array((n_poses, 4, 4), np.float64),
+            cuda.device_array((n_poses, shares, kernels.SUMS), np.float64),
+            cuda.to_device(np.zeros(n_poses, np.int32)),
+            cuda.device_array(n_poses * RESULTS, np.float64),
+        )
+
+    def begin(self, n: int, launch: Callable[..., None]) -> None:
+        """Begin to copy n poses that are in `poses`, to compute, and to copy the results back."""
+        poses, sums, ended, out = self.on_gpu
+        if n < len(poses):
+            poses, out = poses[:n], out[: n * RESULTS]
+        poses.copy_to_device(self.poses[:n], stream=self.stream)
+        launch(self.stream, poses, sums, ended, out)
+        out.copy_to_host(self.out[: n * RESULTS], stream=self.stream)
+
+    def results(self) -> RawFrames:
+        """Results, when they are there; they are overwritten by the next `begin`."""
+        self.stream.synchronize()
+        n = self.part.stop - self.part.start
+        rows = self.out[: n * RESULTS].reshape(RESULTS, n)
+        vectors = self.out[: 6 * n].reshape(2, n, 3)
+        return RawFrames(
+            vectors[0], vectors[1], rows[HITS], rows[CONTACTS], rows[UNKNOWNS], rows[DEEPEST]
+        )
+
+
+class GpuFrames:
+    """Frames of one shell on the GPU, on the cells of its residency.
+
+    Parameters
+    ----------
+    frames : ResidentFrames
+        Frames of the shell on the processor, which fetch cells.
+    """
+
+    def __init__(self, frames: ResidentFrames) -> None:
+        check_gpu()
+        self._frames = frames
+        residency = frames.residency
+        self.mirror = CellMirror(residency.table, frames.law, residency.grid.side)
+        points = np.hstack([frames.clusters.points.T, np.zeros((6, 1))])
+        points[:3, -1] = frames.clusters.center
+        self._shell = cuda.to_device(np.ascontiguousarray(points))
+        self._shares, self._threads = kernels.shares_of(len(frames.shell))
+        law_type: Any = type(frames.law)  # mypy takes no class for hashable
+        self._kernel = kernels.frames_under(law_type, self._threads, single=False)
+        self._piece = max(1, min(PIECE_POSES, PIECE_POINTS // len(frames.shell)))
+        self._lanes: list[_Lane] = []
+        self._copiers = ThreadPoolExecutor(COPIERS, thread_name_prefix="copy")
+        self._stream = cuda.stream()
+        one = kernels.frames_under(law_type, self._threads, single=True)
+        self._one = one[self._shares, self._threads, self._stream]
+        self._out = cuda.mapped_array(RESULTS, np.float64)
+        self._sums = cuda.device_array((1, self._shares, kernels.SUMS), np.float64)
+        self._end = cuda.to_device(np.zeros(1, np.int32))
+
+    def close(self) -> None:
+        """End the threads."""
+        self._copiers.shutdown()
+
+    def feel(self, pose: Floats) -> Floats:
+        """Results (RESULTS,) of a frame at one pose (4, 4), in the cells that are in memory.
+
+        The pose travels with the launch, and the results come without a copy: a tenth of the time
+        of `run` for one pose.
+
+        Raises
+        ------
+        UsageError
+            If the pose is not rigid.
+        """
+        if rigid.first_not_rigid(pose[None]) == 0:
+            raise _not_rigid(0)
+        self.mirror.update()
+        self._one(
+            self._frames.law, self._frames.residency.place, self._shell,
+            tuple(pose[:3].ravel().tolist()), *self.mirror.arrays, self._sums, self._end, self._out,
+        )  # fmt: skip
+        self._stream.synchronize()
+        return np.array(self._out)
+
+    def touch(
+        self, poses: Floats, felt: TouchBatch, progress: Callable[[int, int], None] | None
+    ) -> None:
+        """Feel poses (B, 4, 4), into `felt`; first where all cells are in memory."""
+        pending: list[NDArray[np.int64]] = []
+        for part, found in self.run(poses):
+            self._put(felt, part, found)
+            pending.append(part.start + np.flatnonzero(found.unknown > 0.0))
+            if progress is not None:
+                progress(part.stop, len(poses))
+        left = np.concatenate(pending) if pending else np.empty(0, np.int64)
+        if len(left):
+            residency, center = self._frames.residency, self._frames.shell.center
+            left = left[order_of(poses[left], center, residency.grid)]
+        while len(left):
+            ready = left[: self._frames.fetch(poses[left])]
+            left = left[len(ready) :]
+            for part, found in self.run(poses[ready]):
+                self._put(felt, ready[part], found)
+
+    def run(self, poses: Floats) -> Iterator[tuple[slice, RawFrames]]:
+        """Results of poses (B, 4, 4), piece by piece, in the cells that are in memory.
+
+        Raises
+        ------
+        UsageError
+            If a pose is not rigid.
+        """
+        self.mirror.update()
+        piece = min(self._piece, len(poses))
+        if self._lanes and len(self._lanes[0].poses) < piece:
+            self._lanes = []
+        if not self._lanes:
+            self._lanes = [_Lane(piece, self._shares) for _ in range(LANES)]
+        under_way: list[_Lane] = []
+        try:
+            for n, start in enumerate(range(0, len(poses), piece or 1)):
+                if len(under_way) == LANES:
+                    yield self._ended(under_way.pop(0))
+                lane = self._lanes[n % LANES]
+                lane.part = slice(start, min(start + piece, len(poses)))
+                self._copy(lane.poses, poses[lane.part])
+                lane.begin(lane.part.stop - start, self._launch)
+                under_way.append(lane)
+            while under_way:
+                yield self._ended(under_way.pop(0))
+        finally:
+            for lane in under_way:  # after an error, or Ctrl-C
+                lane.stream.synchronize()
+
+    def nearest(self, poses: Floats, reach: float) -> tuple[Floats, NDArray[np.int64]]:
+        """Squares (B,) of distances, voxels, and nearest points (B,), or `NO_POINT`, `UNDECIDED`.
+
+        poses (B, 4, 4), rigid; reach: voxels.
+        """
+        self.mirror.update()
+        keys, slots, masks, used = self.mirror.directory()
+        squares, points = np.empty(len(poses)), np.empty(len(poses), dtype=np.int64)
+        search = searches.search_kernel(searches.THREADS)
+        for start in range(0, len(poses), PIECE_POSES):
+            part = slice(start, min(start + PIECE_POSES, len(poses)))
+            found = (
+                cuda.device_array(part.stop - start, np.float64),
+                cuda.device_array(part.stop - start, np.int64),
+            )
+            search[min(part.stop - start, MOST_BLOCKS), searches.THREADS](
+                self._frames.residency.place, self._shell, cuda.to_device(poses[part]), keys, slots,
+                self.mirror.arrays[2], masks, used, reach, *found,
+            )  # fmt: skip
+            squares[part], points[part] = (one.copy_to_host() for one in found)
+        return squares, points
+
+    def _launch(self, stream: Any, poses: Any, sums: Any, ended: Any, out: Any) -> None:  # noqa: ANN401 - numba's
+        blocks = min(len(poses) * self._shares, MOST_BLOCKS)
+        self._kernel[blocks, self._threads, stream](
+            self._frames.law, self._frames.residency.place, self._shell, poses, *self.mirror.arrays,
+            sums, ended, out,
+        )  # fmt: skip
+
+    @staticmethod
+    def _ended(lane: _Lane) -> tuple[slice, RawFrames]:
+        found = lane.results()
+        if len(found.unknown) and found.unknown.min() == kernels.NOT_RIGID:
+            pose = lane.part.start + int(found.unknown.argmin())
+            raise _not_rigid(pose)
+        return lane.part, found
+
+    def _copy(self, to: Floats, poses: Floats) -> None:
+        """Copy poses (n, 4, 4) to the front of `to`."""
+        self._divide(len(poses), lambda part: np.copyto(to[part], poses[part]))
+
+    def _put(self, felt: TouchBatch, at: slice | NDArray[np.int64], found: RawFrames) -> None:
+        """Enter results into a batch, at those of its poses."""
+
+        def put(part: slice) -> None:
+            to = (
+                slice(at.start + part.start, at.start + part.stop)
+                if isinstance(at, slice)
+                else at[part]
+            )
+            felt.forces[to], felt.torques[to] = found.forces[part], found.torques[part]
+            felt.hits[to], felt.n_contacts[to] = found.hits[part], found.contacts[part]
+            felt.deepest[to] = found.deepest[part]
+
+        self._divide(len(found.hits), put)
+
+    def _divide(self, n: int, work: Callable[[slice], None]) -> None:
+        """Do work on n rows in several threads."""
+        step = max(LEAST_COPIED, -(-n // COPIERS))
+        parts = [slice(start, min(start + step, n)) for start in range(0, n, step)]
+        for _ in self._copiers.map(work, parts) if len(parts) > 1 else map(work, parts):
+            pass
+
+
+def _not_rigid(pose: int) -> UsageError:
+    return UsageError(
+        f"pose {pose}: a pose that is no rigid transform: give finite numbers and a rotation"
+    )

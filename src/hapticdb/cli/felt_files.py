@@ -1,0 +1,77 @@
+"""Results of many poses as one table in a file, Parquet or .npz: whole or not at all."""
+
+import importlib.util
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from hapticdb.cli.csv_files import WRENCH, new_file
+from hapticdb.errors import MissingExtraError, UsageError
+
+if TYPE_CHECKING:
+    import numpy as np
+    from numpy.typing import NDArray
+
+    from hapticdb.batches.result import TouchBatch
+
+    Columns = dict[str, NDArray[np.generic]]
+
+OPTION = "--out"
+
+
+def columns_of(first: int, felt: "TouchBatch") -> "Columns":
+    """Columns of a batch whose first pose has that index; `revision` is the one that was felt."""
+    import numpy as np
+
+    wrenches = [*felt.forces.T, *felt.torques.T]
+    return {
+        "pose": np.arange(first, first + len(felt)),
+        **{name: np.ascontiguousarray(one) for name, one in zip(WRENCH, wrenches, strict=True)},
+        "hits": felt.hits,
+        "contacts": felt.n_contacts,
+        "deepest_m": felt.deepest,
+        "revision": np.full(len(felt), felt.revision),
+    }
+
+
+@contextmanager
+def open_felt(target: Path) -> "Iterator[Callable[[Columns], None]]":
+    """Open a new file, whose suffix says of which kind; yields what adds rows to it."""
+    if target.suffix not in {".parquet", ".npz"}:
+        raise UsageError(f"{OPTION} '{target}': give a name that ends with .parquet or .npz")
+    if target.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
+        raise MissingExtraError(
+            f"{OPTION} '{target}' needs the extra 'parquet': pip install 'hapticdb[parquet]', or "
+            "give a name that ends with .npz"
+        )
+    with new_file(target, OPTION) as part:
+        yield from _row_groups(part) if target.suffix == ".parquet" else _arrays(part)
+
+
+def _row_groups(path: Path) -> "Iterator[Callable[[Columns], None]]":
+    """Rows are written as they come."""
+    import pyarrow as pa
+    from pyarrow import parquet
+
+    with ExitStack() as opened:
+        writers: list[parquet.ParquetWriter] = []
+
+        def write(columns: "Columns") -> None:
+            table = pa.table(columns)
+            if not writers:
+                writers.append(opened.enter_context(parquet.ParquetWriter(path, table.schema)))
+            writers[0].write_table(table)
+
+        yield write
+
+
+def _arrays(path: Path) -> "Iterator[Callable[[Columns], None]]":
+    """Rows stay in memory until the end."""
+    import numpy as np
+
+    pieces: list[Columns] = []
+    yield pieces.append
+    whole = {name: np.concatenate([one[name] for one in pieces]) for name in pieces[0]}
+    with path.open("xb") as file:
+        np.savez(file, **whole)  # type: ignore[arg-type]

@@ -1,0 +1,203 @@
+"""Frames on a graphics processor: `resident.feeling.felt` at many poses, or of millions of points.
+
+A block of threads takes a pose, or one of several shares of the points of a large shell. Each
+thread adds up every so manieth point; the threads' sums are added in pairs, and the block that ends
+last adds those of the shares. So the order of a sum depends on the number of points alone, and a
+frame repeats bit for bit, whatever poses are beside it.
+"""
+
+import functools
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import cuda, float64, int32
+
+from hapticdb.kernels import law as laws
+from hapticdb.kernels import rigid
+from hapticdb.kernels.gpu.sources import on_gpu
+from hapticdb.kernels.resident import cells
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS
+
+WEIGHT = RESULTS
+"""Row of a block's sums, after those of the results."""
+SUMS = RESULTS + 1
+NOT_RIGID = -1.0
+"""In the place of a frame's number of points in unknown cells: the pose is not rigid."""
+THREADS, THREADS_OF_LARGE = 64, 256
+"""Threads of a block. More of them end a large shell sooner, and idle for a small one."""
+LARGE_FROM = 4096
+"""Points from which several blocks share a shell."""
+MOST_SHARES = 1056
+"""Most blocks that share a shell: 8 for each multiprocessor of the largest cards. More of them
+leave less to each block and more to the one that adds up."""
+
+_moved, _turned, _transform_of, _is_rigid = map(
+    on_gpu, (rigid.moved, rigid.turned, rigid.transform_of, rigid.is_rigid)
+)
+_slot_of, _cell_key, _column_of, _bit_in = map(
+    on_gpu, (cells.slot_of, cells.cell_key, cells.column_of, cells.bit_in)
+)
+_accumulate, _average_into = on_gpu(laws.accumulate), on_gpu(laws.average_into)
+
+
+def shares_of(n_points: int) -> tuple[int, int]:
+    """Blocks that share a shell of so many points, and the threads of each."""
+    if n_points < LARGE_FROM:
+        return 1, THREADS
+    return min(-(-n_points // THREADS_OF_LARGE), MOST_SHARES), THREADS_OF_LARGE
+
+
+@on_gpu
+def _slot_at(keys, slots, side, i, j, k):
+    """Slot of the cell of voxel (i, j, k): from a list of all cells, or from a directory."""
+    if keys.shape[1] == 1:
+        n = (np.int64(side) + 31) >> 5
+        return slots[0, ((i >> 5) * n + (j >> 5)) * n + (k >> 5)]
+    return np.int32(_slot_of(keys, slots, 0, _cell_key(i, j, k)))
+
+
+@on_gpu
+def _transform_at(poses, n):
+    """Transform of pose n of an array (B, 4, 4)."""
+    return _transform_of(poses[n])
+
+
+@on_gpu
+def _transform_itself(pose, n):  # noqa: ARG001 - as `_transform_at`
+    """Transform of the only pose, which is given as one."""
+    return pose
+
+
+@functools.cache
+def _adding_under(law_type: type) -> Callable[..., Any]:
+    """Function that adds up every `step`-th point of a placed shell under that type of law."""
+    leaves = laws.LEAVES[law_type]
+    respond, reach = on_gpu(leaves.respond), on_gpu(leaves.reach)
+    sample_at, share_at = on_gpu(leaves.sample_slot), on_gpu(leaves.share_slot)
+
+    def add_points(
+        law, place, shell, transform, first, step, keys, slots, words, gate, payload, sums
+    ):  # fmt: skip
+        total = shell.shape[1] - 1
+        mx, my, mz = _moved(transform, shell[0, total], shell[1, total], shell[2, total])
+        for row in range(SUMS):
+            sums[row] = 0.0
+        size, side = place.size, place.side
+        for n in range(first, total, step):
+            px, py, pz = _moved(transform, shell[0, n], shell[1, n], shell[2, n])
+            x, y, z = (px - place.x) / size, (py - place.y) / size, (pz - place.z) / size
+            if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
+                continue
+            i, j, k = np.int64(x), np.int64(y), np.int64(z)
+            slot = _slot_at(keys, slots, side, i, j, k)
+            if slot <= cells.EMPTY_SLOT:
+                sums[UNKNOWNS] += slot < 0
+                continue
+            column = _column_of(i, j)
+            if not _bit_in(gate[slot, column], k):
+                continue
+            is_hit = _bit_in(words[slot, column], k) != 0
+            sample = sample_at(law, payload, slot, x, y, z)
+            if not (is_hit or sample <= reach(law)):
+                continue
+            nx, ny, nz = _turned(transform, shell[3, n], shell[4, n], shell[5, n])
+            cx = place.x + size * (float(i) + 0.5)
+            cy = place.y + size * (float(j) + 0.5)
+            cz = place.z + size * (float(k) + 0.5)
+            depth, counted = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+            share = share_at(law, payload, slot, x, y, z, nx, ny, nz, sample)
+            depth *= share
+            sums[WEIGHT] += counted * share
+            sums[HITS] += is_hit
+            if depth > 0.0:
+                sums[CONTACTS] += 1.0
+                sums[DEEPEST] = max(sums[DEEPEST], depth)
+                sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = _accumulate(
+                    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], px, py, pz, nx, ny, nz,
+                    mx, my, mz, depth, law.stiffness,
+                )  # fmt: skip
+
+    return on_gpu(add_points)
+
+
+@cuda.jit(device=True)
+def _add_up(both, t):
+    """Add up the rows of both (SUMS, threads) over the threads, into the first; deepest: most."""
+    cuda.syncthreads()
+    half = both.shape[1] // 2
+    while half > 0:
+        if t < half:
+            for row in range(SUMS):
+                if row == DEEPEST:
+                    both[row, t] = max(both[row, t], both[row, t + half])
+                else:
+                    both[row, t] += both[row, t + half]
+        cuda.syncthreads()
+        half //= 2
+
+
+@cuda.jit(device=True)
+def _write(sums, n, total, out):
+    """Write frame n of `total` from its sums (SUMS,), as `frames_under` has it."""
+    _average_into(sums, sums[WEIGHT], sums[0], sums[1], sums[2], sums[3], sums[4], sums[5])
+    for axis in range(3):
+        out[3 * n + axis] = sums[axis]
+        out[3 * total + 3 * n + axis] = sums[3 + axis]
+    for row in range(HITS, RESULTS):
+        out[row * total + n] = sums[row]
+
+
+@functools.cache
+def frames_under(law_type: type, threads: int, *, single: bool) -> Any:  # noqa: ANN401 - numba's kernels are untyped
+    """Kernel of frames under that type of law, for blocks of so many threads (a power of two).
+
+    Its arguments: law, place; shell (6, N + 1): points and normals, last the centre; poses
+    (B, 4, 4), or if `single` the 12 numbers of one transform, known to be rigid; keys
+    (1, capacity), slots (1, capacity), words (S, 1024), payload (S, 34^3) as
+    `resident.cells.Cells`, or keys (1, 1) and slots of all cells of the grid; gate (S, 1024)
+    uint32: voxels in which a point may be felt; sums (B, shares, SUMS): scratch of the shares;
+    ended (B,) int32: 0 before and after; out (RESULTS x B,): forces (B, 3), torques (B, 3), and B
+    each of hits, contacts, points in unknown cells or `NOT_RIGID`, and deepest.
+    """
+    add_points = _adding_under(law_type)
+    transform_at = _transform_itself if single else _transform_at
+
+    @cuda.jit
+    def frames(law, place, shell, poses, keys, slots, words, gate, payload, sums, ended, out):
+        both = cuda.shared.array((SUMS, threads), float64)
+        n_ended = cuda.shared.array(1, int32)
+        t, total, shares = cuda.threadIdx.x, out.shape[0] // RESULTS, sums.shape[1]
+        for at in range(cuda.blockIdx.x, total * shares, cuda.gridDim.x):
+            n, block = at // shares, at % shares
+            add_points(
+                law, place, shell, transform_at(poses, n), block * threads + t, shares * threads,
+                keys, slots, words, gate, payload, both[:, t],
+            )  # fmt: skip
+            _add_up(both, t)
+            if shares > 1:
+                if t < SUMS:
+                    sums[n, block, t] = both[t, 0]
+                cuda.threadfence()
+                cuda.syncthreads()
+                if t == 0:
+                    n_ended[0] = cuda.atomic.add(ended, n, 1)
+                cuda.syncthreads()
+                if n_ended[0] < shares - 1:
+                    continue
+                for row in range(SUMS):
+                    both[row, t] = 0.0
+                    for one in range(t, shares, threads):
+                        if row == DEEPEST:
+                            both[row, t] = max(both[row, t], sums[n, one, row])
+                        else:
+                            both[row, t] += sums[n, one, row]
+                _add_up(both, t)
+            if t == 0:
+                ended[n] = 0
+                _write(both[:, 0], n, total, out)
+                if not single and not _is_rigid(poses[n]):
+                    out[UNKNOWNS * total + n] = NOT_RIGID
+            cuda.syncthreads()
+
+    return frames

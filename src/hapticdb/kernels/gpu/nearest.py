@@ -1,0 +1,80 @@
+"""Distances on a graphics processor: the occupied voxel nearest to a shell, at many poses.
+
+A block of threads takes a pose. Its threads search around as many points at once, no farther than
+the nearest voxel found so far; then they agree on the nearest, and go on with the next points.
+"""
+
+import functools
+from typing import Any
+
+import numpy as np
+from numba import cuda, float64, int64
+
+from hapticdb.kernels import rigid
+from hapticdb.kernels.gpu.sources import on_gpu
+from hapticdb.kernels.resident import clearance
+
+THREADS = 64
+"""Threads of a block. More of them search side by side, with a bound that is renewed seldomer."""
+NO_POINT, UNDECIDED = -1, -2
+"""In the place of a pose's nearest point: nothing within reach; a cell in reach is unknown."""
+
+_moved, _transform_of = on_gpu(rigid.moved), on_gpu(rigid.transform_of)
+_nearest_voxel = on_gpu(clearance.nearest_voxel)
+
+
+@cuda.jit(device=True)
+def _agree(squares, points, t):
+    """Least of squares (threads,) and its point, the first one of several, to the first place."""
+    cuda.syncthreads()
+    half = squares.shape[0] // 2
+    while half > 0:
+        if t < half:
+            other = squares[t + half]
+            if other < squares[t] or (other == squares[t] and points[t + half] < points[t]):
+                squares[t], points[t] = other, points[t + half]
+        cuda.syncthreads()
+        half //= 2
+
+
+@functools.cache
+def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
+    """Kernel that searches, for blocks of so many threads (a power of two).
+
+    Its arguments: place; shell (6, N + 1), as in `frames`; poses (B, 4, 4), rigid; keys
+    (1, capacity), slots (1, capacity), words (S, 1024), masks (S,), used (S,) as
+    `resident.cells.Cells`; reach, voxels; found squares (B,) of distances, voxels, and points (B,).
+    """
+
+    @cuda.jit
+    def search(place, shell, poses, keys, slots, words, masks, used, reach, squares, points):
+        best = cuda.shared.array(threads, float64)
+        nearest = cuda.shared.array(threads, int64)
+        t, total = cuda.threadIdx.x, shell.shape[1] - 1
+        for n in range(cuda.blockIdx.x, poses.shape[0], cuda.gridDim.x):
+            transform = _transform_of(poses[n])
+            square, point = reach * reach, np.int64(total)  # no point yet
+            for first in range(0, total, threads):
+                at = first + t
+                best[t], nearest[t] = square, point
+                if at < total and point >= 0:
+                    x, y, z = _moved(transform, shell[0, at], shell[1, at], shell[2, at])
+                    x = (x - place.x) / place.size
+                    y = (y - place.y) / place.size
+                    z = (z - place.z) / place.size
+                    found, voxel = _nearest_voxel(
+                        keys, slots, words, masks, used, 0, x, y, z, square, np.int64(-1),
+                        place.side,
+                    )  # fmt: skip
+                    if voxel == UNDECIDED:
+                        best[t], nearest[t] = -1.0, np.int64(UNDECIDED)
+                    elif voxel >= 0:
+                        best[t], nearest[t] = found, np.int64(at)
+                _agree(best, nearest, t)
+                square, point = best[0], nearest[0]
+                cuda.syncthreads()
+            if t == 0:
+                squares[n] = square
+                points[n] = point if point < total else NO_POINT
+
+    return search

@@ -1,0 +1,152 @@
+"""A copy of a cell table in the memory of a graphics processor."""
+
+from typing import Any
+
+import numpy as np
+from numba import cuda
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.field.lattice import BEYOND
+from hapticdb.kernels.field.law import DistanceFieldLaw
+from hapticdb.kernels.law import reads_distances
+from hapticdb.kernels.resident.cells import (
+    BUFFERS,
+    CELL_WORDS,
+    EMPTY_SLOT,
+    UNKNOWN,
+    Cells,
+)
+from hapticdb.resident.table import CellTable
+
+MOST_LISTED = 1 << 21
+"""Cells of a grid up to which the GPU has a list of all of them, 8 MB: one look-up finds a slot. A
+larger value lists larger grids, and the list is copied whenever a cell comes or goes."""
+
+
+class CellMirror:
+    """The cells of a table on the GPU: slots that have changed are copied, the directory whole.
+
+    It has as many slots as the table, so what the table evicts leaves the GPU, too, and what is
+    unknown in the table is unknown there. Only the process that writes the table may use it.
+
+    Parameters
+    ----------
+    table : CellTable
+        The table.
+    law : NamedTuple
+        Law of the frames that read it, in the kernels' form.
+    side : int
+        Voxels of the grid on each axis.
+
+    Attributes
+    ----------
+    arrays : tuple
+        keys, slots, words, gate and payload, as `kernels.gpu.frames.frames_under` takes them.
+    n_copied : int
+        Number of slots copied so far.
+
+    Raises
+    ------
+    UsageError
+        If the table is larger than the GPU's free memory.
+    """
+
+    def __init__(self, table: CellTable, law: object, side: int) -> None:
+        self._table = table
+        self._law = law
+        self._version = 0
+        self._directory: tuple[int, tuple[Any, ...]] = 0, ()
+        self.n_copied = 0
+        self._has_distances = reads_distances(law)
+        n_slots = table.n_slots
+        free = cuda.current_context().get_memory_info()[0]
+        if free < table.size_bytes:
+            raise UsageError(
+                f"a budget of {table.size_bytes} bytes for resident cells: the GPU has {free} free"
+            )
+        across = -(-side // 32)
+        self._across = across if across**3 <= MOST_LISTED else 0
+        n_listed = self._across**3 or table.capacity
+        values = table.cells.payload
+        words = cuda.to_device(np.zeros((n_slots, CELL_WORDS), np.uint32))
+        gate, payload = words, cuda.to_device(np.full((1, 1), BEYOND, np.uint8))
+        if self._has_distances and values is not None:
+            gate = cuda.to_device(np.zeros((n_slots, CELL_WORDS), np.uint32))
+            payload = cuda.device_array(values.shape, np.uint8)
+        self.arrays = (
+            cuda.device_array((1, 1 if self._across else n_listed), np.int64),
+            cuda.device_array((1, n_listed), np.int32),
+            words,
+            gate,
+            payload,
+        )
+
+    def update(self) -> int:
+        """Copy what the table has published since the last time; returns the slots copied.
+
+        No kernel may read the arrays meanwhile.
+        """
+        version = self._table.version
+        if version == self._version:
+            return 0
+        cells, which = self._table.cells, version % BUFFERS
+        keys, slots, words, gate, payload = self.arrays
+        if self._across:
+            slots.copy_to_device(self._listed(cells, which))
+        else:
+            keys.copy_to_device(np.ascontiguousarray(cells.keys[which : which + 1]))
+            slots.copy_to_device(np.ascontiguousarray(cells.slots[which : which + 1]))
+        is_new = self._table.filled > self._version
+        is_new[EMPTY_SLOT] = False
+        runs = _runs_of(np.flatnonzero(is_new))
+        for first, end in runs:
+            words[first:end].copy_to_device(cells.words[first:end])
+            if self._has_distances and cells.payload is not None:
+                payload[first:end].copy_to_device(cells.payload[first:end])
+                gate[first:end].copy_to_device(self._gate_of(cells, slice(first, end)))
+        self._version = version
+        n_slots = sum(end - first for first, end in runs)
+        self.n_copied += n_slots
+        return n_slots
+
+    def directory(self) -> tuple[Any, ...]:
+        """keys, slots, masks and used of the cells that are there, as searches take them."""
+        version, arrays = self._directory
+        if version != self._version:
+            cells, which = self._table.cells, slice(self._version % BUFFERS, None)
+            parts = cells.keys[which][:1], cells.slots[which][:1], cells.masks, cells.used
+            arrays = tuple(cuda.to_device(np.ascontiguousarray(one)) for one in parts)
+            self._directory = self._version, arrays
+        return arrays
+
+    def _listed(self, cells: Cells, which: int) -> NDArray[np.int32]:
+        """Slots (1, n) of all cells of the grid, in the published directory."""
+        found = np.full((1, self._across**3), UNKNOWN, np.int32)
+        filled = np.flatnonzero(cells.keys[which] >= 0)
+        of_cells = cells.keys[which][filled]
+        i, j, k = of_cells >> 32, (of_cells >> 16) & 0xFFFF, of_cells & 0xFFFF  # `cell_of_key`
+        found[0, (i * self._across + j) * self._across + k] = cells.slots[which][filled]
+        return found
+
+    def _gate_of(self, cells: Cells, part: slice) -> NDArray[np.uint32]:
+        """Voxels of slots in which a point may be felt: a frame looks up no distances elsewhere."""
+        if isinstance(self._law, DistanceFieldLaw) and cells.near is not None:
+            return cells.near[part]
+        voxels = np.zeros((len(cells.masks[part]), CELL_WORDS), np.uint32)  # of the marked bricks
+        columns = np.arange(CELL_WORDS)
+        shifts = ((columns >> 8) << 4 | ((columns >> 3) & 3) << 2).astype(np.uint64)
+        for brick in range(4):
+            is_marked = (cells.masks[part, None] >> (shifts + np.uint64(brick))) & np.uint64(1)
+            voxels |= is_marked.astype(np.uint32) * np.uint32(0xFF << 8 * brick)
+        return voxels
+
+
+def _runs_of(slots: NDArray[np.int64]) -> list[tuple[int, int]]:
+    """First slot and end of each run of neighbours in slots (n,), ascending."""
+    if not len(slots):
+        return []
+    breaks = np.flatnonzero(np.diff(slots) > 1) + 1
+    firsts = slots[np.concatenate([[0], breaks])]
+    ends = slots[np.concatenate([breaks - 1, [-1]])] + 1
+    return list(zip(firsts.tolist(), ends.tolist(), strict=True))

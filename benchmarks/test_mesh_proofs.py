@@ -25,8 +25,8 @@ from hapticdb import PointShell
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.surfaces.sides import triangle_tree
 from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.mesh import read_file
-from hapticdb.sweeps.gap import MEETING
 from hapticdb.sweeps.run import sweep
 
 if "CI" in os.environ:

@@ -10,8 +10,9 @@ from scipy.spatial.transform import Rotation
 from draws import drawn
 from hapticdb import PointShell
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
+from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
-from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
+from hapticdb.sweeps.gap import OverTimeError, Pair, error_of
 from hapticdb.sweeps.way import Way
 from moving_boxes import Boxes, distances, mesh
 from naive_motion import poses_at
@@ -64,8 +65,7 @@ def check_a_path(rng: np.random.Generator) -> str:
     poses, center = random_path(rng), rng.uniform(-0.02, 0.02, 3)
     way = Way.of(poses, tool.corners()[0], center)
     pair = Pair(tree_of(still), tool_of(tool), way)
-    whole = np.zeros(1), np.array([way.length])
-    found, closed = pair.least(*whole, np.inf)
+    found, closed = pair.least(0.0, np.inf)
     assert found is not None
     times = np.linspace(0.0, len(poses) - 1.0, PLACES)
     placed = Boxes(poses_at(poses, center, times), np.repeat(tool.halves, PLACES, axis=0))
@@ -75,11 +75,8 @@ def check_a_path(rng: np.random.Generator) -> str:
     at_place = float(distances(still, here)[0][0])
     assert at_place == pytest.approx(found.at_most, abs=1e-9)
     if found.at_most <= MEETING:
-        first = pair.first(*whole, found)
-        where = Boxes(way.at([first.way]), tool.halves)
-        assert distances(still, where)[0][0] <= MEETING + 1e-9
-        if first.way > MEETING:
-            before = way.at(np.linspace(0.0, first.way - MEETING, PLACES))
+        if found.way > MEETING:
+            before = way.at(np.linspace(0.0, found.way - MEETING, PLACES))
             earlier = distances(others, Boxes(before, placed.halves))[0]
             assert earlier.min() >= 0.5 * MEETING - 1e-9
         return "hits"
@@ -111,7 +108,7 @@ def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
     poses[:, :3, 3] = [[-0.2, 0.0, 0.04 + gap], [0.2, 0.01, 0.04 + gap]]
     way = Way.of(poses, tool.corners()[0], np.zeros(3))
     pair = Pair(tree_of(still), tool_of(tool), way)
-    found, closed = pair.least(np.zeros(1), np.array([way.length]), np.inf)
+    found, closed = pair.least(0.0, np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(gap, rel=1e-9)
     assert gap - error_of(gap) - 1e-12 <= closed <= gap
@@ -123,7 +120,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
     poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
     way = Way.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
     pair = Pair(tree_of(still), MovingSurface(PointShell.sphere(0.03)), way)
-    found, _ = pair.least(np.zeros(1), np.array([way.length]), np.inf)
+    found, _ = pair.least(0.0, np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(0.02, rel=0.01)
     assert np.allclose(found.on_tool, [0.12, 0.02, 0.0], atol=3e-4)
@@ -135,4 +132,4 @@ def test_a_limit_of_time_ends_the_search() -> None:
     way = Way.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
     pair = Pair(tree_of(still), tool_of(still), way, time.monotonic() - 1.0)
     with pytest.raises(OverTimeError):
-        pair.least(np.zeros(1), np.zeros(1), np.inf)
+        pair.least(0.0, np.inf)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, PointShell
 from hapticdb.errors import NoSurfaceError, ObjectNotFoundError, UsageError
+from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.poses import rotation_of
-from hapticdb.sweeps.gap import MEETING
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import CONTACT, sweep
 from hapticdb.testing import write_voxels

@@ -32,15 +32,15 @@ def exact_clearance(
     found = ClearanceBatch(len(poses), reach, 0.0)
     places = np.zeros((len(poses), 3))
     found.revision = store.revision()
-    gaps = _box_gaps(objects, tool.corners, poses)
-    order = np.argsort(gaps.min(axis=1, initial=np.inf), kind="stable")
-    for n, i in enumerate(order.tolist()):
+    bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
+    gaps = tool.box_gaps(bounds, poses)
+    order = np.argsort(gaps.min(axis=1, initial=np.inf), kind="stable").tolist()
+    parts = parts_of(store, [objects[i] for i in order])
+    for n, (i, (_, part)) in enumerate(zip(order, parts, strict=True)):
         near = np.flatnonzero(gaps[i] < found.distances)
         if len(near):
-            ((_, part),) = parts_of(store, [objects[i]])
-            measured = tool.nearest(
-                tree_of(part.surface()), poses[near], found.distances[near].copy()
-            )
+            tree = tree_of(part.surface())
+            measured = tool.nearest(tree, poses[near], found.distances[near].copy())
             is_nearer = measured.pairs[:, 0] >= 0
             at = near[is_nearer]
             found.distances[at] = measured.at_least[is_nearer]
@@ -52,15 +52,3 @@ def exact_clearance(
     local = np.einsum("nji,nj->ni", poses[at, :3, :3], places[at] - poses[at, :3, 3])
     found.points[at] = cKDTree(shell.points).query(local)[1] if len(at) else 0
     return found
-
-
-def _box_gaps(objects: Sequence[Object], corners: Floats, poses: Floats) -> Floats:
-    """Distances (O, B) of objects' boxes from the tool's box at poses, never too large."""
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    middles = poses[:, :3, :3] @ (0.5 * (low + high)) + poses[:, :3, 3]
-    reach = np.abs(poses[:, :3, :3]) @ (0.5 * (high - low))
-    out = np.empty((len(objects), len(poses)))
-    for row, obj in zip(out, objects, strict=True):
-        apart = np.maximum(middles - reach - obj.bounds[1], obj.bounds[0] - middles - reach)
-        row[:] = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
-    return out

@@ -19,11 +19,11 @@ MOST_BYTES = 1_000_000_000
 
 
 def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
-    """Yield objects in the order of their ids with their geometry; reads each surface once.
+    """Yield objects with their geometry, as `found_parts`.
 
     Raises `NoSurfaceError` if the surface of an object is not in the database.
     """
-    for obj, part in found_parts(store, sorted(objects, key=lambda obj: obj.id)):
+    for obj, part in found_parts(store, objects):
         if part is None:
             raise NoSurfaceError(
                 f"object {obj.id} ({obj.name}) has no surface in {store.url}: run "
@@ -94,7 +94,7 @@ def shell_of_objects(
     if not objects:
         raise UsageError("a shell of no objects: name at least one")
     triangles = []
-    for obj, part in parts_of(store, objects):
+    for obj, part in parts_of(store, sorted(objects, key=lambda obj: obj.id)):
         if part.is_cloud:
             raise UsageError(
                 f"object {obj.id} ({obj.name}) is a point cloud, which has no surface: leave it out"

@@ -58,7 +58,7 @@ def shift_objects(
     """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
-    pairs = list(parts_of(store, [store.object(int(i)) for i in as_ids(ids)]))
+    pairs = list(parts_of(store, [store.object(int(i)) for i in sorted(as_ids(ids))]))
     for obj, part in pairs:
         bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
     for known, part in pairs:

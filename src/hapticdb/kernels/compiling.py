@@ -49,6 +49,8 @@ ENTRIES = {
     "surfaces.sides": "side_votes_kernel nesting_kernel",
     "surfaces.nearest": "distances_kernel",
     "triangles.nearest": "nearest_kernel",
+    "triangles.sweeping": "least_kernel",
+    "triangles.motion": "poses_kernel",
     "triangles.piercing": "piercing_kernel",
     "triangles.parting": "components_kernel depths_kernel",
     "motion": "play sway survey pull",

@@ -1,11 +1,13 @@
 """The surface of a tool, to be measured from other surfaces."""
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
+from hapticdb.kernels.triangles.motion import PathMotion
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.kernels.triangles.sweeping import Search
 from hapticdb.pointshell.coverage import Ball
 from hapticdb.pointshell.shell import PointShell
 
@@ -33,20 +35,10 @@ class MovingSurface:
             self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.tree = tree_of(triangles)
 
-    def nearest(
-        self,
-        other: TriangleTree,
-        poses: Floats,
-        farthest: Floats,
-        *,
-        then: float = np.inf,
-        enough: float = 0.0,
-    ) -> Nearest:
+    def nearest(self, other: TriangleTree, poses: Floats, farthest: Floats) -> Nearest:
         """Measure from another surface at poses (N, 4, 4), as `kernels.triangles.nearest` does."""
         radius = self._radius
-        near = nearest(
-            other, self.tree, poses, farthest + radius, then=then + radius, enough=enough + radius
-        )
+        near = nearest(other, self.tree, poses, farthest + radius)
         if radius == 0.0:
             return near
         away = near.on_a - near.on_b
@@ -56,6 +48,28 @@ class MovingSurface:
             at_most=np.maximum(near.at_most - radius, 0.0),
             on_b=near.on_b + away,
         )
+
+    def search(
+        self, other: TriangleTree, motion: PathMotion, *, begin: float, best: float, fine: float
+    ) -> Search:
+        """Search the least distance from another surface, as `kernels.triangles.sweeping` does."""
+        return Search(
+            other, self.tree, motion, radius=self._radius, begin=begin, best=best, fine=fine
+        )
+
+    def box_gaps(self, bounds: Floats, poses: Floats, more: ArrayLike = 0.0) -> Floats:
+        """Distances (O, N) of boxes (O, 2, 3) from this one's at poses (N, 4, 4), never too large.
+
+        more (N,) : metres by which the surface's box is larger on each side.
+        """
+        low, high = self.corners.min(axis=0), self.corners.max(axis=0)
+        middles = poses[:, :3, :3] @ (0.5 * (low + high)) + poses[:, :3, 3]
+        reach = np.abs(poses[:, :3, :3]) @ (0.5 * (high - low)) + np.reshape(more, (-1, 1))
+        out = np.empty((len(bounds), len(poses)))
+        for row, box in zip(out, bounds, strict=True):
+            apart = np.maximum(middles - reach - box[1], box[0] - middles - reach)
+            row[:] = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        return out
 
 
 def tree_of(triangles: Floats) -> TriangleTree:

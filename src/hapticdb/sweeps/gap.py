@@ -1,10 +1,4 @@
-"""Least distance of two surfaces along a path, and where they meet first: branch and bound.
-
-A place of the path is told by its way: the metres that the tool's farthest-moving place has moved
-at most. So the distance of two surfaces changes by no more than the way does, and one measurement
-in the middle of a stretch bounds the distance on all of it. A stretch is halved until its bound is
-as good as the nearest place that is known.
-"""
+"""Distances of the tool and one object along a path, and where they meet first."""
 
 import time
 from typing import NamedTuple
@@ -14,20 +8,20 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.nearest import Nearest
+from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 
-FINE = 9e-6
-"""Metres to which a least distance is found, if that is more than `SHARE` of it."""
-SHARE = 0.009
-"""Share of a least distance to which it is found. Larger: fewer measurements."""
-MEETING = 1e-5
-"""Metres: surfaces that come so near have met."""
-AT_ONCE = 512
-"""Stretches that are measured together. Larger: more memory, and a limit of time is overrun by
-more."""
+COARSE, FINE = 9e-6, 1e-6
+"""Metres to which a least distance is found, and per mille of it if that is more: always, and where
+it is soon found."""
+EASY = 20_000
+"""Looks up to which that is soon."""
+STEPS = 1 << 16
+"""Entries of a search between two looks at the clock: some hundredths of a second. Larger: a limit
+of time is overrun by more."""
 
 
 class OverTimeError(Exception):
@@ -56,76 +50,49 @@ class Pair:
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
         self.looks = 0
 
-    def measure(
-        self, ways: Floats, farthest: Floats, then: float = np.inf, enough: float = 0.0
-    ) -> Nearest:
-        """Measure at ways (n,); the others are as for `kernels.triangles.nearest`."""
+    def measure(self, ways: Floats, farthest: Floats) -> Nearest:
+        """Measure at ways (n,), as `kernels.triangles.nearest`."""
+        self._check_time()
+        self.looks += len(ways)
+        return self.tool.nearest(self.tree, self.way.at(ways), farthest)
+
+    def least(self, begin: float, best: float) -> tuple[Least | None, float]:
+        """Least distance from a way on, if it is less than `best`; else None.
+
+        Returns what is proved, too. If the surfaces meet, it is their first meeting. Where that
+        took few looks, it is found nine times as exactly.
+        """
+        found, closed, looks = self._search(begin, best, COARSE)
+        known = best if found is None else found.at_most
+        if MEETING < known < np.inf and looks <= EASY:
+            nearer, closed, _ = self._search(begin, known, FINE)
+            found = nearer or found
+        if found is None:
+            return None, closed
+        return found, 0.0 if found.at_most <= MEETING else max(min(closed, found.at_most), 0.0)
+
+    def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
+        """The same to `fine` metres, and how many looks it took."""
+        search = self.tool.search(self.tree, self.way.motion, begin=begin, best=best, fine=fine)
+        is_over = False
+        while not is_over:
+            self._check_time()
+            is_over = search.go_on(STEPS)
+        self.looks += search.looks
+        (at_most, closed), (way,), (on_object, on_tool) = search.found
+        if way < 0.0:
+            return None, float(closed), search.looks
+        near = self.measure(np.array([way]), np.array([at_most]))  # all of both surfaces, there
+        if near.pairs[0, 0] >= 0:
+            at_most, on_object, on_tool = near.at_most[0], near.on_a[0], near.on_b[0]
+        found = Least(float(at_most), float(way), on_object, on_tool)
+        return found, float(closed), search.looks
+
+    def _check_time(self) -> None:
         if time.monotonic() > self.until:
             raise OverTimeError
-        self.looks += len(ways)
-        return self.tool.nearest(self.tree, self.way.at(ways), farthest, then=then, enough=enough)
-
-    def least(self, lows: Floats, highs: Floats, best: float) -> tuple[Least | None, float]:
-        """Least distance on stretches of the path (n,), if it is less than `best`; else None.
-
-        Returns what is proved of the stretches, too. Ends as soon as the surfaces have met.
-        """
-        found: Least | None = None
-        closed = best
-        while len(lows):
-            (low, high), (lows, highs) = _last(lows, highs)
-            middles, halves = 0.5 * (low + high), 0.5 * (high - low)
-            wanted = best - error_of(best) if np.isfinite(best) else best
-            near = self.measure(middles, wanted + halves, best, MEETING)
-            n = int(np.argmin(near.at_most))
-            if near.at_most[n] < best:
-                best = float(near.at_most[n])
-                found = Least(best, float(middles[n]), near.on_a[n], near.on_b[n])
-            if best <= MEETING:
-                return found, 0.0
-            bounds = near.at_least - halves
-            is_open = bounds < best - error_of(best)
-            closed = min(closed, float(bounds[~is_open].min(initial=np.inf)))
-            low, high = _halved(low, high, is_open)
-            lows, highs = np.concatenate([lows, low]), np.concatenate([highs, high])
-        return found, max(min(closed, best), 0.0)
-
-    def first(self, lows: Floats, highs: Floats, known: Least) -> Least:
-        """Where on stretches of the path (n,), ascending, the surfaces meet first.
-
-        known : where they do. Before the place that is told they keep half of `MEETING` apart.
-        """
-        found = known
-        lows, highs = lows[::-1], highs[::-1]
-        while len(lows):
-            (low, high), (lows, highs) = _last(lows, highs)
-            middles, halves = 0.5 * (low + high), 0.5 * (high - low)
-            near = self.measure(middles, MEETING + halves, MEETING)
-            met = np.flatnonzero((near.at_most <= MEETING) & (middles < found.way))
-            if len(met):
-                n = int(met[np.argmin(middles[met])])
-                found = Least(float(near.at_most[n]), float(middles[n]), near.on_a[n], near.on_b[n])
-            is_open = (near.at_least - halves < 0.5 * MEETING) & (low < found.way)
-            is_open &= halves > 0.25 * MEETING
-            low, high = _halved(low[::-1], high[::-1], is_open[::-1])
-            is_before = lows < found.way
-            lows = np.concatenate([lows[is_before], low[::-1]])
-            highs = np.concatenate([highs[is_before], high[::-1]])
-        return found
 
 
 def error_of(distance: float) -> float:
-    """Metres to which a least distance is found."""
-    return max(FINE, SHARE * distance)
-
-
-def _last(lows: Floats, highs: Floats) -> tuple[tuple[Floats, Floats], tuple[Floats, Floats]]:
-    """The last stretches, `AT_ONCE` at most, and those before them."""
-    return (lows[-AT_ONCE:], highs[-AT_ONCE:]), (lows[:-AT_ONCE], highs[:-AT_ONCE])
-
-
-def _halved(lows: Floats, highs: Floats, is_open: NDArray[np.bool_]) -> tuple[Floats, Floats]:
-    """Both halves of the stretches that are open, in order."""
-    low, high = lows[is_open], highs[is_open]
-    middle = 0.5 * (low + high)
-    return np.stack([low, middle], axis=1).ravel(), np.stack([middle, high], axis=1).ravel()
+    """Metres to which a least distance is found at least."""
+    return COARSE * max(1.0, 1e3 * distance)

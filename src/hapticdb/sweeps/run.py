@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.ingest.geometry import parts_of
+from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.mesh import Part
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.moving import MovingSurface, tree_of
@@ -25,15 +26,17 @@ from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import FollowedContact, follow
 from hapticdb.sweeps.cut import Mesh
-from hapticdb.sweeps.gap import MEETING, OverTimeError, Pair, error_of
+from hapticdb.sweeps.gap import OverTimeError, Pair, error_of
 from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
-from hapticdb.sweeps.stretches import Stretches
 from hapticdb.sweeps.way import Way
 
 CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
 WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
+
+STRETCHES = 256
+"""Stretches of a path on which boxes are compared. More: fewer objects are looked at."""
 
 Floats = NDArray[np.float64]
 SweepCallback = Callable[[int, int], None]
@@ -162,9 +165,8 @@ class _Sweep:
         with self._env.store.snapshot():
             revision = self._env.store.revision()
             objects = self._env.felt(where, exclude)
-            stretches = Stretches(self._way, self._tool.corners, objects)
             try:
-                near = self._decide(objects, stretches)
+                near = self._decide(objects)
             except OverTimeError:
                 near, is_stopped = len(objects), True
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
@@ -181,17 +183,22 @@ class _Sweep:
             profile=Profile(self._fractions, self._gaps) if self._asked.profile else None,
         )  # fmt: skip
 
-    def _decide(self, objects: list[Object], stretches: Stretches) -> int:
+    def _decide(self, objects: list[Object]) -> int:
         """Look at objects, the nearest boxes first; returns how many were looked at."""
-        order = np.argsort(stretches.least, kind="stable")
-        n_near = int((stretches.least < self._asked.limit).sum())
-        for n, i in enumerate(order.tolist()):
-            least = float(stretches.least[i])
+        edges = np.linspace(0.0, self._way.length, (STRETCHES if self._way.length else 1) + 1)
+        bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
+        poses = self._way.at(0.5 * (edges[:-1] + edges[1:]))
+        gaps = self._tool.box_gaps(bounds, poses, 0.5 * np.diff(edges))
+        nearest = gaps.min(axis=1, initial=np.inf)
+        order = np.argsort(nearest, kind="stable").tolist()
+        n_near = int((nearest < self._asked.limit).sum())
+        parts = parts_of(self._env.store, [objects[i] for i in order])
+        for n, i in enumerate(order):
+            least = float(nearest[i])
             if least >= self._wanted() and not self._is_profiled(least):
                 self._closed = min(self._closed, least)
                 return n
-            ((obj, part),) = parts_of(self._env.store, [objects[i]])
-            self._look_at(obj, part, stretches.gaps[i], stretches)
+            self._look_at(*next(parts), is_inside=bool(gaps[i, 0] <= 0.0))
             if self._asked.progress is not None:
                 self._asked.progress(n + 1, n_near)
         return len(objects)
@@ -205,8 +212,8 @@ class _Sweep:
     def _is_profiled(self, least: float) -> bool:
         return self._asked.profile and least < float(self._gaps.max())
 
-    def _look_at(self, obj: Object, part: Part, gaps: Floats, stretches: Stretches) -> None:
-        """Decide about one object; gaps (W,) : of its box from the tool's on each stretch."""
+    def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
+        """Decide about one object; is_inside : whether its box meets the tool's at the start."""
         triangles = part.surface()
         pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until)
         try:
@@ -214,11 +221,11 @@ class _Sweep:
             if start <= self._asked.contact and not part.is_cloud:
                 begin = self._follow(obj, pair)
                 if begin < self._way.length:
-                    self._measure(obj, pair, gaps, stretches, begin)
+                    self._measure(obj, pair, begin)
             else:
-                if self._holds(triangles, obj, gaps):
+                if is_inside and self._holds(triangles, obj):
                     self._enclosed.append(obj)
-                self._measure(obj, pair, gaps, stretches, 0.0)
+                self._measure(obj, pair, 0.0)
         finally:
             self._looks += pair.looks
 
@@ -234,9 +241,7 @@ class _Sweep:
         self._touching.append(_told(obj, found, self._way, contact, refused))
         return found.until if found.is_apart else self._way.length
 
-    def _measure(
-        self, obj: Object, pair: Pair, gaps: Floats, stretches: Stretches, begin: float
-    ) -> None:
+    def _measure(self, obj: Object, pair: Pair, begin: float) -> None:
         """Find where an object is met first from a way on, or how near it comes.
 
         What was touched begins to be near, so it has no part in the gap: is it met again?
@@ -244,18 +249,13 @@ class _Sweep:
         if self._asked.profile:
             self._note_profile(pair, begin)
         is_counted = not (begin or self._hits or self._enclosed)
-        wanted = self._wanted() if is_counted else 2.0 * MEETING
-        lows, highs = stretches.nearer(gaps, wanted, begin)
-        least, closed = pair.least(lows, highs, self._best if is_counted else 2.0 * MEETING)
+        least, closed = pair.least(begin, self._best if is_counted else 2.0 * MEETING)
         if is_counted:
-            beyond = float(gaps[gaps >= wanted].min(initial=np.inf))
-            self._closed = min(self._closed, closed, beyond)
+            self._closed = min(self._closed, closed)
         if least is None:
             return
         if least.at_most <= MEETING:
-            lows, highs = stretches.nearer(gaps, MEETING, begin)
-            first = pair.first(lows, highs, least)
-            self._hits.append(self._place(obj, first.way, first.on_tool, first.on_object))
+            self._hits.append(self._place(obj, least.way, least.on_tool, least.on_object))
             return
         if not is_counted:
             return
@@ -275,13 +275,11 @@ class _Sweep:
             obj, self._way.fraction(way), segment, self._way.at(ways)[0], on_tool, on_object
         )
 
-    def _holds(self, triangles: Floats, obj: Object, gaps: Floats) -> bool:
+    def _holds(self, triangles: Floats, obj: Object) -> bool:
         """Whether the object is in a closed body of the tool, or around it, at the start.
 
-        Both are apart there; the first stretch has their boxes one in the other.
+        Both are apart there.
         """
-        if gaps[0] > 0.0:
-            return False
         pose = self._way.at([0.0])[0]
         corners = np.unique(triangles.reshape(-1, 3), axis=0)
         inside = Interior(self._tool.surface)

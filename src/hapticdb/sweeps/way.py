@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.triangles.motion import PathMotion, poses_kernel
 from hapticdb.poses import as_floats, quaternion_of, rotation_of
 
 Floats = NDArray[np.float64]
@@ -31,14 +32,13 @@ class Way:
     ways : (M,)
         Metres at each given pose: from one to the next, no place of the tool moves more than the
         difference.
+    motion : PathMotion
+        The same for kernels.
     """
 
     poses: Floats
     ways: Floats
-    _center: Floats
-    _centers: Floats
-    _quaternions: Floats
-    _turns: Floats
+    motion: PathMotion
 
     @classmethod
     def of(cls, poses: ArrayLike, corners: Floats, center: Floats) -> "Way":
@@ -55,11 +55,19 @@ class Way:
         turns = _turns_between(quaternions)
         with np.errstate(over="ignore"):
             motion = np.linalg.norm(np.diff(centers, axis=0), axis=1)
-        motion += _turned(corners - center, turns, rotation_of(quaternions[:-1]))
+        rotations = rotation_of(quaternions)
+        motion += _turned(corners - center, turns, rotations[:-1])
         ways = np.concatenate([[0.0], np.cumsum(motion)])
         if not np.isfinite(ways[-1]):
             raise UsageError("the path is longer than numbers go: check its unit")
-        return cls(given, ways, center, centers, quaternions, turns)
+        again = list(range(len(ways))) if len(ways) > 1 else [0, 0]  # two poses at least
+        moved = (
+            ways[again],
+            centers[again],
+            rotations[again],
+            turns if len(turns) else np.zeros((1, 3)),
+        )
+        return cls(given, ways, PathMotion(*map(np.ascontiguousarray, (*moved, center))))
 
     @property
     def length(self) -> float:
@@ -77,19 +85,9 @@ class Way:
 
     def at(self, ways: ArrayLike) -> Floats:
         """Poses (n, 4, 4) at ways (n,); the first and the last one where a way is beyond them."""
-        ways = np.asarray(ways, dtype=np.float64)
-        at = self.segments(ways)
+        ways = np.array(ways, dtype=np.float64)
         out = np.tile(np.eye(4), (len(ways), 1, 1))
-        if len(self.ways) == 1:
-            out[:, :3, :3] = rotation_of(self._quaternions)
-            centers = self._centers[at]
-        else:
-            length = self.ways[at + 1] - self.ways[at]
-            share = np.where(length > 0.0, (ways - self.ways[at]) / np.where(length, length, 1), 0)
-            share = np.clip(share, 0.0, 1.0)[:, None]
-            out[:, :3, :3] = rotation_of(_by(share * self._turns[at], self._quaternions[at]))
-            centers = self._centers[at] + share * (self._centers[at + 1] - self._centers[at])
-        out[:, :3, 3] = centers - out[:, :3, :3] @ self._center
+        poses_kernel(self.motion, self.segments(ways), ways, out)
         return out
 
 
@@ -132,7 +130,6 @@ def _turned(corners: Floats, turns: Floats, rotations: Floats) -> Floats:
     turning = np.flatnonzero(angles > 0.0)
     if not len(turning):
         return out
-    corners = np.unique(corners, axis=0)
     squares = (corners**2).sum(axis=1)
     axes = np.einsum("nij,ni->nj", rotations[turning], turns[turning] / angles[turning, None])
     for at in range(0, len(turning), AT_ONCE):
@@ -140,15 +137,3 @@ def _turned(corners: Floats, turns: Floats, rotations: Floats) -> Floats:
         beside = np.sqrt(np.maximum(squares[:, None] - along**2, 0.0).max(axis=0))
         out[turning[at : at + AT_ONCE]] = angles[turning[at : at + AT_ONCE]] * beside
     return out * (1.0 + 1e-9)
-
-
-def _by(turns: Floats, quaternions: Floats) -> Floats:
-    """Quaternions (n, 4) after turns (n, 3), rotation vectors in the world frame."""
-    angle = np.linalg.norm(turns, axis=1, keepdims=True)
-    w = np.cos(0.5 * angle)
-    v = turns * np.where(angle < 1e-12, 0.5, np.sin(0.5 * angle) / np.maximum(angle, 1e-300))
-    bw, b = quaternions[:, :1], quaternions[:, 1:]
-    product = np.hstack(
-        [w * bw - (v * b).sum(axis=1, keepdims=True), w * b + bw * v + np.cross(v, b)]
-    )
-    return np.asarray(product / np.linalg.norm(product, axis=1, keepdims=True))

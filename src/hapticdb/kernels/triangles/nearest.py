@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels._jit import FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
 
@@ -114,7 +114,7 @@ def plane_gap(one, n, other, m):
 
 
 @leaf
-def _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, out):
+def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
     """Measure the triangles of two leaves; notes what is nearer than out[0] from below.
 
     The nearest pair from above has its triangles in pair (2,) and its places in out[2:8].
@@ -132,15 +132,15 @@ def _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, ou
                 and plane_gap(placed, m - begin, a.corners, n) < far
             ):
                 below, above = measure_pair(a.corners, n, placed, m - begin, size, found)
-                _keep(below, above, n, m, then, found, pair, out)
+                _keep(below, above, n, m, found, pair, out)
 
 
 @leaf
-def _keep(below, above, n, m, then, found, pair, out):
+def _keep(below, above, n, m, found, pair, out):
     """Note a pair of triangles where it is nearer than what is known."""
     is_nearer = below < out[0]
     if is_nearer:
-        out[0] = min(below, then)
+        out[0] = below
     if above < out[1] and (is_nearer or pair[0] >= 0):
         out[1] = above
         pair[0], pair[1] = n, m
@@ -149,15 +149,13 @@ def _keep(below, above, n, m, then, found, pair, out):
 
 
 @leaf
-def nearest_pair(a, b, pose, then, enough, nodes, squares, placed, found, pair, out):
+def nearest_pair(a, b, pose, nodes, squares, placed, found, pair, out):
     """Find the nearest triangles of tree a and of tree b, moved by a pose (4, 4) into a's frame.
 
     out (8,): bounds of the distance from below and from above, which begin as the greatest distance
-    that is looked for and infinity, then the place on each. Once something is nearer than that,
-    only what is nearer than `then` is looked for, and the bound below is `then` at most. pair (2,):
-    triangles that are tried first, -1 where none is known; afterwards the nearest ones, or -1. Ends
-    at once where the bound above is `enough` or less. nodes (.., 2), squares, placed, found are
-    scratch.
+    that is looked for and infinity, then the place on each. pair (2,): triangles that are tried
+    first, -1 where none is known; afterwards the nearest ones, or -1. nodes (.., 2), squares,
+    placed, found are scratch.
     """
     size = largest(a.boxes)
     reach = largest(b.boxes)
@@ -169,18 +167,18 @@ def nearest_pair(a, b, pose, then, enough, nodes, squares, placed, found, pair, 
     if first >= 0:
         place_corners(b.corners, second, second + 1, pose, placed)
         below, above = measure_pair(a.corners, first, placed, 0, size, found)
-        _keep(below, above, first, second, then, found, pair, out)
+        _keep(below, above, first, second, found, pair, out)
     leaves_a, leaves_b = a.boxes.shape[0] // 2, b.boxes.shape[0] // 2
     nodes[0, 0], nodes[0, 1] = 0, 0
     squares[0] = box_gap(a.boxes, np.int64(0), b.boxes, np.int64(0), pose, slack)
     top = 1
-    while top > 0 and out[1] > enough:
+    while top > 0 and out[1] > 0.0:
         top -= 1
         if not squares[top] < out[0] * out[0]:
             continue
         node, other = nodes[top, 0], nodes[top, 1]
         if node >= leaves_a and other >= leaves_b:
-            _measure_leaves(a, node, b, other, pose, size, then, placed, found, pair, out)
+            _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out)
             continue
         if other >= leaves_b or (
             node < leaves_a and _extent(a.boxes, node) >= _extent(b.boxes, other)
@@ -199,12 +197,12 @@ def nearest_pair(a, b, pose, then, enough, nodes, squares, placed, found, pair, 
         top += 1
 
 
-@entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, FLOAT, INTS2, FLOATS2)
-def nearest_kernel(a, b, poses, farthest, then, enough, pairs, out):
+@entry(TREE, TREE, FLOATS3, FLOATS, INTS2, FLOATS2)
+def nearest_kernel(a, b, poses, farthest, pairs, out):
     """Find the nearest triangles at poses (N, 4, 4), which lead b into a's frame.
 
-    farthest (N,): the greatest distance that is looked for; then, enough, pairs (N, 2), out (N, 8):
-    as for `nearest_pair`. The pair of a pose is tried first at the next one that has none.
+    farthest (N,): the greatest distance that is looked for; pairs (N, 2), out (N, 8): as for
+    `nearest_pair`. The pair of a pose is tried first at the next one that has none.
     """
     nodes = np.empty((WAITING, 2), dtype=np.int64)
     squares = np.empty(WAITING)
@@ -214,7 +212,7 @@ def nearest_kernel(a, b, poses, farthest, then, enough, pairs, out):
         if n and pairs[n, 0] < 0:
             pairs[n, 0], pairs[n, 1] = pairs[n - 1, 0], pairs[n - 1, 1]
         out[n, 0], out[n, 1] = farthest[n], math.inf
-        nearest_pair(a, b, poses[n], then, enough, nodes, squares, placed, found, pairs[n], out[n])
+        nearest_pair(a, b, poses[n], nodes, squares, placed, found, pairs[n], out[n])
 
 
 class Nearest(NamedTuple):
@@ -232,25 +230,12 @@ class Nearest(NamedTuple):
     pairs: Ints
 
 
-def nearest(
-    a: TriangleTree,
-    b: TriangleTree,
-    poses: Floats,
-    farthest: Floats,
-    *,
-    then: float = math.inf,
-    enough: float = 0.0,
-) -> Nearest:
+def nearest(a: TriangleTree, b: TriangleTree, poses: Floats, farthest: Floats) -> Nearest:
     """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
 
-    farthest (N,): the greatest distance that is looked for. Once something is nearer, only what is
-    nearer than `then` is looked for: `at_least` is `then` at most, and `at_most` some distance if
-    it is more. A distance of `enough` or less ends the search at a pose, and is that of some
-    triangles.
+    farthest (N,): the greatest distance that is looked for.
     """
     pairs = np.full((len(poses), 2), -1, dtype=np.int64)
     out = np.zeros((len(poses), 8))
-    nearest_kernel(
-        a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), then, enough, pairs, out
-    )
+    nearest_kernel(a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), pairs, out)
     return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)

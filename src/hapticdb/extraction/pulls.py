@@ -15,7 +15,9 @@ from hapticdb.extraction.directions import (
     opposed_shares,
 )
 from hapticdb.extraction.free_space import STEP, FreeSpace
+from hapticdb.extraction.judge import judge
 from hapticdb.extraction.problem import Exit, Problem
+from hapticdb.extraction.result import WayOut
 from hapticdb.store.base import Object
 from hapticdb.sweeps.run import SweepCallback
 
@@ -27,6 +29,11 @@ its start. Larger: more pulls that the proof refuses."""
 MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against. Larger: more pulls
 that the proof refuses."""
+MOST_LIKELY = 16
+"""Greatest number of pulls that are swept, of those that the part's axes or contacts suggest.
+Larger: more oblique bores are left, at the price of a sweep each."""
+SHARE_OF_PULL = 0.25
+"""Share of the time left that the sweep of one of them has."""
 BLOCKS = (8, 64)
 """Poses that are looked at together: at first, since most pulls are blocked soon, and at most; each
 block is twice as long as the one before."""
@@ -37,8 +44,8 @@ class Pull(NamedTuple):
 
     direction (3,) : unit vector; length : metres until the part is out; touching : metres in
     contact with what it touches at its start; free : metres until the first other hit, `length` if
-    there is none; blockers : ids of the objects at the first hit in the way; is_likely : whether
-    the part's axes or contacts suggest it; is_swept : whether a sweep says so, not voxels.
+    there is none; blockers : ids of the objects at the first hit in the way; is_swept : whether a
+    sweep says so, not voxels.
     """
 
     direction: Floats
@@ -46,7 +53,6 @@ class Pull(NamedTuple):
     touching: float
     free: float
     blockers: tuple[int, ...]
-    is_likely: bool
     is_swept: bool = False
 
     @property
@@ -65,12 +71,13 @@ class Pulls:
     Attributes
     ----------
     done : list of Pull
-        In the order in which they were tried: those that fewest contacts oppose first.
+        In the order in which they were tried: those that are swept first.
     """
 
     def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
         self.done: list[Pull] = []
-        self._space, self._step = space, STEP * problem.voxel_size
+        self._swept: set[int] = set()
+        self._problem, self._space, self._step = problem, space, STEP * problem.voxel_size
         normals, own = space.start.contact_normals, problem.own_axes
         self._directions = candidate_directions(normals, own, seed)
         alike = self._directions @ likely_directions(normals, own).T
@@ -79,14 +86,40 @@ class Pulls:
         self._opposed = opposed_shares(self._directions, normals)
 
     def run(self, until: float, progress: SweepCallback | None) -> None:
-        """Try each direction; stops at a time of `time.monotonic`, but tries the first one."""
+        """Try other directions by voxels, one at least; stops at a time of `time.monotonic`."""
         total = len(self._directions)
         for n in range(total):
+            if n in self._swept:
+                continue
             if self.done and time.monotonic() > until:
                 return
             self.done.append(self._pull(n))
             if progress is not None:
-                progress(n + 1, total)
+                progress(len(self.done), total)
+
+    def sweep(self, until: float) -> WayOut | None:
+        """Sweep likely pulls until one is free; None if none is, or at a time of `monotonic`.
+
+        Those that fewest contacts oppose come first, of these the shortest ones.
+        """
+        likely = np.flatnonzero(self._is_likely)
+        order = np.lexsort((self._lengths[likely], np.round(self._opposed[likely], 2)))
+        for n in likely[order[:MOST_LIKELY]].tolist():
+            if self.done and time.monotonic() > until:
+                return None
+            direction, length = self._directions[n], float(self._lengths[n])
+            now = time.monotonic()
+            poses = poses_along(direction, np.array([0.0, length]))
+            way = judge(self._problem, poses, "pull", now + SHARE_OF_PULL * max(until - now, 0.0))
+            if not (way.in_way or way.swept.is_free):
+                continue  # the time was over
+            self._swept.add(n)
+            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
+            free = way.free_share * length
+            self.done.append(Pull(direction, length, 0.0, free, blockers, is_swept=True))
+            if way.swept.is_free:
+                return way
+        return None
 
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
@@ -100,7 +133,7 @@ class Pulls:
                 touching = float(ways[contact]) if contact < end else 0.0
                 free = float(ways[end - 1]) * (end > contact)
                 blockers = () if end == len(ways) else self._hit_at(direction * ways[end])
-        return Pull(direction, length, touching, free, blockers, bool(self._is_likely[n]))
+        return Pull(direction, length, touching, free, blockers)
 
     def _followed(self, direction: Floats, ways: Floats) -> tuple[int, int]:
         """Number of the first poses after (n,) metres in contact, and of those before a hit."""

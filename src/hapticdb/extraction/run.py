@@ -38,11 +38,8 @@ DEFAULT_MOTIONS = 20_000
 """Default number of motions that the planner may ask about."""
 MOST_OUT = 8
 """Greatest number of straight pulls that are judged of those that lead out by voxels."""
-MOST_LIKELY = 16
-"""The same of those that voxels refuse, but the part's axes or contacts suggest: surfaces may slide
-where voxels are shared. Larger: more oblique bores are left, at the price of a sweep each."""
 SHARE_OF_LIKELY = 0.3
-"""Greatest share of the time for them."""
+"""Greatest share of the time for sweeps of likely pulls, before voxels say what else leads out."""
 MOST_PLANS = 3
 """Greatest number of planned paths that are judged, until one is not refuted. Larger: more ways are
 found past places that the search overlooks."""
@@ -169,9 +166,10 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
     with FreeSpace(problem, asked.budget_bytes) as space:
         pulls = Pulls(problem, space, leaving, asked.seed)
         if way is None or way.verdict == "not decided":
-            pulls.run(until, progress)
-            soon = time.monotonic() + SHARE_OF_LIKELY * max(until - time.monotonic(), 0.0)
-            pulled = _best_pull(problem, pulls, soon)
+            pulled = pulls.sweep(until - (1.0 - SHARE_OF_LIKELY) * asked.seconds)
+            if pulled is None or asked.to is not None:
+                pulls.run(until, progress)
+                pulled = _best_pull(problem, pulls)
             way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict == "not decided"):
                 way = unscrewed(problem, leaving, asked.screw, until) or way
@@ -206,32 +204,25 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
     )
 
 
-def _best_pull(problem: Problem, pulls: Pulls, until: float) -> WayOut | None:
-    """First of the straight pulls that is proved: of those that lead out, then of likely ones.
+def _best_pull(problem: Problem, pulls: Pulls) -> WayOut | None:
+    """First that is proved of the straight pulls that lead out by voxels; else an undecided one.
 
     Of the pulls that are judged, surfaces then say how far they are free, and what stops them.
     """
-    order = range(len(pulls.done))
-    outs = [n for n in order if pulls.done[n].is_out]
+    outs = [n for n, pull in enumerate(pulls.done) if pull.is_out]
     outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
-    del outs[MOST_OUT:]
-    likely = [n for n in order if pulls.done[n].is_likely and n not in outs]
     undecided: WayOut | None = None
-    for n in outs + likely[:MOST_LIKELY]:
+    for n in outs[:MOST_OUT]:
         pull = pulls.done[n]
-        if n not in outs and time.monotonic() > until:
-            break
-        poses = pull.poses(np.array([0.0, pull.length]))
-        way = judge(problem, poses, "pull", math.inf if n in outs else until)
-        if way.in_way or way.swept.is_free:
-            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
-            pulls.done[n] = pull._replace(
-                free=way.free_share * pull.length, blockers=blockers, is_swept=True
-            )
-        elif n in outs and undecided is None:
-            undecided = way
+        way = judge(problem, pull.poses(np.array([0.0, pull.length])), "pull")
         if way.swept.is_free:
             return way
+        if way.in_way:
+            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
+            free = way.free_share * pull.length
+            pulls.done[n] = pull._replace(free=free, blockers=blockers, is_swept=True)
+        elif undecided is None:
+            undecided = way
     return undecided
 
 

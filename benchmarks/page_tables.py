@@ -6,6 +6,7 @@ A page is written by hand. Below each line ``<!-- table: NAME -->`` stands a tab
 from results; it is replaced, up to the next empty line.
 """
 
+import math
 import os
 import re
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -199,6 +200,22 @@ def ways_out(results: Results) -> str:
     return table(["part", "answer", "path, mm", "proved gap, mm", "coal's gap, mm"], rows)
 
 
+def fits(results: Results) -> str:
+    """Gaps of pegs in their holes, and what a hand beside the axis feels."""
+
+    def lengths(*values: float | None) -> str:
+        return " to ".join(NONE if value is None else f"{1e3 * value:.4f}" for value in values)
+
+    rows = []
+    for one in results["fits"]["rows"]:
+        gaps = lengths(one["nominal_m"]), lengths(one["gap_m"], one["gap_at_most_m"])
+        aside = math.hypot(*one["force_aside_n"])
+        felt = f"{one['force_on_axis_n']:.2f}", f"{aside:.2f}"
+        rows.append([one["fit"], one["verdict"], *gaps, f"{one['cpu_s']:.2f}", *felt])
+    head = ["peg", "verdict", "nominal gap, mm", "proved gap, mm", "processor time, s"]
+    return table([*head, "on the axis, N", "beside it, N"], rows)
+
+
 def contact_proxies(results: Results) -> str:
     """Round trips (median), ages (p50 / p99) and errors, with their shares of the force."""
 
@@ -238,6 +255,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "gpu-frames": gpu_frames,
         "gpu-batches": gpu_batches,
         "ways-out": ways_out,
+        "fits": fits,
         "contact-proxies": contact_proxies,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),

@@ -11,6 +11,7 @@ import contact_proxies
 import editing
 import feeling
 import figures
+import fits
 import hapticdb
 import in_real_time
 import large_shells
@@ -110,6 +111,14 @@ def test_the_spark_plug_comes_out_and_its_triangles_keep_the_proved_distance(
     (row,) = ways_out.measure(tmp_path, model, 7, [question])["rows"]
     assert (row["verdict"], row["how"]) == ("comes out", "pull")
     assert 0.0 < row["gap_m"] <= row["mesh_distance_m"]
+
+
+def test_a_peg_comes_out_of_its_hole_by_its_nominal_gap(tmp_path: Path) -> None:
+    data = Path(os.environ["HAPTICDB_TEST_DATA"], "fits")
+    row = fits.measured(tmp_path, data, "round 8 mm, tight", 6)
+    assert row["verdict"] == "clear"
+    assert row["gap_m"] == pytest.approx(row["nominal_m"], abs=2e-6)
+    assert page_tables.tables()["fits"]({"fits": {"rows": [row]}}).count("\n") == 2
 
 
 def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFiles) -> None:

@@ -1,0 +1,102 @@
+"""Fits: pegs drawn out of their holes at real tolerances, and what a hand off the axis feels.
+
+    HAPTICDB_TEST_DATA=... python benchmarks/fits.py     # the folder that holds fits/
+
+A round peg's nominal gap is half the difference of the diameters. A sweep draws each peg out along
+its axis. Then a hand holds the peg in the hole, beside the axis.
+"""
+
+import argparse
+import os
+import tempfile
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+import hapticdb
+import page_tables
+import records
+from hapticdb import GridOptions, ImportOptions, PointShell
+
+Floats = NDArray[np.float64]
+BITS = 7
+SEATED, OUT = 1e-3, 60e-3
+"""Where a peg begins and ends along its axis, metres; the holes are 9 mm deep."""
+ASIDE = 2e-5
+"""Metres from the axis at which the hand holds the peg."""
+
+
+class Fit(NamedTuple):
+    """A hole and its peg: files, and the nominal gap in metres, if the diameters are known."""
+
+    hole: str
+    peg: str
+    nominal_m: float | None = None
+
+
+FITS = {
+    "round 8 mm, tight": Fit(
+        "round_hole_8mm_subdiv_3x", "round_peg_8mm_tight", 0.5 * (8.1e-3 - 7.995e-3)
+    ),
+    "round 16 mm, loose": Fit(
+        "round_hole_16mm_subdiv_3x", "round_peg_16mm_loose", 0.5 * (16.5e-3 - 15.983e-3)
+    ),
+    "rectangular 8 mm, tight": Fit(
+        "rectangular_hole_8mm_subdiv_3x", "rectangular_peg_8mm_tight_subdiv_3x"
+    ),
+}
+
+
+def path(*places: tuple[float, float, float]) -> Floats:
+    """Poses (M, 4, 4) at places, metres."""
+    poses = np.tile(np.eye(4), (len(places), 1, 1))
+    poses[:, :3, 3] = places
+    return poses
+
+
+def measured(folder: Path, data: Path, name: str, bits: int) -> dict[str, Any]:
+    """Draw a peg out twice, of which the second time counts, and hold it beside the axis."""
+    fit = FITS[name]
+    url = folder / f"{fit.hole}.db"
+    options = ImportOptions(grid=GridOptions(bits=bits))
+    hapticdb.import_files(url, [data / f"factory_{fit.hole}.obj"], options)
+    shell = PointShell.from_file(data / f"factory_{fit.peg}.obj")
+    with hapticdb.open(url, read_only=True) as env:
+        for _ in range(2):
+            began = time.process_time()
+            found = hapticdb.sweep(env, shell, path((0, 0, SEATED), (0, 0, OUT)))
+            spent = time.process_time() - began
+        held = [env.touch(shell, path((x, 0, SEATED))[0]).force for x in (0.0, ASIDE)]
+        return {
+            "fit": name,
+            "nominal_m": fit.nominal_m,
+            "verdict": found.verdict,
+            "gap_m": found.gap.at_least,
+            "gap_at_most_m": found.gap.at_most,
+            "cpu_s": spent,
+            "looks": found.looks,
+            "voxel_m": env.grid.voxel_size,
+            "force_on_axis_n": float(np.linalg.norm(held[0])),
+            "force_aside_n": np.asarray(held[1]).tolist(),
+        }
+
+
+def main() -> None:
+    """Measure, print, and fill the table of docs/paths.md."""
+    argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0]).parse_args()
+    data = Path(os.environ["HAPTICDB_TEST_DATA"], "fits")
+    with tempfile.TemporaryDirectory() as folder:
+        rows = [measured(Path(folder), data, name, BITS) for name in FITS]
+    for row in rows:
+        print(row, flush=True)
+    inputs = {"bits": BITS, "aside_m": ASIDE}
+    found = records.conditions() | {"inputs": inputs, "rows": rows}
+    records.write(Path("results"), {"fits": found})
+    page_tables.refill("docs/paths.md", Path("results"))
+
+
+if __name__ == "__main__":
+    main()

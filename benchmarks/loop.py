@@ -17,7 +17,7 @@ from PIL import Image, ImageDraw, ImageFont
 from playwright.sync_api import Page, sync_playwright
 
 import hapticdb
-from hapticdb import Environment, GridOptions, ImportOptions, PointShell
+from hapticdb import Environment, GridOptions, ImportOptions
 from hapticdb.page import colours, tools
 from hapticdb.page.drawing import put_at
 from hapticdb.page.process import new_server, stop
@@ -111,8 +111,7 @@ def _curve(picture: Image.Image, forces: Floats, now: int, top: float) -> Image.
 
 def wrench(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     """Pictures of the wrench that slides under the smooth law, with its force."""
-    inset = tools.inset_of(stage.env.grid.voxel_size, smooth=True)
-    shell = PointShell.from_file(tool, points=400, inset=inset)
+    shell = stage.env.tool(tool, points=400)
     poses = hapticdb.read_poses(path)[FIRST:LAST]
     felt = np.array([stage.env.touch(shell, pose).force for pose in poses])
     forces = np.linalg.norm(felt, axis=1)

@@ -12,7 +12,7 @@ from hapticdb.batches.nearest import NearestSearch
 from hapticdb.batches.order import order_of
 from hapticdb.batches.result import TouchBatch
 from hapticdb.batches.threads import BatchThreads
-from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.kernels import rigid
 from hapticdb.kernels.gpu import frames as kernels
 from hapticdb.kernels.gpu import nearest as searches
@@ -42,7 +42,7 @@ def check_gpu() -> None:
     if not cuda.is_available():
         raise MissingExtraError(
             "device 'cuda': numba finds no GPU that it can use; it takes one of NVIDIA with its "
-            "driver, and pip install 'hapticdb[gpu]'"
+            f"driver, and {pip_line('gpu')}"
         )
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli.csv_files import WRENCH, new_file
-from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:
     import numpy as np
@@ -42,8 +42,8 @@ def open_felt(target: Path) -> "Iterator[Callable[[Columns], None]]":
         raise UsageError(f"{OPTION} '{target}': give a name that ends with .parquet or .npz")
     if target.suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         raise MissingExtraError(
-            f"{OPTION} '{target}' needs the extra 'parquet': pip install 'hapticdb[parquet]', or "
-            "give a name that ends with .npz"
+            f"{OPTION} '{target}' needs pyarrow: install it with {pip_line('parquet')}, or give a "
+            "name that ends with .npz"
         )
     with new_file(target, OPTION) as part:
         yield from _row_groups(part) if target.suffix == ".parquet" else _arrays(part)

@@ -35,6 +35,7 @@ def simulated() -> str:
     return done.stdout + done.stderr
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("check", CHECKS)
 def test_the_simulator_feels_as_the_processor(simulated: str, check: str) -> None:
     assert check in simulated.splitlines(), simulated
@@ -76,7 +77,7 @@ def env(tmp_path: Path) -> Environment:
 def test_no_gpu_is_told_in_a_line(env: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     shell, poses = cloud(5), poses_in(env.grid, 2)
-    with pytest.raises(MissingExtraError, match=r"no GPU.*hapticdb\[gpu\]"):
+    with pytest.raises(MissingExtraError, match=r"no GPU.*pip install .*numba-cuda"):
         env.touch(shell, poses=poses, device="cuda")
     assert len(env.touch(shell, poses=poses)) == 2
 

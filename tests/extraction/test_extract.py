@@ -193,7 +193,7 @@ def test_a_missing_planner_is_said_with_what_is_in_the_way(
     (shadow / "__init__.py").write_text("raise ImportError('no planner')")
     monkeypatch.syspath_prepend(str(shadow.parent))  # the child has the path of its parent
     url = enclosed(tmp_path)
-    with pytest.raises(MissingExtraError, match=r"cage is in the way.*hapticdb\[extract\]"):
+    with pytest.raises(MissingExtraError, match=r"cage is in the way.*pip install .*ompl"):
         found_in(url, "block")
     assert found_in(url, "block", motions=0).verdict == "no way found"
 

@@ -15,7 +15,7 @@ from recorded_scene import write_parts
 from servers import Place
 
 
-def test_parts_are_those_of_the_file_in_the_order_of_ids(
+def test_parts_are_those_of_the_file_in_the_order_asked(
     tmp_path: Path, place: Place, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """On both engines; objects of one shape share its arrays."""
@@ -33,7 +33,7 @@ def test_parts_are_those_of_the_file_in_the_order_of_ids(
 
             monkeypatch.setattr(env.store, "surfaces", surfaces)
             found = list(parts_of(env.store, env.objects()[::-1]))
-            assert [obj.id for obj, _ in found] == [obj.id for obj in env.objects()]
+            assert [obj.id for obj, _ in found] == [obj.id for obj in env.objects()[::-1]]
             assert (
                 len(asked) == len(set(asked)) == len({obj.digest for obj, _ in found}) < len(found)
             )

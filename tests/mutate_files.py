@@ -63,7 +63,8 @@ class Forked:
             os.dup2(request[0], 0)
             os.dup2(answer[1], 1)
             os.dup2(stderr.fileno(), 2)
-            os.closerange(3, 256)
+            for end in (*request, *answer):  # others stay: PROJ would close its own a second time
+                os.close(end)
             os.environ.update(env)
             _run_child()
         os.close(request[0])

@@ -192,7 +192,7 @@ def random_edit(env: Environment, rng: np.random.Generator, removed: list[haptic
     what = rng.integers(8)
     if removed and what == 0:
         env.restore(removed.pop())
-    elif what == 1 and len(ids) > 4:
+    elif what == 1 and len(removed) < 5:
         removed.append(env.remove(int(rng.choice(ids))))
     else:
         pose = trimesh.transformations.random_rotation_matrix(rng.random(3))

@@ -59,7 +59,7 @@ def stored(admin: psycopg.Connection, url: str) -> list[object]:
 
 
 def take_the_wheel_out(person: PagePerson) -> None:
-    person.press("wheel")
+    person.choose("Parts", "wheel")
     person.choose("For everyone", "Take out")
 
 

@@ -283,7 +283,7 @@ def import_once(url: str, file: Path) -> None:
 def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
     shell = two_tools()
     name = parse(url).environment
-    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D50", read_only=True) as env:
+    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D400", read_only=True) as env:
         # the first frame that groups by cost measures the costs, which a lock would stop
         expected = env.touch(shell, np.eye(4), "cbgroup").hits.tolist()
         for strategy in STRATEGIES:
@@ -314,7 +314,7 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
 ) -> None:
     monkeypatch.setattr(link, "GRACE_MS", 100)
     shell = two_tools()
-    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D200", read_only=True) as env:
+    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D500", read_only=True) as env:
         expected = env.touch(shell, np.eye(4)).hits.tolist()
         touch = partial(env.touch, shell, np.eye(4), law="plane")
         touches = [partial(touch, strategy=strategy) for strategy in STRATEGIES]

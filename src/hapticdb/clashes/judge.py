@@ -8,7 +8,6 @@ hide from a cut.
 """
 
 from collections.abc import Iterator
-from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -18,17 +17,13 @@ from hapticdb.clashes.shapes import BuiltShape
 from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
 from hapticdb.store.pairs import Kind
+from hapticdb.sweeps.contact import SHIFT, WAYS
 from hapticdb.sweeps.cut import Cut, cut
 
 Floats = NDArray[np.float64]
 
 TINY = 1e-9
 """Metres: surfaces that are farther apart do not meet."""
-SHIFT = 0.05
-"""Contact tolerances by which surfaces are shifted before they are cut: the error of a cut."""
-WAYS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
-WAYS /= np.linalg.norm(WAYS, axis=1)[:, None]
-"""Directions of the shifts that may free surfaces, beside those of their normals."""
 STRIDES = (1.05, 1.5, 2.5)
 """Depths that a shift is tried for that frees what overlaps. More: closer bounds, slower."""
 

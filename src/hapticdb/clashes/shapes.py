@@ -7,8 +7,8 @@ from itertools import product
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import NoSurfaceError, UsageError
-from hapticdb.ingest.geometry import unpacked_part
+from hapticdb.errors import UsageError
+from hapticdb.ingest.geometry import no_surface, unpacked_part
 from hapticdb.kernels.triangles.parting import components
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.moving import tree_of
@@ -110,10 +110,7 @@ class Shapes:
         if packed is None:
             if all(now.digest != obj.digest for now in self._store.objects() if now.id == obj.id):
                 return None
-            raise NoSurfaceError(
-                f"object {obj.id} ({obj.name}) has no surface in {self._store.url}: run "
-                f"'hapticdb upgrade {self._store.url}', which reads it from {obj.link}"
-            )
+            raise no_surface(self._store.url, obj)
         part = unpacked_part(self._store.url, obj, packed)
         corners = part.vertices @ linear.T
         if part.faces is None:

@@ -60,9 +60,6 @@ ToolUnitOption = Annotated[
     UnitName | None,
     typer.Option(help="Unit of a tool whose file names no unit; metres unless given."),
 ]
-PosesOption = Annotated[
-    str, typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header.")
-]
 PathUnitOption = Annotated[
     UnitName | None,
     typer.Option(help="Unit of the positions of the poses.", show_default="m"),

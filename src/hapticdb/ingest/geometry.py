@@ -25,11 +25,16 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
     """
     for obj, part in found_parts(store, objects):
         if part is None:
-            raise NoSurfaceError(
-                f"object {obj.id} ({obj.name}) has no surface in {store.url}: run "
-                f"'hapticdb upgrade {store.url}', which reads it from {obj.link}"
-            )
+            raise no_surface(store.url, obj)
         yield obj, part
+
+
+def no_surface(url: str, obj: Object) -> NoSurfaceError:
+    """Error of an object whose surface is not in the database."""
+    return NoSurfaceError(
+        f"object {obj.id} ({obj.name}) has no surface in {url}: run 'hapticdb upgrade {url}', "
+        f"which reads it from {obj.link}"
+    )
 
 
 def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part | None]]:

@@ -28,6 +28,9 @@ DEEP = 0.06
 differ by half as much where places and corners are few. Larger: more of it is allowed."""
 BLOCK = 64
 """Looks that are measured together."""
+WAYS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
+WAYS /= np.linalg.norm(WAYS, axis=1)[:, None]
+"""Directions (26, 3) of the shifts that may free surfaces."""
 PATIENCE = 16
 """Looks without shifts, after none of them freed the surfaces."""
 
@@ -85,8 +88,7 @@ class _Depths:
     def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
         self._pair, self._object, self._tool = pair, object_mesh, tool_mesh
         self._contact, self._ease = contact, EASE * contact
-        ways = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
-        self._shifts = self._ease * ways / np.linalg.norm(ways, axis=1)[:, None]
+        self._shifts = self._ease * WAYS
         self._known = 0
         self._resting = 0
 

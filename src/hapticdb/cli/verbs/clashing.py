@@ -7,6 +7,7 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.csv_files import STDOUT, open_csv, text_cell
 from hapticdb.cli.options import CsvOption, JsonOption, UrlArgument
+from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.units import length_text
 
@@ -15,8 +16,6 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.store.pairs import Kind
 
-MM = 1e-3
-"""Metres of a millimetre: lengths among the options are in millimetres."""
 MOST_ROWS = 20
 """Rows of the table; further pairs are counted below it."""
 NOT_DECIDED = 3

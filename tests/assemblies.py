@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
+import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
@@ -167,3 +168,18 @@ def left_behind(folder: Path) -> list[str]:
     """Names in a folder that are not input files."""
     inputs = {".obj", ".ply", ".glb", ".gltf", ".stl", ".las"}
     return sorted(p.name for p in folder.iterdir() if p.suffix not in inputs)
+
+
+def row_of_boxes(path: Path, n_boxes: int, step: float = 0.1) -> Path:
+    """An environment of cubes of 0.1 m in a row along x, `step` apart."""
+    scene = trimesh.Scene()
+    for n in range(n_boxes):
+        cube = trimesh.creation.box((0.1, 0.1, 0.1))
+        placed = trimesh.transformations.translation_matrix((step * n, 0.0, 0.0))
+        scene.add_geometry(cube, node_name=f"cube{n}", geom_name=f"cube{n}", transform=placed)
+    file = path.with_suffix(".glb")
+    file.write_bytes(scene.export(file_type="glb"))
+    grid = hapticdb.Grid(0.02, (-2.0, -2.0, -2.0), 8)
+    with hapticdb.create(path, grid, distances=False) as env:
+        env.add(file)
+    return path

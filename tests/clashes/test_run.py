@@ -19,6 +19,7 @@ import trimesh
 from psycopg import conninfo, sql
 
 import hapticdb
+from assemblies import row_of_boxes
 from children import finished
 from hapticdb import Environment, accept_clash, find_clashes
 from hapticdb.clashes.result import Clashes
@@ -30,21 +31,6 @@ from servers import Place
 
 MM = 1e-3
 Found = list[tuple[object, ...]]
-
-
-def row_of_boxes(path: Path, n_boxes: int, step: float = 0.1) -> Path:
-    """An environment of cubes of 0.1 m in a row along x, `step` apart."""
-    scene = trimesh.Scene()
-    for n in range(n_boxes):
-        cube = trimesh.creation.box((0.1, 0.1, 0.1))
-        placed = trimesh.transformations.translation_matrix((step * n, 0.0, 0.0))
-        scene.add_geometry(cube, node_name=f"cube{n}", geom_name=f"cube{n}", transform=placed)
-    file = path.with_suffix(".glb")
-    file.write_bytes(scene.export(file_type="glb"))
-    grid = hapticdb.Grid(0.02, (-2.0, -2.0, -2.0), 8)
-    with hapticdb.create(path, grid, distances=False) as env:
-        env.add(file)
-    return path
 
 
 @pytest.fixture

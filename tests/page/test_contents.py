@@ -14,7 +14,7 @@ import hapticdb
 from assemblies import small_options
 from children import until
 from hapticdb.mesh import read_file
-from hapticdb.page.colours import MARKED, Colour
+from hapticdb.page.colours import FADED, MARKED, Colour, Rgba
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member, Sight
@@ -108,17 +108,22 @@ def test_equal_parts_are_one_node_and_a_mirrored_one_is_drawn_too(shown: Shown) 
 
 
 @settings(max_examples=15, deadline=None)
-@given(st.sets(st.integers(1, 34)), st.sets(st.integers(1, 34)), st.integers(0, 2))
-def test_one_browser_hides_and_marks_for_itself(
-    path: Path, hidden: set[int], marked: set[int], rounds: int
+@given(
+    st.sets(st.integers(1, 34)),
+    st.sets(st.integers(1, 34)),
+    st.sampled_from([MARKED, FADED]),
+    st.integers(0, 2),
+)
+def test_one_browser_hides_marks_and_fades_for_itself(
+    path: Path, hidden: set[int], marked: set[int], shade: Colour | Rgba, rounds: int
 ) -> None:
     shown, own = _SHOWN.setdefault(path, Shown(path)), RecordedScene()
     state: dict[str, set[int]] = {"hidden": set(), "marked": set()}
 
-    def sight(member: Member) -> tuple[int, int, int] | None:
+    def sight(member: Member) -> Colour | Rgba | None:
         if member.id in state["hidden"]:
             return None
-        return MARKED if member.id in state["marked"] else member.colour
+        return shade if member.id in state["marked"] else member.colour
 
     shown.contents.watch("one", Audience(cast("Any", own)), sight)
     everything = set(shown.triangles)
@@ -127,6 +132,9 @@ def test_one_browser_hides_and_marks_for_itself(
         shown.contents.see("one", everything)
         seen = drawn(shown.scene, own)
         assert are_same(seen, shown.of(everything - hidden))
+        faded = RecordedScene()
+        faded.nodes = {name: n for name, n in own.nodes.items() if vars(n).get("opacity")}
+        assert are_same(drawn(faded), shown.of(marked - hidden if shade is FADED else set()))
         state["hidden"], state["marked"] = set(), set()
         shown.contents.see("one", everything)
         assert own.nodes == {}  # it sees the shared nodes again

@@ -3,6 +3,7 @@
 import contextlib
 import os
 from collections.abc import Iterator
+from pathlib import Path
 from urllib.parse import quote, urlencode
 
 import psycopg
@@ -10,8 +11,9 @@ import pytest
 from psycopg import conninfo, sql
 
 import hapticdb
+from assemblies import row_of_boxes
 from children import until
-from hapticdb import Grid
+from hapticdb import Grid, find_clashes
 from hapticdb.server.access import Role
 from hapticdb.server.running import Serving
 from hapticdb.store.connect import grant
@@ -22,7 +24,7 @@ from servers import Place
 from serving import TOKENS, running
 
 PASSWORD = "of-a-test"  # noqa: S105 - of roles that live as long as a test
-GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
+GRID = Grid(0.01, (-0.1, -0.1, -0.1), 6)
 
 
 @pytest.fixture
@@ -106,3 +108,43 @@ def test_only_an_editors_browser_reaches_the_address_that_may_write(
             until(lambda: (person.look(), stored(admin, url) != before)[1])
     with contextlib.closing(hapticdb.open(url, read_only=True)) as env:
         assert [obj.name for obj in env.objects()] == ["door"]
+
+
+def said(person: PagePerson, words: str) -> None:
+    """Wait until the page shows these words."""
+    until(lambda: (person.look(0.05), any(words in text for text in person.received))[1])
+
+
+def test_a_viewers_search_for_clashes_keeps_nothing_and_an_editor_accepts(
+    urls: dict[Role, str], tmp_path: Path
+) -> None:
+    file = row_of_boxes(tmp_path / "row.db", 2, 0.099).with_suffix(".glb")
+    with hapticdb.open(urls[Role.EDITOR]) as env:
+        for obj in env.objects():
+            env.remove(obj.id)
+        env.add(file)
+        (pair,) = find_clashes(env).pairs
+        env.store.put_pairs([], [pair[:2]])
+        with running(Serving(urls, tokens=TOKENS)) as server:
+            with server.browser(Role.VIEWER) as browser:
+                person = PagePerson(browser)
+                person.press("Look for clashes")
+                said(person, "1 overlapping. They are not kept")
+                person.choose("Pair", "Accept")
+                until(person.look)
+                assert "this takes the role editor" in person.told[-1]
+                assert env.store.pairs() == []
+            with server.browser(Role.EDITOR) as browser:
+                person = PagePerson(browser)
+                person.press("Look for clashes")
+                said(person, "1 overlapping.")
+                listed = person.widgets[person.find("Pairs")]["options"]
+                person.choose("Pairs", listed[1])
+                person.choose("Because", "welded")
+                person.choose("Pair", "Accept")
+                said(person, "the pair is accepted")
+                (row,) = env.store.pairs()
+                assert (row.kind, row.because) == ("overlapping", "welded")
+                person.choose("Pair", "Take back")
+                said(person, "no longer accepted")
+                assert env.store.pairs()[0].because is None

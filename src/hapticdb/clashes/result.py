@@ -5,6 +5,7 @@ from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple
 
 from hapticdb.store.pairs import KINDS, Kind, Status
+from hapticdb.units import length_text
 
 Shown = Literal[Status, "accepted", "not looked at"]
 GRAVITY: tuple[Kind, ...] = ("overlapping", "inside", "not known", "touching", "apart")
@@ -38,6 +39,22 @@ class Clash(NamedTuple):
         """Whether the pair is there, and nobody has accepted it."""
         return self.status not in {"gone", "accepted"}
 
+    @property
+    def is_left(self) -> bool:
+        """Whether the pair was not looked at."""
+        return self.status == "not looked at"
+
+    def length_text(self) -> str:
+        """Write the gap or the depth: exact, or with the bound that is known."""
+        if self.is_left:
+            return "-"
+        at_least = length_text(self.at_least)
+        if self.kind != "overlapping":
+            return at_least
+        if self.at_most is None:
+            return f"{at_least} or more"
+        return f"{at_least} to {length_text(self.at_most)}"
+
     def record(self) -> dict[str, Any]:
         """Everything by name, as `hapticdb clashes --json` prints it."""
         return self._asdict()
@@ -66,9 +83,7 @@ class Clashes:
     def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
         """Pairs of some kinds, and what was not looked at; without accepted and gone ones."""
         return tuple(
-            one
-            for one in self.pairs
-            if one.is_open and (one.kind in kinds or one.status == "not looked at")
+            one for one in self.pairs if one.is_open and (one.kind in kinds or one.is_left)
         )
 
     def counts(self) -> dict[str, int]:

@@ -41,6 +41,11 @@ HEIGHTS: tuple[Colour, ...] = (
 """Colours of a cloud without its own, from low to high."""
 MARKED: Colour = (255, 170, 0)
 """Colour of what is highlighted."""
+FADED: Rgba = (128, 138, 150, 20)
+"""Colour and opacity of everything beside a pair that is shown. More opaque: its place in the whole
+is seen better, and the pair worse."""
+PAIR: tuple[Colour, Colour] = ((235, 104, 20), (36, 99, 160))
+"""Colours of the two parts of a pair: orange and blue."""
 
 
 def _hue(number: int, lightness: float, saturation: float) -> Colour:

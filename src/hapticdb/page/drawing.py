@@ -54,6 +54,19 @@ def add_tool(
     )
 
 
+def add_marks(
+    scene: "SceneApi", name: str, places: Floats, words: str, size: float
+) -> "list[SceneNodeHandle]":
+    """Mark places (N, 3), metres, with words beside the first; returns the nodes."""
+    return [
+        scene.add_point_cloud(
+            name, places, (255, 214, 0), point_size=size, point_shape="circle",
+            precision="float32",
+        ),
+        scene.add_label(f"{name}_words", words, position=tuple(places[0]), anchor="bottom-left"),
+    ]  # fmt: skip
+
+
 def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
     """Put a node at a pose (7,): metres, unit quaternion, scalar first."""
     node.position = pose[:3]

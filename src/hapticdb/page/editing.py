@@ -6,6 +6,7 @@ from typing import Any, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.clashes.run import accept_clash
 from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
 from hapticdb.errors import AccessError, ConflictError, HapticDBError, UsageError
@@ -46,6 +47,11 @@ class PersonsEdits:
     def undo(self) -> str:
         """Undo the person's last step; ConflictError if somebody has written its object since."""
         return self._editor.undo()
+
+    def accept(self, a: int, b: int, because: str | None) -> str:
+        """Accept a pair of objects that are near, or no longer without a reason."""
+        accept_clash(self._env, [a], [b], because)
+        return "the pair is no longer accepted" if because is None else "the pair is accepted"
 
     def _check(self, obj: Object) -> None:
         """Base the next step on an object as the person saw it, if nobody has written it since.

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from hapticdb.page import checks
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
+from hapticdb.page.panels.clashes import ClashPanel
 from hapticdb.page.panels.parts import PartsPanel
 from hapticdb.page.panels.record import RecordPanel
 from hapticdb.page.panels.sweeps import SweepPanel
@@ -20,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class TabbedBrowser(Browser):
-    """A browser with the tabs Touch, Parts, Sweep and Record; parameters as for `Browser`."""
+    """A browser with all tabs; parameters as for `Browser`."""
 
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
         super().__init__(site, client, visitor, number)
@@ -33,6 +34,8 @@ class TabbedBrowser(Browser):
             self.parts = PartsPanel(self, gui)
         with tabs.add_tab("Sweep"):
             self.sweeps = SweepPanel(self, gui)
+        with tabs.add_tab("Clashes"):
+            self.clashes = ClashPanel(self, gui)
         with tabs.add_tab("Record"):
             self.record = RecordPanel(self, gui)
         client.scene.on_click()(self.guarded("viewer", self._clicked))
@@ -76,6 +79,7 @@ class TabbedBrowser(Browser):
         """Objects were added, moved or removed by someone; called in the database's thread."""
         super().objects_changed()
         self.parts.show_objects()
+        self.clashes.objects_changed()
         self.parts.moving.renew()
 
     def close(self) -> None:

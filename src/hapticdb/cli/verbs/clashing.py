@@ -124,7 +124,7 @@ def clashes(
                 env, within=MM * within, contact=MM * contact, of=of or (), against=against or (),
                 seconds=seconds, budget=int(budget * 2**20), progress=progress,
             )  # fmt: skip
-        told = [one for one in found.pairs if not kinds or one.kind in kinds or _is_left(one)]
+        told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
         if table:
             table.write(map(_row, told))
     if json:
@@ -134,7 +134,7 @@ def clashes(
         _show(found, told)
     if not found.is_kept:
         render.note(f"{url} can only be read by this user: what was found is not kept")
-    is_found = any(not _is_left(one) for one in (found.of(kinds) if kinds else found.of()))
+    is_found = any(not one.is_left for one in (found.of(kinds) if kinds else found.of()))
     raise typer.Exit(1 if is_found else NOT_DECIDED if found.left else 0)
 
 
@@ -172,10 +172,6 @@ def _accept(url: str, pair: tuple[str, str], because: str | None, *, json: bool)
     render.say(f"{render.counted(len(rows), 'pair')} {what}")
 
 
-def _is_left(one: "Clash") -> bool:
-    return one.status == "not looked at"
-
-
 def _row(one: "Clash") -> list[object]:
     place = ("",) * 6 if one.place is None else one.place
     at_most = "" if one.at_most is None else one.at_most
@@ -189,7 +185,7 @@ def _show(found: "Clashes", told: "list[Clash]") -> None:
     """Print the gravest pairs, and how many there are of each kind and status."""
     rows = [
         (str(one.a), one.a_name or "(gone)", str(one.b), one.b_name or "(gone)", one.kind,
-         _length_text(one), one.because or one.status)
+         one.length_text(), one.because or one.status)
         for one in told[:MOST_ROWS]
     ]  # fmt: skip
     if rows:
@@ -206,17 +202,3 @@ def _show(found: "Clashes", told: "list[Clash]") -> None:
         facts.append(("not looked at", f"{found.left:,} pairs: call again to go on"))
     facts.append(("took", f"{found.elapsed:.2f} s"))
     render.facts(facts)
-
-
-def _length_text(one: "Clash") -> str:
-    """Write the gap or the depth: exact, or with the bound that is known."""
-    if _is_left(one):
-        return "-"
-    at_least = length_text(one.at_least)
-    if one.kind != "overlapping":
-        return at_least
-    return (
-        f"{at_least} or more"
-        if one.at_most is None
-        else f"{at_least} to {length_text(one.at_most)}"
-    )

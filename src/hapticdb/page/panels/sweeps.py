@@ -1,19 +1,17 @@
 """The tab Sweep: whether a tool, or a part, is free along a way, and what it hits or nears."""
 
-import logging
 import math
-from collections.abc import Callable
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.environment import open as open_environment
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
-from hapticdb.page.drawing import add_tool, put_at
-from hapticdb.page.widgets import put
+from hapticdb.page.drawing import add_marks, add_tool, put_at
+from hapticdb.page.panels.working import Progress, Work
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
@@ -24,7 +22,6 @@ from hapticdb.sweeps.verdict import gap_text, percent, verdict_line
 if TYPE_CHECKING:
     from viser import GuiApi
 
-LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
 MOST_NAMED = 8
@@ -60,7 +57,6 @@ class SweepPanel:
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._drawn: list[Any] = []
-        self._is_running = False
         guard = browser.guarded
         gui.add_html(
             note_html("Moves a part or the tool along a way, and says what is in its way.")
@@ -76,14 +72,11 @@ class SweepPanel:
         )
         self._run = gui.add_button("Run the sweep")
         self._run.on_click(guard("viewer", self._begin))
-        self._bar = gui.add_progress_bar(0.0, visible=False)
-        self._said = gui.add_html("")
+        self._work = Work(browser, gui, "a sweep")
         self._clear = gui.add_button("Clear", color="gray", visible=False)
-        self._clear.on_click(guard("viewer", lambda _: self._erase()))
+        self._clear.on_click(guard("viewer", self._clean))
 
     def _begin(self, _: object) -> None:
-        if self._is_running:
-            raise UsageError("a sweep is running: wait for it")
         browser = self._browser
         is_part = checks.choice_of(self._what.value, self._what.options, "what").endswith("part")
         way = checks.choice_of(self._way.value, WAYS, "a way")
@@ -92,31 +85,11 @@ class SweepPanel:
         if is_part:
             part = browser.taken if browser.taken is not None else browser.only_chosen().id
         job = _SweepJob(browser, part, way, length)
-        self._is_running = True
-        self._erase()
-        put(self._bar, 0.0)
-        self._bar.visible = True
-        self._said.content = note_html("Waits for its turn, then moves it along.")
-        browser.site.sweeping.submit(self._work, job)
-
-    def _work(self, job: "_SweepJob") -> None:
-        """Sweep; in the site's thread for sweeps."""
-        try:
-            self._show(job.run(self._progress), job.name)
-        except HapticDBError as error:
-            self._said.content = note_html(self._browser.site.error_text(error))
-        except Exception:
-            LOG.exception("a sweep of the page failed")
-            self._said.content = note_html("The sweep failed; the operator's log says why.")
-        finally:
-            self._is_running = False
-            self._bar.visible = False
-
-    def _progress(self, done: int, total: int) -> None:
-        put(self._bar, 100.0 * done / max(total, 1))
+        self._work.begin(job.run, lambda found: self._show(found, job.name))
 
     def _show(self, found: _SweepAnswer, name: str) -> None:
         swept = found.swept
+        self._erase()
         if found.place is not None:
             self._draw(found, found.place, name)
         line = verdict_line(swept, found.shell)
@@ -126,7 +99,7 @@ class SweepPanel:
             for place in swept.hits[:MOST_NAMED]
         )
         more = len(swept.hits) - MOST_NAMED
-        self._said.content = (
+        self._work.said.content = (
             '<div style="margin:2px 12px;font-size:0.85em">'
             f'<b style="color:{VERDICTS.get(swept.verdict, FREE)}">'
             f"{escaped(name)}: {escaped(swept.verdict)}</b>"
@@ -147,22 +120,20 @@ class SweepPanel:
         words = "hit" if swept.hits else f"nearest, {gap_text(swept)},"
         self._drawn = [
             node,
-            scene.add_point_cloud(
-                "/swept_places", np.stack([place.on_tool, place.on_object]), (255, 214, 0),
-                point_size=0.007 * self._browser.site.facts.diagonal, point_shape="circle",
-                precision="float32",
-            ),
-            scene.add_label(
-                "/swept_label", f"{words} at {percent(place.fraction)}",
-                position=tuple(place.on_object), anchor="bottom-left",
+            *add_marks(
+                scene, "/swept_places", np.stack([place.on_object, place.on_tool]),
+                f"{words} at {percent(place.fraction)}", 0.007 * self._browser.site.facts.diagonal,
             ),
         ]  # fmt: skip
+
+    def _clean(self, _: object) -> None:
+        self._erase()
+        self._work.said.content = ""
 
     def _erase(self) -> None:
         for node in self._drawn:
             node.remove()
         self._drawn = []
-        self._said.content = ""
         self._clear.visible = False
 
 
@@ -184,7 +155,7 @@ class _SweepJob:
         obj = None if part is None else browser.site.objects[part]
         self.name = self._tool.name if obj is None else short_name(obj.name)
 
-    def run(self, progress: Callable[[int, int], None]) -> _SweepAnswer:
+    def run(self, progress: Progress) -> _SweepAnswer:
         """Sweep on a connection of its own."""
         with open_environment(self._site.url, read_only=True) as env:
             shell = self._tool.shell if self._part is None else env.shell(self._part, inset=0.0)

@@ -1,22 +1,27 @@
 """What one browser sees: hidden, isolated, highlighted and coloured objects, clicks, distances."""
 
-from collections.abc import Iterable
+import time
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import ArrayLike
+from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.page.colours import MARKED, Colour
+from hapticdb.page.colours import FADED, MARKED, Colour, Rgba
 from hapticdb.page.scene.contents import Contents
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.nodes import Member
 from hapticdb.page.scene.picking import Struck
+from hapticdb.page.scene.surroundings import FIELD_OF_VIEW
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from viser import ClientHandle
 
+Floats = NDArray[np.float64]
+FLIGHT_S, FLIGHT_STEPS = 0.6, 18
+"""Seconds in which the eye comes to a place, and the steps of its way."""
 INK: Colour = (24, 32, 44)
 """Colour of lines and labels of distances."""
 
@@ -29,14 +34,19 @@ class _Look:
     isolated: frozenset[int] | None = None
     marked: set[int] = field(default_factory=set)
     colours: dict[int, Colour] = field(default_factory=dict)
+    spotlit: dict[int, Colour] = field(default_factory=dict)
 
     def sees(self, object_id: int) -> bool:
         isolated = self.isolated
         return object_id not in self.hidden and (isolated is None or object_id in isolated)
 
-    def colour(self, member: Member) -> Colour | None:
+    def colour(self, member: Member) -> Colour | Rgba | None:
+        if member.id in self.spotlit:
+            return self.spotlit[member.id]
         if not self.sees(member.id):
             return None
+        if self.spotlit:
+            return FADED
         if member.id in self.marked:
             return MARKED
         return self.colours.get(member.id, member.colour)
@@ -103,6 +113,29 @@ class BrowserScene:
             wanted = set(ids)
             self._look.colours.update(dict.fromkeys(wanted, colour))
             self._draw(wanted)
+
+    def spotlight(self, colours: Mapping[int, Colour]) -> None:
+        """See these objects, hidden ones too, in these colours, and through all others.
+
+        None: all as they were.
+        """
+        with self._contents.lock:
+            before, self._look.spotlit = self._look.spotlit, dict(colours)
+            is_whole = bool(before) != bool(colours)
+            self._draw(list(self._contents.records) if is_whole else before | self._look.spotlit)
+
+    def fly_to(self, middle: Floats, radius: float) -> None:
+        """Bring the eye, in short steps, to where a ball (3,), metres, fills its view."""
+        camera = self._client.camera
+        start = np.stack([camera.position, camera.look_at])
+        way = start[0] - start[1]
+        way *= radius / np.sin(FIELD_OF_VIEW / 2) / max(float(np.linalg.norm(way)), 1e-12)
+        for step in range(1, FLIGHT_STEPS + 1):
+            share = (step / FLIGHT_STEPS) ** 2 * (3.0 - 2.0 * step / FLIGHT_STEPS)
+            eye, target = start + share * (np.stack([middle + way, middle]) - start)
+            with self._client.atomic():
+                camera.position, camera.look_at = eye, target
+            time.sleep(FLIGHT_S / FLIGHT_STEPS)
 
     def _draw(self, ids: Iterable[int]) -> None:
         with self._client.atomic():

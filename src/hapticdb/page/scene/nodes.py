@@ -1,7 +1,7 @@
 """Objects gathered into few nodes: batches of one shape, and merged shapes of one colour."""
 
 from collections.abc import Callable, Hashable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import partial
 from typing import Protocol
 
@@ -41,8 +41,9 @@ class Member:
     shape: PartShape | None = None
 
 
-Sight = Callable[[Member], Colour | None]
-"""Colour in which an audience sees an object; None if it does not."""
+Sight = Callable[[Member], Colour | Rgba | None]
+"""Colour in which an audience sees an object, with an opacity if it sees through it; None if it
+does not see it."""
 
 
 class Node(Protocol):
@@ -93,9 +94,9 @@ class BatchNode:
         return self._is_boxes or len(self._slots) <= 256
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
-        """A node for each colour of the shape; hidden objects have size 0."""
+        """A node for each colour of the shape, and for each opacity; hidden objects have size 0."""
         colours = [sight(one) if one.id in self.members else None for one in self._slots]
-        is_seen = np.array([colour is not None for colour in colours], dtype=np.float64)
+        opacities = np.array([(*colour, _OPAQUE)[3] if colour else -1 for colour in colours])
         for slot, member in enumerate(self._slots):
             if member.id not in self.members:
                 continue
@@ -104,19 +105,22 @@ class BatchNode:
                 self._edges[slot] = np.maximum(member.box[1] - member.box[0], 1e-9)
             else:
                 self._poses[slot] = member.pose
-        if not is_seen.any():
-            return {}
         wxyzs, positions = quaternion_of(self._poses[:, :3, :3]), self._poses[:, :3, 3].copy()
-        sizes = is_seen[:, None] * self._edges if self._is_boxes else is_seen
         found = {}
-        for n, (painted, geometry) in enumerate(self._geometries):
-            shades = [
-                painted[:3] if painted and colour == member.colour else colour or (0, 0, 0)
-                for colour, member in zip(colours, self._slots, strict=True)
-            ]
-            found[f"{self.name}-{n}" if n else self.name] = Drawing(
-                geometry, wxyzs, positions, sizes, np.array(shades, dtype=np.uint8)
-            )
+        for opacity in set(opacities.tolist()) - {-1}:
+            is_seen = (opacities == opacity).astype(np.float64)
+            sizes = is_seen[:, None] * self._edges if self._is_boxes else is_seen
+            for n, (painted, geometry) in enumerate(self._geometries):
+                shades = [
+                    ((painted if colour == member.colour else None) or colour or (0, 0, 0))[:3]
+                    for colour, member in zip(colours, self._slots, strict=True)
+                ]
+                name, drawn = f"{self.name}-{n}" if n else self.name, geometry
+                if opacity != _OPAQUE:
+                    name, drawn = f"{name}-o{opacity}", replace(geometry, opacity=opacity / _OPAQUE)
+                found[name] = Drawing(
+                    drawn, wxyzs, positions, sizes, np.array(shades, dtype=np.uint8)
+                )
         return found
 
 
@@ -140,7 +144,7 @@ class _CloudNode:
         if colour is None:
             return {}
         wxyz, at = quaternion_of(member.pose[None, :3, :3])[0], member.pose[:3, 3].copy()
-        own = None if colour == member.colour else colour
+        own = None if colour == member.colour else colour[:3]
         return {self.name: Sprinkle(self._serial, self._dots, wxyz, at, own)}
 
 
@@ -185,8 +189,10 @@ class _MergedNode:
             if colour is None or member.shape is None:
                 continue
             for n, piece in enumerate(member.shape.pieces):
-                shade = (*colour, _OPAQUE if piece.colour is None else piece.colour[3])
-                if piece.colour is not None and colour == member.colour:
+                shade = (*colour[:3], _OPAQUE if piece.colour is None else piece.colour[3])
+                if len(colour) == 4:
+                    shade = colour
+                elif piece.colour is not None and colour == member.colour:
                     shade = piece.colour
                 own = shade == (*member.colour, _OPAQUE)
                 name = self.name if own else f"{self.name}-{bytes(shade).hex()}"

@@ -1,0 +1,60 @@
+"""Work of a panel that takes long: in the site's thread for it, with a bar."""
+
+import logging
+from collections.abc import Callable
+from typing import TYPE_CHECKING, TypeVar
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.page.browser import Browser
+from hapticdb.page.widgets import put
+from hapticdb.page.wording import note_html
+
+if TYPE_CHECKING:
+    from viser import GuiApi
+
+LOG = logging.getLogger("hapticdb.page")
+Progress = Callable[[int, int], None]
+"""Called with what is done and what there is to do; HapticDBError once the browser has gone."""
+
+Answer = TypeVar("Answer")
+
+
+class Work:
+    """One job of a browser's panel at a time: how far it is, and what came of it.
+
+    gui : where the bar and the words are made, inside the present container; what : names the job.
+    """
+
+    def __init__(self, browser: Browser, gui: "GuiApi", what: str) -> None:
+        self._browser, self._what = browser, what
+        self._is_running = False
+        self._bar = gui.add_progress_bar(0.0, visible=False)
+        self.said = gui.add_html("")
+
+    def begin(self, job: Callable[[Progress], Answer], show: Callable[[Answer], None]) -> None:
+        """Do a job later, then show its answer, both in the site's thread for long work."""
+        if self._is_running:
+            raise UsageError(f"{self._what} is running: wait for it")
+        self._is_running = True
+        put(self._bar, 0.0)
+        self._bar.visible = True
+        self.said.content = note_html("Waits for its turn.")
+
+        def work() -> None:
+            try:
+                show(job(self._progress))
+            except HapticDBError as error:
+                self.said.content = note_html(self._browser.site.error_text(error))
+            except Exception:
+                LOG.exception("%s of the page failed", self._what)
+                self.said.content = note_html("It failed; the operator's log says why.")
+            finally:
+                self._is_running = False
+                self._bar.visible = False
+
+        self._browser.site.sweeping.submit(work)
+
+    def _progress(self, done: int, total: int) -> None:
+        if self._browser.has_gone:
+            raise HapticDBError("the browser has gone")
+        put(self._bar, 100.0 * done / max(total, 1))

@@ -1,7 +1,7 @@
 """Assemblies for tests of the import: shapes, files, and what a database then holds."""
 
 import sqlite3
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Any, cast
@@ -170,13 +170,14 @@ def left_behind(folder: Path) -> list[str]:
     return sorted(p.name for p in folder.iterdir() if p.suffix not in inputs)
 
 
-def row_of_boxes(path: Path, n_boxes: int, step: float = 0.1) -> Path:
+def row_of_boxes(path: Path, n_boxes: int, step: float = 0.1, names: Sequence[str] = ()) -> Path:
     """An environment of cubes of 0.1 m in a row along x, `step` apart."""
     scene = trimesh.Scene()
     for n in range(n_boxes):
         cube = trimesh.creation.box((0.1, 0.1, 0.1))
         placed = trimesh.transformations.translation_matrix((step * n, 0.0, 0.0))
-        scene.add_geometry(cube, node_name=f"cube{n}", geom_name=f"cube{n}", transform=placed)
+        name = names[n] if names else f"cube{n}"
+        scene.add_geometry(cube, node_name=name, geom_name=f"cube{n}", transform=placed)
     file = path.with_suffix(".glb")
     file.write_bytes(scene.export(file_type="glb"))
     grid = hapticdb.Grid(0.02, (-2.0, -2.0, -2.0), 8)

@@ -2,13 +2,19 @@
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
+import base64
 import csv
+import html
 import json
+import re
 from pathlib import Path
 
+import imageio.v3 as iio
+import numpy as np
 import pytest
 
 import hapticdb
+from assemblies import row_of_boxes
 from command_line import Run, boxes, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.cli.verbs.clashing import COLUMNS
 
@@ -54,6 +60,24 @@ def test_rows_are_written_as_csv(run: Run, meeting: Path, tmp_path: Path) -> Non
     (row,) = csv.DictReader((tmp_path / "pairs.csv").open())
     assert tuple(row) == COLUMNS
     assert (row["a_name"], row["kind"], row["at_least_m"]) == ("box1", "touching", "0.0")
+
+
+def test_a_page_needs_no_other_file_and_shows_names_as_they_are(run: Run, tmp_path: Path) -> None:
+    name = "<script>alert('&')</script>"
+    path = row_of_boxes(tmp_path / "row.db", 3, 0.099, names=("a/one", f"a/b/{name}", "a/b/two"))
+    assert run("clashes", path, "--html", tmp_path / "meet.html")[0] == 1
+    page = (tmp_path / "meet.html").read_text()
+    assert "<script" not in page
+    assert html.escape(name) in page
+    assert re.findall(r"(?:src|href)=.([a-z:]*)", page) == ["data:image", "data:image"]
+    matrix = page[page.index("class=matrix") :]
+    assert re.findall(r"<td[^>]*>(\d*/?\d*)", matrix)[:4] == ["1/1", "1/1", "1/1", ""]
+    pictures = [base64.b64decode(one) for one in re.findall(r'base64,([^"]*)', page)]
+    for picture in pictures:
+        image = iio.imread(picture, extension=".png")[..., :3].astype(np.float64)
+        orange, blue = (image[..., i] > 1.5 * image[..., j] for i, j in ((0, 2), (2, 0)))
+        assert min(orange.sum(), blue.sum()) > 5_000
+    refused(run("clashes", path, "--html", tmp_path / "meet.html"), "not there yet")
 
 
 def test_a_search_that_was_not_finished_gives_exit_code_3(run: Run, meeting: Path) -> None:

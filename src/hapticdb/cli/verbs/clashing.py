@@ -1,11 +1,13 @@
 """The verb clashes."""
 
+from contextlib import nullcontext
+from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.csv_files import STDOUT, open_csv, text_cell
+from hapticdb.cli.csv_files import STDOUT, new_file, open_csv, text_cell
 from hapticdb.cli.options import CsvOption, JsonOption, UrlArgument
 from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import ReadOnlyError, UsageError
@@ -66,6 +68,12 @@ AcceptOption = Annotated[
 BecauseOption = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Why --accept accepts; '' takes it back.")
 ]
+HtmlOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="FILE", help="Write a page with pictures, a matrix and the table to a new file."
+    ),
+]
 
 HELP = """Say which parts meet, how deep, and which are near: every pair of an assembly.
 
@@ -101,6 +109,7 @@ def clashes(
     accept: AcceptOption = None,
     because: BecauseOption = None,
     csv: CsvOption = None,
+    html: HtmlOption = None,
     json: JsonOption = False,
 ) -> None:
     """Find every pair of objects that are near; the help text is `HELP`."""
@@ -117,6 +126,7 @@ def clashes(
     kinds = _checked(kind)
     with (
         open_csv(csv, "--csv", COLUMNS) as table,
+        nullcontext() if html is None else new_file(Path(html), "--html") as page,
         _opened(url) as env,
         render.bar("measuring", "pairs", lambda *now: now) as progress,
     ):
@@ -127,6 +137,10 @@ def clashes(
         told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
         if table:
             table.write(map(_row, told))
+        if page is not None:
+            from hapticdb.pictures.clashes import clashes_page
+
+            page.write_text(clashes_page(env, found, told), encoding="utf-8")
     if json:
         for one in told:
             render.say_json(one.record())

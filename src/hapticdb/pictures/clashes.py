@@ -1,0 +1,237 @@
+"""The page of a search for clashes, in one file: counts, pictures, a matrix, and the table."""
+
+import base64
+import html
+import io
+from collections import Counter
+from collections.abc import Iterator, Sequence
+
+import numpy as np
+from matplotlib.image import imsave
+from numpy.typing import NDArray
+
+from hapticdb.clashes.result import GRAVITY, Clash, Clashes
+from hapticdb.clashes.run import BUDGET
+from hapticdb.clashes.shapes import Shapes
+from hapticdb.environment import Environment
+from hapticdb.pictures.demo import TOWARDS, shortened
+from hapticdb.pictures.splat import (
+    DEPTH_STEPS,
+    FAR,
+    NUMBER_BITS,
+    Camera,
+    Depths,
+    Image,
+    empty_depths,
+    shade,
+)
+from hapticdb.store.attributes import up_axis
+from hapticdb.store.base import Object
+from hapticdb.units import length_text
+
+Floats = NDArray[np.float64]
+
+PICTURES = 10
+"""Pairs that are drawn, the gravest ones."""
+MOST_ROWS = 5_000
+"""Rows of the table. More: a browser opens the page more slowly."""
+MOST_UNITS = 24
+"""Sub-assemblies in the matrix, those of most overlaps, then of most pairs; the rest is one row."""
+NAME = 40
+"""Letters of a name beside the matrix."""
+REST = "all others"
+SIZE = (400, 300)
+"""Pixels of a picture."""
+SAMPLES = 2
+"""Pixels drawn for each pixel shown, an axis."""
+TINTS = ((0.92, 0.41, 0.08), (0.14, 0.39, 0.63), (1.0, 0.93, 0.2))
+"""Colours of the first part, of the second one, and of the place."""
+PAPER = (0.94, 0.95, 0.96)
+STYLE = """
+body{font:14px/1.45 system-ui,sans-serif;color:#1c2530;margin:2em auto;max-width:80em;padding:0 1em}
+table{border-collapse:collapse}td,th{padding:.2em .6em;text-align:left;border-bottom:1px solid #dde}
+figure{display:inline-block;width:350px;margin:0 1em 1em 0;vertical-align:top}
+figcaption{overflow-wrap:anywhere}img{width:100%;border-radius:6px}
+.matrix th,.n{white-space:nowrap}.n{text-align:right}
+.matrix td{text-align:center;padding:.2em .4em}
+.o{color:#eb6814}.b{color:#2463a0}
+"""
+
+
+def clashes_page(env: Environment, found: Clashes, told: Sequence[Clash]) -> str:
+    """Write the page of pairs, the gravest first: HTML that needs no other file.
+
+    env : with the surfaces of its objects, as they were searched; told : of the found ones.
+    """
+    objects = env.objects()
+    counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n) or "no pair"
+    rest = len(told) - MOST_ROWS
+    facts = (
+        f"within {length_text(found.within)}, contact {length_text(found.contact)}, "
+        f"revision {found.revision}, {len(objects):,} objects"
+    )
+    parts = [
+        f"<h1>{html.escape(counts)}</h1><p>{html.escape(facts)}</p>",
+        f"<p>{found.left:,} pairs were not looked at.</p>" if found.left else "",
+        "<h2>The gravest</h2>",
+        *_figures(env, told, {obj.id: obj for obj in objects}),
+        "<h2>Sub-assemblies</h2><p>Pairs that overlap, of all that are near.</p>",
+        _matrix(told),
+        "<h2>Pairs</h2>",
+        _table(told[:MOST_ROWS]),
+        f"<p>and {rest:,} more: --csv writes all</p>" if rest > 0 else "",
+    ]
+    return (
+        '<!doctype html><html lang="en"><meta charset="utf-8"><title>Which parts meet</title>'
+        f"<style>{STYLE}</style>{''.join(parts)}</html>\n"
+    )
+
+
+def _text(words: str | None) -> str:
+    """Words as HTML shows them, without letters that cannot be printed."""
+    shown = "".join(letter if letter.isprintable() else "?" for letter in words or "(gone)")
+    return html.escape(shown)
+
+
+def _table(told: Sequence[Clash]) -> str:
+    rows = "".join(
+        f"<tr><td class=n>{one.a}<td>{_text(one.a_name)}<td class=n>{one.b}<td>{_text(one.b_name)}"
+        f"<td>{one.kind}<td class=n>{one.length_text()}<td>{one.status}<td>"
+        f"{_text(one.because or '')}"
+        for one in told
+    )
+    head = "<tr><th>id<th>object<th>id<th>and<th>are<th>by<th>status<th>because"
+    return f"<table>{head}{rows}</table>"
+
+
+# -- the matrix ------------------------------------------------------------------------------------
+
+
+def _matrix(told: Sequence[Clash]) -> str:
+    """Numbers of pairs between sub-assemblies: those that overlap, of all."""
+    there = [one for one in told if one.status != "gone" and one.a_name and one.b_name]
+    depth = _common([name.split("/") for one in there for name in (one.a_name, one.b_name) if name])
+    pairs = [(_unit(one.a_name, depth), _unit(one.b_name, depth)) for one in there]
+    weights: Counter[str] = Counter()
+    for one, pair in zip(there, pairs, strict=True):
+        for unit in pair:
+            weights[unit] += len(told) * (one.kind == "overlapping") + 1
+    units = sorted(unit for unit, _ in weights.most_common(MOST_UNITS))
+    near: Counter[tuple[str, str]] = Counter()
+    deep: Counter[tuple[str, str]] = Counter()
+    for one, pair in zip(there, pairs, strict=True):
+        a, b = sorted(unit if unit in units else REST for unit in pair)
+        for cell in {(a, b), (b, a)}:
+            near[cell] += 1
+            deep[cell] += one.kind == "overlapping"
+    units += [REST] if any(REST in cell for cell in near) else []
+    head = "".join(f"<th title='{_text(unit)}'>{n}" for n, unit in enumerate(units, 1))
+    rows = ""
+    for n, row in enumerate(units, 1):
+        cells = "".join(_cell(deep[row, column], near[row, column]) for column in units)
+        rows += f"<tr><th>{n} {_text(shortened(row, NAME))}{cells}"
+    return f"<table class=matrix><tr><th>{head}{rows}</table>"
+
+
+def _common(paths: Sequence[Sequence[str]]) -> int:
+    """Number of elements that all paths have in common, before their last ones."""
+    depth = 0
+    while paths and all(len(path) > depth + 1 and path[depth] == paths[0][depth] for path in paths):
+        depth += 1
+    return depth
+
+
+def _unit(name: str | None, depth: int) -> str:
+    return (name or "").split("/")[depth]
+
+
+def _cell(deep: int, near: int) -> str:
+    if not near:
+        return "<td>"
+    shade = f" style='background:rgb(235 104 20/{min(0.15 + deep / 10, 0.8):.2f})'" if deep else ""
+    return f"<td{shade}>{deep:,}/{near:,}"
+
+
+# -- pictures --------------------------------------------------------------------------------------
+
+
+def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]) -> Iterator[str]:
+    shapes = Shapes(env.store, BUDGET)
+    up, drawn = up_axis(objects.values()), 0
+    for one in sorted(told, key=lambda one: not one.is_open):
+        pair = [objects.get(i) for i in (one.a, one.b)]
+        a, b = pair
+        if one.kind not in GRAVITY[:4] or one.place is None or a is None or b is None:
+            continue
+        surfaces = [_placed(shapes, obj) for obj in (a, b)]
+        picture = io.BytesIO()
+        imsave(picture, _drawn(one, (a, b), surfaces, up), format="png")
+        data = base64.b64encode(picture.getvalue()).decode()
+        yield (
+            f'<figure><img alt="" src="data:image/png;base64,{data}"><figcaption>'
+            f"<b class=o>{_text(one.a_name)}</b>, <b class=b>{_text(one.b_name)}</b>: "
+            f"{one.kind} {one.length_text()}, {one.status}</figcaption></figure>"
+        )
+        drawn += 1
+        if drawn == PICTURES:
+            return
+
+
+def _placed(shapes: Shapes, obj: Object) -> Floats:
+    """Triangles (T, 3, 3) of an object, world frame."""
+    placed = shapes.placed(obj)
+    if placed is None:
+        return np.empty((0, 3, 3))
+    shape, pose = placed
+    return np.asarray(shape.tree.corners @ pose[:3, :3].T + pose[:3, 3])
+
+
+def _drawn(one: Clash, pair: tuple[Object, Object], surfaces: Sequence[Floats], up: int) -> Image:
+    """Draw both surfaces around the place where they meet; an image (height, width, 3), 0 to 1."""
+    places = np.array(one.place).reshape(2, 3)
+    middle = places.mean(axis=0)
+    edge = min(float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) for obj in pair)
+    radius = max(0.4 * edge, 2.0 * float(np.linalg.norm(places[1] - places[0])), 1e-6)
+    size = (SIZE[0] * SAMPLES, SIZE[1] * SAMPLES)
+    window = np.array([[0.0, 0.0], size])
+    box = np.stack([middle - radius, middle + radius])[None]
+    camera = Camera.looking_at(box, np.array(TOWARDS), size, window, up)
+    depths = empty_depths(camera)
+    for number, triangles in enumerate(surfaces):
+        _fill(depths, camera, _flat(camera, triangles), number)
+    image = shade(depths, camera, np.array(TINTS), np.array(PAPER), radius / size[1])
+    at = _flat(camera, places)[:, :2]
+    rows, columns = np.mgrid[: size[1], : size[0]] + 0.5
+    for x, y in at:
+        away = np.abs(np.hypot(columns - x, rows - y) - 9.0 * SAMPLES)
+        image[away < SAMPLES] = TINTS[2]
+    small = image.reshape(SIZE[1], SAMPLES, SIZE[0], SAMPLES, 3).mean(axis=(1, 3))
+    return np.asarray(np.clip(small, 0.0, 1.0))
+
+
+def _flat(camera: Camera, points: Floats) -> Floats:
+    """Pixels across and down, and metres ahead, of points (..., 3), seen from far away."""
+    seen = (points - camera.eye) @ camera.axes.T
+    scale = camera.focal / (0.5 * (camera.near + camera.far))
+    seen[..., :2] = seen[..., :2] * scale + camera.middle
+    return np.asarray(seen)
+
+
+def _fill(depths: Depths, camera: Camera, triangles: Floats, number: int) -> None:
+    """Put triangles (T, 3, 3), pixels and metres ahead, into a buffer of depths, in place."""
+    low = np.maximum(np.ceil(triangles[..., :2].min(axis=1) - 0.5), 0.0).astype(np.int64)
+    high = np.minimum(np.floor(triangles[..., :2].max(axis=1) + 0.5), camera.size).astype(np.int64)
+    edges = triangles[:, 1:] - triangles[:, :1]
+    areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
+    steps = DEPTH_STEPS / (camera.far - camera.near)
+    for n in np.flatnonzero((high > low).all(axis=1) & (np.abs(areas) > 1e-12)).tolist():
+        (x0, y0), (x1, y1), first = low[n], high[n], triangles[n, 0]
+        (ax, ay, az), (bx, by, bz) = edges[n]
+        x, y = np.arange(x0, x1) + 0.5 - first[0], (np.arange(y0, y1) + 0.5 - first[1])[:, None]
+        u, v = (x * by - y * bx) / areas[n], (y * ax - x * ay) / areas[n]
+        ahead = first[2] + u * az + v * bz
+        is_in = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
+        is_in &= (ahead > camera.near) & (ahead < camera.far)
+        entry = ((np.where(is_in, ahead, camera.near) - camera.near) * steps).astype(np.int64)
+        block = depths[y0:y1, x0:x1]
+        np.minimum(block, np.where(is_in, entry << NUMBER_BITS | number, FAR), out=block)

@@ -17,8 +17,9 @@ from hapticdb.clashes.shapes import BuiltShape
 from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
 from hapticdb.store.pairs import Kind
-from hapticdb.sweeps.contact import SHIFT, WAYS
+from hapticdb.sweeps.contact import SHIFT
 from hapticdb.sweeps.cut import Cut, cut
+from hapticdb.sweeps.easing import WAYS, normal
 
 Floats = NDArray[np.float64]
 
@@ -110,7 +111,7 @@ def _motions(
 def _normals(a: BuiltShape, b: BuiltShape, pose: Floats, near: Nearest) -> Floats:
     """Unit normals (2, 3) of the triangles that are nearest, frame of a."""
     first, second = near.pairs[0]
-    return np.stack([_normal(a, first), pose[:3, :3] @ _normal(b, second)])
+    return np.stack([normal(a.tree.corners[first]), pose[:3, :3] @ normal(b.tree.corners[second])])
 
 
 def _shifted(pose: Floats, shifts: Floats) -> Floats:
@@ -118,14 +119,6 @@ def _shifted(pose: Floats, shifts: Floats) -> Floats:
     poses = np.tile(pose, (len(shifts), 1, 1))
     poses[:, :3, 3] += shifts
     return poses
-
-
-def _normal(shape: BuiltShape, triangle: int) -> Floats:
-    """Unit normal (3,) of a triangle of the tree; zero where it has no area."""
-    first, second, third = shape.tree.corners[triangle]
-    normal = np.cross(second - first, third - first)
-    length = float(np.linalg.norm(normal))
-    return normal / length if length > 0.0 else np.zeros(3)
 
 
 def _cut(a: BuiltShape, b: BuiltShape, pose: Floats, most: float, contact: float) -> Cut:

@@ -2,7 +2,6 @@
 
 from collections import OrderedDict
 from functools import cached_property
-from itertools import product
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,16 +14,13 @@ from hapticdb.pointshell.moving import tree_of
 from hapticdb.pointshell.orientation import orient
 from hapticdb.store.base import Object, Store
 from hapticdb.sweeps.cut import Mesh
+from hapticdb.sweeps.easing import stretches
 
 Floats = NDArray[np.float64]
 
 RIGID = 1e-12
 """Greatest deviation of a rotation's columns from orthonormal ones. Other placements get a shape of
 their own."""
-LEAST_STRETCH = 0.01
-"""Least share to which a stretch shrinks a thin part."""
-THIN = 1e-9
-"""Metres: least half of a box's edge that is stretched."""
 BYTES_OF_CORNERS = 6
 """Bytes of a shape for each byte of its corners, with all that is built from them."""
 
@@ -63,7 +59,7 @@ class BuiltShape:
     def stretches(self, contact: float) -> Floats:
         """Maps (N, 4, 4) that move no place of it by more than `contact`, built once for each."""
         if contact not in self._stretches:
-            self._stretches[contact] = _stretches(*self.box, contact)
+            self._stretches[contact] = stretches(*self.box, contact)
         return self._stretches[contact]
 
     def holds(self, places: Floats) -> NDArray[np.bool_]:
@@ -116,29 +112,6 @@ class Shapes:
         if part.faces is None:
             return BuiltShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
         return BuiltShape(corners[part.faces], is_cloud=False)
-
-
-def _stretches(low: Floats, high: Floats, contact: float) -> Floats:
-    """Maps (N, 4, 4) about the middle of a box that move no place in it by more than `contact`.
-
-    They shrink or widen it across an axis of its frame, with a shift along the axis or without, or
-    along all axes.
-    """
-    middle, half = 0.5 * (low + high), np.maximum(0.5 * (high - low), THIN)
-    step = contact / np.sqrt(3.0)
-    maps = []
-    for sign, axis, shift in product((1.0, -1.0), (0, 1, 2, 3), (0.0, 1.0, -1.0)):
-        if axis == 3 and shift:
-            continue
-        scale = np.maximum(1.0 + sign * step / half, LEAST_STRETCH)
-        made = np.eye(4)
-        if axis < 3:
-            scale[axis] = 1.0
-            made[axis, 3] = shift * step
-        made[:3, 3] += middle - scale * middle
-        made[:3, :3] = np.diag(scale)
-        maps.append(made)
-    return np.array(maps)
 
 
 def _bytes_of(shape: BuiltShape) -> int:

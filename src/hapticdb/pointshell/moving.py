@@ -13,12 +13,15 @@ from hapticdb.pointshell.shell import PointShell
 
 Floats = NDArray[np.float64]
 
+AT_ONCE = 32
+"""Boxes that are compared together. Larger: more memory."""
+
 
 class MovingSurface:
     """A shell's surface, tool frame: triangles, or a ball about the origin.
 
     tree : its triangles, or the ball's middle as one without area; corners (V, 3) : whose box holds
-    it, metres.
+    it; radius : of the ball, 0 of a surface; metres.
 
     Raises `UsageError` if the shell has no surface.
     """
@@ -28,17 +31,19 @@ class MovingSurface:
             raise UsageError("the tool has points but no surface: give its mesh, not a saved shell")
         self.surface = shell.surface
         if isinstance(self.surface, Ball):
-            self._radius, triangles = self.surface.radius, np.zeros((1, 3, 3))
-            self.corners = self._radius * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+            self.radius, triangles = self.surface.radius, np.zeros((1, 3, 3))
+            self.corners = self.radius * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
         else:
-            self._radius, triangles = 0.0, self.surface.triangles
+            self.radius, triangles = 0.0, self.surface.triangles
             self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.tree = tree_of(triangles)
 
-    def nearest(self, other: TriangleTree, poses: Floats, farthest: Floats) -> Nearest:
+    def nearest(
+        self, other: TriangleTree, poses: Floats, farthest: Floats, enough: float = 0.0
+    ) -> Nearest:
         """Measure from another surface at poses (N, 4, 4), as `kernels.triangles.nearest` does."""
-        radius = self._radius
-        near = nearest(other, self.tree, poses, farthest + radius)
+        radius = self.radius
+        near = nearest(other, self.tree, poses, farthest + radius, enough + radius)
         if radius == 0.0:
             return near
         away = near.on_a - near.on_b
@@ -54,7 +59,7 @@ class MovingSurface:
     ) -> Search:
         """Search the least distance from another surface, as `kernels.triangles.sweeping` does."""
         return Search(
-            other, self.tree, motion, radius=self._radius, begin=begin, best=best, fine=fine
+            other, self.tree, motion, radius=self.radius, begin=begin, best=best, fine=fine
         )
 
     def box_gaps(self, bounds: Floats, poses: Floats, more: ArrayLike = 0.0) -> Floats:
@@ -66,9 +71,13 @@ class MovingSurface:
         middles = poses[:, :3, :3] @ (0.5 * (low + high)) + poses[:, :3, 3]
         reach = np.abs(poses[:, :3, :3]) @ (0.5 * (high - low)) + np.reshape(more, (-1, 1))
         out = np.empty((len(bounds), len(poses)))
-        for row, box in zip(out, bounds, strict=True):
-            apart = np.maximum(middles - reach - box[1], box[0] - middles - reach)
-            row[:] = np.linalg.norm(np.maximum(apart, 0.0), axis=1)
+        low, high = middles - reach, middles + reach
+        for first in range(0, len(bounds), AT_ONCE):
+            some = slice(first, first + AT_ONCE)
+            apart = low - bounds[some, 1, None]
+            np.maximum(apart, bounds[some, 0, None] - high, out=apart)
+            np.maximum(apart, 0.0, out=apart)
+            np.sqrt(np.einsum("onk,onk->on", apart, apart), out=out[some])
         return out
 
 

@@ -1,38 +1,40 @@
-"""Objects that the tool touches where its path starts: followed until they are apart."""
+"""Objects that the tool touches where its path starts: followed until they are apart.
 
-from itertools import product
+Where a small motion of the tool frees it, tool and object overlap by no more than that motion
+(`easing`). So the tool that is moved aside is swept on: until it meets the object, the contact is
+no deeper. Where no such motion is found, how deep they overlap is measured, look by look (`cut`).
+"""
+
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.sweeps.cut import NONE, Cut, Mesh, cut
+from hapticdb.sweeps.easing import Easing
 from hapticdb.sweeps.gap import Pair
 
 Floats = NDArray[np.float64]
 
 SLIDE = 4.0
 """Contact tolerances that the tool moves on while it touches, from which it slides."""
+STRIDE = 3.0
+"""Contact tolerances between two looks whether the surfaces are apart, where they are eased."""
 STEP, STEP_OF_GROWTH = 1.5, 0.75
-"""Way between two looks: contact tolerances, or a share of what a cut may grow by if that is more.
-Larger: fewer looks, and less is allowed at each."""
+"""Way between two looks at a cut: contact tolerances, or a share of what a cut may grow by if that
+is more. Larger: fewer looks, and less is allowed at each."""
 KEPT = 0.53
 """Share of that way by which a cut must stay below what is allowed, since it is deeper by half of
 the way at most between two looks."""
-EASE = 0.2
-"""Contact tolerances by which surfaces are shifted, to see that they only touch."""
 SHIFT = 0.05
 """Contact tolerances by which surfaces are shifted, to measure how deep they overlap."""
 DEEP = 0.06
 """Share of the start's cut by which it may grow, if that is more than the tolerance: measurements
 differ by half as much where places and corners are few. Larger: more of it is allowed."""
 BLOCK = 64
-"""Looks that are measured together."""
-WAYS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
-WAYS /= np.linalg.norm(WAYS, axis=1)[:, None]
-"""Directions (26, 3) of the shifts that may free surfaces."""
+"""Looks whether surfaces are apart that are done together."""
 PATIENCE = 16
-"""Looks without shifts, after none of them freed the surfaces."""
+"""Looks at a cut until motions that ease it are tried again."""
 
 
 class FollowedContact(NamedTuple):
@@ -60,66 +62,82 @@ def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> Fo
     A cut may grow to the greater one of the start's and `contact`, and by `contact` more, or by
     `DEEP` of the start's if that is more.
     """
-    depths = _Depths(pair, contact, object_mesh, tool_mesh)
-    start = depths.cut(pair.way.at([0.0])[0], np.inf, contact).depth
-    growth = max(contact, DEEP * start)
-    step = max(STEP * contact, STEP_OF_GROWTH * growth)
-    allowed = max(start, contact) + growth
-    deepest, way, length = start, 0.0, pair.way.length
-    while way < length:
-        ways = np.minimum(way + step * np.arange(1, BLOCK + 1), length)
-        ways = ways[: int(np.searchsorted(ways, length)) + 1]
-        gaps = pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
-        for way, gap, pose in zip(ways.tolist(), gaps.tolist(), pair.way.at(ways), strict=True):
-            if gap > contact:
-                return FollowedContact(start, deepest, allowed, way, is_apart=True)
-            found = NONE
-            if gap <= 0.0:
-                found = depths.of(pose, allowed + contact, allowed - KEPT * step)
-            deepest = max(deepest, found.depth)
-            if found.depth > allowed - KEPT * step:
-                return FollowedContact(start, deepest, allowed, way, refused=(way, found))
-    return FollowedContact(start, deepest, allowed, length)
+    return _Following(pair, contact, object_mesh, tool_mesh).followed()
 
 
-class _Depths:
-    """How deep the surfaces overlap at poses, or a bound of it."""
+class _Following:
+    """State of a contact that is followed."""
 
     def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
-        self._pair, self._object, self._tool = pair, object_mesh, tool_mesh
-        self._contact, self._ease = contact, EASE * contact
-        self._shifts = self._ease * WAYS
-        self._known = 0
-        self._resting = 0
+        self._pair, self._contact = pair, contact
+        self._object, self._tool = object_mesh, tool_mesh
+        self._start = self._cut(pair.way.at([0.0])[0], np.inf, contact).depth
+        growth = max(contact, DEEP * self._start)
+        self._step = max(STEP * contact, STEP_OF_GROWTH * growth)
+        self._allowed = max(self._start, contact) + growth
+        deep = self._start > contact
+        self._easing = Easing(pair, self._start + 0.5 * growth if deep else contact)
+        self._deepest = self._depth = self._start
+        self._looked_at = 0.0
 
-    def of(self, pose: Floats, most: float, enough: float) -> Cut:
-        """Cut at a pose, as `cut`.
+    def followed(self) -> FollowedContact:
+        """Follow it to its end."""
+        way, length = 0.0, self._pair.way.length
+        while way < length:
+            eased = self._easing.until(way)
+            if eased > way + self._step or eased >= length:
+                self._deepest = max(self._deepest, self._easing.reach)
+                apart = self._first_apart(way, eased)
+                if apart is not None:
+                    return self._told(apart, is_apart=True)
+                way = self._looked_at = eased
+                self._depth = self._easing.reach
+                continue
+            told = self._looked(way, min(way + PATIENCE * self._step, length))
+            if told is not None:
+                return told
+            way = min(way + PATIENCE * self._step, length)
+        return self._told(length)
 
-        Surfaces that a shift by `ease` frees overlap by that much at most, which is told then.
-        """
-        if self._is_freed(pose):
-            return Cut(self._ease, pose[:3, 3])
-        return self.cut(pose, most, enough)
+    def _told(
+        self, until: float, refused: tuple[float, Cut] | None = None, *, is_apart: bool = False
+    ) -> FollowedContact:
+        return FollowedContact(self._start, self._deepest, self._allowed, until, is_apart, refused)
 
-    def _is_freed(self, pose: Floats) -> bool:
-        """Whether a small shift frees the surfaces; the last one that did is tried first."""
-        if self._resting:
-            self._resting -= 1
-            return False
-        order = [self._known, *(n for n in range(len(self._shifts)) if n != self._known)]
-        for some in (order[:1], order[1:]):
-            poses = np.tile(pose, (len(some), 1, 1))
-            poses[:, :3, 3] += self._shifts[some]
-            far = np.full(len(some), self._ease)
-            apart = self._pair.tool.nearest(self._pair.tree, poses, far).at_least
-            self._pair.looks += len(some)
-            free = np.flatnonzero(apart > 0.0)
-            if len(free):
-                self._known = some[int(free[0])]
-                return True
-        self._resting = PATIENCE
-        return False
+    def _first_apart(self, begin: float, end: float) -> float | None:
+        """The first look between two ways at which the surfaces are apart."""
+        stride = STRIDE * self._contact
+        for first in np.arange(begin, end, BLOCK * stride).tolist():
+            ways = np.minimum(first + stride * np.arange(1, BLOCK + 1), end)
+            ways = ways[: int(np.searchsorted(ways, end)) + 1]
+            far = np.flatnonzero(self._gaps(ways, self._contact) > self._contact)
+            if len(far):
+                return float(ways[far[0]])
+        return None
 
-    def cut(self, pose: Floats, most: float, enough: float) -> Cut:
+    def _gaps(self, ways: Floats, enough: float = 0.0) -> Floats:
+        far = np.full(len(ways), 2.0 * self._contact)
+        return self._pair.measure(ways, far, enough).at_least
+
+    def _looked(self, begin: float, end: float) -> FollowedContact | None:
+        """Look at the cut between two ways; how it ends if it does."""
+        ways = np.append(np.arange(begin + self._step, end, self._step), end)
+        enough = self._allowed - KEPT * self._step
+        poses = self._pair.way.at(ways)
+        for way, gap, pose in zip(ways.tolist(), self._gaps(ways).tolist(), poses, strict=True):
+            if gap > self._contact:
+                return self._told(way, is_apart=True)
+            if way < end and self._depth + way + self._step - self._looked_at <= self._allowed:
+                continue  # no deeper than is allowed at the next look, either
+            found = NONE
+            if gap <= 0.0:
+                found = self._cut(pose, self._allowed + self._contact, enough)
+            self._looked_at, self._depth = way, found.depth
+            self._deepest = max(self._deepest, found.depth)
+            if found.depth > enough:
+                return self._told(way, (way, found))
+        return None
+
+    def _cut(self, pose: Floats, most: float, enough: float) -> Cut:
         """Cut at a pose, up to `most` metres; `enough` ends its search."""
         return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough)

@@ -53,15 +53,18 @@ class Mesh:
     def __init__(self, tree: TriangleTree) -> None:
         self.tree = tree
         corners = tree.corners.reshape(-1, 3)
-        self.near = JOIN * float(np.linalg.norm(np.ptp(corners, axis=0))) or 1.0
+        low = corners.min(axis=0)
+        self.near = JOIN * float(np.linalg.norm(corners.max(axis=0) - low)) or 1.0
+        cells = np.rint((corners - low) / self.near).astype(np.int64)  # below 2^20
         _, first, inverse = np.unique(
-            np.rint(corners / self.near).astype(np.int64),
-            axis=0, return_index=True, return_inverse=True,
-        )  # fmt: skip
+            cells @ np.array([1 << 42, 1 << 21, 1]), return_index=True, return_inverse=True
+        )
         self.points = np.ascontiguousarray(corners[first])
         self.faces = inverse.reshape(-1, 3)
         sides = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2).reshape(-1, 2)
-        self.edges, which = np.unique(np.sort(sides, axis=1), axis=0, return_inverse=True)
+        sides.sort(axis=1)
+        keys, which = np.unique(sides @ np.array([len(first), 1]), return_inverse=True)
+        self.edges = np.stack(np.divmod(keys, len(first)), axis=1)
         which = which.reshape(-1)
         order = np.argsort(which, kind="stable")
         self._faces_at = order // 3
@@ -92,13 +95,14 @@ def cut(
 
     one_from_other (4, 4) : rigid. It is the least one of `WAYS` by which the other surface is
     shifted, until one is `enough`: where surfaces coincide, rounding decides what goes through, and
-    a shift of many times that makes it plain. So it is exact to `shift` metres.
+    a shift of many times that makes it plain. So it is exact to `shift` metres. Of a cut of
+    `enough` or less, it is only told that it is no more.
     """
     found: Cut | None = None
     for way in WAYS:
         pose = one_from_other.copy()
         pose[:3, 3] += shift * way
-        here = _cut(one, other, pose, most)
+        here = _cut(one, other, pose, most, enough)
         found = here if found is None or here.depth < found.depth else found
         if found.depth <= enough:
             break
@@ -106,7 +110,7 @@ def cut(
     return found
 
 
-def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float) -> Cut:
+def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, enough: float) -> Cut:
     """Greatest cut without a shift."""
     other_from_one: Floats = np.asarray(np.linalg.inv(one_from_other), dtype=np.float64)
     mine, theirs = _Parted(one, other, other_from_one), _Parted(other, one, one_from_other)
@@ -115,11 +119,16 @@ def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float) -> Cut:
     spots = mine.spots(), theirs.spots()
     mine.add(*spots[1], one_from_other)
     theirs.add(*spots[0], other_from_one)
-    return _deepest(mine, theirs, one_from_other, most)
+    return _deepest(mine, theirs, one_from_other, most, enough)
 
 
-def _deepest(mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float) -> Cut:
-    """The deepest of all curves: at each the lesser of what either surface gets through."""
+def _deepest(
+    mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float, enough: float
+) -> Cut:
+    """The deepest of all curves: at each the lesser of what either surface gets through.
+
+    The smaller surface is measured first, the other one where that gets farther than `enough`.
+    """
     own, at_own = mine.crossings()
     other, at_other = theirs.crossings()
     pairs = np.concatenate([own, other[:, ::-1]])  # triangles that cross: of one, of the other
@@ -131,12 +140,13 @@ def _deepest(mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: f
     links = np.stack([place, n_all + pair], axis=1)
     _, curve = np.unique(components(links, size), return_inverse=True)
     n_curves = int(curve.max()) + 1
-    through = [np.full(n_curves, -1.0), np.full(n_curves, -1.0)]
-    depths = mine.depths(most), theirs.depths(most)
-    for deepest, values, curves in zip(
-        through, depths, (curve[:n_own], curve[n_own:n_all]), strict=True
-    ):
-        np.maximum.at(deepest, curves, values)
+    parted = (mine, curve[:n_own]), (theirs, curve[n_own:n_all])
+    through, is_open = np.full((2, n_curves), -1.0), np.ones(n_curves, dtype=bool)
+    for n in (0, 1) if mine.size <= theirs.size else (1, 0):
+        surface, curves = parted[n]
+        if is_open[curves].any():
+            np.maximum.at(through[n], curves, surface.depths(most))
+        is_open = (through[n] < 0.0) | (through[n] > enough)
     lesser = np.where(
         through[0] < 0.0, through[1], np.where(through[1] < 0.0, through[0], np.minimum(*through))
     )
@@ -175,6 +185,11 @@ class _Parted:
         self.shares = np.concatenate([self.shares, shares[is_next]])
         self._triangles = np.concatenate([self._triangles, triangles])
         self._place_of = np.concatenate([self._place_of, place_of])
+
+    @property
+    def size(self) -> int:
+        """Number of points."""
+        return len(self._points)
 
     def places(self) -> Floats:
         """The places (P, 3)."""

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.nearest import Nearest
-from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.kernels.triangles.sweeping import MEETING, Search
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.sweeps.way import Way
 
@@ -50,11 +50,38 @@ class Pair:
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
         self.looks = 0
 
-    def measure(self, ways: Floats, farthest: Floats) -> Nearest:
+    def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
         """Measure at ways (n,), as `kernels.triangles.nearest`."""
         self._check_time()
         self.looks += len(ways)
-        return self.tool.nearest(self.tree, self.way.at(ways), farthest)
+        return self.tool.nearest(self.tree, self.way.at(ways), farthest, enough)
+
+    def nearest_at(self, pose: Floats) -> Nearest:
+        """Measure at one pose (4, 4) of the tool, however far."""
+        return self.tool.nearest(self.tree, pose[None], np.array([np.inf]))
+
+    def are_apart(
+        self, poses: Floats, theirs: TriangleTree, own: TriangleTree, far: float
+    ) -> NDArray[np.bool_]:
+        """Whether surfaces that are eased keep `far` metres apart at poses (n, 4, 4)."""
+        self.looks += len(poses)
+        least = far + self.tool.radius
+        found = nearest(theirs, own, poses, np.full(len(poses), least), least)
+        return np.asarray(found.pairs[:, 0] < 0)
+
+    def first_met(
+        self, begin: float, shift: Floats, theirs: TriangleTree, own: TriangleTree
+    ) -> float:
+        """Way of the first meeting of surfaces that are eased, from a way on; or the end."""
+        motion = self.way.motion
+        search = Search(
+            theirs, own, motion._replace(centers=motion.centers + shift),
+            radius=self.tool.radius, begin=begin, best=2.0 * MEETING, fine=COARSE,
+        )  # fmt: skip
+        while not search.go_on(STEPS):
+            self._check_time()
+        self.looks += search.looks
+        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else self.way.length
 
     def least(self, begin: float, best: float) -> tuple[Least | None, float]:
         """Least distance from a way on, if it is less than `best`; else None.

@@ -49,8 +49,9 @@ class Gap(NamedTuple):
 class TouchedObject(NamedTuple):
     """An object within the contact tolerance of the tool where the path starts.
 
-    start, deepest : how deep the surfaces overlap at the start, and at most on the path while they
-    touch; allowed : how deep they may; until : fraction of the path up to which they touch, 1 if
+    start : how deep the surfaces overlap at the start; deepest : no deeper than this on the path
+    while they touch: the deepest cut, or the motion that frees them if that is more; allowed : how
+    deep they may; until : fraction of the path up to which they touch, 1 if
     they still do at its end; is_sliding : whether the tool moves on by more than the tolerance
     while they touch; cut : where they overlap by more than is allowed, or None.
     """

@@ -6,6 +6,7 @@ The objects' boxes say which of them may be near the path, never too few. Their 
 import time
 from collections.abc import Callable
 from contextlib import suppress
+from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -97,12 +98,9 @@ def sweep(
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, _center_of(tool, about))
-    if proportions is None:
-        felt = env.felt(where, exclude)
-        proportions = compare_proportions(felt, env.grid.voxel_size, shell, poses)
     with suppress(ConnectionLostError):
-        return _Sweep(env, tool, way, asked).swept(where, exclude, proportions)
-    return _Sweep(env, tool, way, asked).swept(where, exclude, proportions)
+        return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
+    return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
 
 
 class _Asked(NamedTuple):
@@ -146,9 +144,11 @@ def _center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
 class _Sweep:
     """State of one sweep."""
 
-    def __init__(self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked) -> None:
-        self._env, self._tool, self._way, self._asked = env, tool, way, asked
-        self._mesh = Mesh(tool.tree)
+    def __init__(
+        self, env: Environment, shell: PointShell, tool: MovingSurface, way: Way, asked: _Asked
+    ) -> None:
+        self._env, self._shell, self._tool = env, shell, tool
+        self._way, self._asked = way, asked
         self._looks = 0
         self._best = asked.limit
         self._closed = asked.limit  # proved where nothing nearer was looked for
@@ -159,12 +159,16 @@ class _Sweep:
         self._fractions = np.linspace(0.0, 1.0, WINDOWS)
         self._gaps = np.full(WINDOWS, asked.limit)
 
-    def swept(self, where: Words, exclude: Words, proportions: Proportions) -> Swept:
+    def swept(self, where: Words, exclude: Words, proportions: Proportions | None) -> Swept:
         """Sweep, in one snapshot."""
         began, is_stopped = time.monotonic(), False
         with self._env.store.snapshot():
             revision = self._env.store.revision()
             objects = self._env.felt(where, exclude)
+            if proportions is None:
+                proportions = compare_proportions(
+                    objects, self._env.grid.voxel_size, self._shell, self._way.poses
+                )
             try:
                 near = self._decide(objects)
             except OverTimeError:
@@ -208,6 +212,11 @@ class _Sweep:
         if self._hits or self._enclosed:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
+
+    @cached_property
+    def _mesh(self) -> Mesh:
+        """The tool's surface with its corners joined."""
+        return Mesh(self._tool.tree)
 
     def _is_profiled(self, least: float) -> bool:
         return self._asked.profile and least < float(self._gaps.max())

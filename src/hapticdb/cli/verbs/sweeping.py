@@ -344,7 +344,7 @@ def _show(told: _Told) -> None:
         for one in found.touching
     ]
     if rows:
-        columns = ("id>", "object", "is", "where", "deep at start>", "deepest>")
+        columns = ("id>", "object", "is", "where", "deep at start>", "deep at most>")
         render.table(columns, rows[:MOST_OBJECTS])
         if len(rows) > MOST_OBJECTS:
             render.say(f"{len(rows)} rows, {MOST_OBJECTS} of them shown")

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
 
@@ -149,12 +149,13 @@ def _keep(below, above, n, m, found, pair, out):
 
 
 @leaf
-def nearest_pair(a, b, pose, nodes, squares, placed, found, pair, out):
+def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
     """Find the nearest triangles of tree a and of tree b, moved by a pose (4, 4) into a's frame.
 
     out (8,): bounds of the distance from below and from above, which begin as the greatest distance
-    that is looked for and infinity, then the place on each. pair (2,): triangles that are tried
-    first, -1 where none is known; afterwards the nearest ones, or -1. nodes (.., 2), squares,
+    that is looked for and infinity, then the place on each; one from above of `enough` or less ends
+    it. pair (2,): triangles that are tried first, -1 where none is known; afterwards the nearest
+    ones, or -1. nodes (.., 2), squares,
     placed, found are scratch.
     """
     size = largest(a.boxes)
@@ -172,7 +173,7 @@ def nearest_pair(a, b, pose, nodes, squares, placed, found, pair, out):
     nodes[0, 0], nodes[0, 1] = 0, 0
     squares[0] = box_gap(a.boxes, np.int64(0), b.boxes, np.int64(0), pose, slack)
     top = 1
-    while top > 0 and out[1] > 0.0:
+    while top > 0 and out[1] > enough:
         top -= 1
         if not squares[top] < out[0] * out[0]:
             continue
@@ -197,12 +198,12 @@ def nearest_pair(a, b, pose, nodes, squares, placed, found, pair, out):
         top += 1
 
 
-@entry(TREE, TREE, FLOATS3, FLOATS, INTS2, FLOATS2)
-def nearest_kernel(a, b, poses, farthest, pairs, out):
+@entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, INTS2, FLOATS2)
+def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
     """Find the nearest triangles at poses (N, 4, 4), which lead b into a's frame.
 
-    farthest (N,): the greatest distance that is looked for; pairs (N, 2), out (N, 8): as for
-    `nearest_pair`. The pair of a pose is tried first at the next one that has none.
+    farthest (N,): the greatest distance that is looked for; enough, pairs (N, 2), out (N, 8): as
+    for `nearest_pair`. The pair of a pose is tried first at the next one that has none.
     """
     nodes = np.empty((WAITING, 2), dtype=np.int64)
     squares = np.empty(WAITING)
@@ -212,7 +213,7 @@ def nearest_kernel(a, b, poses, farthest, pairs, out):
         if n and pairs[n, 0] < 0:
             pairs[n, 0], pairs[n, 1] = pairs[n - 1, 0], pairs[n - 1, 1]
         out[n, 0], out[n, 1] = farthest[n], math.inf
-        nearest_pair(a, b, poses[n], nodes, squares, placed, found, pairs[n], out[n])
+        nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
 
 
 class Nearest(NamedTuple):
@@ -230,12 +231,17 @@ class Nearest(NamedTuple):
     pairs: Ints
 
 
-def nearest(a: TriangleTree, b: TriangleTree, poses: Floats, farthest: Floats) -> Nearest:
+def nearest(
+    a: TriangleTree, b: TriangleTree, poses: Floats, farthest: Floats, enough: float = 0.0
+) -> Nearest:
     """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
 
-    farthest (N,): the greatest distance that is looked for.
+    farthest (N,): the greatest distance that is looked for. Surfaces within `enough` are near: then
+    `at_most` is right, but not the least, and `at_least` has no meaning.
     """
     pairs = np.full((len(poses), 2), -1, dtype=np.int64)
     out = np.zeros((len(poses), 8))
-    nearest_kernel(a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), pairs, out)
+    nearest_kernel(
+        a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out
+    )
     return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)

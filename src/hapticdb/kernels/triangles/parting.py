@@ -16,6 +16,8 @@ Ints = NDArray[np.int64]
 
 SAMPLES = 4
 """Steps in which a part of an edge is measured. More: deeper cuts of curved surfaces."""
+FEW = 16
+"""One of so many points is measured first: mostly one of them is far enough, and ends its piece."""
 
 
 @leaf
@@ -81,26 +83,47 @@ def _part_far(points, edges, edge, begin, end, tree, pose, most, waiting, square
 
 @leaf
 def _measure_parts(
-    points, edges, cuts, shares, tree, pose, most, pieces, parts, far, waiting, squares
+    points, edges, cuts, shares, tree, pose, most, pieces, parts, far, piece_far, waiting, squares
 ):
-    """Measure the parts of edges between places, far (2 P,), and note the piece of each, parts."""
+    """Measure the parts of edges between places, far (2 P,), and note the piece of each, parts.
+
+    A part at an end of its edge is passed over if its piece is known to get far enough, and the
+    other end is of another piece.
+    """
     n_points, n_places, n_parts = points.shape[0], cuts.shape[0], 0
     for p in range(n_places):
-        is_first = p == 0 or cuts[p - 1] != cuts[p]
-        is_last = p + 1 == n_places or cuts[p + 1] != cuts[p]
-        if is_first:
-            far[n_parts] = _part_far(
-                points, edges, cuts[p], 0.0, shares[p], tree, pose, most, waiting, squares
-            )
-            parts[n_parts] = pieces[edges[cuts[p], 0]]
+        edge = cuts[p]
+        one, other = pieces[edges[edge, 0]], pieces[edges[edge, 1]]
+        is_last = p + 1 == n_places or cuts[p + 1] != edge
+        for k in range(0 if p == 0 or cuts[p - 1] != edge else 1, 2):
+            if k == 0:
+                begin, end, part = 0.0, shares[p], one
+            elif is_last:
+                begin, end, part = shares[p], 1.0, other
+            else:
+                begin, end, part = shares[p], shares[p + 1], n_points + n_parts
+            parts[n_parts] = part
+            far[n_parts] = most
+            if one == other or piece_far[part] < most:
+                far[n_parts] = _part_far(
+                    points, edges, edge, begin, end, tree, pose, most, waiting, squares
+                )
+            piece_far[part] = max(piece_far[part], far[n_parts])
             n_parts += 1
-        end = 1.0 if is_last else shares[p + 1]
-        far[n_parts] = _part_far(
-            points, edges, cuts[p], shares[p], end, tree, pose, most, waiting, squares
-        )
-        parts[n_parts] = pieces[edges[cuts[p], 1]] if is_last else n_points + n_parts
-        n_parts += 1
     return n_parts
+
+
+@leaf
+def _measure_pieces(points, tree, pose, most, pieces, piece_far, waiting, squares):
+    """Measure the points of pieces whose piece_far is 0 or more, until each gets far enough."""
+    n_points = points.shape[0]
+    for n in range(n_points + n_points // FEW):  # a few points spread over all come first
+        v = n * FEW if n < n_points // FEW else n - n_points // FEW
+        known = piece_far[pieces[v]]
+        if 0.0 <= known < most:
+            x, y, z = points[v, 0], points[v, 1], points[v, 2]
+            found = _far(tree, pose, x, y, z, known, most, waiting, squares)
+            piece_far[pieces[v]] = max(known, found)
 
 
 @leaf
@@ -141,18 +164,14 @@ def depths_kernel(points, edges, cuts, shares, tree, pose, most, parents, out):
         parents[v] = _root(parents, v)
     parts, far = np.empty(2 * n_places, dtype=np.int64), np.empty(2 * n_places)
     piece_far = np.full(n_points + 2 * n_places, -1.0)
+    for p in range(n_places):
+        piece_far[parents[edges[cuts[p], 0]]] = piece_far[parents[edges[cuts[p], 1]]] = 0.0
     waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
-    n_parts = _measure_parts(
-        points, edges, cuts, shares, tree, pose, most, parents, parts, far, waiting, squares
-    )
-    for n in range(n_parts):
-        piece_far[parts[n]] = max(piece_far[parts[n]], far[n])
-    for v in range(n_points):
-        known = piece_far[parents[v]]
-        if 0.0 <= known < most:
-            x, y, z = points[v, 0], points[v, 1], points[v, 2]
-            found = _far(tree, pose, x, y, z, known, most, waiting, squares)
-            piece_far[parents[v]] = max(known, found)
+    _measure_pieces(points, tree, pose, most, parents, piece_far, waiting, squares)
+    _measure_parts(
+        points, edges, cuts, shares, tree, pose, most, parents, parts, far, piece_far, waiting,
+        squares,
+    )  # fmt: skip
     first, at = 0, 0
     while first < n_places:
         last = first

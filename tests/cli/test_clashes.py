@@ -86,6 +86,21 @@ def test_a_search_that_was_not_finished_gives_exit_code_3(run: Run, meeting: Pat
     assert "2 pairs: call again" in out
 
 
+def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None:
+    path = row_of_boxes(tmp_path / "row.db", 2, 0.3)
+    hinge = ("--of", "cube1", "--turn", "z", "--about", "150,0,0", "--from", "90", "--to", "270")
+    code, out, _ = run("clashes", path, *hinge, "--json")
+    (one,) = map(json.loads, out.splitlines())
+    assert (code, one["name"], one["kind"]) == (1, "cube0", "overlapping")
+    assert one["begin"] + one["end"] == pytest.approx(360.0, abs=0.05)
+    assert "1 meeting" in run("clashes", path, *hinge)[1]
+    (tmp_path / "way.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0.1,0,0,1,0,0,0\n")
+    code, out, _ = run("clashes", path, "--of", "cube0", "--poses", tmp_path / "way.csv")
+    assert (code, out) == (0, "0 meetings on the way\n")
+    refused(run("clashes", path, "--turn", "z"), "--of")
+    refused(run("clashes", path, "--of", "cube0", "--turn", "w"), "--turn x, y or z")
+
+
 def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
     refused(run("clashes", meeting, "--kind", "near"), "--kind 'near'", "touching")
     refused(run("clashes", meeting, "--within", "0"), "give lengths above 0")

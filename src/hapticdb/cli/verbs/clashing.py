@@ -2,13 +2,14 @@
 
 from contextlib import nullcontext
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.csv_files import STDOUT, new_file, open_csv, text_cell
+from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
 from hapticdb.cli.options import CsvOption, JsonOption, UrlArgument
+from hapticdb.cli.values import numbers_of
 from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.units import length_text
@@ -74,6 +75,29 @@ HtmlOption = Annotated[
         metavar="FILE", help="Write a page with pictures, a matrix and the table to a new file."
     ),
 ]
+PosesOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="CSV",
+        help="Displacements x,y,z,qw,qx,qy,qz of --of, metres: say when it meets what.",
+    ),
+]
+TurnOption = Annotated[
+    str | None,
+    typer.Option(metavar="AXIS", help="Instead: turn --of about x, y or z, as on a hinge."),
+]
+AboutOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="X,Y,Z",
+        help="Millimetres, scene's frame: a point of the hinge, or the centre of turns.",
+        show_default="middle of --of",
+    ),
+]
+FromOption = Annotated[
+    float, typer.Option("--from", metavar="DEG", help="Degrees: start of --turn.")
+]
+ToOption = Annotated[float, typer.Option("--to", metavar="DEG", help="Degrees: end of --turn.")]
 
 HELP = """Say which parts meet, how deep, and which are near: every pair of an assembly.
 
@@ -87,6 +111,10 @@ same. --accept marks pairs as intended, until either part changes its shape.
 
 Ctrl-C and --seconds lose nothing: the next call goes on. What was not looked
 at is told as that.
+
+--poses and --turn move the parts of --of together, and say in which intervals of the
+motion they meet each other object, and how deep. Where they do not is proved, as by
+sweep. Numbers are those of poses, from 0, or degrees. Nothing of it is kept.
 
 The exit code is 1 when a pair of a --kind was found that nobody has accepted, 3 when
 there is none but not all pairs were looked at, and else 0.
@@ -110,16 +138,23 @@ def clashes(
     because: BecauseOption = None,
     csv: CsvOption = None,
     html: HtmlOption = None,
+    poses: PosesOption = None,
+    turn: TurnOption = None,
+    about: AboutOption = None,
+    from_: FromOption = 0.0,
+    to: ToOption = 90.0,
     json: JsonOption = False,
 ) -> None:
     """Find every pair of objects that are near; the help text is `HELP`."""
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
-    if (accept is None) != (because is None):
-        raise UsageError("--accept A B and --because TEXT: give both, or neither")
-    if accept is not None:
-        _accept(url, accept, because or None, json=json)
+    if accept is not None or because is not None:
+        _accept(url, accept, because, json=json)
         return
+    if poses is not None or turn is not None:
+        motion = _Motion(of or [], poses, turn, about, from_, to)
+        is_more = bool(csv or html or kind or seconds)
+        raise typer.Exit(_moved(url, motion, against, contact, is_more=is_more, json=json))
     render.compile_kernels("clashes")
     from hapticdb.clashes.run import find_clashes
 
@@ -141,15 +176,87 @@ def clashes(
             from hapticdb.pictures.clashes import clashes_page
 
             page.write_text(clashes_page(env, found, told), encoding="utf-8")
-    if json:
-        for one in told:
-            render.say_json(one.record())
-    elif csv != STDOUT:
+    for one in told if json else ():
+        render.say_json(one.record())
+    if not json and csv != STDOUT:
         _show(found, told)
     if not found.is_kept:
         render.note(f"{url} can only be read by this user: what was found is not kept")
-    is_found = any(not one.is_left for one in (found.of(kinds) if kinds else found.of()))
-    raise typer.Exit(1 if is_found else NOT_DECIDED if found.left else 0)
+    raise typer.Exit(_exit_code(found, kinds))
+
+
+class _Motion(NamedTuple):
+    """How the parts of --of move, as the options say."""
+
+    of: list[str]
+    poses: str | None
+    turn: str | None
+    about: str | None
+    begin: float
+    end: float
+
+
+def _moved(
+    url: str, motion: _Motion, against: list[str] | None, contact: float, *,
+    is_more: bool, json: bool,
+) -> int:  # fmt: skip
+    """Print when parts that move meet others; returns the exit code."""
+    import numpy as np
+
+    import hapticdb
+    from hapticdb.clashes.moving import find_meetings, hinge
+    from hapticdb.poses import read_poses
+
+    if is_more or not motion.of:
+        raise UsageError("--poses and --turn take --of, and no --csv, --html, --kind, --seconds")
+    if (motion.poses is None) == (motion.turn is None) or motion.turn not in {None, *AXES}:
+        raise UsageError("give either --poses CSV, or --turn x, y or z")
+    center = None
+    if motion.about is not None:
+        center = [MM * x for x in numbers_of(motion.about, 3, "--about", "X,Y,Z in millimetres")]
+    render.compile_kernels("sweep", "clashes")
+    with (
+        hapticdb.open(url, read_only=True) as env,
+        render.bar("moving", "objects", lambda *now: now) as progress,
+    ):
+        if motion.poses is not None:
+            poses = read_poses(motion.poses)
+        else:
+            boxes = np.array([obj.bounds for obj in env.find(*motion.of)])
+            middle = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
+            center = middle.tolist() if center is None else center
+            poses = hinge(AXES.index(motion.turn or "x"), center, motion.begin, motion.end)
+        found = find_meetings(
+            env,
+            motion.of,
+            poses,
+            about=center,
+            against=against or (),
+            contact=MM * contact,
+            progress=progress,
+        )
+    start, step = 0.0, 1.0
+    if motion.turn is not None:
+        start, step = motion.begin, (motion.end - motion.begin) / (len(poses) - 1)
+    told = [
+        one._replace(begin=start + step * one.begin, end=start + step * one.end) for one in found
+    ]
+    for one in told if json else ():
+        render.say_json(one._asdict())
+    if not json:
+        rows = [(str(one.id), one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
+                 length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
+        unit = "pose" if motion.turn is None else "degrees"
+        if rows:
+            render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
+        render.say(f"{render.counted(len(told), 'meeting')} on the way")
+    return int(any(one.kind == "overlapping" for one in told))
+
+
+def _exit_code(found: "Clashes", kinds: "tuple[Kind, ...]") -> int:
+    if any(not one.is_left for one in (found.of(kinds) if kinds else found.of())):
+        return 1
+    return NOT_DECIDED if found.left else 0
 
 
 def _checked(names: list[str] | None) -> "tuple[Kind, ...]":
@@ -172,17 +279,19 @@ def _opened(url: str) -> "Environment":
         return hapticdb.open(url, read_only=True)
 
 
-def _accept(url: str, pair: tuple[str, str], because: str | None, *, json: bool) -> None:
+def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> None:
     import hapticdb
     from hapticdb.clashes.run import accept_clash
 
+    if pair is None or because is None:
+        raise UsageError("--accept A B and --because TEXT: give both, or neither")
     with hapticdb.open(url) as env:
-        rows = accept_clash(env, [pair[0]], [pair[1]], because)
+        rows = accept_clash(env, [pair[0]], [pair[1]], because or None)
     if json:
         for row in rows:
-            render.say_json({"a": row.a, "b": row.b, "because": because})
+            render.say_json({"a": row.a, "b": row.b, "because": because or None})
         return
-    what = "no longer accepted" if because is None else "accepted until a part changes its shape"
+    what = "accepted until a part changes its shape" if because else "no longer accepted"
     render.say(f"{render.counted(len(rows), 'pair')} {what}")
 
 

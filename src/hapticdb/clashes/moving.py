@@ -1,0 +1,192 @@
+"""Clashes of parts that move: the intervals of a motion in which they meet each object.
+
+Where they do not meet is proved by the search that sweeps have. Within a meeting, looks a step
+apart say where it ends, and a few poses say how deep it is.
+"""
+
+from collections.abc import Callable, Iterator
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.clashes.judge import judge
+from hapticdb.clashes.result import GRAVITY
+from hapticdb.clashes.run import BUDGET, CONTACT
+from hapticdb.clashes.shapes import BuiltShape, Shapes
+from hapticdb.environment import Environment
+from hapticdb.errors import UsageError
+from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.poses import rotation_of
+from hapticdb.ready import make_ready
+from hapticdb.store.finding import Words
+from hapticdb.store.pairs import Kind
+from hapticdb.sweeps.gap import Pair
+from hapticdb.sweeps.way import Way
+
+Floats = NDArray[np.float64]
+
+STRETCHES = 256
+"""Stretches of a motion on which boxes are compared. More: fewer objects are looked at."""
+STEP, MOST_STEPS = 1.5, 4096
+"""Contact tolerances from one look of a meeting to the next, or the motion's share if that is
+more. Longer steps: a parting between two of them is not seen."""
+HALVINGS = 12
+"""Halvings of a step that find where a meeting ends."""
+POSES = 9
+"""Poses of a meeting at which it is measured how deep it is."""
+MOST_TURN, TURN_STEP = 360.0, 30.0
+"""Degrees of a whole turn, and from one of its poses to the next: less than half of it."""
+
+
+class Meeting(NamedTuple):
+    """An interval of a motion in which what moves meets an object.
+
+    id, name : of the object; begin, end : numbers of poses, with the share of the way to the next
+    one; kind, at_least : the gravest at `POSES` poses of it, as of a pair; place : where, x, y, z,
+    world frame, metres.
+    """
+
+    id: int
+    name: str
+    begin: float
+    end: float
+    kind: Kind
+    at_least: float
+    place: tuple[float, ...]
+
+
+def find_meetings(
+    env: Environment,
+    of: Words,
+    poses: ArrayLike,
+    *,
+    about: ArrayLike | None = None,
+    against: Words = (),
+    contact: float = CONTACT,
+    progress: Callable[[int, int], object] | None = None,
+) -> list[Meeting]:
+    """Find when parts that move together meet other objects, in the order of the motion.
+
+    Parameters
+    ----------
+    env : Environment
+        With the surfaces of its objects.
+    of, against : iterable of int or str
+        What moves; what it may meet: all other objects unless given.
+    poses : (M, 4, 4) array
+        Displacements of the parts from their places, rigid, world frame, metres.
+    about : (3,) array or None
+        The point that moves straight and that turns are about, world frame; the middle of the
+        parts' box unless given.
+    contact : float
+        Metres: a meeting ends where the surfaces are farther apart.
+    progress : callable or None
+        Called with the number of objects decided, and of all near the motion.
+    """
+    if not 0.0 < contact < np.inf:
+        raise UsageError(f"contact {contact} m: give a length above 0")
+    make_ready("sweep", "clashes")
+    with env.store.snapshot():
+        shell = env.shell(*of, inset=0.0)
+        tool = MovingSurface(shell)
+        box = np.stack([tool.corners.min(axis=0), tool.corners.max(axis=0)])
+        center = box.mean(axis=0) if about is None else np.asarray(about, dtype=np.float64)
+        way = Way.of(poses, tool.corners, center)
+        own = {obj.id for obj in env.find(*of)}
+        objects = [obj for obj in env.felt(against, ()) if obj.id not in own]
+        edges = np.linspace(0.0, way.length, STRETCHES + 1)
+        bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
+        middles = way.at(0.5 * (edges[:-1] + edges[1:]))
+        gaps = tool.box_gaps(bounds, middles, 0.5 * np.diff(edges)).min(axis=1, initial=np.inf)
+        near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
+        shapes, moved = Shapes(env.store, BUDGET), BuiltShape(tool.tree.corners, is_cloud=False)
+        found = []
+        for n, obj in enumerate(near):
+            placed = shapes.placed(obj)
+            if placed is None:
+                continue
+            turn, at = placed[1][:3, :3], placed[1][:3, 3]
+            still = BuiltShape(placed[0].tree.corners @ turn.T + at, is_cloud=placed[0].is_cloud)
+            for ways in _intervals(Pair(still.tree, tool, way), contact):
+                kind, depth, place = _gravest(
+                    still, moved, way.at(np.linspace(*ways, POSES)), contact
+                )
+                found.append(Meeting(obj.id, obj.name, *_numbers(way, ways), kind, depth, place))
+            if progress is not None:
+                progress(n + 1, len(near))
+    return sorted(found, key=lambda one: (one.begin, one.end, one.id))
+
+
+def hinge(axis: int, about: ArrayLike, begin: float, end: float) -> Floats:
+    """Displacements (M, 4, 4) of a turn about a world axis through a point (3,), in equal steps.
+
+    begin, end : degrees, counterclockwise where the axis points at the eye; UsageError if they are
+    equal, or more than `MOST_TURN` apart.
+    """
+    if not 0.0 < abs(end - begin) <= MOST_TURN:
+        raise UsageError(
+            f"a turn from {begin:g} to {end:g} degrees: give two that differ, up to 360"
+        )
+    angles = np.radians(np.linspace(begin, end, 1 + int(np.ceil(abs(end - begin) / TURN_STEP))))
+    quaternions = np.zeros((len(angles), 4))
+    quaternions[:, 0], quaternions[:, 1 + axis] = np.cos(0.5 * angles), np.sin(0.5 * angles)
+    poses = np.tile(np.eye(4), (len(angles), 1, 1))
+    poses[:, :3, :3] = rotation_of(quaternions)
+    poses[:, :3, 3] = np.asarray(about) - poses[:, :3, :3] @ np.asarray(about)
+    return poses
+
+
+def _intervals(pair: Pair, contact: float) -> Iterator[tuple[float, float]]:
+    """Ways where meetings begin and end."""
+    end = 0.0
+    while True:
+        first = pair.least(end, 2.0 * MEETING)[0]
+        if first is None or first.at_most > MEETING:
+            return
+        end = _parted(pair, first.way, contact)
+        yield first.way if first.way > MEETING else 0.0, end
+        if end >= pair.way.length:
+            return
+
+
+def _parted(pair: Pair, way: float, contact: float) -> float:
+    """Way from which on surfaces that meet are farther apart than `contact`, or the last one."""
+    length = pair.way.length
+    step = max(STEP * contact, length / MOST_STEPS)
+    for start in np.arange(way, length, 64 * step):
+        ways = np.minimum(start + step * np.arange(1, 65), length)
+        is_free = _gaps(pair, ways, contact) > contact
+        if is_free.any():
+            high = float(ways[int(np.argmax(is_free))])
+            low = max(high - step, way)
+            for _ in range(HALVINGS):
+                middle = 0.5 * (low + high)
+                is_apart = _gaps(pair, np.array([middle]), contact)[0] > contact
+                low, high = (low, middle) if is_apart else (middle, high)
+            return high
+    return length
+
+
+def _gaps(pair: Pair, ways: Floats, contact: float) -> Floats:
+    return pair.measure(ways, np.full(len(ways), 2.0 * contact)).at_least
+
+
+def _gravest(
+    still: BuiltShape, moved: BuiltShape, poses: Floats, contact: float
+) -> tuple[Kind, float, tuple[float, ...]]:
+    """The gravest of what a pair is at poses, how deep it is there, and where."""
+    judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]
+    told = [one for one in judged if one.kind in GRAVITY[:4]] or judged
+    rank = {kind: n for n, kind in enumerate((*GRAVITY, "far"))}
+    worst = min(told, key=lambda one: (rank[one.kind], -one.at_least))
+    kind: Kind = "touching" if worst.kind in {"apart", "far"} else worst.kind
+    depth = worst.at_least if kind == "overlapping" else 0.0
+    return kind, depth, tuple(worst.on_a.tolist())
+
+
+def _numbers(way: Way, ways: tuple[float, float]) -> tuple[float, float]:
+    """Numbers of poses at ways, with the share of the way to the next one."""
+    begin, end = np.interp(ways, way.ways, np.arange(len(way.ways))).tolist()
+    return begin, end

@@ -77,8 +77,7 @@ class GrantedHand(SmoothHand):
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats) -> None:
         super().__init__(ground, shell, pose, Terms())
-        lever = self._spring.radius
-        self._spring = self._spring._replace(damping=0.0, cap=CAP, turn_cap=CAP * lever)
+        self.grant(CAP)
 
 
 def case_of(name: str, ground: Ground, shell: PointShell, places: Floats) -> Case:

@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from hapticdb.grid import Grid
 from hapticdb.kernels.field.lattice import (
     BEYOND,
     CELL_SIDE,
@@ -13,12 +14,11 @@ from hapticdb.kernels.field.lattice import (
     HALF_WIDTH,
     STEPS,
 )
-from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
-from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, pose_numbers, views_of
+from hapticdb.kernels.records import FRAME, SEAT, SESSION, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (
     READER_STRIDE,
+    SCRATCH_ROWS,
     Cells,
     Clusters,
     Place,
@@ -27,6 +27,9 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
+from hapticdb.query.law import SMOOTH
+from hapticdb.realtime.stations import Station, Stations
+from hapticdb.resident.held import PreparedTool, asleep_of, spheres_of
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -193,14 +196,15 @@ SPRING = DeviceSpring(
 )  # fmt: skip
 
 
-def clusters(points: ArrayLike, run: int = 64) -> Clusters:
-    """A shell of points (N, 3) about its centre; it needs no normals."""
+def tool_of(points: ArrayLike, size: float, run: int = 64) -> PreparedTool:
+    """A tool of points (N, 3) about their centre, without normals; size: of a voxel, m."""
     at = np.asarray(points, float).reshape(-1, 3)
     both = np.hstack([at, np.tile([0.0, 0.0, 1.0], (len(at), 1))])
-    return Clusters(
-        both, at.mean(axis=0), np.zeros((0, 4)), np.zeros((0, 4)), run,
-        np.ascontiguousarray(at.T), np.zeros((6, run)),
+    clusters = Clusters(
+        both, at.mean(axis=0), *spheres_of(both, size, run), run, np.ascontiguousarray(at.T),
+        np.zeros((SCRATCH_ROWS, run)),
     )  # fmt: skip
+    return PreparedTool(clusters, asleep_of(np.zeros((0, 4)), None, len(at)))
 
 
 class Hand:
@@ -215,27 +219,28 @@ class Hand:
         **spring: float,
     ) -> None:
         self.field = field
-        self.shell = clusters(points)
+        tool = tool_of(points, field.place.size)
+        self.shell = tool.clusters
         reach = np.linalg.norm(self.shell.points[:, :3] - self.shell.center, axis=1).max()
         radius = max(float(reach), field.place.size)
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
-        self.servo = np.zeros((), SERVO)
-        self.follower = np.zeros((), FOLLOWER)
+        self._periods = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._station = Station(
+            self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
+        )
+        row = self._station.row
+        row["place"], row["is_running"], self._station.follower["merges_from"] = field.place, 1, 0
+        self._station.set_spring(self.spring)
+        self._station.rest_at(np.concatenate([position, quaternion]))
+        self.servo, self.follower = self._station.servo, self._station.follower
         views = views_of(self.servo)
         self.tool, self.hand, self.sent = views.tool, views.hand, views.sent
-        self.tool.position[:] = self.hand.position[:] = position
-        self.tool.quaternion[:] = self.hand.quaternion[:] = quaternion
-        n = len(self.shell.points)
-        self.rows = np.full((FIELD_ROWS, n), np.nan)
-        self.met = np.zeros((MET_ROWS, n), dtype=np.int64)
-        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self.rows, self.missed = self._station.field, self._station.missed
+        self.rows[:] = np.nan
 
     def advance(self, dt: float = 1e-3) -> Floats:
         """Run one period; returns the force at the device (3,), a copy."""
-        quasistatic.advance(
-            self.field.cells, 0, self.shell, self.field.place, self.spring, self.servo,
-            self.follower, dt, self.rows, self.met, self.missed,
-        )  # fmt: skip
+        self._periods.step(0, 0, dt)
         force: Floats = self.sent.wrench[:3].copy()
         return force
 

@@ -11,13 +11,13 @@ from numpy.typing import NDArray
 
 from feel.ground import Ground
 from hapticdb.devices.protocol import Reading
-from hapticdb.kernels.hand import quasistatic
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
-from hapticdb.kernels.records import FOLLOWER, MOST_MISSED, SERVO, views_of
+from hapticdb.kernels.records import FRAME, SEAT, pose_numbers
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.handle import Handle
-from hapticdb.resident.held import clusters_of
+from hapticdb.realtime.stations import Station, Stations
+from hapticdb.resident.held import held_tool
 
 Floats = NDArray[np.float64]
 
@@ -55,19 +55,16 @@ class SmoothHand:
     """
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._cells, self._place = ground.table.cells, ground.residency.place
-        self._row = 0
-        self._clusters = clusters_of(shell, ground.size)
-        self._servo = np.zeros((), SERVO)
-        views = views_of(self._servo)
-        self._tool, self._hand, self._sent = views.tool, self._servo["hand"], views.sent
-        self._met = np.zeros((MET_ROWS, len(shell)), dtype=np.int64)
-        self._missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self._periods = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._station = Station(
+            self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
+            ground.residency.grid, held_tool(shell, ground.size, sleeps=False),
+        )  # fmt: skip
+        self._hand, self._sent = self._station.servo["hand"], self._station.servo["sent"]
         self._handle = Handle(scale=terms.scale)
         self._period = 1.0 / terms.rate
         self._handle.start(Reading(pose, np.zeros(6), 0), self._hand)
-        self._tool.position[:] = self._hand["position"]
-        self._tool.quaternion[:] = self._hand["quaternion"]
+        self._station.rest_at(pose_numbers(self._hand).copy())
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
         lever = max(reach, ground.size) / terms.scale
         self._spring = DeviceSpring(
@@ -81,10 +78,18 @@ class SmoothHand:
             hold=0.02,
             fade=0.02,
         )
-        self._follower = np.zeros((), FOLLOWER)
-        self._field = np.zeros((FIELD_ROWS, len(shell)))
+        self._station.set_spring(self._spring)
+        self._station.row["is_running"], self._station.follower["merges_from"] = True, 0
+        self._station.row["staleness"] = np.iinfo(np.int64).max
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))
+
+    def grant(self, cap: float) -> None:
+        """Take the cap of a server, N, and no damper, which is the client's."""
+        self._spring = self._spring._replace(
+            damping=0.0, cap=cap, turn_cap=cap * self._spring.radius
+        )
+        self._station.set_spring(self._spring)
 
     def step(self, pose: Floats, velocity: Floats) -> Floats:
         """Force (3,) on the device after one period, N.
@@ -93,11 +98,8 @@ class SmoothHand:
         returned is the caller's own.
         """
         self._handle.follow(Reading(pose, velocity, 0), self._hand)
-        quasistatic.advance(
-            self._cells, self._row, self._clusters, self._place, self._spring, self._servo,
-            self._follower, self._period, self._field, self._met, self._missed,
-        )  # fmt: skip
-        return np.array(self._sent.wrench[:3])
+        self._periods.step(0, 0, self._period)
+        return np.array(self._sent["wrench"][:3])
 
 
 class Drive(NamedTuple):

@@ -41,8 +41,7 @@ class Undamped(SmoothHand):
 
     def __init__(self, ground: Ground, place: Floats) -> None:
         super().__init__(ground, ball(RADIUS, SIZE, 300), posed(place), Terms())
-        lever = self._spring.radius
-        self._spring = self._spring._replace(damping=0.0, cap=CAP, turn_cap=CAP * lever)
+        self.grant(CAP)
 
 
 def round_the_edge(folder: Path) -> tuple[str, Floats, Floats]:
@@ -157,9 +156,9 @@ def test_proxies_of_a_broad_tool_are_merged_and_push_as_the_spring_does(tmp_path
         ContactSource(cells, tool, ProxyWish()) as source,
     ):
         merged = proxies_of(source, places[:40])
-        assert 1 < source._follower["merged"] <= 64
+        assert 1 < source._station.follower["merged"] <= 64
         merged += proxies_of(source, places[40:])
-        assert source._follower["merged"] == 1
+        assert source._station.follower["merged"] == 1
     ours = np.array([proxy.wrench for proxy in merged])
     assert ours[39, 2] == pytest.approx(4.0, rel=0.02, abs=1000.0 * SIZE * 2.75 / 508 + 0.03)
     assert not ours[-1].any()

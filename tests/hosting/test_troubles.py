@@ -16,10 +16,10 @@ from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.board import Board
 from hapticdb.hosting.channel import Channel
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.session_recording import SessionRecording
 from realtime.hands import at
 

@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from hapticdb.kernels.hosting.following import LONGEST_GAP_NS, STRETCH, follow_hand
+from hapticdb.kernels.period.following import LONGEST_GAP_NS, STRETCH, follow_arrivals
 from hapticdb.kernels.records import HAND, SEAT, STATION
 
 MS = 1_000_000
@@ -31,7 +31,7 @@ class Followed:
         self.seat.hand_sequence += 2
 
     def at(self, now: int) -> float:
-        follow_hand(self.station, self.seat, self.hand, now)
+        follow_arrivals(self.station, self.seat, self.hand, now)
         return float(self.hand.position[0])
 
 

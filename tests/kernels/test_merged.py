@@ -7,8 +7,7 @@ from numpy.typing import NDArray
 
 from closed_forms import Field, Hand, cylinder, field_of, plane, punch, sheet
 from hapticdb.kernels.hand.near_points import MOST_MERGED
-from hapticdb.kernels.resident.feeling import bounding_spheres
-from hapticdb.realtime.drive import MERGES_FROM
+from hapticdb.realtime.stations import MERGES_FROM
 
 Floats = NDArray[np.float64]
 NEEDS_JIT = pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="too slow without the JIT")
@@ -29,10 +28,6 @@ def in_curve_order(points: Floats) -> Floats:
 def hand_over(field: Field, points: Floats, at: Floats, **follower: int) -> Hand:
     """A hand that rests 30 mm above a place, with numbers of its follower set."""
     hand = Hand(field, points, at + RISE)
-    if follower.get("is_large"):
-        spheres = np.empty((-(-len(points) // 64), 4))
-        bounding_spheres(hand.shell.points, 64, 1e-3 * SIZE, spheres)
-        hand.shell = hand.shell._replace(spheres=spheres)
     for name, number in follower.items():
         hand.follower[name] = number
     hand.advance()

@@ -19,9 +19,8 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import RandomHand
 from hapticdb.errors import DatabaseError, HapticDBError
-from hapticdb.kernels.hand import servo
-from hapticdb.kernels.records import TOLD
-from hapticdb.kernels.resident.cells import cell_key
+from hapticdb.kernels.period.telling import name_voxels
+from hapticdb.kernels.resident.cells import LISTED, cell_key
 from hapticdb.realtime.fetching import (
     CONFIRM_EVERY,
     Fetcher,
@@ -52,24 +51,25 @@ class Side:
         self.grid = grid
         self.row = self.reader.row
         self.session = table.desk.sessions[self.row, ...]
-        self.told = np.zeros((), TOLD)
 
     def be_at(
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
     ) -> tuple[list[int], bytes, int]:
         """Run a frame, write the state; return the frame's hits, wrench and unknown points."""
         found = self.reader.feel(pose)
-        self.told["is_active"] = True
-        self.told["tool"] = self.told["handle"] = pose[:3, 3]
-        self.told["velocity"] = 0.0 if velocity is None else velocity[:3]
-        self.told["radius"] = RADIUS_M
-        servo.tell(self.session, self.told, self.reader.missed)
+        told, missed = self.session["told"], self.reader.missed
+        told["is_active"], told["radius"] = True, RADIUS_M
+        told["tool"] = told["handle"] = pose[:3, 3]
+        told["velocity"] = 0.0 if velocity is None else velocity[:3]
+        self.session["n_missed"] = missed[LISTED]
+        self.session["missed"] = missed[LISTED + 1 :]
+        self.session["sequence"] += 2
         return found
 
     def name(self, pose: Pose, n_hits: int) -> None:
         """Ask for the objects at the last frame's hits."""
-        servo.name_voxels(
-            self.session, self.reader.clusters, pose, self.reader.place, self.grid.bits,
+        name_voxels(
+            self.session[()], self.reader.clusters, pose, self.reader.place, self.grid.bits,
             self.grid.curve_code, self.reader.hits, n_hits,
         )  # fmt: skip
 

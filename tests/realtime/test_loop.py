@@ -15,15 +15,15 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Device
 from hapticdb.errors import DeviceError
 from hapticdb.realtime import loop as subject
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
-from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of, work
+from hapticdb.realtime.loop import LoopRequest, work
 from hapticdb.realtime.processes import Message, MessageSender
 from hapticdb.realtime.report import LoopAnswer
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.frame import State
-from hapticdb.resident.table import anonymous_memory
 from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Clutched, Lost, Odd, Slow, Unplugged, still, stroking
 from realtime.worlds import make
@@ -54,14 +54,14 @@ def cells(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ResidentCells]:
 def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """A function that runs the loop's work in this process and returns its answer and frames."""
     monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
-    memory = anonymous_memory("frames", ring_bytes(N_RING))
     with cells.table.reading() as row:
 
         def ran(device: Device, **options: object) -> Ran:
+            board = Board.create(1, N_RING)
             rate = float(str(options.pop("rate", 500.0)))
             request = LoopRequest(
                 descriptor=cells.table.descriptor, n_slots=cells.table.n_slots, row=row,
-                ring=memory, n_ring=N_RING, grid=cells.grid, shell=sphere, device=device,
+                board=board.descriptor, n_ring=N_RING, grid=cells.grid, shell=sphere, device=device,
                 law=TangentPlane(), coupling=DIRECT, handle=Handle(), timing=Timing(rate),
                 seconds=0.3, staleness=60.0, is_waiting=False,
             )  # fmt: skip
@@ -70,7 +70,8 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
             said = list(messages(heard.getvalue()))
             assert [message.word for message in said] == ["running", "done"]
             answer = said[-1].content
-            frames = ring_of(memory, N_RING)[: answer.loop.frames].copy()
+            frames = board.rings[0, : answer.loop.frames].copy()
+            board.close()
             return Ran(answer, frames)
 
         yield ran
@@ -158,30 +159,6 @@ def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: R
 def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)
     assert not run(still(0.03)).answer.is_warm
-
-
-def test_a_frame_that_waits_lets_go_and_ends_with_the_session(
-    run: Run, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    applied: list[Floats] = []
-    hand = still(0.010)
-    hand.apply = lambda wrench: applied.append(wrench.copy())  # type: ignore[method-assign]
-    known, n_steps = subject.Loop._step, 0
-
-    def step(loop: subject.Loop, dt: float, *, is_stale: bool) -> None:
-        nonlocal n_steps
-        n_steps += 1
-        known(loop, dt, is_stale=is_stale)
-        if n_steps > 50:  # from now on all cells count as unknown
-            loop.sent.unknown[()] = 1
-
-    monkeypatch.setattr(subject.Loop, "_step", step)
-    answer, frames = run(hand, is_waiting=True, seconds=0.5)
-    assert answer.counts.unknown_frames == 1
-    assert answer.loop.seconds == pytest.approx(0.5, abs=0.2)
-    assert applied[-5].any()
-    assert not np.any(applied[-4:])  # one during the wait, one of that frame, two at the end
-    assert not frames["applied"][-1].any()
 
 
 def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> None:

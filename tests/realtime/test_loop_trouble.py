@@ -21,16 +21,18 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import DeviceError
 from hapticdb.kernels.hand.holding import RISE_FRAMES
+from hapticdb.kernels.period.loop import ALWAYS, WITHDRAWN_NS
 from hapticdb.kernels.resident.cells import BUFFERS, VERSION, Cells
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
-from hapticdb.realtime.loop import WITHDRAWN_NS, Loop, LoopRequest, ring_bytes, work
+from hapticdb.realtime.loop import Loop, LoopRequest, work
 from hapticdb.realtime.processes import MessageSender
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.table import HEARTBEAT, CellTable, anonymous_memory
+from hapticdb.resident.table import HEARTBEAT, CellTable
 from hapticdb.testing import write_voxels
 from realtime.hands import at
 from realtime.sessions import floor_points
@@ -104,7 +106,7 @@ def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
         descriptor=world.table.descriptor,
         n_slots=world.table.n_slots,
         row=world.table.join(),
-        ring=anonymous_memory("frames", ring_bytes(N_RING)),
+        board=Board.create(1, N_RING).descriptor,
         n_ring=N_RING,
         grid=world.grid,
         shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
@@ -118,13 +120,12 @@ def requested(world: World, hand: Pressing, **options: object) -> LoopRequest:
     )
 
 
-def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> Reading:
+def frame(loop: Loop, hand: Pressing, dt: float = 1e-3) -> None:
     """Run one frame that waits for its cells."""
-    reading = hand.read()
-    loop.request.handle.follow(reading, loop.hand)
-    used = loop._step_exactly(reading, dt, time.perf_counter_ns() + LATE)
+    loop._take(hand.read())
+    now = time.perf_counter_ns()
+    loop._step_exactly(dt, now + LATE, now, now)
     hand.apply(loop.sent.wrench)
-    return used
 
 
 def pressed(world: World, hand: Pressing, **options: object) -> Loop:
@@ -186,14 +187,34 @@ def test_after_a_wait_that_let_go_the_force_rises_from_nothing(world: World) -> 
 def test_after_a_wait_that_let_go_it_counts_where_the_hand_is_by_then(
     world: World,
 ) -> None:
-    """The frame returns the reading it used, and that reading is the one that is recorded."""
+    """The reading that the frame used is the one that is recorded."""
     hand = Summoning(0.02)
     loop = pressed(world, hand, hold=1e-3)
     hand.take(world.table.cells)
-    used = frame(loop, hand)
+    frame(loop, hand)
     assert not loop.sent.unknown
-    assert used.buttons == 2
-    assert used.pose[2, 3] == loop.hand["position"][2] == -0.02
+    noted = loop.board.last_frame(0)
+    assert noted is not None
+    assert noted["buttons"][0] == 2
+    assert noted["hand"][0, 2] == loop.hand["position"][2] == -0.02
+
+
+def test_a_frame_that_waits_lets_go_and_ends_with_the_session(world: World) -> None:
+    class Lost(Summoning):
+        def apply(self, wrench: Floats) -> None:
+            super().apply(wrench)
+            self.reads_left = 1 << 30  # the cells stay away
+            self.z = -0.01 if len(self.sent) > 5 else 0.02  # it begins in the air
+            if len(self.sent) == 50:
+                self.take(world.table.cells)
+
+    hand = Lost(0.02)
+    request = requested(world, hand, seconds=0.5)
+    board = Board(os.dup(request.board), N_RING)
+    work(request, MessageSender(io.BytesIO()))
+    assert board.seats["unknown_frames"][0] == 1
+    assert hand.sent[-5].any()
+    assert not np.any(hand.sent[-4:])  # one during the wait, one of that frame, two at the end
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
@@ -225,10 +246,10 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     assert loop.tool["felt"].any()
     hand.z = 0.02
     loop._place()
-    loop._step(1e-3, is_stale=True)
-    loop._note(0, 0.0, 0.0, 0.0, 0.0, 0, loop._count(is_clutch_open=False, is_stale=True))
-    (noted,) = loop.ring[[0]]
-    assert noted["hits"] == loop.counts.hit_frames == 0
+    loop.station.row["staleness"] = -(10**18)
+    loop._step(1e-3, ALWAYS)
+    noted = loop.board.rings[0, 0]
+    assert noted["hits"] == loop.board.seats["hit_frames"][0] == 0
     assert not noted["wrench"].any()
 
 

@@ -1,23 +1,20 @@
 """A running session feels edits of the environment, on both engines."""
 
-from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.kernels.large.budget import Asleep
-from hapticdb.kernels.records import MOST_MISSED, SERVO
-from hapticdb.kernels.resident import cells as resident
+from hapticdb.kernels.period.loop import ALWAYS
+from hapticdb.kernels.records import FRAME, SEAT
 from hapticdb.kernels.resident.cell_table import publish
 from hapticdb.query.law import PLANE, SMOOTH
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.drive import DirectDrive, SmoothDrive
 from hapticdb.realtime.session import Session
+from hapticdb.realtime.stations import Station, Stations
 from hapticdb.recording.frame import State
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
@@ -46,54 +43,26 @@ def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
         check_edits(env, sphere, tmp_path / "edited.hdbrec")
 
 
-@dataclass
-class Scene:
-    """What a drive reads, of a table without cells."""
-
-    cells: resident.Cells
-    row: int
-    clusters: resident.Clusters
-    asleep: Asleep
-    servo: NDArray[np.void]
-    pose: NDArray[np.float64]
-    missed: NDArray[np.int64]
-    place: resident.Place
-
-
 @pytest.mark.parametrize("is_smooth", [False, True])
 def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
-    sphere: PointShell, monkeypatch: pytest.MonkeyPatch, *, is_smooth: bool
+    sphere: PointShell, *, is_smooth: bool
 ) -> None:
     """Others write just before its kernel begins, and again as soon as it has ended."""
-    law = SMOOTH if is_smooth else PLANE
+    grid, seats, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
     with CellTable.create(8 << 20, distances=is_smooth) as table, table.reading() as row:
-        control, servo = table.cells.control, np.zeros((), SERVO)
-        servo["hand"]["quaternion"][0] = 1.0
-        place = resident.Place(0.0, 0.0, 0.0, 0.01, 64.0)
-        missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-        tool = held_tool(sphere, 0.01)
-        scene = Scene(table.cells, row, *tool, servo, np.eye(4), missed, place)
-        drive: DirectDrive | SmoothDrive
-        if is_smooth:
-            spring = Coupling().settled(SCRIPTED, 500.0, 1.0, 0.024).spring()
-            drive = SmoothDrive(scene, spring, law)
-        else:
-            drive = DirectDrive(scene, Coupling().direct(SCRIPTED, 1.0, 0.024).terms(), 0.024, law)
-        frame = drive._frame
-
-        def edited(*arguments: NDArray[np.float64]) -> int:
-            publish(control, 2, 8, NO_KEYS)
-            left_out = frame(*arguments)  # type: ignore[arg-type]
-            publish(control, 3, 9, NO_KEYS)
-            return left_out
-
-        publish(control, 1, 7, NO_KEYS)
-        monkeypatch.setattr(drive, "_frame", edited)
-        if is_smooth:
-            drive.feel()
-        else:
-            drive.step(1e-3)
-        assert servo["sent"]["revision"] == 8
+        periods = Stations(1, seats, rings, SMOOTH if is_smooth else PLANE)
+        cells = table.cells if is_smooth else table.cells.without_distances()
+        station = Station(
+            periods.rows, cells, row, table.desk.sessions[row, ...], grid, held_tool(sphere, 0.01)
+        )
+        station.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
+        station.servo["hand"]["quaternion"][0] = station.servo["tool"]["quaternion"][0] = 1.0
+        station.row["is_running"], station.row["noted"] = True, ALWAYS
+        seats["is_recorded"] = True
+        for revision in (7, 8, 9):
+            publish(table.cells.control, revision - 6, revision, NO_KEYS)
+            periods.step(0, 0, 1e-3)
+        assert rings["revision"][0].tolist() == [7, 8, 9, 0]
 
 
 def check_edits(edited: Environment, sphere: PointShell, path: Path) -> None:

@@ -8,11 +8,11 @@ from typing import Any, Self
 from numpy.typing import ArrayLike
 
 from hapticdb.errors import HapticDBError
-from hapticdb.hosting.board import Board
 from hapticdb.hosting.channel import Ask, Channel
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling
 
 LOG = logging.getLogger("hapticdb.hosting")

@@ -8,7 +8,6 @@ a proxy computes it, without the interpreter lock.
 import math
 import threading
 import time
-from dataclasses import replace
 from typing import Self
 
 import numpy as np
@@ -17,24 +16,13 @@ from numpy.typing import NDArray
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.errors import UsageError
 from hapticdb.kernels.field.law import ONSET
-from hapticdb.kernels.hand import quasistatic, servo
-from hapticdb.kernels.hand.device_spring import contact_stiffness
+from hapticdb.kernels.hand import quasistatic
+from hapticdb.kernels.hand.device_spring import DeviceSpring, contact_stiffness
 from hapticdb.kernels.hand.holding import IS_HELD
-from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.proxy.linearize import linearize
 from hapticdb.kernels.proxy.planes import ROW_COLUMNS
-from hapticdb.kernels.records import (
-    CONTACT_MODEL,
-    FOLLOWER,
-    MOST_MISSED,
-    SERVO,
-    TOLD,
-    pose_numbers,
-)
-from hapticdb.kernels.resident.cells import Place
-from hapticdb.kernels.rigid import poses_of
+from hapticdb.kernels.records import CONTACT_MODEL, FRAME, SEAT
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.poses import rotation_of
 from hapticdb.protocol.contacts import (
     FINE,
     IS_LOOSE,
@@ -46,12 +34,12 @@ from hapticdb.protocol.contacts import (
     ProxyTerms,
     ProxyWish,
 )
+from hapticdb.query.law import SMOOTH
 from hapticdb.ready import make_ready
 from hapticdb.realtime.coupling import Coupling, radius_of
-from hapticdb.realtime.drive import prepare_follower
 from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
-from hapticdb.resident.table import HEARTBEAT
 
 Floats = NDArray[np.float64]
 
@@ -66,8 +54,6 @@ steps, and a hand that turns back is followed less exactly."""
 MOST_STEPS = 10
 """Most steps of the coupling for one proxy. Larger: fast hands are followed more exactly, and a
 proxy takes longer."""
-STALENESS_NS = 1_000_000_000
-"""Nanoseconds without an answer of the database after which cells count as unknown."""
 
 
 class ContactSource:
@@ -96,17 +82,19 @@ class ContactSource:
             cap=wish.cap or None,
             torque_cap=wish.turn_cap or None,
         ).settled(SCRIPTED, 1.0 / STEP, 1.0, radius)
-        self._spring = coupling.spring()._replace(damping=0.0)  # the client damps at its own rate
-        self._cells, self._shell = cells, replace(shell, surface=None)
-        self._place = Place(*cells.grid.origin, size, float(cells.grid.side))
-        self._clusters, asleep = held_tool(shell, size)
-        self._servo, self._follower = np.zeros((), SERVO), np.zeros((), FOLLOWER)
-        prepare_follower(self._follower, len(shell), asleep)
-        self._field = np.zeros((FIELD_ROWS, len(shell)))
-        self._met = np.zeros((MET_ROWS, len(shell)), dtype=np.int64)
-        self._missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        self._spring: DeviceSpring = coupling.spring()._replace(
+            damping=0.0
+        )  # the client damps at its own rate
+        self._cells = cells
+        self._row = cells.table.join()
+        self._stations = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._station = Station(
+            self._stations.rows, cells.table.cells, self._row,
+            cells.table.desk.sessions[self._row, ...], cells.grid, held_tool(shell, size),
+        )  # fmt: skip
+        self._station.set_spring(self._spring)
+        self._station.row["is_running"] = True
         self._rows = np.zeros((len(shell), ROW_COLUMNS))
-        self._told, self._pose = np.zeros((), TOLD), np.eye(4)[None]
         self.model: NDArray[np.void] = np.zeros((), CONTACT_MODEL)
         """Record of `CONTACT_MODEL`: the last proxy before it was rounded for its message."""
         self.terms = ProxyTerms(
@@ -120,7 +108,6 @@ class ContactSource:
         self._clock = 0.0  # of that hand, s
         self.n_sent = 0
         """Proxies computed so far."""
-        self._row = cells.table.join()
 
     def __enter__(self) -> Self:
         return self
@@ -131,7 +118,7 @@ class ContactSource:
     @property
     def share(self) -> float:
         """Share of the stiffness that the guard against shaking leaves; 1 where nothing shakes."""
-        return float(self._follower["share"])
+        return float(self._station.follower["share"])
 
     def close(self) -> None:
         """Stop being a reader of the cells; a second call does nothing."""
@@ -155,24 +142,22 @@ class ContactSource:
         at = np.concatenate([hand.position, hand.quaternion])
         if hand.is_open or self._last is None:
             self._begin(at)
-        self._follow(at, hand.clock)
-        self._tell(hand.velocity)
+        self._follow(at, hand)
+        one = self._station
         linearize(
-            self._cells.table.cells, self._row, self._clusters, self._place, self._spring,
-            self._servo, self._follower, self._field, self._rows, self.model,
+            one.cells, one.reader, one.clusters, one.place, self._spring, one.servo, one.follower,
+            one.field, self._rows, self.model,
         )  # fmt: skip
         self.n_sent += 1
         return self._state(hand, kept + time.monotonic() - start)
 
     def _begin(self, at: Floats) -> None:
         """Put the tool where the hand is, at rest."""
-        self._servo[()] = np.zeros((), SERVO)
-        pose_numbers(self._servo["tool"])[:] = at
-        pose_numbers(self._servo["hand"])[:] = at
+        self._station.rest_at(at)
         self._last = at
 
-    def _follow(self, at: Floats, clock: float) -> None:
-        """Move the tool after the hand, from the last hand to the one at (7,), s of its clock.
+    def _follow(self, at: Floats, newest: HandState) -> None:
+        """Move the tool after the hand, from the last hand to the newest one, at (7,).
 
         The time that the hand took is the coupling's: its guard counts how often a force turns back
         in a time, and would take a way in quick steps for shaking.
@@ -182,40 +167,23 @@ class ContactSource:
         turned = at[3:] if float(last[3:] @ at[3:]) >= 0.0 else -at[3:]
         angle = 2.0 * float(np.linalg.norm(turned - last[3:]))
         way = float(np.linalg.norm(at[:3] - last[:3])) + self._spring.radius * angle
-        steps = min(max(math.ceil(way / (STEP_WAY * self._place.size)), 1), MOST_STEPS)
-        period = min(max(clock - self._clock, STEP), LONGEST) / steps
-        self._clock = clock
-        control = self._cells.table.cells.control
-        hand = self._servo["hand"]
-        hand["is_stale"] = time.monotonic_ns() - int(control[HEARTBEAT]) > STALENESS_NS
+        steps = min(max(math.ceil(way / (STEP_WAY * self._station.place.size)), 1), MOST_STEPS)
+        period = min(max(newest.clock - self._clock, STEP), LONGEST) / steps
+        self._clock = newest.clock
+        hand = self._station.servo["hand"]
+        hand["velocity"][:3] = newest.velocity[:3]
         for step in range(1, steps + 1):
             share = step / steps
             quaternion = last[3:] + share * (turned - last[3:])
             hand["position"] = last[:3] + share * (at[:3] - last[:3])
             hand["quaternion"] = quaternion / np.linalg.norm(quaternion)
-            quasistatic.advance(
-                self._cells.table.cells, self._row, self._clusters, self._place, self._spring,
-                self._servo, self._follower, period, self._field, self._met, self._missed,
-            )  # fmt: skip
+            self._stations.step(0, time.monotonic_ns(), period)
         self._last = at.copy()
-
-    def _tell(self, velocity: Floats) -> None:
-        """Report to the fetching process where hand and tool are, and which cells are missing."""
-        told, center = self._told, self._shell.center
-        poses_of(pose_numbers(self._servo["tool"])[None], self._pose)
-        pose = self._pose[0]
-        lever = rotation_of(self._servo["hand"]["quaternion"])[0] @ center
-        told["is_active"] = True
-        told["tool"] = pose[:3, :3] @ center + pose[:3, 3]
-        told["handle"] = self._servo["hand"]["position"] + lever
-        told["velocity"] = velocity[:3]
-        told["radius"] = self._spring.radius
-        servo.tell(self._cells.table.desk.sessions[self._row, ...], told, self._missed)
 
     def _state(self, hand: HandState, kept: float) -> ProxyState:
         """Round the model for its message."""
         model, n = self.model, int(self.model["n_planes"])
-        sent = self._servo["sent"]
+        sent = self._station.servo["sent"]
         flags = IS_WAITING if int(sent["marks"]) & IS_HELD else 0
         flags |= IS_LOOSE if int(sent["marks"]) & quasistatic.IS_LOOSE else 0
         return ProxyState(
@@ -224,7 +192,7 @@ class ContactSource:
             model["tool"][:3] - model["hand"][:3], model["tool"][3:].copy(),
             model["wrench"].copy(), model["stiffness"].copy(), float(model["spring"]),
             float(model["turn_spring"]),
-            _rounded_planes(model, n, self._spring.radius, self._place.size),
+            _rounded_planes(model, n, self._spring.radius, self._station.place.size),
         )  # fmt: skip
 
 

@@ -17,19 +17,20 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.board import Board
 from hapticdb.hosting.hosted import HostedSession, Recorded
 from hapticdb.hosting.running import Running
-from hapticdb.hosting.stations import SeatRequest
 from hapticdb.hosting.tables import SharedTables, Words
+from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import quaternion_of
 from hapticdb.query.law import SMOOTH
 from hapticdb.ready import make_ready
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
+from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.header import Header
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.filtering import Filter
@@ -167,9 +168,9 @@ class SessionHost:
             cells.table.desk.pids[reader] = worker.pid
             request = SeatRequest(
                 seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
-                grid=cells.grid, shell=shell, coupling=settled,
+                grid=cells.grid, shell=without_surface(shell), coupling=settled,
                 pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
-            ).without_surface()  # fmt: skip
+            )  # fmt: skip
             hand = np.array(request.pose)
             self._board.seats["hand_pose"][seat] = hand
             self._board.seats["is_held"][seat] = 1

@@ -1,6 +1,5 @@
 """HostedSession: one hand that a host runs, seen from the process that moves it."""
 
-import math
 import os
 import time
 from typing import NamedTuple, Protocol
@@ -10,13 +9,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
-from hapticdb.hosting.board import TAKEN, Board
 from hapticdb.kernels.hand.handle import FARTHEST
-from hapticdb.kernels.records import TIME_BIN, TIME_BINS
+from hapticdb.kernels.records import TIME_BIN
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of
+from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.report import Spread
+from hapticdb.realtime.report import Spread, spread_of
 from hapticdb.recording.frame import Frames, State
 
 
@@ -158,8 +157,8 @@ class HostedSession:
             frames=frames,
             missed=missed,
             in_time=int(row["in_time"]) / max(frames + missed, 1),
-            lateness=_spread(row["lateness"], float(row["worst_lateness"])),
-            elapsed=_spread(row["elapsed"], float(row["worst_elapsed"])),
+            lateness=spread_of(row["lateness"], TIME_BIN, float(row["worst_lateness"])),
+            elapsed=spread_of(row["elapsed"], TIME_BIN, float(row["worst_elapsed"])),
             unknown=int(row["unknown_frames"]),
             held=int(row["held_frames"]),
             stale=int(row["stale_frames"]),
@@ -169,16 +168,3 @@ class HostedSession:
         """End the session and its recording; a second call does nothing."""
         if self._board.seats["id"][self.seat] == self.id:
             self._ended_recording("end")
-
-
-def _spread(counts: NDArray[np.int64], worst: float) -> Spread:
-    """Percentiles of a histogram of `TIME_BINS` bins; zeros if it is empty."""
-    sums = np.cumsum(counts)
-    total = int(sums[-1])
-    if not total:
-        return Spread(0.0, 0.0, 0.0, 0.0)
-    at = np.searchsorted(sums, [math.ceil(share * total) for share in (0.5, 0.99, 0.999)])
-    p50, p99, p999 = np.where(
-        at == TIME_BINS, worst, np.minimum((at + 0.5) * TIME_BIN, worst)
-    ).tolist()
-    return Spread(p50, p99, p999, worst)

@@ -5,10 +5,10 @@ import time
 from pathlib import Path
 
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.hosting.board import Board
 from hapticdb.hosting.hosted import Recorded
-from hapticdb.hosting.stations import SeatRequest
+from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import WorkerProcess
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT

@@ -12,16 +12,24 @@ import threading
 import time
 from dataclasses import dataclass
 
+import numpy as np
+
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.hosting.board import Board
+from hapticdb.grid import Grid
 from hapticdb.hosting.channel import Ask, Channel
-from hapticdb.hosting.stations import SeatRequest, Stations
 from hapticdb.kernels.compiling import load
+from hapticdb.kernels.period.loop import ALWAYS
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import SMOOTH
+from hapticdb.realtime.board import Board
+from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.deadlines import SPIN, Timing, undisturbed
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
+from hapticdb.realtime.stations import Station, Stations
+from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 
-ENTRIES = ("hosting.loop.run", "resident.feeling.bounding_spheres")
+ENTRIES = ("period.loop.run", "resident.feeling.bounding_spheres")
 """Kernels that a worker calls; the loop's has all others that a frame needs within it."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""
@@ -38,15 +46,42 @@ class WorkerRequest:
     rate: float
 
 
+@dataclass(frozen=True)
+class SeatRequest:
+    """What a worker needs to run a session.
+
+    seat : row of the board; table, n_slots : name and slots of the table of cells, whose descriptor
+    comes beside; reader : the session's row there; pose (7,) : where hand and tool start.
+    """
+
+    seat: int
+    table: int
+    n_slots: int
+    reader: int
+    grid: Grid
+    shell: PointShell
+    coupling: SettledCoupling
+    pose: tuple[float, ...]
+
+
 class Worker:
-    """The sessions of one process and their loop."""
+    """The sessions of one process and their loop.
+
+    A session's memory is made beside the loop. The loop sees the session when `is_running` of its
+    station is set, which is done last, and leaves it between two periods when that is withdrawn.
+    """
 
     def __init__(self, request: WorkerRequest) -> None:
         self._board = Board(request.board)
         self._channel = Channel(socket.socket(fileno=request.sock))
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
-        self._stations = Stations(self._board, request.rate, SPIN)
+        seats = self._board.seats
+        self._stations = Stations(
+            len(seats), seats, self._board.rings, SMOOTH, period=round(1e9 / request.rate),
+            spin=round(1e9 * SPIN),
+        )  # fmt: skip
+        self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------
 
@@ -68,26 +103,44 @@ class Worker:
         elif word == "end":
             self._end(content[0])
         elif word == "set_coupling":
-            self._stations.set_coupling(*content)
+            seat, coupling = content
+            self._running[seat][1].set_spring(coupling.spring())
         else:
             raise UsageError(f"a worker does not know the command {word!r}")
 
     def _begin(self, request: SeatRequest, descriptor: int) -> None:
         if request.table not in self._tables:
             self._tables[request.table] = CellTable(os.dup(descriptor), request.n_slots)
-        self._stations.begin(request, self._tables[request.table])
+        table, rows = self._tables[request.table], self._stations.rows
+        n = int(np.flatnonzero(rows["is_running"] == 0)[0])
+        row = rows[n : n + 1]
+        station = Station(
+            row, table.cells, request.reader, table.desk.sessions[request.reader, ...],
+            request.grid, held_tool(request.shell, request.grid.voxel_size),
+        )  # fmt: skip
+        pose = np.array(request.pose)
+        station.rest_at(pose)
+        station.arrive_at(pose)
+        station.set_spring(request.coupling.spring())
+        row["seat"], row["noted"] = request.seat, ALWAYS
+        row["began"] = row["last"] = time.monotonic_ns()
+        self._running[request.seat] = request, station
+        row["is_running"] = 1
 
     def _end(self, seat: int) -> None:
-        self._stations.withdraw(seat)
-        last, until = self._stations.n_periods + 2, time.monotonic() + LEAVE_PATIENCE
-        while self._stations.n_periods < last:
+        request, station = self._running[seat]
+        station.row["is_running"] = 0
+        periods = self._stations.pace["periods"]
+        last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
+        while int(periods) < last:
             if time.monotonic() > until:
                 raise HapticDBError("a worker's loop hangs: end the host")
             time.sleep(0.5 / self._rate)
-        self._stations.free(seat)
-        used = self._stations.used_tables()
-        for name in [name for name in self._tables if name not in used]:
-            self._tables.pop(name).close()
+        station.session["told"]["is_active"] = False
+        del self._running[seat]
+        used = {request.table for request, _ in self._running.values()}
+        if request.table not in used:
+            self._tables.pop(request.table).close()
 
     def run(self) -> None:
         """Run periods until the host ends; the work of the loop's thread."""

@@ -6,9 +6,9 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.hosting.board import TAKEN, Board
 from hapticdb.hosting.channel import Channel
 from hapticdb.hosting.worker import WorkerRequest
+from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.resident_cells import start_error
 

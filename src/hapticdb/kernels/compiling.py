@@ -27,9 +27,9 @@ from typing import NamedTuple, Self
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 ENTRIES = {
-    "hand.quasistatic": "advance",
+    "period.loop": "run",
+    "period.direct": "run_directly",
     "proxy.linearize": "linearize",
-    "hosting.loop": "run",
     "surfaces.distances": "find_blocks rows_of_blocks",
     "surfaces.voxelize": "voxelize_kernel",
     "resident.nearest": "find_nearest",
@@ -58,21 +58,18 @@ ENTRIES = {
     "resident.feeling": "bounding_spheres",
     "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
     "surfaces.sampling": "eliminate_kernel",
-    "hand.direct": "render",
-    "hand.servo": "tell name_voxels note",
     "curves": "encode_kernel decode_kernel",
     "rigid": "poses_of first_not_rigid",
     "surfaces.bricks": "mark_points_kernel brick_voxels_kernel",
-    "hand.handle": "is_somewhere grip carry",
+    "hand.handle": "is_somewhere follow",
     "proxy.evaluate": "evaluate",
 }
 """Entries of each module; modules that take longest to compile come first. The names are listed
 here so that a process can check for compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "large.budget": "hand.quasistatic",
-    "proxy.linearize": "hand.quasistatic",
-    "hosting.loop": "hand.quasistatic",
+    "large.budget": "period.direct",
+    "proxy.linearize": "period.loop",
     "resident.clearance": "resident.nearest",
 }
 """Modules that are compiled after another module in the same process: they share its leaves."""
@@ -119,15 +116,13 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "feel": (
         *_SHELL,
         *_RESIDENT,
-        "large.*",
-        "hand.direct.*",
-        "hand.quasistatic.*",
-        "hand.servo.*",
+        "period.loop.*",
         "hand.handle.*",
         "motion.*",
         "rigid.*",
     ),
-    "host": (*_RESIDENT, "hosting.*"),
+    "direct": ("period.direct.*",),
+    "host": (*_RESIDENT, "period.loop.*"),
     "replay": (*_RESIDENT, "large.*", "rigid.poses_of"),
     "clashes": ("surfaces.sides.*", "surfaces.nearest.*", "triangles.*", "curves.encode_kernel"),
     "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
@@ -142,7 +137,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "query.contact.*",
         "query.refining.*",
     ),
-    "proxies": (*_RESIDENT, "hand.quasistatic.*", "hand.servo.*", "proxy.linearize.*", "rigid.*"),
+    "proxies": (*_RESIDENT, "period.loop.*", "proxy.linearize.*"),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
     "everything": ("*",),
 }

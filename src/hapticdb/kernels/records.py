@@ -88,8 +88,23 @@ HAND: Layout = _record(
 )
 """The handle to which the tool is pulled: its frame in the scene. NaN: there is no handle yet."""
 
-OFFSET: Layout = _record([("position", "<f8", 3), ("quaternion", "<f8", 4)])
-"""Offset from hand to handle: added to the hand's position, applied before the hand's turn."""
+HANDLE: Layout = _record(
+    [
+        ("scale", "<f8"),  # m of the scene for a metre of the device
+        ("clutch", "<i8"),  # bit of the button that opens it, 0 for none
+        ("starts_elsewhere", "?"),  # than at the hand: at `start`
+        ("start", "<f8", 7),  # position m, unit quaternion
+        ("is_placed", "?"),  # there was a reading
+        ("x", "<f8"),  # of its last known place, m
+        # from hand to handle: added to the hand's position, applied before the hand's turn
+        ("position", "<f8", 3),
+        ("quaternion", "<f8", 4),
+    ]
+)
+"""How a device's readings move a handle (`kernels.hand.handle`)."""
+
+READING: Layout = _record([("pose", "<f8", (4, 4)), ("velocity", "<f8", 6), ("buttons", "<i8")])
+"""What a device has read (`hapticdb.devices.protocol.Reading`)."""
 
 TOOL: Layout = _record(
     [
@@ -258,17 +273,11 @@ SESSION: Layout = _record_in_lines(
             ("n_asked", "<i8"),
             ("asked", "<i8", MOST_ASKED),  # keys of voxels whose objects the loop asks for
         ],
-        [  # written by the loop in every frame
-            ("n_frames", "<i8"),  # done so far
-        ],
         [  # written by the fetching process
             ("heard", "<i8"),  # the sequence number that it has read
             ("n_missing", "<i8"),  # cells wanted at that number and not there yet
             ("n_objects", "<i8"),
             ("objects", "<i8", MOST_ASKED),  # ids of the objects in the voxels asked for
-        ],
-        [  # written by the process that began the session
-            ("is_asked_to_end", "?"),
         ],
     ],
     SESSION_BYTES,
@@ -300,32 +309,44 @@ densely."""
 TIME_BINS, TIME_BIN = 1000, 5e-6
 """Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
 bins: less exact percentiles. The worst time is kept exactly."""
-LABEL_BYTES = 128
-"""Longest label of a hosted session, bytes of UTF-8."""
 
 SEAT: Layout = _record(
     [
-        # written by the host
-        ("state", "<i8"),  # named in `hapticdb.hosting.board`
+        # written by who began the session
+        ("state", "<i8"),  # named in `hapticdb.realtime.board`
         ("id", "<i8"),  # of the session
-        ("label", f"S{LABEL_BYTES}"),
         ("worker", "<i8"),  # number of the worker process
         ("is_recorded", "<i8"),  # frames have the law's wrench, for a recording
-        # written by the process that moves the hand
+        ("is_asked_to_end", "<i8"),
+        # written by the process that moves a hosted session's hand
         ("hand_sequence", "<i8"),  # odd while the next fields are written
         ("hand_time", "<i8"),  # ns, CLOCK_MONOTONIC
         ("hand_pose", "<f8", 7),  # position m, unit quaternion, scalar first
         ("is_held", "<i8"),  # somebody holds the tool
         ("n_moves", "<i8"),
-        # written by the worker
+        # written by the process that runs the periods; counts of frames and of what they met
         ("n_frames", "<i8"),
         ("missed", "<i8"),  # deadlines at which no frame began
         ("in_time", "<i8"),  # frames that were done within their period
+        ("hit_frames", "<i8"),
+        ("contact_frames", "<i8"),
         ("unknown_frames", "<i8"),
+        ("unknown_points", "<i8"),
         ("held_frames", "<i8"),
         ("stale_frames", "<i8"),
+        ("cut_frames", "<i8"),
+        ("nowhere_frames", "<i8"),
+        ("loose_frames", "<i8"),
+        ("first_loose_frame", "<i8"),
+        ("ended_loose", "<i8"),
+        ("snapping_frames", "<i8"),
+        ("guard_actions", "<i8"),
         ("left_out_frames", "<i8"),  # frames in which the budget left out points
         ("most_left_out", "<i8"),  # points that one frame left out
+        ("peak_force", "<f8"),  # N
+        ("peak_torque", "<f8"),  # N m
+        ("deepest", "<f8"),  # m
+        ("least_share", "<f8"),  # of the stiffness
         ("worst_lateness", "<f8"),  # s
         ("worst_elapsed", "<f8"),  # s
         ("n_objects", "<i8"),
@@ -337,7 +358,7 @@ SEAT: Layout = _record(
         ("elapsed", "<i8", TIME_BINS + 1),
     ]
 )
-"""A hosted session on the board (`hapticdb.hosting.board`), which several processes share."""
+"""A session on the board (`hapticdb.realtime.board`), which several processes share."""
 
 WAY: Layout = _record(
     [
@@ -362,23 +383,26 @@ SLEEPING: Layout = _record(
         ("budget", "<i8"),  # most points near something that a frame looks at
     ]
 )
-"""The sleeping clusters of a hosted session's tool: where their memory is."""
+"""The sleeping clusters of a session's tool: where their memory is."""
 
 STATION: Layout = _record(
     [
         ("is_running", "<i8"),  # all other fields are complete
         ("seat", "<i8"),  # row of the board
         ("reader", "<i8"),  # row of the table of cells
+        ("source", "<i8"),  # of the hand: named in `kernels.period.loop`
+        ("noted", "<i8"),  # which periods are frames: named there, too
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
         *((name, "<i8") for name in ("used", "payload", "near", "session")),
         *((name, "<i8") for name in ("n_control", "n_readers", "n_slots", "capacity")),
         ("heartbeat", "<i8"),  # index in the control block: time of the database's last answer
-        # addresses of records: SERVO, FOLLOWER, TOLD
-        *((name, "<i8") for name in ("servo", "follower", "told")),
+        ("staleness", "<i8"),  # ns without an answer after which all cells count as unknown
         # addresses of the tool's arrays, and their sizes
         *((name, "<i8") for name in ("points", "center", "spheres", "groups", "columns")),
         *((name, "<i8") for name in ("scratch", "field", "met")),
+        # of the tool's pose, the law's frame there, and the unknown cells that were met
+        *((name, "<i8") for name in ("pose", "felt", "missed")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
         ("sleeping", SLEEPING),  # of a large tool; zeros of all others
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
@@ -386,31 +410,43 @@ STATION: Layout = _record(
         ("curve", "<i8"),  # its code
         ("coupling", "<i8"),  # which of the two rows is used: the other one may be written
         ("springs", "<f8", (2, 9)),  # fields of DeviceSpring
-        ("stiffness", "<f8"),  # of the law of a recording, N/m
-        # the hand between arrivals
+        # of a device's hand
+        ("handle", HANDLE),
+        ("reading", READING),
+        # of a hosted hand, between arrivals
         ("seen", "<i8"),  # sequence number of the last arrival
         ("arrived", "<i8"),  # ns
         ("gap", "<i8"),  # ns, mean time between arrivals
         ("is_let_go", "<i8"),
         ("way", WAY),
+        # what periods keep
+        ("servo", SERVO),
+        ("follower", FOLLOWER),
         # times, ns
-        ("began", "<i8"),
+        ("began", "<i8"),  # the session
+        ("begun", "<i8"),  # this period
         ("last", "<i8"),  # frame
-        ("asked_at", "<i8"),
+        ("told_at", "<i8"),
+        ("looked_at", "<i8"),
+        ("asked_at", "<i8"),  # 0 where nothing is asked for
         ("shown_at", "<i8"),
     ]
 )
-"""A hosted session in its worker: where its memory is, and what it keeps between periods."""
+"""A session where its periods run: where its memory is, and what it keeps between them."""
 
 PACE: Layout = _record(
     [
         ("is_over", "<i8"),
         ("periods", "<i8"),  # done so far
-        ("period", "<i8"),  # ns
+        ("period", "<i8"),  # ns; 0: one period, whose times the caller has written
         ("spin", "<i8"),  # ns before a deadline at which the loop watches the clock
+        ("due", "<i8"),  # ns, the deadline of the period
+        ("begun", "<i8"),  # ns, when it began
+        ("dt", "<f8"),  # s since the one before
+        ("moment", "<i8", 4),  # scratch of the clock
     ]
 )
-"""What a worker's loop is told, and what it tells."""
+"""What the loop of periods is told, and what it tells."""
 
 NEAR_CUBE: Layout = _record(
     [

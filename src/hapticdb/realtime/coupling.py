@@ -13,7 +13,6 @@ from hapticdb.devices.profiles import DeviceProfile
 from hapticdb.devices.stability import allow
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.direct import DirectTerms
 from hapticdb.pointshell.shell import PointShell
 
 HOLD = FADE = 0.02
@@ -237,12 +236,16 @@ class DirectRendering:
     hold: float = HOLD
     fade: float = FADE
 
-    def terms(self) -> DirectTerms:
-        """Return the numbers in the kernel's form."""
-        return DirectTerms(
+    def spring(self) -> DeviceSpring:
+        """Return the numbers in the kernel's form, of a spring that is not there."""
+        return DeviceSpring(
+            stiffness=0.0,
+            turn_stiffness=0.0,
             cap=float(self.cap),
             turn_cap=float(self.torque_cap),
+            damping=0.0,
             scale=float(self.scale),
+            radius=float(self.radius),
             hold=float(self.hold),
             fade=float(self.fade),
         )

@@ -14,9 +14,8 @@ import numpy as np
 
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.realtime.object_names import ObjectAnswers
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
-from hapticdb.realtime.tracking import SessionTracker
+from hapticdb.realtime.tracking import ObjectAnswers, SessionTracker
 from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (

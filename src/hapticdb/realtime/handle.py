@@ -9,8 +9,8 @@ from hapticdb.devices.protocol import Device, Reading
 from hapticdb.devices.scripted import Player, RandomHand, pose_at
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
-from hapticdb.kernels.hand.handle import carry, grip, is_somewhere
-from hapticdb.kernels.records import OFFSET, pose_numbers
+from hapticdb.kernels.hand.handle import follow
+from hapticdb.kernels.records import HANDLE, pose_numbers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import quaternion_of, rotation_of
 
@@ -60,63 +60,34 @@ class Handle:
         if clutch is not None and not 0 <= clutch < 31:
             raise UsageError(f"button {clutch} for the clutch: give 0 to 30")
         self.scale = float(scale)
-        self._bit = 0 if clutch is None else 1 << clutch
-        self._start = None if start is None else pose_at(start)
-        if self._start is not None and not is_rigid(self._start):
-            raise UsageError("a handle starts at a pose that is a rigid transform")
-        self.is_open = False
-        self._offset = np.zeros((), OFFSET)
-        self._is_placed = False
-        self._x = 0.0  # x of the handle's last known place
+        self.record = np.zeros((), HANDLE)
+        """Record of `HANDLE`, in the form that kernels read."""
+        self.record["scale"], self.record["clutch"] = scale, 0 if clutch is None else 1 << clutch
+        if start is not None:
+            pose = pose_at(start)
+            if not is_rigid(pose):
+                raise UsageError("a handle starts at a pose that is a rigid transform")
+            self.record["starts_elsewhere"] = True
+            self.record["start"] = (*pose[:3, 3], *quaternion_of(pose[:3, :3])[0])
 
     @property
     def starts_elsewhere(self) -> bool:
         """Whether the handle starts at a given place and not at the hand."""
-        return self._start is not None
+        return bool(self.record["starts_elsewhere"])
 
     def start(self, reading: Reading, hand: Hand) -> None:
         """Place the handle for a reading, at rest; writes `hand`, except its `is_stale`.
 
         If the reading has no valid place, `follow` places the handle at the next one that has.
         """
-        self.is_open = False
-        self._is_placed = is_somewhere(reading.pose, reading.velocity)
-        pose_numbers(hand)[:] = NO_POSE
-        hand["is_open"] = False
-        if self._start is not None:
-            hand["position"] = self._start[:3, 3]
-            hand["quaternion"] = quaternion_of(self._start[:3, :3])[0]
-        # called even if it is not needed, so that the kernel is compiled before the loop runs
-        grip(reading.pose, self.scale, self._offset, hand)
-        if self._start is None:
-            pose_numbers(self._offset)[:] = NO_POSE
-        carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
+        self.record["is_placed"] = hand["is_open"] = False
+        pose_numbers(hand)[:] = (math.nan, *NO_POSE[1:])
+        self.follow(reading, hand)
         hand["velocity"] = 0.0
-        if not self._is_placed:
-            pose_numbers(hand)[:] = (math.nan, *NO_POSE[1:])
 
     def follow(self, reading: Reading, hand: Hand) -> None:
         """Move the handle as far as the reading says; writes `hand`."""
-        position = hand["position"]
-        if not is_somewhere(reading.pose, reading.velocity):
-            if not math.isnan(position[0]):
-                self._x = position[0]
-                position[0] = math.nan
-            return
-        if not self._is_placed:
-            self.start(reading, hand)
-        elif math.isnan(position[0]):
-            position[0] = self._x
-        if reading.buttons & self._bit:
-            self.is_open = True
-            hand["is_open"] = True
-            hand["velocity"] = 0.0
-            return
-        if self.is_open:
-            self.is_open = False
-            hand["is_open"] = False
-            grip(reading.pose, self.scale, self._offset, hand)
-        carry(reading.pose, reading.velocity, self.scale, self._offset, hand)
+        follow(self.record, reading.pose, reading.velocity, reading.buttons, hand)
 
 
 def path_of_hand(device: Device, handle: Handle) -> tuple[Floats | None, float]:

@@ -1,6 +1,6 @@
 """Report of a session: its rate, lateness and computing time, and those of an empty loop."""
 
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from typing import NamedTuple
 
 import numpy as np
@@ -41,14 +41,22 @@ class Times:
 
     def spread(self) -> Spread:
         """Percentiles of the times added; zeros if there are none."""
-        total = int(self.counts.sum())
-        if not total:
-            return Spread(0.0, 0.0, 0.0, 0.0)
-        at = np.searchsorted(
-            np.cumsum(self.counts), np.ceil([0.5 * total, 0.99 * total, 0.999 * total])
-        )
-        p50, p99, p999 = np.where(at == BINS, self.worst, np.minimum((at + 0.5) * BIN, self.worst))
-        return Spread(float(p50), float(p99), float(p999), self.worst)
+        return spread_of(self.counts, BIN, self.worst)
+
+
+def spread_of(counts: NDArray[np.int64], width: float, worst: float) -> Spread:
+    """Percentiles of a histogram whose bins have that width (s); the last bin has all above.
+
+    Zeros if it is empty.
+    """
+    total = int(counts.sum())
+    if not total:
+        return Spread(0.0, 0.0, 0.0, 0.0)
+    at = np.searchsorted(np.cumsum(counts), np.ceil([0.5 * total, 0.99 * total, 0.999 * total]))
+    p50, p99, p999 = np.where(
+        at == len(counts) - 1, worst, np.minimum((at + 0.5) * width, worst)
+    ).tolist()
+    return Spread(p50, p99, p999, worst)
 
 
 @dataclass(frozen=True)
@@ -135,6 +143,16 @@ class Counts:
     left_out_frames: int = 0
     most_left_out: int = 0
     conditions: dict[str, str] = field(default_factory=dict)
+
+    @classmethod
+    def of_seat(cls, seat: NDArray[np.void], bad_reading: str | None) -> "Counts":
+        """Counts of a session's seat, a row of `SEAT`."""
+        names = set(seat.dtype.names or ()) & {one.name for one in fields(cls)}
+        counts = cls(bad_reading=bad_reading, **{name: seat[name].item() for name in names})
+        counts.ended_loose = bool(counts.ended_loose)
+        if not counts.loose_frames:
+            counts.first_loose_frame = -1
+        return counts
 
 
 class LoopAnswer(NamedTuple):

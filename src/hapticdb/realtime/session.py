@@ -3,7 +3,7 @@
 import os
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import asdict, replace
+from dataclasses import asdict
 from typing import Literal, Self, get_args
 
 import numpy as np
@@ -15,17 +15,18 @@ from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.ready import make_ready
+from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand
-from hapticdb.realtime.loop import LoopRequest, ring_bytes, ring_of
+from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident_cells import ResidentCells, start_error, without_distances
 from hapticdb.realtime.session_recording import SessionRecording
+from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.table import anonymous_memory
 
 Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
@@ -150,7 +151,8 @@ class Session:
         self._check_distances(law)
         self.coupling = self._settled(coupling or Coupling(), device)
         self.proportions = self._compared(device)
-        self._pid, self._row, self._memory = os.getpid(), -1, -1
+        self._pid, self._row = os.getpid(), -1
+        self._board: Board | None = None
         self._process: Process | None = None
         self._objects: set[int] = set()
         self._loose_objects: set[int] = set()
@@ -205,22 +207,22 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        make_ready("feel")  # here, so that the loop does not compile
+        purposes = ["feel"] if is_smooth(self.law) else ["feel", "direct"]
+        make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.begin(self._header())
         n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
-        self._memory = anonymous_memory("hapticdb-frames", ring_bytes(n_ring))
-        self._ring = ring_of(self._memory, n_ring)
+        self._board = Board.create(1, n_ring)
         self._row = table.join()
         request = LoopRequest(
             descriptor=table.descriptor,
             n_slots=table.n_slots,
             row=self._row,
-            ring=self._memory,
+            board=self._board.descriptor,
             n_ring=n_ring,
             grid=self.cells.grid,
-            shell=replace(self.shell, surface=None),
+            shell=without_surface(self.shell),
             device=device,
             law=self.law,
             coupling=self.coupling,
@@ -234,7 +236,10 @@ class Session:
             budget_points=self.budget_points,
         )
         self._process = Process(
-            "hapticdb.realtime.loop:work", request, [table.descriptor, self._memory], ["feel"]
+            "hapticdb.realtime.loop:work",
+            request,
+            [table.descriptor, self._board.descriptor],
+            purposes,
         )
         table.desk.pids[self._row] = self._process.pid
         if self._process.receive(START_PATIENCE) is None:
@@ -267,7 +272,7 @@ class Session:
     @property
     def n_frames(self) -> int:
         """Number of frames so far."""
-        return int(self.cells.table.desk.sessions["n_frames"][self._open_row])
+        return int(self._open_board.seats["n_frames"][0])
 
     @property
     def pid(self) -> int:
@@ -279,6 +284,12 @@ class Session:
         if self._row < 0:
             raise UsageError("the session is closed: begin another")
         return self._row
+
+    @property
+    def _open_board(self) -> Board:
+        if self._board is None:
+            raise UsageError("the session is closed: begin another")
+        return self._board
 
     @property
     def objects(self) -> tuple[int, ...]:
@@ -308,8 +319,7 @@ class Session:
 
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
-        done = self.n_frames
-        return self._ring[[(done - 1) % len(self._ring)]] if done else None
+        return self._open_board.last_frame(0)
 
     def wait(self, seconds: float | None = None) -> Report | None:
         """Supervise the session until it ends; returns its report, or None after `seconds`.
@@ -336,7 +346,7 @@ class Session:
 
     def ask_to_end(self) -> None:
         """Make the loop end after its next frame. `wait` then returns the report."""
-        self.cells.table.desk.sessions["is_asked_to_end"][self._open_row] = True
+        self._open_board.seats["is_asked_to_end"][0] = True
 
     def stop(self) -> Report:
         """End the session; returns its report."""
@@ -349,10 +359,11 @@ class Session:
     def _drain(self) -> None:
         """Add the touched objects to the list, and record the new frames."""
         sessions, done = self.cells.table.desk.sessions, self.n_frames
+        ring = self._open_board.rings[0]
         n_objects = int(sessions["n_objects"][self._row])
         named = set(sessions["objects"][self._row, :n_objects].tolist())
-        first = max(self._n_drained, done - len(self._ring))
-        frames = self._ring[np.arange(first, done) % len(self._ring)]
+        first = max(self._n_drained, done - len(ring))
+        frames = ring[np.arange(first, done) % len(ring)]
         self._n_drained = done
         if self.is_loose:
             self._loose_objects |= named
@@ -363,7 +374,7 @@ class Session:
             # before the first contact an answer about the place where the tool lay may be left
             self._objects |= named if self._has_touched else named - self._loose_objects
         if self._recording is not None:
-            self._recording.take(self._ring, done)
+            self._recording.take(ring, done)
 
     def _report(self) -> Report:
         answer = self._answer
@@ -419,9 +430,9 @@ class Session:
         if self._row >= 0:
             self.cells.table.leave(self._row)
             self._row = -1
-        if self._memory >= 0:
-            os.close(self._memory)
-            self._memory = -1
+        if self._board is not None:
+            self._board.close()
+            self._board = None
 
 
 def _check_choices(rate: float, seconds: float | None, staleness: float, policy: str) -> None:

@@ -1,17 +1,20 @@
-"""Tracks sessions for the fetching process: where their tools are, and which cells they need."""
+"""Tracks sessions for the fetching process: where tools are, which cells they need and touch."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
+from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.records import MOST_ASKED
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.realtime.wishes import Motion, Wish
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
-from hapticdb.store.base import NO_KEYS, Keys
+from hapticdb.store.base import NO_KEYS, Keys, Store
+from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
 
 SPEED_HALF_LIFE = 0.7
 """Half-life (s) of a hand's greatest observed speed. A larger value fetches more cells around a
@@ -25,6 +28,10 @@ unfinished belongs to a loop that died."""
 MET = -1.0
 """Urgency of unknown cells that a frame has already met; all other cells have 0 or more, and come
 later."""
+NEAR = ONSET + 0.87
+"""Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
+and half a voxel's diagonal, since the distance counts at the centre of the voxel that holds the
+point. Larger: objects are named that are not felt."""
 
 Ranked = tuple[Keys, NDArray[np.float64]]
 """Cells (n,) int64 and their urgency (n,), smallest first."""
@@ -154,3 +161,50 @@ def ranked(wanted: Sequence[Ranked]) -> Keys:
         _, first = np.unique(cells[order], return_index=True)
         order = order[np.sort(first)]
     return cells[order]
+
+
+class ObjectAnswers:
+    """Answers on the desk of a table: ids of the objects that are felt in the voxels asked for.
+
+    These are the objects in the voxels; in a table with distances, those near the voxels, too.
+
+    Parameters
+    ----------
+    table : CellTable
+        Table of the sessions.
+    residency : Residency
+        Its cells; objects that are left out of them are left out of the answers.
+    """
+
+    def __init__(self, table: CellTable, residency: Residency) -> None:
+        self._desk = table.desk.sessions
+        self._residency = residency
+        self._has_distances = table.has_distances
+        self._answered: dict[int, bytes] = {}
+
+    def forget(self) -> None:
+        """Forget all answers, so that every request is answered again: the database has changed."""
+        self._answered.clear()
+
+    def answer(self, store: Store, rows: Iterable[int]) -> None:
+        """Answer the sessions in `rows` whose requests have changed since the last answer."""
+        before, self._answered = self._answered, {}
+        for row in rows:
+            n_asked = int(self._desk["n_asked"][row])
+            if n_asked <= 0:
+                self._desk["n_objects"][row] = 0
+                continue
+            keys = np.unique(self._desk["asked"][row, :n_asked])
+            question = keys.tobytes()
+            if before.get(row) != question:
+                ids = self.ids_of(store, keys)[:MOST_ASKED]
+                self._desk["objects"][row, : len(ids)] = ids
+                self._desk["n_objects"][row] = len(ids)
+            self._answered[row] = question
+
+    def ids_of(self, store: Store, keys: Keys) -> Keys:
+        """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
+        exclude = self._residency.exclude
+        if self._has_distances:
+            return ids_near_voxels(store, keys, exclude, NEAR)
+        return ids_of_voxels(store, keys, exclude)

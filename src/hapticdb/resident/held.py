@@ -52,8 +52,14 @@ def held_tool(
     sleeps = sleeps or budget is not None or (sleeps is None and len(shell) >= LARGE_FROM)
     n_points = len(shell)
     clusters = clusters_of(shell, voxel_size, run or RUN if sleeps else run)
-    sleepers = _sleepers_of(clusters.spheres if sleeps else clusters.spheres[:0], budget, n_points)
-    return PreparedTool(clusters, Asleep(sleepers, min(budget or n_points, n_points), counts_of(1)))
+    spheres = clusters.spheres if sleeps else clusters.spheres[:0]
+    return PreparedTool(clusters, asleep_of(spheres, budget, n_points))
+
+
+def asleep_of(spheres: Floats, budget: int | None, n_points: int) -> Asleep:
+    """What sleeps of a tool with those spheres (C, 4) of runs: nothing without any."""
+    sleepers = _sleepers_of(spheres, budget, n_points)
+    return Asleep(sleepers, min(budget or n_points, n_points), counts_of(1))
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:

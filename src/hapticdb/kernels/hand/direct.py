@@ -4,46 +4,26 @@ This is the loop of the paper (section 4, Figure 4). The tool is where the hand 
 keeps it out of surfaces. The device's caps bound the wrench.
 """
 
-from typing import NamedTuple
-
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, entry, fields_of, record_of
+from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import lever_in_hand, shortened
 from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD, is_somewhere, share_of_wrench
-from hapticdb.kernels.records import RESULTS, SERVO
+from hapticdb.kernels.records import RESULTS
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, UNKNOWNS, WRENCH
 from hapticdb.kernels.rigid import moment
 
 
-class DirectTerms(NamedTuple):
-    """What bounds the wrench, at the device.
-
-    cap and turn_cap: the most force and torque that are sent, N and N m; scale: S, metres of the
-    scene for a metre of the device; hold and fade, s: how long the wrench is kept when cells are
-    unknown, and how long it then falls to zero.
-    """
-
-    cap: float
-    turn_cap: float
-    scale: float
-    hold: float
-    fade: float
-
-
-DIRECT_TERMS = fields_of(DirectTerms, *(FLOAT,) * 5)
-
-
-@entry(DIRECT_TERMS, FLOATS, record_of(SERVO), FLOATS2, INT, FLOAT)
-def render(terms, center, servo_record, felt, revision, dt):
+@leaf
+def render(terms, center, servo, frame, dt):
     """Put the tool where the hand is, and send the wrench of the frame there to the device.
 
-    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. felt (1,
-    RESULTS): the frame at the hand, of a tool with that centre (3,), in the cells of that revision.
-    If the hand is stale or not finite, or points are in unknown cells, the tool stays, and its
-    wrench is kept for `hold` seconds and then falls to zero within `fade` seconds.
+    terms: a `DeviceSpring`, of which stiffness and damping count for nothing. servo, a record of
+    SERVO: `tool` is updated, `hand` is read, `sent` is written. frame (RESULTS,): at the hand, of a
+    tool with that centre (3,). If the hand is stale or not finite, or points are in unknown cells,
+    the tool stays, and its wrench is kept for `hold` seconds and then falls to zero within `fade`
+    seconds.
     """
-    servo, frame = servo_record[()], felt[0]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     is_lost = hand.is_stale or not is_somewhere(hand)
     unknown = 0 if is_lost else np.int64(frame[UNKNOWNS])
@@ -74,4 +54,3 @@ def render(terms, center, servo_record, felt, revision, dt):
     sent.contacts = np.int64(tool.felt[CONTACTS])
     sent.unknown = unknown
     sent.deepest = tool.felt[DEEPEST]
-    sent.revision = revision

@@ -1,7 +1,9 @@
 """How a hand moves the handle: by a scale, and an offset that remains after the clutch was open."""
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, record_of
-from hapticdb.kernels.records import HAND, OFFSET
+import math
+
+from hapticdb.kernels._jit import FLOATS, FLOATS2, INT, entry, leaf, record_of
+from hapticdb.kernels.records import HAND, HANDLE
 from hapticdb.kernels.rigid import product, quaternion_in
 
 FARTHEST = 1e6
@@ -22,34 +24,83 @@ def is_somewhere(pose, velocity):
     return True
 
 
-@entry(FLOATS2, FLOAT, record_of(OFFSET), record_of(HAND))
-def grip(pose, scale, offset_record, hand_record):
+@leaf
+def _grip(handle, pose, hand):
     """Set the offset such that the handle stays in place for a hand at pose (4, 4)."""
-    offset, hand = offset_record[()], hand_record[()]
     position, turn = hand.position, hand.quaternion
     w, x, y, z = quaternion_in(pose)
     # the offset is the right factor: the handle then turns about the same axes as the hand
     w, x, y, z = product(w, -x, -y, -z, turn[0], turn[1], turn[2], turn[3])
     for axis in range(3):
-        offset.position[axis] = position[axis] - scale * pose[axis, 3]
-    turn = offset.quaternion
+        handle.position[axis] = position[axis] - handle.scale * pose[axis, 3]
+    turn = handle.quaternion
     turn[0], turn[1], turn[2], turn[3] = w, x, y, z
 
 
-@entry(FLOATS2, FLOATS, FLOAT, record_of(OFFSET), record_of(HAND))
-def carry(pose, velocity, scale, offset_record, hand_record):
+@leaf
+def _carry(handle, pose, velocity, hand):
     """Write the handle's position, turn and velocity for a hand at pose (4, 4), velocity (6,).
 
-    They go into `hand_record`. Without an offset and at scale 1 the handle is exactly at the hand.
+    Without an offset and at scale 1 the handle is exactly at the hand.
     """
-    offset, hand = offset_record[()], hand_record[()]
-    turn = offset.quaternion
+    scale, turn = handle.scale, handle.quaternion
     w, x, y, z = quaternion_in(pose)
     w, x, y, z = product(w, x, y, z, turn[0], turn[1], turn[2], turn[3])
     length = (w * w + x * x + y * y + z * z) ** 0.5
     turn = hand.quaternion
     turn[0], turn[1], turn[2], turn[3] = w / length, x / length, y / length, z / length
     for axis in range(3):
-        hand.position[axis] = scale * pose[axis, 3] + offset.position[axis]
+        hand.position[axis] = scale * pose[axis, 3] + handle.position[axis]
         hand.velocity[axis] = scale * velocity[axis]
         hand.velocity[3 + axis] = velocity[3 + axis]
+
+
+@leaf
+def _place(handle, pose, velocity, hand):
+    """Put the handle where it starts, for the first reading that has a place."""
+    start, offset = handle.start, handle.quaternion
+    if handle.starts_elsewhere:
+        for axis in range(3):
+            hand.position[axis] = start[axis]
+        for part in range(4):
+            hand.quaternion[part] = start[3 + part]
+        _grip(handle, pose, hand)
+    else:
+        for axis in range(3):
+            handle.position[axis] = offset[1 + axis] = 0.0
+        offset[0] = 1.0
+    _carry(handle, pose, velocity, hand)
+
+
+@leaf
+def follow_reading(handle, pose, velocity, buttons, hand):
+    """Move the handle, a record of HANDLE, as far as a device's reading says; writes `hand`.
+
+    Without a place of the hand the handle has none: its x is NaN.
+    """
+    position = hand.position
+    if not is_somewhere(pose, velocity):
+        if not math.isnan(position[0]):
+            handle.x = position[0]
+            position[0] = math.nan
+        return
+    if not handle.is_placed:
+        handle.is_placed = True
+        _place(handle, pose, velocity, hand)
+    elif math.isnan(position[0]):
+        position[0] = handle.x
+    if buttons & handle.clutch:
+        hand.is_open = True
+        for axis in range(6):
+            hand.velocity[axis] = 0.0
+        return
+    if hand.is_open:
+        hand.is_open = False
+        _grip(handle, pose, hand)
+    _carry(handle, pose, velocity, hand)
+
+
+@entry(record_of(HANDLE), FLOATS2, FLOATS, INT, record_of(HAND))
+def follow(handle_record, pose, velocity, buttons, hand_record):
+    """`follow_reading` for records ()."""
+    follow_reading(handle_record[()], pose, velocity, buttons, hand_record[()])

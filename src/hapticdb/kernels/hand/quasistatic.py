@@ -12,10 +12,9 @@ import math
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS, INTS2, entry, leaf, record_of
+from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import (
     BEYOND_CAP,
-    DEVICE_SPRING,
     STOPPING,
     contact_stiffness,
     lever_in_hand,
@@ -66,20 +65,7 @@ from hapticdb.kernels.hand.steadying import (
     soften_change,
 )
 from hapticdb.kernels.hand.step import solve_step
-from hapticdb.kernels.records import FOLLOWER, SERVO
-from hapticdb.kernels.resident.cells import (
-    CELLS_WITH_DISTANCES,
-    CLUSTERS,
-    CONTACTS,
-    DEEPEST,
-    FELT_REVISION,
-    HITS,
-    PLACE,
-    READER_STRIDE,
-    WRENCH,
-    begin_frame,
-    end_frame,
-)
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, WRENCH
 from hapticdb.kernels.rigid import pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
@@ -351,18 +337,13 @@ def _move_tool(
     return found
 
 
-@entry(
-    CELLS_WITH_DISTANCES, INT, CLUSTERS, PLACE, DEVICE_SPRING, record_of(SERVO),
-    record_of(FOLLOWER), FLOAT, FLOATS2, INTS2, INTS,
-)  # fmt: skip
-def advance(
-    cells, reader, shell, place, spring, servo_record, follower_record, dt, field, met, missed
-):
-    """Move the tool for one period of dt seconds.
+@leaf
+def advance(cells, which, version, shell, place, spring, servo, follower, dt, field, met, missed):
+    """Move the tool for one period of dt seconds, in a version of the cells.
 
-    servo_record () of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
-    missed, as `felt` fills it, between periods. follower_record () of FOLLOWER, field (FIELD_ROWS,
-    N) float64 and met (MET_ROWS, N) int64 are the coupling's own from period to period; it starts
+    servo, a record of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
+    missed, as `felt` fills it, between periods. follower, of FOLLOWER, field (FIELD_ROWS, N)
+    float64 and met (MET_ROWS, N) int64 are the coupling's own from period to period; it starts
     anew, whatever they hold, while `tool.version` is 0. The caller may put the tool back to an
     earlier pose, but must not put back these three.
 
@@ -381,9 +362,6 @@ def advance(
     push, which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
     """
     dt = max(dt, 0.0)
-    which = begin_frame(cells, reader)
-    version = cells.readers[reader * READER_STRIDE]
-    servo, follower = servo_record[()], follower_record[()]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     is_hand = is_somewhere(hand)
     is_held = hand.is_stale or not is_hand
@@ -395,7 +373,6 @@ def advance(
         found = _move_tool(
             cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
         )
-    end_frame(cells, reader)
     is_held = is_held or found == NOT_KNOWN
     sent.marks = finish(
         spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, sent.wrench
@@ -408,4 +385,3 @@ def advance(
     if follower.n_active > 0:  # a period in contact without a look rests on the last look
         sent.left_out = max(sent.left_out, follower.n_left_out)
     sent.n_steps = follower.n_looks
-    sent.revision = cells.readers[reader * READER_STRIDE + FELT_REVISION]

@@ -55,7 +55,7 @@ def _take_arrival(station, seat, hand, now):
 
 
 @leaf
-def follow_hand(station, seat, hand, now):
+def follow_arrivals(station, seat, hand, now):
     """Write where the hand is at a time, ns; NaN while nobody holds the tool."""
     _take_arrival(station, seat, hand, now)
     position, turned, velocity = hand.position, hand.quaternion, hand.velocity

@@ -5,17 +5,22 @@ addresses and sizes of their arrays, and the arrays are made where they are used
 """
 
 import ctypes
+from typing import NamedTuple
 
 import numpy as np
 from numba import carray, config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import leaf, maker
 from hapticdb.kernels.field.lattice import CELL_VALUES
+from hapticdb.kernels.hand.device_spring import DeviceSpring
+from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.large.budget import Asleep
 from hapticdb.kernels.large.sleeping import COUNTS, RADIUS, REST, Sleepers
 from hapticdb.kernels.large.waking import STATE
+from hapticdb.kernels.records import MOST_MISSED, RESULTS
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     CELL_WORDS,
@@ -26,6 +31,10 @@ from hapticdb.kernels.resident.cells import (
     Clusters,
     Place,
 )
+
+TOUCHING, FELT, PERIOD_ROWS = MET_ROWS, MET_ROWS + 1, MET_ROWS + 2
+"""Rows of a session's `met`, after those of the coupling: the indices of the points that lie in
+something; those of the frame of a recording."""
 
 if config.DISABLE_JIT:
 
@@ -53,10 +62,10 @@ else:
 
 
 @maker
-def cells_of(station):
-    """Cells of a session."""
+def _voxels_of(station):
+    """The arrays of a session's cells that have no distances."""
     n_slots, capacity = station.n_slots, station.capacity
-    return Cells(
+    return (
         array_at(station.control, (station.n_control,), np.int64),
         array_at(station.readers, (station.n_readers * READER_STRIDE,), np.int64),
         array_at(station.keys, (BUFFERS, capacity), np.int64),
@@ -64,6 +73,29 @@ def cells_of(station):
         array_at(station.words, (n_slots, CELL_WORDS), np.uint32),
         array_at(station.masks, (n_slots,), np.uint64),
         array_at(station.used, (n_slots,), np.uint8),
+    )
+
+
+@maker
+def voxels_of(station):
+    """Cells of a session, without distances."""
+    control, readers, keys, slots, words, masks, used = _voxels_of(station)
+    return Cells(control, readers, keys, slots, words, masks, used, None, None)
+
+
+@maker
+def cells_of(station):
+    """Cells of a session, with distances."""
+    control, readers, keys, slots, words, masks, used = _voxels_of(station)
+    n_slots = station.n_slots
+    return Cells(
+        control,
+        readers,
+        keys,
+        slots,
+        words,
+        masks,
+        used,
         array_at(station.payload, (n_slots, CELL_VALUES), np.uint8),
         array_at(station.near, (n_slots, CELL_WORDS), np.uint32),
     )
@@ -104,8 +136,42 @@ def asleep_of(station):
     return Asleep(sleepers, at.budget, array_at(at.counts, (1, COUNTS), np.int64))
 
 
+class Memory(NamedTuple):
+    """Arrays that the parts of a period share.
+
+    pose (4, 4): of the tool; felt (RESULTS,): the law's frame; missed (1 + MOST_MISSED,): unknown
+    cells, as `felt` fills it; met and field: rows for each point of the tool, `hand.near_points`.
+    """
+
+    pose: NDArray[np.float64]
+    felt: NDArray[np.float64]
+    missed: NDArray[np.int64]
+    met: NDArray[np.int64]
+    field: NDArray[np.float64]
+
+
+@maker
+def memory_of(station):
+    """What the parts of a session's period share."""
+    n_points = station.n_points
+    return Memory(
+        array_at(station.pose, (4, 4), np.float64),
+        array_at(station.felt, (RESULTS,), np.float64),
+        array_at(station.missed, (1 + MOST_MISSED,), np.int64),
+        array_at(station.met, (PERIOD_ROWS, n_points), np.int64),
+        array_at(station.field, (FIELD_ROWS, n_points), np.float64),
+    )
+
+
 @leaf
 def grid_of(station):
     """Grid of a session."""
     place = station.place
     return Place(place[0], place[1], place[2], place[3], place[4])
+
+
+@leaf
+def spring_of(station):
+    """Coupling of a session."""
+    n = station.springs[station.coupling]
+    return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])

@@ -1,7 +1,7 @@
-"""Board: where hosted sessions' hands and frames are, in memory that several processes share.
+"""Board: frames and counts of sessions, and hosted hands, in memory that several processes share.
 
-Each session has a seat: a row of `SEAT`. The process that moves the hand writes the hand's place;
-the worker process that runs the session writes what came of it. No reader waits for a writer: a
+Each session has a seat: a row of `SEAT`. The process that moves a hosted hand writes the hand's
+place; the process that runs the session writes what came of it. No reader waits for a writer: a
 sequence number, odd while a part of a row is written, tells a reader to read again.
 """
 
@@ -22,8 +22,8 @@ from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import anonymous_memory
 
 RING = 2048
-"""Frames of a session that the board holds: two seconds at 1 kHz. Larger: a recording survives
-longer pauses of the host's process, and each session takes more memory."""
+"""Frames of a hosted session that the board holds: two seconds at 1 kHz. Larger: a recording
+survives longer pauses of the host's process, and each session takes more memory."""
 QUICK_ATTEMPTS = 100
 """Attempts, without a pause between them, to read what another process writes: that takes it
 microseconds, unless it is stopped in the middle by a busy machine."""
@@ -40,27 +40,27 @@ Seats = NDArray[np.void]
 
 
 class Board:
-    """Seats of hosted sessions in shared memory.
+    """Seats of sessions in shared memory.
 
     descriptor : of the memory of a board that `create` has made; owned from now on; seats (S,) of
-    `SEAT`; rings (S, RING) of `FRAME`: frame n of a session is at index n modulo RING.
+    `SEAT`; rings (S, ring) of `FRAME`: frame n of a session is at index n modulo ring.
     """
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, ring: int = RING) -> None:
         self.descriptor = descriptor
         size = os.fstat(descriptor).st_size
-        n_seats = size // _bytes_a_seat()
+        n_seats = size // _bytes_a_seat(ring)
         self._memory = mmap.mmap(descriptor, size)
         self.seats: Seats = np.ndarray((n_seats,), SEAT, self._memory)
         self.rings: Frames = np.ndarray(
-            (n_seats, RING), FRAME, self._memory, n_seats * SEAT.itemsize
+            (n_seats, ring), FRAME, self._memory, n_seats * SEAT.itemsize
         )
         self._taking = threading.Lock()
 
     @classmethod
-    def create(cls, n_seats: int) -> Self:
-        """Make a board with free seats."""
-        return cls(anonymous_memory("hapticdb-board", n_seats * _bytes_a_seat()))
+    def create(cls, n_seats: int, ring: int = RING) -> Self:
+        """Make a board with free seats, and that many frames for each."""
+        return cls(anonymous_memory("hapticdb-board", n_seats * _bytes_a_seat(ring)), ring)
 
     def close(self) -> None:
         """Free the memory in this process; the mapping goes with the last array."""
@@ -106,13 +106,14 @@ class Board:
 
     def last_frame(self, row: int) -> Frames | None:
         """Latest frame of a seat, (1,) of `FRAME`; None before the first."""
+        ring = self.rings[row]
         for _ in _attempts():
             done = int(self.seats["n_frames"][row])
             if not done:
                 return None
-            frame = self.rings[row, [(done - 1) % RING]]
+            frame: Frames = ring[[(done - 1) % len(ring)]]
             # the ring is long: a frame that was copied slowly may still be overwritten
-            if int(self.seats["n_frames"][row]) - done < RING // 2:
+            if int(self.seats["n_frames"][row]) - done < len(ring) // 2:
                 return frame
         raise _unreadable()
 
@@ -128,8 +129,8 @@ class Board:
         raise _unreadable()
 
 
-def _bytes_a_seat() -> int:
-    return SEAT.itemsize + RING * FRAME.itemsize
+def _bytes_a_seat(ring: int) -> int:
+    return SEAT.itemsize + ring * FRAME.itemsize
 
 
 def _attempts() -> Iterator[None]:

@@ -37,3 +37,13 @@ else:
         moment[0] = 0
         moment[1] = nanoseconds
         _nanosleep(moment.ctypes.data, moment.ctypes.data)
+
+
+@leaf
+def wait_until(moment, due, spin):
+    """Sleep until `spin` ns before a time, then watch the clock until then."""
+    left = due - now_ns(moment) - spin
+    if left > 0:
+        sleep_ns(moment, left)
+    while now_ns(moment) < due:
+        pass

@@ -1,1 +1,0 @@
-"""The loop of a worker that runs many sessions, as one kernel."""

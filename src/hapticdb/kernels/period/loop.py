@@ -1,0 +1,258 @@
+"""The loop of sessions: their periods, one call each or period by period, in this one kernel.
+
+A period of a session reads its hand, moves the tool, tells others of it, and notes the frame. A
+session's loop has a device, which Python reads and drives: it calls the kernel once a period. A
+worker of a host has many sessions and no device: there the kernel is one call that ends when the
+worker ends. It allocates nothing, compiles nothing, holds no interpreter lock and asks no database.
+Another thread makes sessions and withdraws them: it sets `is_running` of a station whose other
+fields are complete, and may free a station two periods after it was withdrawn.
+"""
+
+from typing import Any
+
+import numpy as np
+
+from hapticdb.kernels._jit import chosen_by_type, entry, leaf, record_of
+from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.hand.direct import render
+from hapticdb.kernels.hand.handle import follow_reading
+from hapticdb.kernels.hand.holding import IS_HELD
+from hapticdb.kernels.hand.near_points import FELT_POINTS
+from hapticdb.kernels.hand.quasistatic import IS_LOOSE, advance
+from hapticdb.kernels.large.budget import felt_asleep
+from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
+from hapticdb.kernels.period.clock import now_ns, wait_until
+from hapticdb.kernels.period.following import follow_arrivals
+from hapticdb.kernels.period.memory import (
+    FELT,
+    array_at,
+    asleep_of,
+    cells_of,
+    grid_of,
+    memory_of,
+    spring_of,
+    tool_of,
+    voxels_of,
+)
+from hapticdb.kernels.period.telling import (
+    count,
+    count_times,
+    list_touching,
+    name_voxels,
+    note,
+    show_contacts,
+    show_objects,
+    tell,
+)
+from hapticdb.kernels.records import FRAME, PACE, RESULTS, SEAT, SESSION, STATION
+from hapticdb.kernels.resident.cells import (
+    FELT_REVISION,
+    READER_STRIDE,
+    UNKNOWNS,
+    begin_frame,
+    end_frame,
+)
+from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import is_rigid, pose_of_quaternion
+
+GIVEN, BOARD, DEVICE = 0, 1, 2
+"""Sources of a session's hand: the caller has written it; it arrives on the board; a device's
+reading is beside."""
+NEVER, KNOWN, ALWAYS = 0, 1, 2
+"""Which periods are frames, noted and counted: none; those without unknown cells; all."""
+TELL_EVERY_NS = 900_000
+"""Nanoseconds between two reports of the tool's place. Larger: cells are requested later. Smaller:
+the loop computes more."""
+ASK_EVERY_NS, SHOW_EVERY_NS = 10_000_000, 30_000_000
+"""Nanoseconds between two requests for the ids of what is touched, and between two lists of the
+contacts. Larger: less computing, and what is shown is older."""
+WITHDRAWN_NS = 250_000_000
+"""Nanoseconds. A request for ids is withdrawn once the database has answered this much later: by
+then the objects are named, and whoever wants to know has read them."""
+
+
+@leaf
+def _place(body, pose):
+    """Write the pose (4, 4) of a tool or a hand."""
+    at, w = body.position, body.quaternion
+    pose_of_quaternion(at[0], at[1], at[2], w[0], w[1], w[2], w[3], pose)
+
+
+@leaf
+def _feel(law, station, cells, which, shell, place, memory, met):
+    """Compute the law's frame at the pose, into memory.felt -> points that the budget left out."""
+    asleep = asleep_of(station)
+    asleep.counts[0, LOOKED_AT] = asleep.counts[0, LEFT_OUT] = 0
+    felt_asleep(
+        cells, which, shell, memory.pose, place, law, met, memory.missed, asleep, np.int64(0),
+        memory.felt,
+    )  # fmt: skip
+    return asleep.counts[0, LEFT_OUT]
+
+
+def _move_by_coupling(law, station, seat, shell, place, dt, memory):
+    """Move the tool by the quasi-static coupling; for a recording, feel the law where it is then.
+
+    `tool.felt` then has the law's frame, which a replay computes again: the coupling itself has
+    contacts of its own stiffness. Returns the row of `met` with the points that touch, and their
+    number.
+    """
+    cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
+    tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
+    _, felt, missed, met, field = memory
+    which = begin_frame(cells, station.reader)
+    advance(
+        cells, which, cells.readers[at], shell, place, spring, servo, follower, dt, field, met,
+        missed,
+    )  # fmt: skip
+    _place(tool, memory.pose)
+    if seat.is_recorded and not sent.marks & IS_HELD:
+        left_out = _feel(law, station, cells, which, shell, place, memory, met[FELT])
+        for n in range(RESULTS):
+            tool.felt[n] = felt[n]
+        sent.left_out = max(sent.left_out, left_out)
+        sent.unknown += np.int64(felt[UNKNOWNS])
+    sent.revision = cells.readers[at + FELT_REVISION]
+    end_frame(cells, station.reader)
+    if station.begun - station.shown_at >= SHOW_EVERY_NS:
+        station.shown_at = station.begun
+        show_contacts(seat, shell, memory.pose, place, spring, follower, field, met)
+    return list_touching(follower, field, met, sent.hits)
+
+
+def _move_directly(law, station, seat, shell, place, dt, memory):  # noqa: ARG001 - as above
+    """Put the tool at the hand, and send the law's frame there; returns as above."""
+    cells, servo = voxels_of(station), station.servo
+    sent = servo.sent
+    _place(servo.hand, memory.pose)
+    if is_rigid(memory.pose):
+        which = begin_frame(cells, station.reader)
+        sent.left_out = _feel(
+            law, station, cells, which, shell, place, memory, memory.met[FELT_POINTS]
+        )
+        sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
+        end_frame(cells, station.reader)
+    render(spring_of(station), shell.center, servo, memory.felt, dt)
+    _place(servo.tool, memory.pose)
+    return FELT_POINTS, sent.hits
+
+
+def _motion_of(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are untyped
+    """What moves a tool under that type of law."""
+    return _move_by_coupling if law_type is DistanceFieldLaw else _move_directly
+
+
+_move = chosen_by_type(_motion_of)
+
+
+@leaf
+def _ask_objects(station, seat, session, shell, place, pose, touching, n_touching, heartbeat):
+    """Ask for the objects that are touched, and show those that were answered.
+
+    touching (n_touching,): the points that touch. A request that stays would be answered again at
+    each write, for voxels that are no longer touched. A request withdrawn at once would never be
+    answered by a slow database.
+    """
+    sent = station.servo.sent
+    if sent.hits > 0 or sent.marks & IS_LOOSE:
+        name_voxels(session, shell, pose, place, station.bits, station.curve, touching, n_touching)
+        station.asked_at = station.begun
+    elif station.asked_at != 0 and heartbeat > station.asked_at + WITHDRAWN_NS:
+        session.n_asked = station.asked_at = 0
+    show_objects(seat, session)
+
+
+@leaf
+def _run_period(law, station, seat, ring, pace):
+    """Run one period of a session, which was due and has begun as `pace` says."""
+    servo, begun = station.servo, pace.begun
+    hand, sent = servo.hand, servo.sent
+    shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
+    session = array_at(station.session, (), SESSION)[()]
+    heartbeat = array_at(station.control, (station.n_control,), np.int64)[station.heartbeat]
+    station.begun, reading = begun, station.reading
+    if station.source == BOARD:
+        follow_arrivals(station, seat, hand, begun)
+    elif station.source == DEVICE:
+        follow_reading(station.handle, reading.pose, reading.velocity, reading.buttons, hand)
+    hand.is_stale = begun - heartbeat > station.staleness
+    row, n_touching = _move(law, station, seat, shell, place, pace.dt, memory)
+    is_frame = station.noted == ALWAYS or (station.noted == KNOWN and sent.unknown == 0)
+    if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not is_frame:
+        station.told_at = begun
+        tell(
+            session, hand, station.is_let_go, memory.pose, shell.center, spring_of(station).radius,
+            memory.missed,
+        )  # fmt: skip
+    if not is_frame:
+        return
+    if begun - station.looked_at >= ASK_EVERY_NS:
+        station.looked_at = begun
+        _ask_objects(
+            station, seat, session, shell, place, memory.pose, memory.met[row], n_touching,
+            heartbeat,
+        )  # fmt: skip
+    station.last = begun
+    lateness, elapsed = 1e-9 * (begun - pace.due), 1e-9 * (now_ns(pace.moment) - begun)
+    note(
+        ring, seat.n_frames, 1e-9 * (begun - station.began), pace.dt, lateness, elapsed, servo,
+        reading.buttons,
+    )  # fmt: skip
+    count(seat, servo, station.follower)
+    count_times(seat, lateness, elapsed)
+    fence()
+    seat.n_frames += 1
+
+
+@leaf
+def _count_missed(stations, seats, pace):
+    """Count the deadlines that passed during a period, which all sessions miss; set the next."""
+    done = now_ns(pace.moment)
+    pace.due += pace.period
+    behind = (done - pace.due) // pace.period + 1 if done > pace.due else np.int64(0)
+    for n in range(stations.shape[0]):
+        if stations[n].is_running:
+            seat = seats[stations[n].seat]
+            seat.in_time += behind == 0
+            seat.missed += behind
+    pace.due += behind * pace.period
+
+
+@leaf
+def run_periods(stations, seats, rings, pace_record, law):
+    """Run one period of all sessions, or periods until `pace.is_over`.
+
+    stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the board; pace_record ()
+    of PACE; law: of all sessions. The distance law moves tools by the quasi-static coupling, every
+    other law is rendered directly. If the frames of a period take longer than it, the deadlines
+    within that time are missed by all sessions alike.
+    """
+    pace = pace_record[()]
+    is_alone = pace.period > 0
+    if is_alone:
+        pace.due = now_ns(pace.moment) + pace.period
+    while True:
+        if is_alone:
+            wait_until(pace.moment, pace.due, pace.spin)
+        for n in range(stations.shape[0]):
+            station = stations[n]
+            if station.is_running:
+                if is_alone:
+                    pace.begun = now_ns(pace.moment)
+                    pace.dt = 1e-9 * (pace.begun - station.last)
+                _run_period(law, station, seats[station.seat], rings[station.seat], pace)
+        if not is_alone:
+            return
+        _count_missed(stations, seats, pace)
+        fence()
+        pace.periods += 1
+        if pace.is_over:
+            return
+
+
+@entry(
+    record_of(STATION, 1), record_of(SEAT, 1), record_of(FRAME, 2), record_of(PACE), DISTANCE_FIELD
+)
+def run(stations, seats, rings, pace_record, law):
+    """`run_periods` of sessions with a coupling."""
+    run_periods(stations, seats, rings, pace_record, law)

@@ -1,0 +1,233 @@
+"""What a period tells others: where the tool is, its frame, what it touches, its counts."""
+
+import math
+
+import numpy as np
+
+from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.curves import key_of
+from hapticdb.kernels.hand.device_spring import contact_stiffness
+from hapticdb.kernels.hand.holding import IS_CUT, IS_FADING, IS_HELD
+from hapticdb.kernels.hand.near_points import (
+    ALONG,
+    FELT_POINTS,
+    FLOOR,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    ONSETS,
+    U,
+)
+from hapticdb.kernels.hand.quasistatic import IS_LOOSE, IS_SNAPPING, IS_SOFTER
+from hapticdb.kernels.period.memory import TOUCHING
+from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH
+from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import moved, transform_of, turn, turned
+
+HELD, FADING, CLUTCH_OPEN, IN_OBJECT = 1, 2, 4, 8
+"""Bits of a frame's state, as `hapticdb.recording.frame.State` names them."""
+
+
+@leaf
+def tell(session, hand, is_let_go, pose, center, radius, missed):
+    """Report tool, hand and the unknown cells of the last look on the session's row of the desk.
+
+    pose (4, 4), center (3,): of the tool; radius: of its farthest point; missed (1 + MOST_MISSED,)
+    as `felt` fills it. The row's sequence number is odd while the row is written.
+    """
+    told, transform = session.told, transform_of(pose)
+    x, y, z = moved(transform, center[0], center[1], center[2])
+    session.sequence += 1
+    fence()
+    told.is_active = True
+    told.tool[0], told.tool[1], told.tool[2] = x, y, z
+    told.radius = radius
+    if not is_let_go:  # else cells around the tool stay wanted
+        rx, ry, rz = turned(transform, center[0], center[1], center[2])
+        at = hand.position
+        x, y, z = at[0] + rx, at[1] + ry, at[2] + rz
+    told.handle[0], told.handle[1], told.handle[2] = x, y, z
+    for axis in range(3):
+        told.velocity[axis] = 0.0 if is_let_go else hand.velocity[axis]
+    session.n_missed = missed[LISTED]
+    for n in range(missed[LISTED]):
+        session.missed[n] = missed[LISTED + 1 + n]
+    fence()
+    session.sequence += 1
+
+
+@leaf
+def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
+    """Ask for the objects in the voxels that a placed shell hits: write these voxels' keys.
+
+    met (n_hits,): indices of the hits. If there are more than MOST_ASKED, every second, third, ...
+    hit is taken.
+    """
+    step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
+    count = 0
+    for hit in range(0, n_hits, step):
+        n = met[hit]
+        x, y, z = shell.points[n, 0], shell.points[n, 1], shell.points[n, 2]
+        i = np.int64(
+            (turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z) + pose[0, 3] - place.x) / place.size
+        )
+        j = np.int64(
+            (turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z) + pose[1, 3] - place.y) / place.size
+        )
+        k = np.int64(
+            (turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z) + pose[2, 3] - place.z) / place.size
+        )
+        session.asked[count] = key_of(i, j, k, bits, curve)
+        count += 1
+    session.n_asked = count
+
+
+@leaf
+def list_touching(follower, field, met, n_hits):
+    """Row of `met` with the points that touch, and their number.
+
+    Where the tool lies in something these are the points that are in it. Their voxels may be free:
+    the fetching process looks around them.
+    """
+    if not follower.is_loose:
+        return FELT_POINTS, n_hits
+    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
+    n_found = np.int64(0)
+    for m in range(follower.n_near):
+        if field[rows + U, m] < FLOOR:
+            met[TOUCHING, n_found] = met[near, m]
+            n_found += 1
+    return TOUCHING, n_found
+
+
+@leaf
+def note(ring, at, time, dt, lateness, elapsed, servo, buttons):
+    """Record frame number `at` in its row of the ring buffer (capacity,) of FRAME."""
+    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    row = ring[at % ring.shape[0]]
+    row.time = time
+    row.dt = dt
+    row.lateness = lateness
+    row.elapsed = elapsed
+    for n in range(3):
+        row.hand[n] = hand.position[n]
+        row.tool[n] = tool.position[n]
+    for n in range(4):
+        row.hand[3 + n] = hand.quaternion[n]
+        row.tool[3 + n] = tool.quaternion[n]
+    for n in range(6):
+        row.hand_velocity[n] = hand.velocity[n]
+        row.wrench[n] = tool.felt[WRENCH + n]
+        row.applied[n] = sent.wrench[n]
+    row.hits = np.int64(tool.felt[HITS])
+    row.contacts = np.int64(tool.felt[CONTACTS])
+    row.unknown = sent.unknown  # at the pose that was tried; the frame at `tool` has none
+    row.deepest = tool.felt[DEEPEST]
+    row.revision = sent.revision
+    row.buttons = buttons
+    state = CLUTCH_OPEN if hand.is_open else 0
+    state |= HELD if sent.marks & IS_HELD else 0
+    state |= FADING if sent.marks & IS_FADING else 0
+    row.state = state | (IN_OBJECT if sent.marks & IS_LOOSE else 0)
+
+
+@leaf
+def _norm(wrench, start):
+    """Length of three axes of a wrench (6,)."""
+    x, y, z = wrench[start], wrench[start + 1], wrench[start + 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@leaf
+def count(seat, servo, follower):
+    """Add a frame to the session's counts."""
+    sent, hand = servo.sent, servo.hand
+    marks, wrench = sent.marks, sent.wrench
+    seat.peak_force = max(seat.peak_force, _norm(wrench, 0))
+    seat.peak_torque = max(seat.peak_torque, _norm(wrench, 3))
+    seat.hit_frames += sent.hits > 0
+    if sent.contacts > 0:
+        seat.contact_frames += 1
+        seat.deepest = max(seat.deepest, sent.deepest)
+    seat.unknown_frames += sent.unknown > 0
+    seat.unknown_points += sent.unknown
+    seat.held_frames += (marks & IS_HELD) != 0
+    seat.stale_frames += hand.is_stale
+    seat.cut_frames += (marks & IS_CUT) != 0
+    seat.nowhere_frames += math.isnan(hand.position[0])
+    seat.ended_loose = (marks & IS_LOOSE) != 0
+    if seat.ended_loose and seat.loose_frames == 0:
+        seat.first_loose_frame = seat.n_frames
+    seat.loose_frames += seat.ended_loose
+    seat.snapping_frames += (marks & IS_SNAPPING) != 0
+    seat.guard_actions += (marks & IS_SOFTER) != 0
+    seat.left_out_frames += sent.left_out > 0
+    seat.most_left_out = max(seat.most_left_out, sent.left_out)
+    seat.least_share = follower.wanted_share if follower.wanted_share > 0.0 else 1.0
+
+
+@leaf
+def _bin_of(seconds):
+    """Bin of a time; a clock of a test may not agree with the system's."""
+    return min(max(np.int64(seconds / TIME_BIN), np.int64(0)), np.int64(TIME_BINS))
+
+
+@leaf
+def count_times(seat, lateness, elapsed):
+    """Count a frame's lateness and computing time, seconds."""
+    seat.lateness[_bin_of(lateness)] += 1
+    seat.elapsed[_bin_of(elapsed)] += 1
+    seat.worst_lateness = max(seat.worst_lateness, lateness)
+    seat.worst_elapsed = max(seat.worst_elapsed, elapsed)
+
+
+@leaf
+def _show_contact(seat, at, transform, x, y, z, fx, fy, fz):
+    """Write a contact at point (x, y, z) of the tool, with its force, world frame."""
+    row = seat.contacts[at]
+    row[0], row[1], row[2] = moved(transform, x, y, z)
+    row[3], row[4], row[5] = fx, fy, fz
+
+
+@leaf
+def show_contacts(seat, shell, pose, place, spring, follower, field, met):
+    """List the contacts on the board."""
+    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
+    points, transform = shell.points, transform_of(pose)
+    stiffness = contact_stiffness(spring, place.size)
+    n_contacts = 0
+    if not follower.is_loose:
+        for m in range(follower.n_near):
+            n_contacts += field[ONSETS, met[near, m]] > field[rows + U, m]
+    every = max((n_contacts + MOST_SHOWN - 1) // MOST_SHOWN, 1)
+    seat.contacts_sequence += 1
+    fence()
+    n_met = n_shown = 0
+    if n_contacts > 0:
+        for m in range(follower.n_near):
+            n = met[near, m]
+            depth = place.size * (field[ONSETS, n] - field[rows + U, m])
+            if depth <= 0.0:
+                continue
+            n_met += 1
+            if (n_met - 1) % every == 0:
+                force = stiffness * depth
+                _show_contact(
+                    seat, n_shown, transform, points[n, 0], points[n, 1], points[n, 2],
+                    force * field[rows + ALONG, m], force * field[rows + ALONG + 1, m],
+                    force * field[rows + ALONG + 2, m],
+                )  # fmt: skip
+                n_shown += 1
+    seat.n_contacts = n_shown
+    fence()
+    seat.contacts_sequence += 1
+
+
+@leaf
+def show_objects(seat, session):
+    """Copy the ids of what is touched from the desk to the board."""
+    n_objects = min(session.n_objects, np.int64(MOST_ASKED))
+    for n in range(n_objects):
+        seat.objects[n] = session.objects[n]
+    seat.n_objects = n_objects

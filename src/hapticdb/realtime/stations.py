@@ -1,0 +1,165 @@
+"""Stations: sessions in the form that the kernel of their periods reads (`kernels.period.loop`)."""
+
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.kernels.hand.device_spring import DeviceSpring
+from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.period import direct, loop
+from hapticdb.kernels.period.following import USUAL_GAP_NS
+from hapticdb.kernels.period.memory import PERIOD_ROWS
+from hapticdb.kernels.records import MOST_MISSED, PACE, RESULTS, STATION, pose_numbers
+from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Place
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import ForceLaw, is_smooth
+from hapticdb.recording.frame import Frames
+from hapticdb.resident.held import PreparedTool
+from hapticdb.resident.table import HEARTBEAT
+
+MERGES_FROM = 4096
+"""Near points of the quasi-static coupling from which one contact stands for several. Larger:
+broader contacts are felt point by point, and a period with them takes longer."""
+STALENESS_NS = 1_000_000_000
+"""Nanoseconds without an answer of the database after which hosted hands and contact proxies take
+all cells for unknown."""
+
+Record = NDArray[np.void]
+
+
+def without_surface(shell: PointShell) -> PointShell:
+    """Return the shell without the tool's triangles, which no frame reads."""
+    return replace(shell, surface=None)
+
+
+class Station:
+    """One session: its row of STATION, and the memory whose addresses the row has.
+
+    Parameters
+    ----------
+    row : array
+        (1,) of STATION.
+    cells, reader : Cells, int
+        The cells that the session reads, and its row there.
+    session : array
+        (1,) of SESSION: its row on the desk.
+    grid : Grid
+        Grid of the cells.
+    tool : PreparedTool
+        The tool.
+    """
+
+    def __init__(
+        self,
+        row: Record,
+        cells: Cells,
+        reader: int,
+        session: Record,
+        grid: Grid,
+        tool: PreparedTool,
+    ) -> None:
+        row[:] = np.zeros((), STATION)
+        self.row, self.cells, self.reader, self.session = row, cells, reader, session
+        self.record = row[0, ...]
+        self.servo, self.follower = self.record["servo"], self.record["follower"]
+        self.clusters, self.asleep = tool
+        n_points = len(self.clusters.points)
+        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+        self.field = np.zeros((FIELD_ROWS, n_points))
+        self.met = np.zeros((PERIOD_ROWS, n_points), dtype=np.int64)
+        self.pose, self.felt = np.eye(4), np.zeros(RESULTS)
+        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        row["reader"], row["session"] = reader, session.ctypes.data
+        row["place"], row["bits"], row["curve"] = self.place, grid.bits, grid.curve_code
+        row["staleness"] = STALENESS_NS
+        self._write_cells()
+        self._write_tool()
+
+    def _write_cells(self) -> None:
+        """Write the addresses of the table's arrays."""
+        row, cells = self.row, self.cells
+        for name, array in cells._asdict().items():
+            row[name] = 0 if array is None else array.ctypes.data
+        row["n_control"], row["heartbeat"] = len(cells.control), HEARTBEAT
+        row["n_readers"] = len(cells.readers) // READER_STRIDE
+        row["n_slots"], row["capacity"] = len(cells.used), cells.keys.shape[1]
+
+    def _write_tool(self) -> None:
+        """Write the addresses of the tool's arrays; let it merge contacts and keep its budget."""
+        row, clusters = self.row, self.clusters
+        self._arrays = {
+            name: np.ascontiguousarray(getattr(clusters, name))
+            for name in ("points", "center", "spheres", "groups", "columns", "scratch")
+        } | {name: getattr(self, name) for name in ("met", "field", "pose", "felt", "missed")}
+        for name, array in self._arrays.items():
+            row[name] = array.ctypes.data
+        n_points = len(clusters.points)
+        row["n_points"], row["run"] = n_points, clusters.run
+        row["n_spheres"], row["n_groups"] = len(clusters.spheres), len(clusters.groups)
+        sleeping, (sleepers, budget, counts) = row["sleeping"], self.asleep
+        for name, array in sleepers._asdict().items():
+            sleeping[name] = array.ctypes.data
+        sleeping["counts"], sleeping["budget"] = counts.ctypes.data, budget
+        sleeping["n_blocks"], sleeping["n_chosen"] = len(sleepers.boxes), len(sleepers.indices)
+        self.follower["merges_from"] = MERGES_FROM
+        if len(sleepers.boxes):
+            self.follower["is_large"] = True
+            self.follower["most_looked"] = budget if budget < n_points else 0
+
+    def set_spring(self, spring: DeviceSpring) -> None:
+        """Replace the coupling; periods take the new one whole."""
+        which = 1 - int(self.row["coupling"][0])
+        self.row["springs"][:, which] = spring
+        self.row["coupling"] = which
+
+    def rest_at(self, pose: NDArray[np.float64]) -> None:
+        """Put hand and tool at a pose (7,), at rest."""
+        tool, hand = self.servo["tool"], self.servo["hand"]
+        tool[()] = np.zeros((), tool.dtype)
+        pose_numbers(tool)[:] = pose_numbers(hand)[:] = pose
+
+    def arrive_at(self, pose: NDArray[np.float64]) -> None:
+        """Take the hand from the board, where it has arrived at a pose (7,)."""
+        way = self.record["way"]
+        way["start"], way["end"], way["seconds"] = pose, pose, 1e-9
+        self.row["source"], self.row["gap"] = loop.BOARD, USUAL_GAP_NS
+
+
+class Stations:
+    """Stations of a process, and the call of their periods.
+
+    most : stations; seats, rings : of the board (`realtime.board.Board`); law : that all sessions
+    feel; period, spin : ns, of periods that `run` keeps; a period of 0 runs one period a call.
+    """
+
+    def __init__(
+        self,
+        most: int,
+        seats: Record,
+        rings: Frames,
+        law: ForceLaw,
+        *,
+        period: int = 0,
+        spin: int = 0,
+    ) -> None:
+        self.rows, self.pace = np.zeros(most, STATION), np.zeros((), PACE)
+        self.pace["period"], self.pace["spin"] = period, spin
+        self._run = loop.run if is_smooth(law) else direct.run_directly
+        self._arguments = (self.rows, seats, rings, self.pace, law.for_kernels)
+        self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
+
+    def run(self) -> None:
+        """Run periods until `stop`, or one; without the interpreter lock."""
+        self._run(*self._arguments)
+
+    def step(self, due: int, begun: int, dt: float) -> None:
+        """Run one period that was due at a time and has begun, ns, `dt` s after the last one."""
+        times = self._times
+        times[0][()], times[1][()], times[2][()] = due, begun, dt
+        self._run(*self._arguments)
+
+    def stop(self) -> None:
+        """End `run` after its period."""
+        self.pace["is_over"] = 1

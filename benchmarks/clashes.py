@@ -20,6 +20,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy.spatial  # noqa: F401 - a quarter of a second that is no part of a search
 
 import hapticdb
 import records

@@ -26,9 +26,10 @@ def near_pairs(
     is_of, is_against (O,) : one object of each pair is of the first, the other of the second.
     """
     boxes = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
-    order = np.argsort(boxes[:, 0, 0], kind="stable")
-    low, high = boxes[order, 0], boxes[order, 1] + within * (1.0 + 1e-9)
-    counts = np.searchsorted(low[:, 0], high[:, 0], side="right") - np.arange(1, len(order) + 1)
+    reach = within * (1.0 + 1e-9)
+    sweeps = [_sweep(boxes[:, :, axis], reach) for axis in range(3)]
+    order, counts = min(sweeps, key=lambda sweep: int(sweep[1].sum()))
+    low, high = boxes[order, 0], boxes[order, 1] + reach
     found = [np.empty((0, 2), dtype=np.int64)]
     start = 0
     ends = np.cumsum(counts)
@@ -47,6 +48,13 @@ def near_pairs(
     a, b = pairs[:, 0], pairs[:, 1]
     pairs = pairs[(is_of[a] & is_against[b]) | (is_of[b] & is_against[a])]
     return pairs[_along_curve(boxes, pairs)]
+
+
+def _sweep(edges: NDArray[np.float64], reach: float) -> tuple[Ints, Ints]:
+    """Order of boxes by their lower ends (O, 2), and how many after each begin before it ends."""
+    order = np.argsort(edges[:, 0], kind="stable")
+    low, high = edges[order, 0], edges[order, 1] + reach
+    return order, np.searchsorted(low, high, side="right") - np.arange(1, len(order) + 1)
 
 
 def _along_curve(boxes: NDArray[np.float64], pairs: Ints) -> Ints:

@@ -14,7 +14,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.judge import judge
+from hapticdb.clashes.judge import Judged, judge
 from hapticdb.clashes.near import near_pairs
 from hapticdb.clashes.result import Clash, Clashes, gravity
 from hapticdb.clashes.shapes import Shapes
@@ -35,6 +35,11 @@ BUDGET = 256 << 20
 """Default of the memory for shapes, bytes."""
 SAME = 1e-9
 """Metres by which a pair's figures may differ and are still the same: rounding of placements."""
+ROUNDING = 2.0**-40
+"""Metres, and share of one in a rotation, to which the placement of two shapes is rounded. Coarser:
+more pairs are found to be placed alike, and lengths are less exact."""
+MOST_KNOWN = 1 << 15
+"""Pairs of shapes whose answer is kept for others that are placed alike. More: more memory."""
 SECONDS_BETWEEN = 2.0
 """Seconds of work that an end without warning loses at most, but for the pair under way."""
 
@@ -144,6 +149,9 @@ class _Search:
         self._is_kept = not store.is_read_only
         self._waiting: list[PairRow] = []
         self._wrote = time.monotonic()
+        self._shapes = Shapes(store, asked.budget)
+        self._setting = asked.setting
+        self._known: dict[tuple[object, ...], Judged] = {}
 
     def found(self, began: float) -> Clashes:
         """Search."""
@@ -160,29 +168,34 @@ class _Search:
             for ids in chosen
         ]
         near = near_pairs(objects, self._asked.within, masks[0], masks[1])
-        pairs = [(objects[i], objects[j]) for i, j in near.tolist()]
-        stale = [pair for pair in pairs if not self._is_fresh(pair, rows.get(_key(*pair)))]
+        known = np.array([(obj.id, obj.revision) for obj in objects], dtype=np.int64)
+        ids, written = known.reshape(-1, 2).T
+        keys: list[tuple[int, int]] = list(map(tuple, ids[near].tolist()))
+        newest = written[near].max(axis=1, initial=0).tolist()
+        looked = {
+            key
+            for key, later in zip(keys, newest, strict=True)
+            if self._is_fresh(rows.get(key), later)
+        }
+        n_kept = len(looked)
+        by_id = {obj.id: obj for obj in objects}
+        stale = [(by_id[a], by_id[b]) for a, b in keys if (a, b) not in looked]
         shown = {key: row for key, row in rows.items() if _is_asked(*key, *chosen)}
-        looked = {_key(*pair) for pair in pairs} - {_key(*pair) for pair in stale}
         with self._keeping():
             for row in self._measured(stale, rows, revision):
                 shown[row.a, row.b] = row
                 looked.add((row.a, row.b))
-        left = [pair for pair in pairs if _key(*pair) not in looked]
-        told = self._told(objects, shown, looked, left)
-        self._settle(shown, looked, left, {obj.id: obj for obj in objects})
+        left = [pair for pair in stale if _key(*pair) not in looked]
+        told = self._told(by_id, shown, looked, left)
+        self._settle(shown, looked, left, by_id)
         return Clashes(
-            tuple(sorted(told, key=gravity)), len(stale) - len(left), len(pairs) - len(stale),
-            len(left), self._asked.within, self._asked.contact, revision,
+            tuple(sorted(told, key=gravity)), len(stale) - len(left), n_kept, len(left),
+            self._asked.within, self._asked.contact, revision,
             time.monotonic() - began, self._is_kept,
         )  # fmt: skip
 
-    def _is_fresh(self, pair: tuple[Object, Object], row: PairRow | None) -> bool:
-        return (
-            row is not None
-            and row.setting == self._asked.setting
-            and row.revision >= max(obj.revision for obj in pair)
-        )
+    def _is_fresh(self, row: PairRow | None, newest: int) -> bool:
+        return row is not None and row.revision >= newest and row.setting == self._setting
 
     def _measured(
         self,
@@ -191,15 +204,13 @@ class _Search:
         revision: int,
     ) -> Iterator[PairRow]:
         """Measure pairs, and keep each; leaves out what was written meanwhile."""
-        shapes = Shapes(self._store, self._asked.budget)
+        # threads on two processors gained a tenth: most of the time holds the interpreter's lock
         for n, (one, other) in enumerate(stale):
             if time.monotonic() > self._asked.until:
                 return
-            placed, moved = shapes.placed(one), shapes.placed(other)
-            if placed is not None and moved is not None:
-                world_from_a, world_from_b = placed[1], moved[1]
-                pose = _inverse(world_from_a) @ world_from_b
-                judged = judge(placed[0], moved[0], pose, self._asked.within, self._asked.contact)
+            judged = self._judged(one, other)
+            if judged is not None:
+                world_from_a = self._shapes.placement(one)[1]
                 on_a, on_b = (
                     world_from_a[:3, :3] @ place + world_from_a[:3, 3]
                     for place in (judged.on_a, judged.on_b)
@@ -207,7 +218,7 @@ class _Search:
                 row = PairRow(
                     one.id, other.id, judged.kind, judged.at_least,
                     judged.at_most if np.isfinite(judged.at_most) else None,
-                    (*on_a.tolist(), *on_b.tolist()), "new", revision, self._asked.setting,
+                    (*on_a.tolist(), *on_b.tolist()), "new", revision, self._setting,
                 )  # fmt: skip
                 row = _compared(row, rows.get((one.id, other.id)))
                 self._waiting.append(row)
@@ -216,6 +227,22 @@ class _Search:
                     self._write()
             if self._asked.progress is not None:
                 self._asked.progress(n + 1, len(stale))
+
+    def _judged(self, one: Object, other: Object) -> Judged | None:
+        """Judge a pair, unless it was judged elsewhere; None if one was written meanwhile."""
+        (a, world_from_a), (b, world_from_b) = map(self._shapes.placement, (one, other))
+        pose = _rounded(_inverse(world_from_a) @ world_from_b)
+        key = a, b, pose.tobytes()
+        if key not in self._known:
+            placed, moved = self._shapes.placed(one), self._shapes.placed(other)
+            if placed is None or moved is None:
+                return None
+            if len(self._known) >= MOST_KNOWN:
+                self._known.clear()
+            self._known[key] = judge(
+                placed[0], moved[0], pose, self._asked.within, self._asked.contact
+            )
+        return self._known[key]
 
     @contextmanager
     def _keeping(self) -> Iterator[None]:
@@ -237,14 +264,13 @@ class _Search:
 
     def _told(
         self,
-        objects: Sequence[Object],
+        by_id: dict[int, Object],
         shown: dict[tuple[int, int], PairRow],
         looked: set[tuple[int, int]],
         left: Sequence[tuple[Object, Object]],
     ) -> Iterator[Clash]:
         """Pairs as they are told: looked at, gone since the last call, and not looked at."""
-        by_id = {obj.id: obj for obj in objects}
-        names = {obj.id: obj.name for obj in objects}
+        names = {i: obj.name for i, obj in by_id.items()}
         waiting = {_key(*pair) for pair in left}
         for key, row in shown.items():
             status: Status = row.status
@@ -277,9 +303,7 @@ class _Search:
         if left:
             return
         self._waiting = [
-            shown[key]._replace(status="same")
-            for key in sorted(looked)
-            if shown[key].status != "same"
+            shown[key]._replace(status="same") for key in looked if shown[key].status != "same"
         ]
         gone = []
         for key, row in shown.items():
@@ -311,6 +335,8 @@ def _shapes(one: Object, other: Object) -> str:
 
 def _accepted(row: PairRow, by_id: dict[int, Object]) -> str | None:
     """Why a pair is accepted; None where it is not, or a shape has changed since."""
+    if row.because is None:
+        return None
     one, other = by_id.get(row.a), by_id.get(row.b)
     if one is None or other is None or row.shapes != _shapes(one, other):
         return None
@@ -340,6 +366,11 @@ def _is_same(row: PairRow, old: PairRow) -> bool:
         np.array([one.at_least, one.at_most or 0.0], dtype=np.float64) for one in (row, old)
     )
     return bool((np.abs(now - before) <= SAME).all())
+
+
+def _rounded(pose: Floats) -> Floats:
+    """A pose to `ROUNDING`, so that equal shapes placed alike are the same pair everywhere."""
+    return np.asarray(np.round(pose / ROUNDING) * ROUNDING + 0.0)
 
 
 def _inverse(pose: Floats) -> Floats:

@@ -78,20 +78,17 @@ class Shapes:
         self._store, self._budget = store, budget
         self._kept: OrderedDict[tuple[str, bytes], BuiltShape] = OrderedDict()
         self._bytes = 0
-        self._placements: dict[int, tuple[tuple[str, bytes], Floats, Floats]] = {}
+        self._placements: dict[int, tuple[tuple[str, bytes], Floats]] = {}
 
     def placed(self, obj: Object) -> tuple[BuiltShape, Floats] | None:
         """BuiltShape of an object and its rigid placement (4, 4); None if it was written meanwhile.
 
         Raises `NoSurfaceError` if the object's surface is not in the database.
         """
-        if obj.id not in self._placements:
-            linear, pose = _placement(obj.transform)
-            self._placements[obj.id] = (obj.digest, linear.tobytes()), linear, pose
-        key, linear, pose = self._placements[obj.id]
+        key, pose = self.placement(obj)
         shape = self._kept.get(key)
         if shape is None:
-            shape = self._read(obj, linear)
+            shape = self._read(obj, np.frombuffer(key[1]).reshape(3, 3))
             if shape is None:
                 return None
             self._kept[key] = shape
@@ -100,6 +97,13 @@ class Shapes:
                 self._bytes -= _bytes_of(self._kept.popitem(last=False)[1])
         self._kept.move_to_end(key)
         return shape, pose
+
+    def placement(self, obj: Object) -> tuple[tuple[str, bytes], Floats]:
+        """Key of an object's shape, equal for equal ones, and its rigid placement (4, 4)."""
+        if obj.id not in self._placements:
+            linear, pose = _placement(obj.transform)
+            self._placements[obj.id] = (obj.digest, linear.tobytes()), pose
+        return self._placements[obj.id]
 
     def _read(self, obj: Object, linear: Floats) -> BuiltShape | None:
         packed = self._store.surfaces([obj.digest]).get(obj.digest)

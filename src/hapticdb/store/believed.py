@@ -221,15 +221,20 @@ def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
 def pair_of(url: str, row: Sequence[Any]) -> PairRow:
     """Read a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
     a, b, kind, at_least, at_most, *place, status, revision, setting, because, shapes = row
-    numbers = (at_least, *place, *(() if at_most is None else (at_most,)))
-    texts = (setting, *(text for text in (because, shapes) if text is not None))
+    try:
+        is_finite = math.isfinite(at_least + (at_most or 0.0) + sum(place))
+    except TypeError:
+        is_finite = False
     if not (
-        all(map(_is_count, (a, b, revision)))
-        and a < b
+        is_finite
+        and type(a) is type(b) is type(revision) is int
+        and 0 <= a < b < KEY_END
+        and 0 <= revision < KEY_END
         and kind in KINDS
         and status in STATUSES
-        and all(map(_is_finite, numbers))
-        and all(isinstance(text, str) for text in texts)
+        and isinstance(setting, str)
+        and (because is None or isinstance(because, str))
+        and (shapes is None or isinstance(shapes, str))
     ):
         raise damaged(url, f"pair {a!s:.40}, {b!s:.40}: it holds what no search for clashes writes")
     return PairRow(

@@ -122,7 +122,7 @@ def _shifted(pose: Floats, shifts: Floats) -> Floats:
 
 
 def _cut(a: BuiltShape, b: BuiltShape, pose: Floats, most: float, contact: float) -> Cut:
-    return cut(a.mesh, b.mesh, pose, most, SHIFT * contact, contact)
+    return cut(a.mesh, b.mesh, pose, most, SHIFT * contact, contact, contact)
 
 
 def _inner(a: BuiltShape, b: BuiltShape, pose: Floats, contact: float) -> Cut:

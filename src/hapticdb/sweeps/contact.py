@@ -33,8 +33,11 @@ DEEP = 0.06
 differ by half as much where places and corners are few. Larger: more of it is allowed."""
 BLOCK = 64
 """Looks whether surfaces are apart that are done together."""
+REACH = 0.9
+"""Share of the way up to the next look on which a cut would stay as deep. Larger: fewer looks, more
+of which are done again, nearer."""
 PATIENCE = 16
-"""Looks at a cut until motions that ease it are tried again."""
+"""Shortest ways between looks until motions that ease a cut are tried again."""
 
 
 class FollowedContact(NamedTuple):
@@ -71,6 +74,7 @@ class _Following:
     def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
         self._pair, self._contact = pair, contact
         self._object, self._tool = object_mesh, tool_mesh
+        self._depth = contact
         self._start = self._cut(pair.way.at([0.0])[0], np.inf, contact).depth
         growth = max(contact, DEEP * self._start)
         self._step = max(STEP * contact, STEP_OF_GROWTH * growth)
@@ -78,7 +82,6 @@ class _Following:
         deep = self._start > contact
         self._easing = Easing(pair, self._start + 0.5 * growth if deep else contact)
         self._deepest = self._depth = self._start
-        self._looked_at = 0.0
 
     def followed(self) -> FollowedContact:
         """Follow it to its end."""
@@ -90,7 +93,7 @@ class _Following:
                 apart = self._first_apart(way, eased)
                 if apart is not None:
                     return self._told(apart, is_apart=True)
-                way = self._looked_at = eased
+                way = eased
                 self._depth = self._easing.reach
                 continue
             told = self._looked(way, min(way + PATIENCE * self._step, length))
@@ -120,24 +123,41 @@ class _Following:
         return self._pair.measure(ways, far, enough).at_least
 
     def _looked(self, begin: float, end: float) -> FollowedContact | None:
-        """Look at the cut between two ways; how it ends if it does."""
-        ways = np.append(np.arange(begin + self._step, end, self._step), end)
-        enough = self._allowed - KEPT * self._step
-        poses = self._pair.way.at(ways)
-        for way, gap, pose in zip(ways.tolist(), self._gaps(ways).tolist(), poses, strict=True):
-            if gap > self._contact:
-                return self._told(way, is_apart=True)
-            if way < end and self._depth + way + self._step - self._looked_at <= self._allowed:
-                continue  # no deeper than is allowed at the next look, either
-            found = NONE
-            if gap <= 0.0:
-                found = self._cut(pose, self._allowed + self._contact, enough)
-            self._looked_at, self._depth = way, found.depth
-            self._deepest = max(self._deepest, found.depth)
-            if found.depth > enough:
-                return self._told(way, (way, found))
+        """Look at the cut between two ways; how it ends if it does.
+
+        On a way of some length a cut gets deeper by as much at most. So between two looks it is no
+        deeper than half of both cuts and the way. Where that is too much, a nearer look follows.
+        """
+        way, length = begin, 0.0
+        while way < end:
+            if not length:
+                length = max(REACH * 2.0 * (self._allowed - self._depth), self._step)
+            there = min(way + length, end)
+            enough = 2.0 * self._allowed - self._depth - (there - way)
+            if length <= self._step:
+                enough = self._allowed - KEPT * self._step
+            found, is_apart = self._look(there, enough)
+            if is_apart:
+                return self._told(there, is_apart=True)
+            if found.depth <= enough:
+                self._depth, way, length = found.depth, there, 0.0
+                self._deepest = max(self._deepest, found.depth)
+            elif length <= self._step:
+                self._deepest = max(self._deepest, found.depth)
+                return self._told(there, (there, found))
+            else:
+                length = max(0.5 * length, self._step)
         return None
+
+    def _look(self, way: float, enough: float) -> tuple[Cut, bool]:
+        """The cut at a way, and whether the surfaces are apart there."""
+        gap = self._gaps(np.array([way]))[0]
+        if gap > 0.0:
+            return NONE, gap > self._contact
+        most = self._allowed + self._contact
+        return self._cut(self._pair.way.at([way])[0], most, min(enough, self._allowed)), False
 
     def _cut(self, pose: Floats, most: float, enough: float) -> Cut:
         """Cut at a pose, up to `most` metres; `enough` ends its search."""
-        return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough)
+        known = min(self._depth, enough)
+        return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough, known)

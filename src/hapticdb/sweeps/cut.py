@@ -47,7 +47,8 @@ class Mesh:
     """A surface with its corners joined.
 
     tree : its triangles; points (V, 3); edges (E, 2), faces (T, 3) : numbers of points, the faces
-    in the order of the tree; near : length up to which places are one, metres.
+    in the order of the tree; lows, highs (E, 3) : boxes of the edges; near : length up to which
+    places are one, metres.
     """
 
     def __init__(self, tree: TriangleTree) -> None:
@@ -65,6 +66,8 @@ class Mesh:
         sides.sort(axis=1)
         keys, which = np.unique(sides @ np.array([len(first), 1]), return_inverse=True)
         self.edges = np.stack(np.divmod(keys, len(first)), axis=1)
+        ends = self.points[self.edges]
+        self.lows, self.highs = ends.min(axis=1), ends.max(axis=1)
         which = which.reshape(-1)
         order = np.argsort(which, kind="stable")
         self._faces_at = order // 3
@@ -89,20 +92,21 @@ NONE = Cut(0.0, np.zeros(3))
 
 
 def cut(
-    one: Mesh, other: Mesh, one_from_other: Floats, most: float, shift: float, enough: float
-) -> Cut:
+    one: Mesh, other: Mesh, one_from_other: Floats, most: float, shift: float, enough: float,
+    known: float = 0.0,
+) -> Cut:  # fmt: skip
     """Greatest cut of two surfaces, up to `most` metres: deeper ones are told as `most`.
 
     one_from_other (4, 4) : rigid. It is the least one of `WAYS` by which the other surface is
     shifted, until one is `enough`: where surfaces coincide, rounding decides what goes through, and
     a shift of many times that makes it plain. So it is exact to `shift` metres. Of a cut of
-    `enough` or less, it is only told that it is no more.
+    `known` or less, it is only told that it is no more.
     """
     found: Cut | None = None
     for way in WAYS:
         pose = one_from_other.copy()
         pose[:3, 3] += shift * way
-        here = _cut(one, other, pose, most, enough)
+        here = _cut(one, other, pose, most, known)
         found = here if found is None or here.depth < found.depth else found
         if found.depth <= enough:
             break
@@ -110,7 +114,7 @@ def cut(
     return found
 
 
-def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, enough: float) -> Cut:
+def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, known: float) -> Cut:
     """Greatest cut without a shift."""
     other_from_one: Floats = np.asarray(np.linalg.inv(one_from_other), dtype=np.float64)
     mine, theirs = _Parted(one, other, other_from_one), _Parted(other, one, one_from_other)
@@ -119,15 +123,15 @@ def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, enough: fl
     spots = mine.spots(), theirs.spots()
     mine.add(*spots[1], one_from_other)
     theirs.add(*spots[0], other_from_one)
-    return _deepest(mine, theirs, one_from_other, most, enough)
+    return _deepest(mine, theirs, one_from_other, most, known)
 
 
 def _deepest(
-    mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float, enough: float
+    mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float, known: float
 ) -> Cut:
     """The deepest of all curves: at each the lesser of what either surface gets through.
 
-    The smaller surface is measured first, the other one where that gets farther than `enough`.
+    The smaller surface is measured first, the other one where that gets farther than `known`.
     """
     own, at_own = mine.crossings()
     other, at_other = theirs.crossings()
@@ -146,7 +150,7 @@ def _deepest(
         surface, curves = parted[n]
         if is_open[curves].any():
             np.maximum.at(through[n], curves, surface.depths(most))
-        is_open = (through[n] < 0.0) | (through[n] > enough)
+        is_open = (through[n] < 0.0) | (through[n] > known)
     lesser = np.where(
         through[0] < 0.0, through[1], np.where(through[1] < 0.0, through[0], np.minimum(*through))
     )
@@ -170,10 +174,18 @@ class _Parted:
         self._spotted: Ints = np.empty(0, dtype=np.int64)
         self.edges, self.shares = np.empty(0, dtype=np.int64), np.empty(0)
         self._triangles, self._place_of = self.edges, self.edges  # what goes through, its place
-        self._pierce(mesh.edges, 0)
+        middle, half = (
+            0.5 * other.tree.boxes[0].sum(axis=0),
+            0.5 * np.ptp(other.tree.boxes[0], axis=0),
+        )
+        back = np.linalg.inv(other_from_mesh)
+        middle, half = back[:3, :3] @ middle + back[:3, 3], np.abs(back[:3, :3]) @ half + mesh.near
+        off = np.maximum(mesh.lows - (middle + half), (middle - half) - mesh.highs)
+        near = np.flatnonzero(off.max(axis=1) <= 0.0)
+        self._pierce(mesh.edges[near], near)
 
-    def _pierce(self, edges: Ints, first: int) -> None:
-        """Add places of edges (n, 2), numbered from `first`; what is at one place is one."""
+    def _pierce(self, edges: Ints, numbers: Ints) -> None:
+        """Add places of edges (n, 2), whose numbers are (n,); what is at one place is one."""
         ends = np.ascontiguousarray(self._points[edges].reshape(-1, 2, 3))
         which, triangles, shares = piercing(ends, self._other.tree, self._pose)
         lengths = np.linalg.norm(ends[which, 1] - ends[which, 0], axis=1)
@@ -181,7 +193,7 @@ class _Parted:
             np.diff(shares, prepend=0.0) * lengths > self._mesh.near
         )
         place_of = len(self.shares) + np.cumsum(is_next) - 1
-        self.edges = np.concatenate([self.edges, first + which[is_next]])
+        self.edges = np.concatenate([self.edges, numbers[which[is_next]]])
         self.shares = np.concatenate([self.shares, shares[is_next]])
         self._triangles = np.concatenate([self._triangles, triangles])
         self._place_of = np.concatenate([self._place_of, place_of])
@@ -221,7 +233,7 @@ class _Parted:
         more = np.stack([numbers, self._mesh.faces[triangles].reshape(-1)], axis=1)
         spots = spots @ mesh_from_other[:3, :3].T + mesh_from_other[:3, 3]
         self._points = np.concatenate([self._points, spots])
-        self._pierce(more, len(self._edges))
+        self._pierce(more, len(self._edges) + np.arange(len(more)))
         self._edges = np.concatenate([self._edges, more])
         self._spotted = np.repeat(triangles, 3)
 

@@ -108,6 +108,9 @@ def test_the_first_contact_of_each_object_is_told_in_order(env: Environment) -> 
     assert wall.segment == 1
     assert wall.pose[0, 3] == pytest.approx(0.12, abs=2.0 * MEETING)
     assert (found.gap.at_least, found.gap.at_most) == (0.0, 0.0)
+    first = sweep(env, TOOL, found.path.poses, until_hit=True)
+    assert names(first) == ["shelf"]
+    assert first.hits[0].fraction == pytest.approx(shelf.fraction, abs=1e-4)
 
 
 def test_what_is_chosen_can_be_met_and_nothing_else(env: Environment) -> None:
@@ -182,6 +185,18 @@ def test_a_peg_leaves_its_hole_though_it_is_too_thick(tmp_path: Path, more: floa
     assert out.comes_out
     assert out.touching[0].start == pytest.approx(1e-3 * more, abs=1e-5)
     assert names(aside) == ["ring"]
+
+
+def test_a_block_slides_in_a_slot_that_it_fills(tmp_path: Path) -> None:
+    walls = [box_at((0.02, 0.3, 0.1), (side * (0.5 * CUBE + 0.01), 0.0, 0.0)) for side in (-1, 1)]
+    slot = trimesh.util.concatenate(walls)
+    with imported(tmp_path / "slot", {"slot": slot}) as env:
+        along = sweep(env, TOOL, line((0.0, -0.1, 0.0), (0.0, 0.1, 0.0)))
+        aside = sweep(env, TOOL, line((0.0, -0.1, 0.0), (3.0 * CONTACT, 0.1, 0.0)))
+    assert along.verdict == "slides"
+    assert along.touching[0].deepest <= CONTACT
+    (cut,) = aside.hits
+    assert cut.pose[0, 3] == pytest.approx(2.0 * CONTACT, abs=CONTACT)
 
 
 def test_a_tolerance_tells_what_touches(env: Environment) -> None:

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.extraction.directions import (
     AGAINST,
     ALIKE,
+    AXES,
     candidate_directions,
     likely_directions,
     opposed_shares,
@@ -29,10 +30,10 @@ its start. Larger: more pulls that the proof refuses."""
 MOST_OPPOSED = 0.1
 """Greatest share of the contacts at the start that a pull may press against. Larger: more pulls
 that the proof refuses."""
-MOST_LIKELY = 16
+MOST_LIKELY = 24
 """Greatest number of pulls that are swept, of those that the part's axes or contacts suggest.
 Larger: more oblique bores are left, at the price of a sweep each."""
-SHARE_OF_PULL = 0.25
+SHARE_OF_PULL = 0.5
 """Share of the time left that the sweep of one of them has."""
 BLOCKS = (8, 64)
 """Poses that are looked at together: at first, since most pulls are blocked soon, and at most; each
@@ -82,6 +83,9 @@ class Pulls:
         self._directions = candidate_directions(normals, own, seed)
         alike = self._directions @ likely_directions(normals, own).T
         self._is_likely = alike.max(axis=1) >= ALIKE
+        self._is_axis = (
+            np.abs(self._directions @ np.concatenate([own, AXES]).T).max(axis=1) >= ALIKE
+        )
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
         self._opposed = opposed_shares(self._directions, normals)
 
@@ -100,10 +104,12 @@ class Pulls:
     def sweep(self, until: float) -> WayOut | None:
         """Sweep likely pulls until one is free; None if none is, or at a time of `monotonic`.
 
-        Those that fewest contacts oppose come first, of these the shortest ones.
+        Those along axes come first, then those that fewest contacts oppose, the shortest first.
         """
         likely = np.flatnonzero(self._is_likely)
-        order = np.lexsort((self._lengths[likely], np.round(self._opposed[likely], 2)))
+        order = np.lexsort(
+            (self._lengths[likely], np.round(self._opposed[likely], 2), ~self._is_axis[likely])
+        )
         for n in likely[order[:MOST_LIKELY]].tolist():
             if self.done and time.monotonic() > until:
                 return None

@@ -85,7 +85,7 @@ class _Following:
 
     def followed(self) -> FollowedContact:
         """Follow it to its end."""
-        way, length = 0.0, self._pair.way.length
+        way, length = 0.0, self._pair.length
         while way < length:
             eased = self._easing.until(way)
             if eased > way + self._step or eased >= length:
@@ -133,31 +133,36 @@ class _Following:
             if not length:
                 length = max(REACH * 2.0 * (self._allowed - self._depth), self._step)
             there = min(way + length, end)
-            enough = 2.0 * self._allowed - self._depth - (there - way)
-            if length <= self._step:
+            enough = min(2.0 * self._allowed - self._depth - (there - way), self._allowed)
+            is_nearest = length <= self._step
+            if is_nearest:
                 enough = self._allowed - KEPT * self._step
-            found, is_apart = self._look(there, enough)
+            found, is_apart = self._look(there, enough, is_nearest=is_nearest)
             if is_apart:
                 return self._told(there, is_apart=True)
             if found.depth <= enough:
                 self._depth, way, length = found.depth, there, 0.0
                 self._deepest = max(self._deepest, found.depth)
-            elif length <= self._step:
+            elif is_nearest:
                 self._deepest = max(self._deepest, found.depth)
                 return self._told(there, (there, found))
             else:
                 length = max(0.5 * length, self._step)
         return None
 
-    def _look(self, way: float, enough: float) -> tuple[Cut, bool]:
-        """The cut at a way, and whether the surfaces are apart there."""
+    def _look(self, way: float, enough: float, *, is_nearest: bool) -> tuple[Cut, bool]:
+        """The cut at a way, and whether the surfaces are apart there.
+
+        Unless it is the nearest look, a greater cut is not looked at closely.
+        """
         gap = self._gaps(np.array([way]))[0]
         if gap > 0.0:
             return NONE, gap > self._contact
         most = self._allowed + self._contact
-        return self._cut(self._pair.way.at([way])[0], most, min(enough, self._allowed)), False
+        pose = self._pair.way.at([way])[0]
+        return self._cut(pose, most, enough if is_nearest else np.inf), False
 
     def _cut(self, pose: Floats, most: float, enough: float) -> Cut:
         """Cut at a pose, up to `most` metres; `enough` ends its search."""
-        known = min(self._depth, enough)
+        known = min(max(self._depth, self._contact), enough)
         return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough, known)

@@ -45,7 +45,7 @@ class Easing:
 
     def until(self, begin: float) -> float:
         """Way from `begin` on up to which one of the motions keeps the surfaces apart, at most."""
-        best, length = begin, self._pair.way.length
+        best, length = begin, self._pair.length
         for _, eased in zip(range(MOST_TRIED), self._freeing(begin), strict=False):
             met = self._pair.first_met(begin, *eased)
             if met > best:
@@ -71,9 +71,16 @@ class Easing:
     def _stretched(self) -> list[Eased]:
         still, theirs, own = np.zeros(3), self._pair.tree, self._pair.tool.tree
         return [
-            *(Eased(still, theirs, tree) for tree in _stretched_trees(own, self.reach)),
+            *(Eased(still, theirs, tree) for tree in self._of_tool()),
             *(Eased(still, tree, own) for tree in _stretched_trees(theirs, self.reach)),
         ]
+
+    def _of_tool(self) -> list[TriangleTree]:
+        """The tool's trees, kept for its next contact."""
+        kept = self._pair.tool.stretched
+        if self.reach not in kept:
+            kept[self.reach] = list(_stretched_trees(self._pair.tool.tree, self.reach))
+        return kept[self.reach]
 
     def _are_free(
         self, pose: Floats, shifts: Floats, theirs: TriangleTree, own: TriangleTree

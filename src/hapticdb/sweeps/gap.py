@@ -41,13 +41,15 @@ class Pair:
     """The tool and one object along a path.
 
     tree : triangles of the object, world frame; until : time of `time.monotonic` at which it ends
-    by OverTimeError.
+    by OverTimeError; end : way up to which they are looked at, the whole path unless given.
     """
 
     def __init__(
-        self, tree: TriangleTree, tool: MovingSurface, way: Way, until: float = np.inf
-    ) -> None:
+        self, tree: TriangleTree, tool: MovingSurface, way: Way, until: float = np.inf,
+        end: float | None = None,
+    ) -> None:  # fmt: skip
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
+        self.length = way.length if end is None else end
         self.looks = 0
 
     def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
@@ -78,10 +80,8 @@ class Pair:
             theirs, own, motion._replace(centers=motion.centers + shift),
             radius=self.tool.radius, begin=begin, best=2.0 * MEETING, fine=COARSE,
         )  # fmt: skip
-        while not search.go_on(STEPS):
-            self._check_time()
-        self.looks += search.looks
-        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else self.way.length
+        self._finish(search)
+        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else self.length
 
     def least(self, begin: float, best: float) -> tuple[Least | None, float]:
         """Least distance from a way on, if it is less than `best`; else None.
@@ -101,11 +101,7 @@ class Pair:
     def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
         """The same to `fine` metres, and how many looks it took."""
         search = self.tool.search(self.tree, self.way.motion, begin=begin, best=best, fine=fine)
-        is_over = False
-        while not is_over:
-            self._check_time()
-            is_over = search.go_on(STEPS)
-        self.looks += search.looks
+        self._finish(search)
         (at_most, closed), (way,), (on_object, on_tool) = search.found
         if way < 0.0:
             return None, float(closed), search.looks
@@ -114,6 +110,18 @@ class Pair:
             at_most, on_object, on_tool = near.at_most[0], near.on_a[0], near.on_b[0]
         found = Least(float(at_most), float(way), on_object, on_tool)
         return found, float(closed), search.looks
+
+    def _finish(self, search: Search) -> None:
+        """Search to the end; on a part of the path, as if they met at its end."""
+        if self.length < self.way.length:
+            search.found.distance[0], search.found.way[0] = MEETING, self.length
+        is_over = False
+        while not is_over:
+            self._check_time()
+            is_over = search.go_on(STEPS)
+        self.looks += search.looks
+        if self.length < self.way.length and search.found.way[0] >= self.length:
+            search.found.way[0] = -1.0
 
     def _check_time(self) -> None:
         if time.monotonic() > self.until:

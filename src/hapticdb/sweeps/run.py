@@ -56,6 +56,7 @@ def sweep(
     limit: float | None = None,
     seconds: float | None = None,
     profile: bool = False,
+    until_hit: bool = False,
     proportions: Proportions | None = None,
     progress: SweepCallback | None = None,
 ) -> Swept:
@@ -82,6 +83,8 @@ def sweep(
         Greatest distance that is told, metres; time after which the sweep ends undecided.
     profile : bool
         Compute the distance along the path, too.
+    until_hit : bool
+        End at the first hit: what is met later is not told.
     proportions : Proportions or None
         Of the same tool, path and scene, with their units; compared here in metres unless given.
     progress : callable or None
@@ -94,7 +97,7 @@ def sweep(
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _asked(contact, limit, seconds, profile=profile, progress=progress)
+    asked = _asked(contact, limit, seconds, profile=profile, until_hit=until_hit, progress=progress)
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, _center_of(tool, about))
@@ -110,6 +113,7 @@ class _Asked(NamedTuple):
     limit: float
     until: float
     profile: bool
+    until_hit: bool
     progress: SweepCallback | None
 
 
@@ -119,6 +123,7 @@ def _asked(
     seconds: float | None,
     *,
     profile: bool,
+    until_hit: bool,
     progress: SweepCallback | None,
 ) -> _Asked:
     """Check numbers; UsageError."""
@@ -128,7 +133,7 @@ def _asked(
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
     until = np.inf if seconds is None else time.monotonic() + seconds
-    return _Asked(contact, most, until, profile, progress)
+    return _Asked(contact, most, until, profile, until_hit, progress)
 
 
 def _center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
@@ -174,6 +179,7 @@ class _Sweep:
             except OverTimeError:
                 near, is_stopped = len(objects), True
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
+        hits = hits[:1] if self._asked.until_hit else hits
         gap = Gap(max(min(self._closed, self._best), 0.0), self._best, self._nearest)
         if hits or self._enclosed:
             gap = Gap(0.0, 0.0, hits[0] if hits else None)
@@ -202,10 +208,20 @@ class _Sweep:
             if least >= self._wanted() and not self._is_profiled(least):
                 self._closed = min(self._closed, least)
                 return n
-            self._look_at(*next(parts), is_inside=bool(gaps[i, 0] <= 0.0))
+            obj, part = next(parts)
+            if gaps[i, edges[:-1] <= self._end].min() < self._wanted():
+                self._look_at(obj, part, is_inside=bool(gaps[i, 0] <= 0.0))
             if self._asked.progress is not None:
                 self._asked.progress(n + 1, n_near)
         return len(objects)
+
+    @property
+    def _end(self) -> float:
+        """Way up to which objects are looked at."""
+        if not (self._asked.until_hit and (self._hits or self._enclosed)):
+            return self._way.length
+        first = min((place.fraction for place in self._hits), default=0.0)
+        return 0.0 if self._enclosed else first * self._way.length
 
     def _wanted(self) -> float:
         """Distance below which something changes the result."""
@@ -224,12 +240,12 @@ class _Sweep:
     def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
         """Decide about one object; is_inside : whether its box meets the tool's at the start."""
         triangles = part.surface()
-        pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until)
+        pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until, self._end)
         try:
             start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
             if start <= self._asked.contact and not part.is_cloud:
                 begin = self._follow(obj, pair)
-                if begin < self._way.length:
+                if begin < pair.length:
                     self._measure(obj, pair, begin)
             else:
                 if is_inside and self._holds(triangles, obj):
@@ -248,7 +264,7 @@ class _Sweep:
             refused = self._place(obj, way, cut.place, cut.place)
             self._hits.append(refused)
         self._touching.append(_told(obj, found, self._way, contact, refused))
-        return found.until if found.is_apart else self._way.length
+        return found.until if found.is_apart else pair.length
 
     def _measure(self, obj: Object, pair: Pair, begin: float) -> None:
         """Find where an object is met first from a way on, or how near it comes.

@@ -1,4 +1,4 @@
-"""Kernels of the hand: coupling, clutch, and the report of the servo loop to other processes."""
+"""Kernels of the hand: the coupling to the tool, direct rendering, scale and clutch."""
 
 from hapticdb.kernels._later import later_modules
 

@@ -140,6 +140,7 @@ def test_a_viewers_search_for_clashes_keeps_nothing_and_an_editor_accepts(
                 said(person, "1 overlapping.")
                 listed = person.widgets[person.find("Pairs")]["options"]
                 person.choose("Pairs", listed[1])
+                said(person, "Orange")
                 person.choose("Because", "welded")
                 person.choose("Pair", "Accept")
                 said(person, "the pair is accepted")

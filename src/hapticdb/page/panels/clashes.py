@@ -66,7 +66,7 @@ class ClashPanel:
         self._act.on_click(guard("viewer", self._show_or_end))
         may_edit = browser.visitor.may("editor") and browser.site.edits is not None
         with gui.add_folder("Meant to be so", visible=may_edit):
-            self._because = gui.add_text("Because", "", hint="Why the pair is accepted.")
+            self._because = gui.add_text("Because", "", hint="Why it is meant to be so.")
             self._accept = gui.add_button_group("Pair", ("Accept", "Take back"))
             self._accept.on_click(guard("editor", self._accept_or_not))
 

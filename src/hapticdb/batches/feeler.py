@@ -18,7 +18,7 @@ from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UN
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
-from hapticdb.query.law import ForceLaw
+from hapticdb.query.law import ForceLaw, frames_by
 from hapticdb.ready import make_ready
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
@@ -71,7 +71,7 @@ class Feeler:
         if device not in get_args(BatchDevice):
             raise UsageError(f"device {device!r}: choose 'cpu' or 'cuda'")
         n_jobs = available_jobs(jobs)
-        make_ready("replay")
+        make_ready(frames_by(law))
         self.shell = shell
         self.law = law
         self._store = store

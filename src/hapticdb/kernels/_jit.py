@@ -20,7 +20,7 @@ from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
-from hapticdb.kernels._linking import EntryCompiler, LeafCompiler, remember_calls
+from hapticdb.kernels._linking import EntryCompiler, compile_once
 
 INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -38,11 +38,13 @@ A read-only array has another type than a writable one.
 
 ENTRIES: list[Any] = []
 """Every compiled entry, in order of definition."""
-SIGNATURES: dict[str, tuple[tuple[Any, ...], ...]] = {}
+SIGNATURES: dict[str, tuple[Any, ...]] = {}
 """Types of the arguments of every entry, by its module and name: ``query.grouping.gap_rows``.
 
-An entry has one such tuple, or several when it is compiled for several laws.
+An entry that is compiled for the distance law, too, has a second name for that, which ends in
+`BY_DISTANCE`.
 """
+BY_DISTANCE = "@distances"
 
 
 _ENTRY_OPTIONS: dict[str, Any] = {
@@ -52,8 +54,8 @@ _ENTRY_OPTIONS: dict[str, Any] = {
 _LEAF_OPTIONS: dict[str, Any] = _ENTRY_OPTIONS | {"_nrt": False}
 if IN_WORKER in os.environ:
     _ENTRY_OPTIONS |= {"pipeline_class": EntryCompiler}
-    _LEAF_OPTIONS |= {"no_cpython_wrapper": True, "pipeline_class": LeafCompiler}
-    remember_calls()
+    _LEAF_OPTIONS |= {"no_cpython_wrapper": True}
+    compile_once()
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
@@ -88,12 +90,10 @@ def entry(
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a kernel that Python calls with arguments of those types, when it is first called.
 
-    `also` declares a second signature: the first one with some types exchanged. The kernel is
+    `also` declares the signature for the distance law: some types exchanged. The kernel is
     cached on disk and runs without the interpreter lock. A call with other types is correct, but
     slow the first time, because the kernel is compiled for them then.
     """
-    second = tuple(also.get(kind, kind) for kind in signature)
-    signatures = (signature, second) if also else (signature,)
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         before = config.CACHE_DIR
@@ -106,7 +106,10 @@ def entry(
             config.CACHE_DIR = before
         ENTRIES.append(compiled)
         module = function.__module__.removeprefix("hapticdb.kernels.")
-        SIGNATURES[f"{module}.{function.__name__}"] = signatures
+        name = f"{module}.{function.__name__}"
+        SIGNATURES[name] = signature
+        if also:
+            SIGNATURES[name + BY_DISTANCE] = tuple(also.get(kind, kind) for kind in signature)
         return compiled  # type: ignore[no-any-return]
 
     return decorate
@@ -117,9 +120,16 @@ def leaf(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:  # no
 
     It counts no references, so arrays cost nothing, but it can make none (`maker`). A process that
     only compiles makes no machine code of a leaf alone (`_linking`). Elsewhere a leaf can be called
-    from Python, as tests do.
+    from Python, as tests do. numba gives a literal a type of its own; a leaf is compiled without.
     """
-    return numba.njit(**_LEAF_OPTIONS | more)(function)  # type: ignore[no-any-return]
+    compiled = numba.njit(**_LEAF_OPTIONS | more)(function)
+    if not config.DISABLE_JIT:
+        search = compiled.get_call_template
+        compiled.get_call_template = lambda given, named: search(
+            [types.unliteral(kind) for kind in given],
+            {name: types.unliteral(kind) for name, kind in named.items()},
+        )
+    return compiled  # type: ignore[no-any-return]
 
 
 def inlined(function: Callable[..., Any]) -> Callable[..., Any]:

@@ -7,28 +7,18 @@ an entry links each leaf below it, once, and its own passes inline and optimize 
 
 from typing import Any
 
-from llvmlite import binding
-from numba.core.codegen import JITCodeLibrary
+from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import Compiler
 from numba.core.types.functions import BaseFunction
-
-ENVIRONMENT = "_ZN08NumbaEnv"
-"""Prefix of the variables through which numba gives functions their constants."""
 
 
 class _LeafLibrary(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
     """Code of a leaf, for entries alone."""
 
-    _final_module: Any
-
     def finalize(self) -> None:
-        """Keep the code for entries; emit nothing but the variables that numba writes to."""
+        """Keep the code for entries."""
         self._finalized = True
         self._get_module_for_linking()
-        names = [known.name for known in self._final_module.global_variables]
-        words = [f'@"{name}" = common global ptr null' for name in names if ENVIRONMENT in name]
-        self._final_module = binding.parse_assembly("\n".join(words))
-        self._finalize_final_module()
 
 
 class _EntryLibrary(JITCodeLibrary):  # type: ignore[misc]  # likewise
@@ -53,26 +43,30 @@ def _add_callees(libraries: list[Any], found: dict[Any, None]) -> None:
             found[library] = None
 
 
-class LeafCompiler(Compiler):  # type: ignore[misc]  # likewise
-    """numba's compiler, for leaves."""
-
-    library: Any = _LeafLibrary
+class EntryCompiler(Compiler):  # type: ignore[misc]  # likewise
+    """numba's compiler, for entries."""
 
     def __init__(self, typing_context: Any, target: Any, library: Any, *others: Any) -> None:  # noqa: ANN401 - likewise
-        if library is None:
-            library = self.library(target.codegen(), "kernel")
-            library.enable_object_caching()
+        library = _EntryLibrary(target.codegen(), "kernel")
+        library.enable_object_caching()
         super().__init__(typing_context, target, library, *others)
 
 
-class EntryCompiler(LeafCompiler):
-    """numba's compiler, for entries."""
+def compile_once() -> None:
+    """Let numba make no machine code but of entries, and search for what a call means once.
 
-    library = _EntryLibrary
+    Leaves are all else that it compiles: ours, and its own functions that they call.
+    """
+    begin = Compiler.__init__
 
+    def __init__(self: Any, typing_context: Any, target: Any, library: Any, *others: Any) -> None:  # noqa: ANN401, N807 - numba's
+        if library is None:
+            library = _LeafLibrary(target.codegen(), "leaf")
+            library.enable_object_caching()
+        begin(self, typing_context, target, library, *others)
 
-def remember_calls() -> None:
-    """Let numba search for the implementation of an operator once for types of arguments."""
+    Compiler.__init__ = __init__
+    JITCPUCodegen.set_env = lambda *_: None  # constants of functions that are called
     search, known = BaseFunction.get_call_type, {}
 
     def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:  # noqa: ANN401

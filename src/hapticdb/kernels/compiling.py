@@ -34,10 +34,10 @@ ENTRIES = {
     "surfaces.voxelize": "voxelize_kernel",
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
-    "large.budget": "feel_kernel",
+    "large.budget": "feel_kernel feel_kernel@distances",
     "query.refining": (
-        "refine_kernel pairs_of_hits pairs_of_contacts unpack_asked_kernel wrench_of_addresses "
-        "depths_of_hits"
+        "refine_kernel refine_kernel@distances pairs_of_hits pairs_of_contacts "
+        "unpack_asked_kernel wrench_of_addresses depths_of_hits"
     ),
     "query.contact": "locate_kernel spans_of_keys",
     "resident.cell_table": (
@@ -64,15 +64,17 @@ ENTRIES = {
     "hand.handle": "is_somewhere follow",
     "proxy.evaluate": "evaluate",
 }
-"""Entries of each module; modules that take longest to compile come first. The names are listed
-here so that a process can check for compiled entries without loading numba."""
+"""Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`); modules
+that take longest to compile come first. The names are listed here so that a process can check for
+compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
     "large.budget": "period.direct",
     "proxy.linearize": "period.loop",
     "resident.clearance": "resident.nearest",
 }
-"""Modules that are compiled after another module in the same process: they share its leaves."""
+"""Modules that are compiled after another module, if it is compiled, too, in the same process: they
+share its leaves."""
 LONGEST_S = 600.0
 """Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
 where it is first called."""
@@ -105,6 +107,7 @@ _RESIDENT = (
     "query.grouping.group_spans_by_cost",
     *_COST,
 )
+_FRAMES = "large.budget.feel_kernel"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "move": (*_VOXELIZE, *_RANGES),
@@ -113,23 +116,18 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "calibrate": _COST,
     "touch": (*_SHELL, *_COST, "query.contact.*", "query.refining.*"),
     "resident": _RESIDENT,
-    "feel": (
-        *_SHELL,
-        *_RESIDENT,
-        "period.loop.*",
-        "hand.handle.*",
-        "motion.*",
-        "rigid.*",
-    ),
+    "feel": (*_SHELL, *_RESIDENT, "hand.handle.*", "motion.*", "rigid.*"),
+    "coupling": ("period.loop.*",),
     "direct": ("period.direct.*",),
     "host": (*_RESIDENT, "period.loop.*"),
-    "replay": (*_RESIDENT, "large.*", "rigid.poses_of"),
+    "frames": (*_RESIDENT, _FRAMES, "rigid.poses_of"),
+    "frames by distance": (*_RESIDENT, _FRAMES + "@distances", "rigid.poses_of"),
     "clashes": ("surfaces.sides.*", "surfaces.nearest.*", "triangles.*", "curves.encode_kernel"),
     "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
     "extract": (
         *_SHELL,
         *_RESIDENT,
-        "large.*",
+        _FRAMES,
         "resident.first_hits.*",
         "triangles.*",
         "surfaces.nearest.*",
@@ -213,9 +211,11 @@ def load(names: Collection[str]) -> None:
 def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
     """Names by job: a module's entries and those of its partner in `TOGETHER` are one job."""
     jobs: dict[str, list[str]] = {}
+    modules = {name.rpartition(".")[0] for name in names}
     for name in sorted(names, key=NAMES.index):
         module = name.rpartition(".")[0]
-        jobs.setdefault(TOGETHER.get(module, module), []).append(name)
+        partner = TOGETHER.get(module)
+        jobs.setdefault(partner if partner in modules else module, []).append(name)
     return list(map(tuple, jobs.values()))
 
 
@@ -306,11 +306,10 @@ def _module_of(name: str) -> ModuleType:
 
 def _compile_here(name: str) -> None:
     """Compile an entry in this process, or load it, and mark it as compiled."""
-    compiled = getattr(_module_of(name), name.rpartition(".")[2])
+    compiled = getattr(_module_of(name), name.rpartition(".")[2].partition("@")[0])
     if not hasattr(compiled, "compile"):
         return  # the JIT is off
-    for signature in importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name]:
-        compiled.compile(signature)
+    compiled.compile(importlib.import_module("hapticdb.kernels._jit").SIGNATURES[name])
     mark = _mark_of(name)
     if not mark.exists():
         with contextlib.suppress(OSError):

@@ -132,3 +132,8 @@ def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
 def is_smooth(law: ForceLaw | LawName) -> bool:
     """Whether a law, or the law of that name, reads distances to surfaces."""
     return law == SMOOTH.name or isinstance(law, DistanceField)
+
+
+def frames_by(law: ForceLaw | LawName) -> str:
+    """Purpose (`kernels.compiling.PURPOSES`) of frames of a law over resident cells."""
+    return "frames by distance" if is_smooth(law) else "frames"

@@ -207,7 +207,7 @@ class Session:
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = ["feel"] if is_smooth(self.law) else ["feel", "direct"]
+        purposes = ["feel", "coupling" if is_smooth(self.law) else "direct"]
         make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:

@@ -12,7 +12,8 @@ from hapticdb.environment import Environment
 from hapticdb.errors import GridError, UsageError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw, is_smooth
+from hapticdb.query.law import ForceLaw, frames_by, is_smooth
+from hapticdb.ready import make_ready
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
 from hapticdb.resident.frames import ResidentFrames
@@ -126,6 +127,7 @@ def resident(
     Raises `UsageError` if the environment is in lexicographic order, which has no cells, or if the
     law is by distances and an object has none.
     """
+    make_ready(frames_by(law))
     with CellTable.create(distances=is_smooth(law)) as table:
         residency = Residency(environment.store, table, exclude, where=where)
         frames = ResidentFrames(residency, shell, law, sleeps=None, budget_points=budget_points)

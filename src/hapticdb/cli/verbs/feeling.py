@@ -194,10 +194,11 @@ def feel(
     """
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    _begin_loop(processor, policy, device, budget_points)
+    drive = "direct" if law == "plane" else "coupling"
+    _begin_loop(drive, processor, policy, device, budget_points)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
-    compile_for(tool, "feel")
+    compile_for(tool, "feel", drive)
     with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
         chosen, coupling = force.law_and_coupling(cells)
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
@@ -236,7 +237,7 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
 
 
 def _begin_loop(
-    processor: int | None, policy: PolicyName, device: str, budget_points: int | None
+    drive: str, processor: int | None, policy: PolicyName, device: str, budget_points: int | None
 ) -> None:
     """Refuse what the loop cannot do; have its processes load kernels while this one does."""
     from hapticdb.pointshell.shell import checked_budget
@@ -247,7 +248,7 @@ def _begin_loop(
     Timing(processor=processor)
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
-    prepare("hapticdb.realtime.loop:work", ["resident", "feel"])
+    prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
 
 
 def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:

@@ -79,6 +79,7 @@ def replay(
 def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "Replayed":
     """Compute a recording's wrenches again."""
     import hapticdb
+    from hapticdb.query.law import frames_by
 
     place: str | Path
     if url is None:
@@ -87,7 +88,7 @@ def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "
     else:
         place = url
     with hapticdb.open(place, read_only=True) as env:
-        render.compile_kernels("replay")
+        render.compile_kernels(frames_by(session.header.law))
         return hapticdb.replay(session, env, until_damage=until_damage)
 
 

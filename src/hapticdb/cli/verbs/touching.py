@@ -130,7 +130,7 @@ def touch(
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
-    from hapticdb.query.law import inset_of
+    from hapticdb.query.law import frames_by, inset_of
 
     plane, smooth = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
     path, opened = _path_of(poses, path_unit, out, on), partial(hapticdb.open, url, read_only=True)
@@ -138,7 +138,7 @@ def touch(
         name: LawName = law or ("smooth" if env.has_distances else "plane")
         chosen: ForceLaw = smooth if name == "smooth" else plane
         felt = felt_objects(env, where, exclude)
-        render.compile_kernels("shell", "touch" if out is None else "replay", files=[tool])
+        render.compile_kernels("shell", "touch" if out is None else frames_by(name), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
         fit = fitting.compare(

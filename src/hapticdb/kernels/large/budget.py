@@ -21,7 +21,6 @@ from hapticdb.kernels.large.sleeping import (
     SLEEPERS,
     Sleepers,
     choose_points,
-    felt_margin,
     list_near_runs,
     placed_center,
     points_listed,
@@ -43,7 +42,7 @@ from hapticdb.kernels.resident.cells import (
     slot_of,
     with_missed,
 )
-from hapticdb.kernels.resident.feeling import frame_of
+from hapticdb.kernels.resident.feeling import felt, felt_margin, felt_words
 from hapticdb.kernels.rigid import is_rigid, transform_of
 
 
@@ -64,9 +63,10 @@ ASLEEP = fields_of(Asleep, SLEEPERS, INT, INTS2)
 
 
 @leaf
-def _runs_beside_unknown(cells, which, shell, listed, count, transform, place, margin, missed):
+def _runs_beside_unknown(
+    keys, slots, which, spheres, listed, count, transform, place, margin, missed
+):  # fmt: skip
     """Number of the listed runs whose box meets an unknown cell; these cells go into `missed`."""
-    keys, slots, spheres = cells.keys, cells.slots, shell.spheres
     top, n_missed, n_runs = place.side - 1.0, missed[LISTED], 0
     for m in range(count):
         n = listed[m]
@@ -101,7 +101,11 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, asleep, coun
     count = n_near = n_looked = np.int64(0)
     part, is_beyond = shell, False
     if sleepers.boxes.shape[0] > 0:
-        count = list_near_runs(cells, which, shell, sleepers, transform, place, law)
+        count = list_near_runs(
+            cells.control, cells.keys, cells.slots, felt_words(law, cells.words, cells.near),
+            cells.masks, cells.used, which, shell.spheres, sleepers, transform, place,
+            felt_margin(law),
+        )  # fmt: skip
         n_near = n_looked = points_listed(listed, count, run, points.shape[0])
         is_beyond = n_near > budget
         part = Clusters(points, center, nothing, skips, run, columns, scratch)
@@ -116,13 +120,14 @@ def felt_asleep(cells, which, shell, pose, place, law, met, missed, asleep, coun
             skip_between(listed, count, skips)
         counts[counted, LOOKED_AT] = max(counts[counted, LOOKED_AT], n_looked)
         counts[counted, LEFT_OUT] = max(counts[counted, LEFT_OUT], n_near - n_looked)
-    frame_of(law, cells, which, part, pose, place, met, missed, out)
+    felt(law, cells, which, part, pose, place, met, missed, out)
     if is_beyond:
         for hit in range(np.int64(out[HITS])):
             met[hit] = indices[met[hit]]
         out[UNKNOWNS] += _runs_beside_unknown(
-            cells, which, shell, listed, count, transform, place, felt_margin(law), missed
-        )
+            cells.keys, cells.slots, which, shell.spheres, listed, count, transform, place,
+            felt_margin(law), missed,
+        )  # fmt: skip
 
 
 @entry(

@@ -25,14 +25,11 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import (
     FLOATS2,
     INTS,
-    chosen_by_type,
     fields_of,
     inlined,
     leaf,
 )
-from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.large.waking import AWAKE, wake_changed
-from hapticdb.kernels.law import felt_within
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     key_of_cell,
@@ -102,30 +99,6 @@ REST = 12
 LOOKED_AT, LEFT_OUT, COUNTS = 0, 1, 2
 """Columns of the counts of frames: points near something that a frame looked at, and that its
 budget left out."""
-
-
-def _voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
-    """Words of the voxels that a law may feel: the occupied ones."""
-    return words
-
-
-def _near_voxels(law, words, near):  # noqa: ARG001 - likewise
-    """Words of the voxels that the distance law may feel."""
-    return near
-
-
-def _no_margin(law):  # noqa: ARG001 - likewise
-    """Voxels that are added to the near ones: none."""
-    return 0.0
-
-
-def _margin(law):
-    """Voxels around an occupied one in which another law may feel a point."""
-    return felt_within(law)
-
-
-felt_words = chosen_by_type(lambda law: _near_voxels if law is DistanceFieldLaw else _voxels)
-felt_margin = chosen_by_type(lambda law: _no_margin if law is DistanceFieldLaw else _margin)
 
 
 @leaf
@@ -304,12 +277,15 @@ def _rest_of_block(
 
 
 @leaf
-def list_near_runs(cells, which, shell, sleepers, transform, place, law):
-    """List the runs of a placed shell that are near something; returns their number."""
-    control, _, keys, slots, words, masks, used, _, near = cells
-    spheres = shell.spheres
+def list_near_runs(
+    control, keys, slots, felt, masks, used, which, spheres, sleepers, transform, place, margin
+):  # fmt: skip
+    """List the runs of a placed shell that are near something; returns their number.
+
+    felt, margin: `feeling.felt_words`, `feeling.felt_margin`. No argument has a law's own type, so
+    this is compiled once.
+    """
     boxes, block_rests, run_rests, state, changed, listed, _, _, _, _, _ = sleepers
-    felt, margin = felt_words(law, words, near), felt_margin(law)
     wake_changed(
         control, which, spheres, run_rests, block_rests, REST, BLOCK, state, changed, margin,
         place.size,

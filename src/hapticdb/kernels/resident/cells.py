@@ -122,7 +122,7 @@ PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 SCRATCH_ROWS = 21
 """Rows of `Clusters.scratch`: 0-2 have the placed points in metres, 3-5 in voxels, the last two the
-cells that the run meets (`runs.cells_of_run`); the others belong to frames (`distance_frames`)."""
+cells that the run meets (`runs.cells_of_run`); the others belong to frames (`feeling`)."""
 
 
 class Clusters(NamedTuple):

@@ -135,7 +135,7 @@ def on_rows(
     rows = (scene.keys, scene.ids, scene.occupancy, scene.values, excluded, origin, SIZE, LAW)
     felt = refining.refine(placed, asked, keys, *rows)
     contacts = np.sort(np.concatenate([felt[1][felt[2] > 0], felt[4]]))
-    return felt, refining.pairs_of_contacts(placed, asked, keys, *rows, contacts)
+    return felt, refining.pairs_of_points(placed, asked, keys, *rows, contacts)
 
 
 @cache

@@ -36,7 +36,7 @@ ENTRIES = {
     "resident.first_hits": "find_first_hits",
     "large.budget": "feel_kernel feel_kernel@distances",
     "query.refining": (
-        "refine_kernel refine_kernel@distances pairs_of_hits pairs_of_contacts "
+        "refine_kernel refine_kernel@distances pairs_of_points pairs_of_points@distances "
         "unpack_asked_kernel wrench_of_addresses depths_of_hits"
     ),
     "query.contact": "locate_kernel spans_of_keys",

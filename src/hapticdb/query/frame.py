@@ -16,7 +16,7 @@ from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
-from hapticdb.query.law import ForceLaw, TangentPlane
+from hapticdb.query.law import PLANE, ForceLaw, TangentPlane
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
 from hapticdb.store.believed import damaged
 
@@ -166,33 +166,20 @@ class HapticQuery:
         started: int,
     ) -> Answer:
         """Answer of a frame from its rows; rows of other poses may lie among them."""
-        placed, asked, keys = located
         row_keys, row_ids, occupancy, _ = rows
         wrench, hits, depths, ids, apart, apart_depths = refining.refine(
-            placed,
-            asked,
-            keys,
-            row_keys,
-            row_ids,
-            occupancy,
-            payload,
-            exclude,
-            self._origin,
-            self._size,
+            *located, row_keys, row_ids, occupancy, payload, exclude, self._origin, self._size,
             law.for_kernels,
-        )
-        pairs = partial(
-            refining.pairs_of_hits, asked, keys, row_keys, row_ids, occupancy, exclude, hits
-        )
+        )  # fmt: skip
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         return Answer(
             wrench,
             hits,
             depths,
             ids.tolist(),
-            pairs,
+            partial(self._touched, located, rows, exclude, PLANE, hits),
             Query(*query, elapsed_us),
-            placed,
+            located.placed,
             law,
             None if payload is None else partial(self._touched, located, rows, exclude, law),
             apart,
@@ -205,14 +192,15 @@ class HapticQuery:
         rows: Rows,
         exclude: Keys,
         law: ForceLaw,
-        contacts: NDArray[np.int64],
+        points: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        """Every (contact, object) pair (P, 2) of a frame whose law reads distances."""
-        payload = self._distances_of(rows, located.keys)
+        """Every (point, object) pair (P, 2) of points of a frame: of its hits under the plane."""
+        reads = laws.reads_distances(law.for_kernels)
+        payload = self._distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
-        return refining.pairs_of_contacts(  # type: ignore[no-any-return]
+        return refining.pairs_of_points(  # type: ignore[no-any-return]
             *located, keys, ids, occupancy, payload, exclude, self._origin, self._size,
-            law.for_kernels, contacts,
+            law.for_kernels, points,
         )  # fmt: skip
 
     def run_many(

@@ -273,51 +273,30 @@ def refine(
     return wrench, hits, depths, ids, apart, apart_depths
 
 
-@entry(INTS2, INTS, INTS, INTS, READ_BYTES, INTS, INTS)
-def pairs_of_hits(asked, keys, row_keys, row_ids, occupancy, exclude, hits):
-    """Every (shell point, object) pair of a frame's hits, (P, 2) int64, ordered by both."""
-    starts, ends = _rows_of_keys(keys, row_keys)
-    counts = _counting_rows(row_ids, exclude)
-    most = 0
-    for h in range(hits.shape[0]):
-        at = asked[1, hits[h]]
-        most += ends[at] - starts[at]
-    pairs = np.empty((most, 2), dtype=np.int64)
-    count = 0
-    for h in range(hits.shape[0]):
-        n = hits[h]
-        at = asked[1, n]
-        for row in range(starts[at], ends[at]):
-            if counts[row] and _has_voxel(occupancy, row, asked[0, n]):
-                pairs[count, 0] = n
-                pairs[count, 1] = row_ids[row]
-                count += 1
-    return pairs[:count]
-
-
 @entry(
-    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, BYTES2, INTS, FLOATS, FLOAT, DISTANCE_FIELD, INTS
+    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, NONE, INTS, FLOATS, FLOAT, TANGENT_PLANE, INTS,
+    also={NONE: BYTES2, TANGENT_PLANE: DISTANCE_FIELD},
 )  # fmt: skip
-def pairs_of_contacts(
-    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law, contacts
+def pairs_of_points(
+    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law, chosen
 ):
-    """Every (felt point, object) pair of a frame, (P, 2) int64, ordered by both.
+    """Every (point, object) pair of chosen points (C,) of a frame, (P, 2) int64, ordered by both.
 
-    A felt point touches the objects in whose voxel it is, and those of `_touch_near_rows`. contacts
-    (C,) are the felt points; the other arguments are those of `refine`.
+    A point touches the objects in whose voxel it is, and those of `_touch_near_rows`. The other
+    arguments are those of `refine`.
     """
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     ox, oy, oz = origin[0], origin[1], origin[2]
     most = 0
-    for c in range(contacts.shape[0]):
-        at = asked[1, contacts[c]]
+    for c in range(chosen.shape[0]):
+        at = asked[1, chosen[c]]
         most += ends[at] - starts[at]
     pairs = np.empty((most, 2), dtype=np.int64)
     count = 0
-    for c in range(contacts.shape[0]):
-        n = contacts[c]
+    for c in range(chosen.shape[0]):
+        n = chosen[c]
         at = asked[1, n]
         first, end = starts[at], ends[at]
         is_hit = False

@@ -98,6 +98,21 @@ def test_collada_materials_are_those_of_the_placement(tmp_path: Path) -> None:
     assert len(found) == 4
 
 
+def test_collada_has_colours_of_corners(tmp_path: Path) -> None:
+    shades = (
+        '<source id="c"><float_array id="ca" count="8">1 0 0 1 0 1 0 1</float_array>'
+        '<technique_common><accessor source="#ca" count="2" stride="4"><param name="R"/>'
+        '<param name="G"/><param name="B"/><param name="A"/></accessor></technique_common></source>'
+    )
+    content = COLLADA.replace('<vertices id="v">', shades + '<vertices id="v">')
+    one = '<input semantic="COLOR" source="#c" offset="1"/><vcount>'
+    content = content.replace("<vcount>", one)
+    content = content.replace("<p>0 1 2 3 0 1 2<", "<p>0 0 1 0 2 0 3 0 0 1 1 1 2 1<")
+    found = colours_of(text(tmp_path / "a.dae", content))
+    np.testing.assert_array_equal(found[:3], [RED, RED, GREEN])
+    assert found[3, 0] not in {0, 255}  # the triangles beside them have none
+
+
 def test_ply_has_colours_of_faces_or_of_vertices(tmp_path: Path) -> None:
     shade = "property uchar red\nproperty uchar green\nproperty uchar blue\n"
     place = "property float x\nproperty float y\nproperty float z\n"

@@ -23,6 +23,7 @@ NAMES = (
     "Body/handle1",
     "Body/left,right",
     "7",
+    "007",
 )
 
 
@@ -71,6 +72,8 @@ def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
         (["left?right"], [10]),
         (["[7]"], [11]),
         (["name=7"], [11]),
+        (["007"], [12]),
+        (["007", "7"], [7, 12]),
         (["name=Body/door"], [6, 7]),
         (["hood,tyre,7"], [1, 3, 5, 7]),
         (["[t-z]*,hood"], [1, 2, 3, 4, 5]),
@@ -83,7 +86,7 @@ def test_words_choose_objects(car: Environment, words: list[int | str], ids: lis
 @pytest.mark.parametrize(
     ("word", "said"),
     [
-        (12, "no object 12 in"),
+        (13, "no object 13 in"),
         (-1, "no object -1 in"),
         (1 << 80, "no object"),
         ("9" * 5000, "no object 9999"),

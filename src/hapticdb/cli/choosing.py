@@ -39,12 +39,12 @@ def as_named(env: "Environment", words: Iterable[str], option: str) -> list[str]
     """Words with a number as a name where no object has that id; says how numbers are taken."""
     from hapticdb.cli import render
     from hapticdb.errors import ObjectNotFoundError
-    from hapticdb.store.finding import NAME
+    from hapticdb.store.finding import NAME, is_id
 
     taken = []
     for word in words:
         named: set[int] = set()
-        if word.isdecimal():
+        if is_id(word):
             with suppress(ObjectNotFoundError):
                 named = {obj.id for obj in env.find(NAME + word)} - {int(word)}
         is_name = named and all(obj.id != int(word) for obj in env.objects())

@@ -29,10 +29,11 @@ def find_objects(store: Store, words: Words) -> list[Object]:
     store : Store
         Store of the objects. It is asked for all objects once, and only if a word is no id.
     words : iterable of int or str
-        An int, or a text of digits, is an id; ``3,4`` is several. Any other text is a name or a
-        pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one, ``[ab]`` for one of
-        those; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
-        compared with every element of the path, one with ``/`` with the path from its beginning.
+        An int, or a text of digits, is an id; ``3,4`` is several. Any other text, such as ``007``,
+        is a name or a pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one,
+        ``[ab]`` for one of those; case counts. Names are paths, such as ``body/door/handle``: a
+        text without ``/`` is compared with every element of the path, one with ``/`` with the path
+        from its beginning.
         If the match is a sub-assembly, everything below it is chosen. A text that is exactly a name
         is no pattern. A text that fits no name, but has ``=``, is ``attribute=value``: see
         `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name, too. A text with commas
@@ -97,7 +98,7 @@ class Listing:
                 return []
             return [word]
         pieces = [piece.strip() for piece in word.split(",")]
-        if not all(_is_id(piece) for piece in pieces):
+        if not all(is_id(piece) for piece in pieces):
             if found := self._fitting(word):
                 return [obj.id for obj in found]
             if len(pieces) == 1:
@@ -143,13 +144,14 @@ def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
 def _read(text: str) -> list[int | str]:
     """Ids where a text is nothing else, such as ``3,4``; otherwise the text."""
     pieces = [piece.strip() for piece in text.split(",")]
-    if all(_is_id(piece) and len(piece.lstrip("0")) <= len(str(MOST_IDS)) for piece in pieces):
+    if all(is_id(piece) and len(piece) <= len(str(MOST_IDS)) for piece in pieces):
         return [int(piece) for piece in pieces]
     return [text]
 
 
-def _is_id(piece: str) -> bool:
-    return piece.isascii() and piece.isdecimal()
+def is_id(piece: str) -> bool:
+    """Whether a text is the id of an object; no id begins with a 0 that it does not need."""
+    return piece.isascii() and piece.isdecimal() and (piece[0] != "0" or piece == "0")
 
 
 def _object_of(store: Store, object_id: int) -> Object:

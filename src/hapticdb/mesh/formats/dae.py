@@ -16,7 +16,7 @@ import collada
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.painting import Colours, joined, rgba
+from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import triangulated
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
@@ -202,12 +202,15 @@ def _shape(geometry: Any, palette: _Palette) -> Shape:  # noqa: ANN401 - untyped
             vertices[source.id] = n_vertices, _positions(source)
             n_vertices += len(vertices[source.id][1])
         offset, corners = vertices[source.id]
-        found, n_short = _faces(primitive, corners)
+        index = np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1)
+        found, n_short = _faces(primitive, corners, index)
         incomplete += n_short
-        inside = (found >= 0) & (found < len(corners))
-        faces.append(np.where(inside, found + offset, -1))
+        vertex = index[found]
+        inside = (vertex >= 0) & (vertex < len(corners))
+        faces.append(np.where(inside, vertex + offset, -1))
         colour = palette.get(str(primitive.material))
-        painted.append((None if colour is None else rgba(colour), len(found)))
+        colours = None if colour is None else rgba(colour)
+        painted.append((_corner_colours(primitive, found, colours), len(found)))
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
     if not faces:
         return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
@@ -222,16 +225,37 @@ def _positions(source: Any) -> NDArray[np.float64]:  # noqa: ANN401 - untyped li
     return found.reshape(-1, len(source.components))[:, :3]
 
 
+def _corner_colours(
+    primitive: Any,  # noqa: ANN401 - untyped library
+    faces: NDArray[np.int64],
+    otherwise: Colours | None,
+) -> Colours | None:
+    """Colours (F, 4) by the primitive's own corners, or else the material's."""
+    inputs = primitive.sources.get("COLOR")
+    if not inputs or not len(faces):
+        return otherwise
+    offset, source = inputs[0][0], inputs[0][4]
+    values = np.asarray(source.data, dtype=np.float64)
+    if not len(values) or values.shape[1] not in (3, 4):
+        return otherwise
+    of_corner = np.asarray(primitive.index, dtype=np.int64).reshape(-1, primitive.nindices)
+    return rgba(mean_of_corners(values, of_corner[:, offset][faces]))
+
+
 def _faces(
     primitive: Any,  # noqa: ANN401 - untyped library
-    corners: NDArray[np.float64],
+    vertices: NDArray[np.float64],
+    index: NDArray[np.int64],
 ) -> tuple[NDArray[np.int64], int]:
-    """Triangles (F, 3) of a primitive, and how many polygons had fewer than three corners."""
-    index = np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1)
+    """Triangles (F, 3) of a primitive, and how many polygons had fewer than three corners.
+
+    They name corners of the primitive; `index` has the vertex of each corner.
+    """
+    corners = np.arange(len(index))
     if isinstance(primitive, collada.triangleset.TriangleSet):
-        return index.reshape(-1, 3), 0
+        return corners.reshape(-1, 3), 0
     ends = np.cumsum(np.asarray(primitive.vcounts, dtype=np.int64))
-    polygons = [polygon.tolist() for polygon in np.split(index, ends[:-1])]
+    polygons = [polygon.tolist() for polygon in np.split(corners, ends[:-1])]
     holes = {}
     rows = [one for one in primitive.xmlnode if _tag(one) == "p"]
     for number, row in enumerate(rows):
@@ -239,4 +263,6 @@ def _faces(
             lengths = np.array(row.get("rows").split(), dtype=np.int64)
             per_corner = max(int(lengths.sum()) // max(len(polygons[number]), 1), 1)
             holes[number] = (np.cumsum(lengths[:-1]) // per_corner).tolist()
-    return triangulated(corners, polygons, holes)
+    known = (index >= 0) & (index < len(vertices))
+    places = np.where(known[:, None], vertices[np.where(known, index, 0)], np.nan)
+    return triangulated(places, polygons, holes)

@@ -23,7 +23,7 @@ from servers import FOUND, admin, database, named, place  # noqa: F401 - fixture
 
 NEWEST = {"cli", "house"}
 """Rooms tested on the newest PostgreSQL alone: what is said, not what a server is asked."""
-OLDER = {"test_contract_postgres.py", "test_session_edits.py"}
+OLDER = {"test_contract_postgres.py", "test_partitions.py", "test_session_edits.py"}
 """Modules tested on every PostgreSQL that is found; the others only with --every-step."""
 QUICK_KINDS = {"brick-z", "voxel-lexicographic"}
 """Layout and curve of the contract's quick tests on other engines than SQLite, which has all."""
@@ -59,10 +59,12 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
         is_older = not older.isdisjoint(words.split("-"))
         is_wanted = name in OLDER or draws.is_every()
         is_left_out = is_older and (item.path.parent.name in NEWEST or not is_wanted)
-        (left_out if is_left_out else kept).append(item)
-        is_other = name.startswith("test_contract_") and name != "test_contract_sqlite.py"
         kinds = {"-".join(kind) for kind in KINDS}
         is_other_kind = any(kind in words for kind in kinds - QUICK_KINDS)
+        if name == "test_partitions.py" and is_other_kind and not draws.is_every():
+            is_left_out = True
+        (left_out if is_left_out else kept).append(item)
+        is_other = name.startswith("test_contract_") and name != "test_contract_sqlite.py"
         if is_older or (is_other and is_other_kind):
             item.add_marker(pytest.mark.long)
     config.hook.pytest_deselected(items=left_out)

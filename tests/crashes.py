@@ -4,7 +4,7 @@ import contextlib
 import shutil
 import tempfile
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -63,10 +63,12 @@ def template(
 
 
 @contextlib.contextmanager
-def running(template: tuple[Path, Binaries]) -> Iterator[PrivateServer]:
+def running(
+    template: tuple[Path, Binaries], settings: Mapping[str, str] | None = None
+) -> Iterator[PrivateServer]:
     place = Path(tempfile.mkdtemp(prefix="crash-")).resolve()
     shutil.copytree(template[0], place / "server", symlinks=True)
-    made = PrivateServer.at(place / "server", template[1])
+    made = PrivateServer.at(place / "server", template[1], settings)
     made.start()
     try:
         yield made

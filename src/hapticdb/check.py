@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.ingest.geometry import AT_ONCE, unpacked_part
+from hapticdb.ingest.moving import rewrite_object
 from hapticdb.kernels import curves
 from hapticdb.kernels.field import packing
 from hapticdb.store.base import (
@@ -25,6 +26,7 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.believed import Checksum
 from hapticdb.store.connect import open_store
+from hapticdb.store.engines import DropsRows
 
 ROWS_AT_ONCE = 1 << 17
 """Rows that are read at a time. A larger value takes more memory and hardly less time."""
@@ -64,6 +66,10 @@ class CheckReport:
         Objects that were written before there were checksums of their rows.
     without_surfaces : int
         Objects that were written before there were surfaces; 'hapticdb upgrade' reads them.
+    wrong : list of int
+        Objects whose rows or distances are not those that were written.
+    strays : list of int
+        Ids of rows or distances that no object has.
     """
 
     url: str
@@ -75,6 +81,8 @@ class CheckReport:
     surfaces: int = 0
     without_row_checksums: int = 0
     without_surfaces: int = 0
+    wrong: list[int] = field(default_factory=list)
+    strays: list[int] = field(default_factory=list)
 
     @property
     def is_sound(self) -> bool:
@@ -125,6 +133,32 @@ def check_environment(
     return report
 
 
+def repair_environment(
+    url: str | os.PathLike[str], report: CheckReport, *, progress: CheckCallback | None = None
+) -> None:
+    """Mend what a check has found about rows: a transaction an object.
+
+    Rows that are not those that were written are made anew from the object's surface. Rows of no
+    object, as a crash between the servers of partitions leaves them, are removed.
+
+    Raises
+    ------
+    NoSurfaceError
+        When an object has no surface; those before it are mended.
+    """
+    with closing(open_store(url)) as store:
+        total = len(report.wrong) + len(report.strays)
+        for n, object_id in enumerate(report.strays):
+            if isinstance(store, DropsRows):
+                store.drop_rows(object_id)
+            if progress is not None:
+                progress(_CheckProgress(n + 1, total))
+        for n, object_id in enumerate(report.wrong, start=len(report.strays)):
+            rewrite_object(store, store.object(object_id))
+            if progress is not None:
+                progress(_CheckProgress(n + 1, total))
+
+
 def _check(store: Store, report: CheckReport, progress: CheckCallback | None) -> None:
     with store.snapshot():
         try:
@@ -140,7 +174,7 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
             report.add(finding)
         for finding in _row_findings(store, objects, report, progress):
             report.add(finding)
-        for finding in _band_findings(store, objects):
+        for finding in _band_findings(store, objects, report):
             report.add(finding)
         for finding in _surface_findings(store, objects, report):
             report.add(finding)
@@ -230,21 +264,25 @@ def _row_findings(
     report.voxels = sum(sums.voxels.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"
-    for missing in sorted(sums.voxels.keys() - objects.keys()):
+    report.strays = sorted(sums.voxels.keys() - objects.keys())
+    for missing in report.strays:
         yield f"rows of object {missing}, which is not there"
     for obj in objects.values():
         found = sums.voxels.get(obj.id, 0)
+        checksum = sums.checksums.get(obj.id, Checksum()).value()
+        is_other = obj.rows_crc is not None and checksum != obj.rows_crc
         if found != obj.voxels:
             yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
-        checksum = sums.checksums.get(obj.id, Checksum()).value()
-        if obj.rows_crc is not None and checksum != obj.rows_crc:
+        if is_other:
             yield f"object {obj.id} ({obj.name}): its rows are not those that were written"
+        if is_other or found != obj.voxels:
+            report.wrong.append(obj.id)
 
 
 # -- distances ------------------------------------------------------------------------------------
 
 
-def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
+def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport) -> Iterator[str]:
     """Distances that are damaged, missing, or of no object."""
     sums = _Sums()
     key, object_id = -1, 0
@@ -264,16 +302,21 @@ def _band_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
         sums.add(rows)
     for found in sorted(sums.checksums):
         if found not in objects:
+            report.strays = sorted({*report.strays, found})
             yield f"distances of object {found}, which is not there"
         elif not objects[found].has_distances:
             yield f"object {found} ({objects[found].name}) has distances, and its record has none"
     for obj in objects.values():
         if not obj.has_distances:
             continue
-        if sums.voxels.get(obj.id, 0) != obj.voxels:
+        lacks = sums.voxels.get(obj.id, 0) != obj.voxels
+        is_other = sums.checksums.get(obj.id, Checksum()).value() != obj.distances_crc
+        if lacks:
             yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
-        if sums.checksums.get(obj.id, Checksum()).value() != obj.distances_crc:
+        if is_other:
             yield f"object {obj.id} ({obj.name}): its distances are not those that were written"
+        if (lacks or is_other) and obj.id not in report.wrong:
+            report.wrong.append(obj.id)
 
 
 # -- surfaces -------------------------------------------------------------------------------------

@@ -14,6 +14,7 @@ from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
 from hapticdb.store.base import Covering, Object, Store
+from hapticdb.store.finding import MOST_IDS
 
 Floats = NDArray[np.float64]
 
@@ -50,6 +51,12 @@ def restore_object(store: Store, record: Object) -> int:
         surface=None,
     )
     return store.add(new, rows, surface)
+
+
+def rewrite_object(store: Store, obj: Object) -> None:
+    """Write an object's rows anew from its surface, wherever rows of it may be."""
+    ((_, part),) = parts_of(store, [obj])
+    _write_moved(store, obj, part, obj.transform, 0, lambda _: [(0, MOST_IDS - 1)])
 
 
 def shift_objects(

@@ -112,6 +112,14 @@ class MayLag(Protocol):
 
 
 @runtime_checkable
+class DropsRows(Protocol):
+    """An opened store in which a crash may leave rows of an object that is not there."""
+
+    def drop_rows(self, object_id: int) -> None:
+        """Delete such rows; nothing if there is an object of that id."""
+
+
+@runtime_checkable
 class SupportsBackup(Protocol):
     """An engine that copies a whole environment as of one moment, and puts a copy in its place."""
 

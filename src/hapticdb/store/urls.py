@@ -1,10 +1,14 @@
 """URLs of environments: their scheme, and secrets that are never shown."""
 
 import re
-from urllib.parse import unquote
+from urllib.parse import quote, unquote
+
+from hapticdb.errors import UsageError
 
 SECRET = re.compile(r"password|secret|passphrase|token|scram", re.IGNORECASE)
 """Names of parameters whose values are not shown."""
+PARTITIONS = "partitions"
+"""Parameter that names the servers of the rows of an environment that is to be made."""
 PASSWORD = re.compile(r"(?P<user>\w+://[^:/?@\[]*):(?P<password>.*)@", re.DOTALL)
 PORTS = re.compile(r"\d*(?:,[^@/?]*)?(?:/[^@?]*)?\?(?:.*&)?[a-z_]+=")
 """Text that begins with a port and not with a password: host:5432/database?user=me@there."""
@@ -17,7 +21,7 @@ def scheme_of(url: str) -> str:
 
 
 def redact(url: str) -> str:
-    """Hide the passwords of a URL, wherever they stand.
+    """Hide the passwords of a URL, wherever they stand, and its partitions, which have some, too.
 
     If a password contains an unescaped @, everything up to the last @ is hidden.
     """
@@ -30,5 +34,20 @@ def redact(url: str) -> str:
     pairs = [
         f"{key}=***" if SECRET.search(unquote(key)) else f"{key}={value}" if equals else "***"
         for key, equals, value in (pair.partition("=") for pair in query.split("&") if pair)
+        if key != PARTITIONS
     ]
-    return head + mark + "&".join(pairs)
+    return head + (mark if pairs or not query else "") + "&".join(pairs)
+
+
+def with_partitions(url: str, servers: str) -> str:
+    """URL of a new environment whose rows get onto those servers: hosts or URLs, commas between.
+
+    Raises
+    ------
+    UsageError
+        When its engine has no partitions.
+    """
+    if scheme_of(url) not in {"postgresql", "postgres"}:
+        raise UsageError(f"{redact(url)}: only environments on PostgreSQL have partitions")
+    named = ",".join(quote(one.strip(), safe="") for one in servers.split(","))
+    return f"{url}{'&' if '?' in url else '?'}{PARTITIONS}={named}"

@@ -81,6 +81,14 @@ DistancesOption = Annotated[
         show_default="yes for bricks",
     ),
 ]
+PartitionsOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="SERVERS",
+        help="A new environment on PostgreSQL: hosts or URLs, with commas between, of the servers "
+        "that get its rows.",
+    ),
+]
 
 
 def import_(
@@ -100,6 +108,7 @@ def import_(
     memory_limit: MemoryLimitOption = None,
     replace: ReplaceOption = False,
     distances: DistancesOption = None,
+    partitions: PartitionsOption = None,
     json: JsonOption = False,
 ) -> None:
     """Import files into an environment, which is made when it does not exist.
@@ -120,7 +129,10 @@ def import_(
     """
     from hapticdb.grid import GridOptions
     from hapticdb.ingest.files import ImportOptions
+    from hapticdb.store.urls import with_partitions
 
+    if partitions is not None:
+        url = with_partitions(url, partitions)
     corner = None if origin is None else numbers_of(origin, 3, "--origin", "X,Y,Z in metres")
     grid = GridOptions(bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve)
     options = ImportOptions(

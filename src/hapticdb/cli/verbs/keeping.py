@@ -10,6 +10,8 @@ from hapticdb.cli.root import Interrupted
 from hapticdb.cli.verbs.importing import JobsOption
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hapticdb.check import CheckReport
     from hapticdb.ingest.upgrading import UpgradeReport
     from hapticdb.store.engines import BackupReport
@@ -24,19 +26,37 @@ MEANINGS: dict[RightName, str] = {
 }
 
 
-def check(url: UrlArgument, *, json: JsonOption = False) -> None:
+def check(
+    url: UrlArgument,
+    *,
+    repair: Annotated[
+        bool,
+        typer.Option(
+            "--repair", help="Then make wrong rows anew, from surfaces; remove stray ones."
+        ),
+    ] = False,
+    json: JsonOption = False,
+) -> None:
     """Read all of an environment and say what is wrong with it, a line each.
 
     The structure, rows, objects and the log of changes are compared. The exit code
-    is 0 when it is sound, 1 when it is damaged, 2 when it cannot be read.
+    is 0 when it is sound, 1 when it is damaged, 2 when it cannot be read. With
+    --repair it says what is still wrong when rows are mended.
 
     Example: hapticdb check car.db
     """
-    from hapticdb.check import check_environment
+    from hapticdb.check import check_environment, repair_environment
 
-    render.compile_kernels("copy")
-    with render.bar("checking", "rows", lambda now: (now.done, now.total)) as progress:
-        report = check_environment(url, progress=progress)
+    render.compile_kernels("copy", *(["move"] if repair else []))
+    report = _read(url, check_environment)
+    if repair and (report.wrong or report.strays):
+        render.note(
+            f"mending rows: of {render.counted(len(report.wrong), 'object')} made anew, of "
+            f"{len(report.strays)} that are not there removed"
+        )
+        with render.bar("mending", "objects", lambda now: (now.done, now.total)) as progress:
+            repair_environment(url, report, progress=progress)
+        report = _read(url, check_environment)
     if json:
         render.say_json({"sound": report.is_sound} | vars(report))
     else:
@@ -50,10 +70,16 @@ def check(url: UrlArgument, *, json: JsonOption = False) -> None:
         raise typer.Exit(1)
 
 
+def _read(url: str, check_environment: "Callable[..., CheckReport]") -> "CheckReport":
+    with render.bar("checking", "rows", lambda now: (now.done, now.total)) as progress:
+        return check_environment(url, progress=progress)
+
+
 def _checked(report: "CheckReport") -> str:
     if not report.is_sound:
         count = render.counted(report.n_findings, "finding")
-        return f"{report.url} is damaged: {count}; restore a copy or import the files again"
+        mend = "'--repair' mends rows, " if report.wrong or report.strays else ""
+        return f"{report.url} is damaged: {count}; {mend}restore a copy or import the files again"
     line = (
         f"{report.url} is sound: {render.counted(report.objects, 'object')}, "
         f"{render.counted(report.voxels, 'voxel')}, {render.counted(report.rows, 'row')}"

@@ -3,7 +3,8 @@
 ``postgresql://user@host:port/database?environment=NAME`` and everything else that libpq takes in a
 URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
 libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`` asks for a private
-server in a folder (see `hapticdb.store.postgres.private_server`).
+server in a folder (see `hapticdb.store.postgres.private_server`). ``?partitions=A,B`` names the
+servers of the rows of an environment that is to be made (`hapticdb.store.postgres.partitions`).
 """
 
 import re
@@ -11,7 +12,7 @@ from typing import NamedTuple
 from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
 
 from hapticdb.errors import UsageError
-from hapticdb.store.urls import redact
+from hapticdb.store.urls import PARTITIONS, redact
 
 DEFAULT_ENVIRONMENT = "hapticdb"
 SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
@@ -23,13 +24,15 @@ class Address(NamedTuple):
     """A URL taken apart.
 
     conninfo : for libpq, without hapticdb's own parameters; environment : the schema; data : folder
-    of the private server, if one is meant; shown : the whole URL as messages may show it.
+    of the private server, if one is meant; shown : the whole URL as messages may show it;
+    partitions : servers that get the rows, as `partition_urls` reads them.
     """
 
     conninfo: str
     environment: str
     data: str | None
     shown: str
+    partitions: tuple[str, ...] = ()
 
 
 def parse(url: str) -> Address:
@@ -45,6 +48,7 @@ def parse(url: str) -> Address:
     _check_login(parts, url)
     named: list[str] = []
     data: list[str] = []
+    partitions: list[str] = []
     others: list[str] = []
     found: str | None = None
     for pair in parts.query.split("&") if parts.query else []:
@@ -53,6 +57,8 @@ def parse(url: str) -> Address:
             named.append(unquote(value))
         elif key == "data":
             data.append(unquote(value))
+        elif key == PARTITIONS:
+            partitions += [unquote(one) for one in value.split(",")]
         else:
             # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
             others.append(f"{key}={value.replace('=', '%3D')}")
@@ -69,7 +75,7 @@ def parse(url: str) -> Address:
     conninfo = urlunsplit(parts._replace(query="&".join(others), fragment=""))
     if not parts.netloc:  # urlunsplit drops the empty host's slashes
         conninfo = f"{parts.scheme}://{parts.path}{'?' + '&'.join(others) if others else ''}"
-    return Address(conninfo, environment, data[0] if data else None, redact(url))
+    return Address(conninfo, environment, data[0] if data else None, redact(url), tuple(partitions))
 
 
 def _split(url: str) -> SplitResult:
@@ -108,6 +114,31 @@ def with_environment(url: str, name: str) -> str:
             kept[n] = f"options={quote(rest, safe='')}"
     named = f"environment={quote(name, safe='')}"
     return f"{head}?{'&'.join([*kept, named])}"
+
+
+def partition_urls(address: Address) -> list[str]:
+    """URLs of the partitions: each a URL, or a host whose user and database are the address's.
+
+    Raises
+    ------
+    UsageError
+        When one is neither.
+    """
+    own = _split(address.conninfo)
+    login = own.netloc.rpartition("@")[0]
+    found = []
+    for given in address.partitions:
+        url = given
+        if "://" not in given:
+            host = f"{login}@{given}" if login else given
+            url = f"postgresql://{host}{own.path}{'?' + own.query if own.query else ''}"
+        if not given or not url.startswith(("postgresql://", "postgres://")):
+            raise UsageError(
+                f"{address.shown}: a partition {redact(given)!r}: give hosts, or URLs of "
+                "PostgreSQL, with commas between"
+            )
+        found.append(with_environment(url, address.environment))
+    return found
 
 
 def check_name(name: str, what: str) -> None:

@@ -201,7 +201,7 @@ END $$"""
 
 # a row has 30 to 1,000 bytes, packed already: EXTERNAL compresses nothing, and spares the three
 # bytes of padding and length that PLAIN takes
-DISTANCES = (
+BAND = (
     f"""
 CREATE TABLE band (
   z_val     bigint NOT NULL,
@@ -211,6 +211,9 @@ CREATE TABLE band (
     "ALTER TABLE band ALTER distances SET STORAGE EXTERNAL",
     "ALTER TABLE band ALTER id SET STATISTICS 0, ALTER distances SET STATISTICS 0",
     "CREATE UNIQUE INDEX band_key ON band (z_val, id)",
+)
+DISTANCES = (
+    *BAND,
     "ALTER TABLE environment ADD COLUMN wants_distances boolean NOT NULL DEFAULT false",
     _granted_as_on_brick(
         "band",

@@ -19,6 +19,7 @@ from hapticdb.errors import (
 from hapticdb.grid import Grid
 from hapticdb.store import believed
 from hapticdb.store.base import Layout
+from hapticdb.store.postgres import partitions
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -155,7 +156,7 @@ def _check_writable(connection: ServerConnection) -> None:
 
 
 TABLE_KINDS = """
-SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'v' THEN 'view'
+SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'p' THEN 'table' WHEN 'v' THEN 'view'
                       WHEN 'm' THEN 'materialized view' ELSE 'relation ' || relkind::text END
   FROM pg_class JOIN pg_namespace n ON n.oid = relnamespace
  WHERE nspname = %s AND relkind <> 'i'"""
@@ -169,13 +170,14 @@ class Made(NamedTuple):
     """What is fixed when an environment is made.
 
     identity : an oid that differs if the environment is remade; wants_distances : may become true
-    later.
+    later; is_spread : whether the rows are on partitions.
     """
 
     grid: Grid
     layout: Layout
     wants_distances: bool
     identity: int
+    is_spread: bool
 
 
 def read_environment(connection: ServerConnection) -> Made:
@@ -190,26 +192,28 @@ def read_environment(connection: ServerConnection) -> Made:
     wish = "wants_distances" if believed.BAND in kinds else "false"
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
-        f" tableoid::bigint, {wish} FROM environment"
+        f" tableoid::bigint, {wish}, (SELECT relkind = 'p' FROM pg_class"
+        "  WHERE oid = to_regclass(layout)) FROM environment"
     )
     grid, layout = believed.grid_of(connection.shown, rows)
     believed.check_tables(connection.shown, kinds)
-    return Made(grid, layout, believed.wish_of(connection.shown, rows[0][8]), rows[0][7])
+    wants = believed.wish_of(connection.shown, rows[0][8])
+    return Made(grid, layout, wants, rows[0][7], bool(rows[0][9]))
 
 
 def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
-    """Make the schema with all tables and the grid, in one transaction."""
+    """Make its partitions, then the schema with all tables and the grid, in one transaction."""
     with connected(url, making=True) as connection:
         name = connection.address.environment
+        if connection.address.partitions and _has_schema(connection):
+            raise _there_already(connection)
+        spread = partitions.spread(connection.address, _partition, grid, layout)
 
         def work() -> None:
             try:
                 connection.execute(sql.SQL("CREATE SCHEMA {}").format(sql.Identifier(name)))
             except (errors.DuplicateSchema, errors.UniqueViolation) as error:
-                raise EnvironmentExistsError(
-                    f"{connection.shown}: schema {name!r} exists already; open it, or name another "
-                    "environment with ?environment=NAME"
-                ) from error
+                raise _there_already(connection) from error
             except errors.InsufficientPrivilege as error:
                 raise AccessError(
                     f"{connection.shown}: there is no environment {name!r}, and this user may not "
@@ -229,8 +233,20 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
                     distances,
                 ),
             )
+            spread(connection)
 
         connection.write(work, lambda: _has_schema(connection))
+
+
+def _there_already(connection: ServerConnection) -> EnvironmentExistsError:
+    return EnvironmentExistsError(
+        f"{connection.shown}: schema {connection.address.environment!r} exists already; open it, "
+        "or name another environment with ?environment=NAME"
+    )
+
+
+def _partition(url: str) -> ServerConnection:
+    return connected(url, making=True)
 
 
 def _migrate_once(connection: ServerConnection) -> None:
@@ -252,8 +268,9 @@ def _migrate(connection: ServerConnection, version: int) -> None:
 
 def drop(connection: ServerConnection) -> None:
     """Delete an environment, whatever is in it."""
+    partitions.drop(connection, _partition)
     schema = sql.Identifier(connection.address.environment)
     connection.write(
-        lambda: connection.execute(sql.SQL("DROP SCHEMA {} CASCADE").format(schema)),
+        lambda: connection.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)),
         lambda: not _has_schema(connection),
     )

@@ -1,6 +1,7 @@
 """An environment in a schema of a PostgreSQL database."""
 
 import contextlib
+from collections.abc import Iterator
 
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout
@@ -10,7 +11,7 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.tables.pairs import PostgresPairs
 from hapticdb.store.postgres.tables.reading import PostgresReader
-from hapticdb.store.postgres.tables.statistics import PostgresStatistics
+from hapticdb.store.postgres.tables.statistics import SIZE_OF_PARTITIONS, PostgresStatistics
 from hapticdb.store.postgres.tables.writing import PostgresWriter
 from hapticdb.store.postgres.watching import Watch
 from hapticdb.store.refusals import check_distances
@@ -47,8 +48,9 @@ class PostgresStore:
         except BaseException:
             connection.close()
             raise
-        self.grid, self.layout, self.wants_distances, self.identity = made
-        reader = PostgresReader(connection, self.layout)
+        self.grid, self.layout, self.wants_distances, self.identity, is_spread = made
+        self._is_spread = is_spread
+        reader = PostgresReader(connection, self.layout, is_spread=is_spread)
         self.lookup, self.lookup_each = reader.lookup, reader.lookup_each
         self.scan, self.count, self.rows_of = reader.scan, reader.count, reader.rows_of
         self.rows_after = reader.rows_after
@@ -59,14 +61,17 @@ class PostgresStore:
         self.surfaces, self.surface_digests = reader.surfaces, reader.surface_digests
         watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
-        loading = self._loading = Loading(connection, self.layout)
-        writer = PostgresWriter(connection, self.grid, self.layout, reader, loading)
+        loading = self._loading = Loading(connection, self.layout, is_spread=is_spread)
+        writer = PostgresWriter(
+            connection, self.grid, self.layout, reader, loading, is_spread=is_spread
+        )
         self.add, self.replace, self.remove = writer.add, writer.replace, writer.remove
+        self.drop_rows = writer.drop_rows
         self.add_surface, self._write_wish = writer.add_surface, writer.want_distances
         kept = PostgresPairs(connection, reader)
         self.pairs, self.put_pairs = kept.pairs, kept.put_pairs
         self.accept_pair = kept.accept_pair
-        known = PostgresStatistics(connection, self.layout, reader)
+        known = PostgresStatistics(connection, self.layout, reader, is_spread=is_spread)
         self.size, self.quantiles, self.freshness = known.size, known.quantiles, known.freshness
         self.analyze, self.costs, self.save_costs = known.analyze, known.costs, known.save_costs
         self.findings = known.findings
@@ -119,9 +124,16 @@ class PostgresStore:
         self._write_wish()
         self.wants_distances = True
 
-    def snapshot(self) -> contextlib.AbstractContextManager[None]:
-        """All reads inside see one committed revision. May be nested."""
-        return self._connection.snapshot()
+    @contextlib.contextmanager
+    def snapshot(self) -> Iterator[None]:
+        """All reads inside see one committed revision. May be nested.
+
+        Partitions have snapshots of their own, taken one after the other when it begins.
+        """
+        with self._connection.snapshot():
+            if self._is_spread:
+                self._connection.rows(SIZE_OF_PARTITIONS)
+            yield
 
     def lag(self) -> Lag | None:
         """How far the server that answers is behind its primary; None if it is no standby."""

@@ -73,6 +73,14 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
         return DatabaseError(
             f"{shown}: the server has no room left ({cause}); nothing is half done"
         )
+    if isinstance(
+        error, (errors.SqlclientUnableToEstablishSqlconnection, errors.ConnectionFailure)
+    ):
+        why = " ".join((error.diag.message_detail or cause).split())
+        return ConnectionLostError(
+            f"{shown}: one of its partitions cannot be reached ({why}); what was committed is "
+            "safe, so run the same again when it is back"
+        )
     if is_lost(error):
         return ConnectionLostError(
             f"{shown}: the server went away ({cause}); what was committed is safe, "

@@ -37,6 +37,8 @@ SETTINGS = {
     "enable_bitmapscan": "off",
     # a plan that was made while the table was small is kept: it must not scan the whole table
     "enable_seqscan": "off",
+    # rows on partitions are counted there
+    "enable_partitionwise_aggregate": "on",
     # readers never wait for locks; a writer that waits longer gets an error
     "lock_timeout": "10s",
     # a frame that takes longer is stuck; writes, indexes and statistics lift this limit

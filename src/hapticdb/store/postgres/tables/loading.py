@@ -30,12 +30,14 @@ KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 class _Indexes:
     """The indexes of an environment's rows, and the tables that they belong to."""
 
-    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
+    def __init__(self, connection: ServerConnection, tables: tuple[Table, ...]) -> None:
         self._connection = connection
-        self._tables = TABLES[layout]
+        self._tables = tables
 
     def are_there(self) -> bool:
         """Whether no index is missing."""
+        if not self._tables:
+            return True
         found = self._connection.rows(
             "SELECT bool_and(to_regclass(name) IS NOT NULL) FROM unnest(%s::text[]) AS name",
             ([f"{table}_key" for table in self._tables],),
@@ -43,9 +45,9 @@ class _Indexes:
         return bool(found[0][0])
 
     def have_no_rows(self) -> bool:
-        """Whether the tables are empty."""
+        """Whether there are tables, and all are empty."""
         held = " OR ".join(f"EXISTS (SELECT 1 FROM {table})" for table in self._tables)
-        return self._connection.rows(f"SELECT {held}") == [(False,)]
+        return self._connection.rows(f"SELECT {held or True}") == [(False,)]
 
     def drop(self) -> None:
         """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
@@ -74,15 +76,19 @@ class _Indexes:
 
     def vacuum(self) -> None:
         """Let frames read the index only."""
-        self._connection.command(f"VACUUM {', '.join(self._tables)}")
+        if self._tables:
+            self._connection.command(f"VACUUM {', '.join(self._tables)}")
 
 
 class Loading:
-    """The context in which a connection writes many objects. May be nested."""
+    """The context in which a connection writes many objects. May be nested.
 
-    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
+    Indexes on partitions stay as they are.
+    """
+
+    def __init__(self, connection: ServerConnection, layout: Layout, *, is_spread: bool) -> None:
         self._connection = connection
-        self._indexes = _Indexes(connection, layout)
+        self._indexes = _Indexes(connection, () if is_spread else TABLES[layout])
         self._depth = 0
         self._is_owner = False
         self._has_written = False

@@ -38,8 +38,11 @@ HAS_TABLE = "SELECT to_regclass(%s) IS NOT NULL"
 class PostgresReader:
     """Reads of one environment. The reader remembers the revision that its last read has seen."""
 
-    def __init__(self, connection: ServerConnection, layout: Layout) -> None:
+    def __init__(
+        self, connection: ServerConnection, layout: Layout, *, is_spread: bool = False
+    ) -> None:
         self._connection = connection
+        self._sql = statements.SPREAD if is_spread else statements.ONE_SERVER
         self._url = connection.shown
         self._layout = layout
         self._shift = row_shift(layout)
@@ -96,12 +99,12 @@ class PostgresReader:
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
         asked = wire.int8s(keys)
-        return self._read(statements.LOOKUP, asked, distances=distances, is_nothing=not keys.size)
+        return self._read(self._sql.lookup, asked, distances=distances, is_nothing=not keys.size)
 
     def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), one statement a key."""
         parts = [
-            self._read(statements.LOOKUP_ONE, wire.int8(key), distances=distances)
+            self._read(self._sql.lookup_one, wire.int8(key), distances=distances)
             for key in keys.tolist()
         ]
         return joined([part for part in parts if len(part)], distances=distances)
@@ -109,31 +112,29 @@ class PostgresReader:
     def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
         ends = wire.int8s(lows), wire.int8s(highs)
-        return self._read(statements.SCAN, *ends, distances=distances, is_nothing=not lows.size)
+        return self._read(self._sql.scan, *ends, distances=distances, is_nothing=not lows.size)
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
         chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(object_id)
-        return self._read(
-            statements.ROWS_OF, *chosen, distances=distances, is_nothing=not lows.size
-        )
+        return self._read(self._sql.rows_of, *chosen, distances=distances, is_nothing=not lows.size)
 
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most that many rows after (key, id), ascending by both."""
         place = wire.int8(key), wire.int8(object_id), wire.int8(limit)
-        return self._read(statements.AFTER, *place, distances=distances)
+        return self._read(self._sql.after, *place, distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
-        text = statements.COUNT[self._layout]
+        text = self._sql.counts[self._layout]
         (found,) = self._connection.fetch(text, wire.int8s(lows), wire.int8s(highs))
         return wire.read_int8(found or b"")
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
-        text = statements.WRENCH[self._layout]
+        text = self._sql.wrench[self._layout]
         parameters = wire.shell(frame)
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         (found,) = self._connection.fetch(text, *parameters)
@@ -141,7 +142,7 @@ class PostgresReader:
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
-        text = statements.HITS[self._layout]
+        text = self._sql.hits[self._layout]
         parameters = [wire.int8s(frame.addresses)]
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         ordinals, ids, seen = self._connection.fetch(text, *parameters)

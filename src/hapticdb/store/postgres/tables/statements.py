@@ -5,7 +5,7 @@ trip whether the environment has changed. Rows come in the order of the index; `
 checks that.
 """
 
-from typing import get_args
+from typing import NamedTuple, get_args
 
 from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout, Table
 
@@ -50,7 +50,7 @@ AFTER: dict[Table, str] = {
     table: f"""
 SELECT {PACKED[table]}, {SEEN}
   FROM (SELECT * FROM {table}
-         WHERE (z_val, id) > ($1, $2)
+         WHERE z_val >= $1 AND (z_val, id) > ($1, $2)
          ORDER BY z_val, id LIMIT $3) AS {table}"""
     for table in TABLES
 }
@@ -70,7 +70,7 @@ DELETE_ROWS: dict[Table, str] = {
     table: f"""
 WITH gone AS (
   DELETE FROM {table}
-   WHERE ctid = ANY (ARRAY(
+   WHERE id = $3 AND ctid = ANY (ARRAY(
            SELECT place
              FROM unnest($1, $2) AS range(low, high),
                   LATERAL (SELECT ctid AS place
@@ -117,6 +117,10 @@ SELECT array_agg(n), array_agg(id), {SEEN}
     ON z_val = shell.key >> 9
    AND get_bit(occupancy, shell.key & 511) = 1""",
 }
+BIT_TEST: dict[Layout, str] = {
+    "voxel": "",
+    "brick": " AND get_bit(occupancy, shell.key & 511) = 1",
+}
 KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = shell.key >> 9"}
 
 
@@ -137,3 +141,88 @@ def without_few(sql: str, layout: Layout, number: int) -> str:
     """Exclude objects whose ids, the parameter of that number, are too far apart for bits."""
     test = KEY_TEST[layout]
     return sql.replace(test, f"{test} AND id <> ALL (${number})")
+
+
+class Texts(NamedTuple):
+    """Statements by table or layout, as the constants above have them."""
+
+    lookup: dict[Table, str]
+    lookup_one: dict[Table, str]
+    scan: dict[Table, str]
+    after: dict[Table, str]
+    rows_of: dict[Table, str]
+    counts: dict[Layout, str]
+    wrench: dict[Layout, str]
+    hits: dict[Layout, str]
+
+
+ONE_SERVER = Texts(LOOKUP, LOOKUP_ONE, SCAN, AFTER, ROWS_OF, COUNT, WRENCH, HITS)
+
+
+# Rows on partitions (docs/postgresql.md): the same questions, so that a condition on keys reaches
+# the partitions. OFFSET 0 makes the planner ask them for each range or key, by its value; a join
+# would fetch all of their rows. Rows of no object, which a crash has left, are passed over.
+HELD = "EXISTS (SELECT 1 FROM object WHERE object.id = {0}.id)"
+
+
+def _spread(table: Table, where: str) -> str:
+    """Rows of a table with a condition on `z_val`, as a subquery; those of `band` with bricks."""
+    if table != "band":
+        return f"(SELECT * FROM {table} WHERE {where} AND {HELD.format(table)} OFFSET 0) AS {table}"
+    return f"""(
+       SELECT z_val, id, occupancy, distances
+         FROM (SELECT * FROM band WHERE {where} AND {HELD.format(table)} OFFSET 0) AS near
+         LEFT JOIN (SELECT * FROM brick WHERE {where} OFFSET 0) AS held USING (z_val, id)
+        ORDER BY z_val, id OFFSET 0) AS band"""
+
+
+SPREAD_PACKED = PACKED | {
+    "band": f"""array_agg(z_val), array_agg(id),
+       string_agg(coalesce(occupancy, decode(repeat('00', {BRICK_BYTES}), 'hex')), ''),
+       string_agg(distances, ''), array_agg(octet_length(distances)::bigint)"""
+}
+_RANGES = "unnest($1, $2) AS range(low, high), LATERAL "
+_IN_RANGE = "z_val BETWEEN range.low AND range.high"
+_NEXT = "SELECT * FROM {0} WHERE z_val >= $1 AND (z_val, id) > ($1, $2) ORDER BY z_val, id LIMIT $3"
+
+
+def _spread_after(table: Table) -> str:
+    if table != "band":
+        return f"SELECT {SPREAD_PACKED[table]}, {SEEN} FROM ({_NEXT.format(table)}) AS {table}"
+    return f"""
+  WITH near AS MATERIALIZED ({_NEXT.format("band")})
+SELECT {SPREAD_PACKED["band"]}, {SEEN}
+  FROM (SELECT z_val, id, occupancy, distances
+          FROM near LEFT JOIN (SELECT * FROM brick
+                                WHERE z_val BETWEEN $1 AND (SELECT max(z_val) FROM near)
+                               OFFSET 0) AS held USING (z_val, id)
+         ORDER BY z_val, id) AS band"""
+
+
+def _spread_rows(source: str, where: str) -> dict[Table, str]:
+    return {
+        table: f"SELECT {SPREAD_PACKED[table]}, {SEEN} FROM {source}{_spread(table, where)}"
+        for table in TABLES
+    }
+
+
+SPREAD = Texts(
+    _spread_rows("", "z_val = ANY ($1)"),
+    _spread_rows("", "z_val = $1"),
+    _spread_rows(_RANGES, _IN_RANGE),
+    {table: _spread_after(table) for table in TABLES},
+    _spread_rows(_RANGES, f"{_IN_RANGE} AND id = $3"),
+    {layout: f"SELECT count(*) FROM {_RANGES}{_spread(layout, _IN_RANGE)}" for layout in LAYOUTS},
+    {
+        layout: text.removesuffix(")") + f" AND {HELD.format(layout)} OFFSET 0)"
+        for layout, text in WRENCH.items()
+    },
+    {
+        layout: f"""
+SELECT array_agg(n), array_agg(id), {SEEN}
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n),
+       LATERAL (SELECT id FROM {layout}
+                 WHERE {KEY_TEST[layout]}{bit} AND {HELD.format(layout)} OFFSET 0) AS found"""
+        for layout, bit in BIT_TEST.items()
+    },
+)

@@ -16,6 +16,7 @@ from hapticdb.store.postgres.tables.histogram import (
 from hapticdb.store.postgres.tables.reading import PostgresReader
 
 SIZE_OF_BAND = "SELECT count(*), pg_total_relation_size('band') FROM band"
+SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages), sum(band) FROM size"
 SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 
 
@@ -23,8 +24,14 @@ class PostgresStatistics:
     """Sizes and statistics of one environment's tables, and the figures kept beside them."""
 
     def __init__(
-        self, connection: ServerConnection, layout: Layout, reader: PostgresReader
+        self,
+        connection: ServerConnection,
+        layout: Layout,
+        reader: PostgresReader,
+        *,
+        is_spread: bool,
     ) -> None:
+        self._is_spread = is_spread
         self._connection = connection
         self._layout = layout
         self._reader = reader
@@ -43,6 +50,9 @@ class PostgresStatistics:
             total, index = self._bytes()
             if self._reader.has_table(believed.BAND):
                 (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
+            if self._is_spread:
+                ((more, index, of_band),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
+                total, index, band = total + int(more), int(index), (band[0], of_band)
             if self._reader.has_table(believed.SURFACE):
                 (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
             return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))

@@ -8,11 +8,11 @@ from psycopg import errors
 
 from hapticdb.grid import Grid
 from hapticdb.store import believed
-from hapticdb.store.base import Covering, Keys, Layout, Object, Rows, Table, touched_ranges
+from hapticdb.store.base import NO_KEYS, Covering, Keys, Layout, Object, Rows, Table, touched_ranges
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.loading import Loading
+from hapticdb.store.postgres.tables.loading import TABLES, Loading
 from hapticdb.store.postgres.tables.reading import PostgresReader
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.refusals import check_unwritten, older_format, present_already
@@ -47,6 +47,7 @@ SELECT EXISTS (SELECT 1 FROM object WHERE digest = %(digest)s)
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
+NEXT_ID = "SELECT setval('object_id_seq', greatest(nextval('object_id_seq'), %s))"
 # the write lock: writers take revisions one after the other, and no reader waits for it
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
 
@@ -61,7 +62,10 @@ class PostgresWriter:
         layout: Layout,
         reader: PostgresReader,
         loading: Loading,
+        *,
+        is_spread: bool,
     ) -> None:
+        self._is_spread = is_spread
         self._connection = connection
         self._grid = grid
         self._layout = layout
@@ -96,7 +100,7 @@ class PostgresWriter:
             revision = self._next_revision()
             known = self._reader.object(record.id)
             check_unwritten(record, known, self._connection.shown)
-            gone = self._take(known, covering)
+            gone = self._take(known, covering, rows.keys)
             self._execute(UPDATE_OBJECT, _contents(record, rows, revision))
             self._put(rows, record.id)
             self._drop_surface(known.digest)
@@ -129,6 +133,17 @@ class PostgresWriter:
             raise older_format(self._connection.shown)
         self._connection.write(work)
 
+    def drop_rows(self, object_id: int) -> None:
+        """Delete the rows that a crash has left of an object that is not there."""
+
+        def work() -> None:
+            self._execute("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")  # the write lock
+            if not self._execute("SELECT 1 FROM object WHERE id = %s", (object_id,)):
+                for table in TABLES[self._layout]:
+                    self._execute(f"DELETE FROM {table} WHERE id = %s", (object_id,))
+
+        self._connection.write(work)
+
     def want_distances(self) -> None:
         """Note in the environment that its parts get distances."""
         self._connection.write(
@@ -140,10 +155,15 @@ class PostgresWriter:
         return int(self._execute(NEXT_REVISION)[0][0])
 
     def _new_id(self, revision: int) -> int:
-        """One above all ids ever given. The write lock is held, so nobody else adds an object."""
+        """One above all ids ever given. The write lock is held, so nobody else adds an object.
+
+        On partitions an id of an add that failed is never given again: rows of it may be there.
+        """
         since, highest = self._highest_id
         found = self._execute(HIGHEST_ID, (since,))
         self._highest_id = revision - 1, max(highest, int(found[0][0]))
+        if self._is_spread:
+            return int(self._execute(NEXT_ID, (self._highest_id[1] + 1,))[0][0])
         return self._highest_id[1] + 1
 
     def _commit(self, work: Callable[[], Result]) -> Result:
@@ -191,9 +211,14 @@ class PostgresWriter:
         if self._reader.has_table(believed.SURFACE):
             self._execute(DROP_SURFACE, {"digest": digest})
 
-    def _take(self, known: Object, covering: Covering) -> Keys:
-        """Delete the rows of an object as it is now, from both tables; returns their keys."""
+    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
+        """Delete the rows of an object as it is now, from both tables; returns their keys.
+
+        keys : of its new rows; on partitions a try that failed may have left such rows.
+        """
         ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        if self._is_spread and keys.size:
+            ends = np.concatenate([ends, [[keys.min(), keys.max()]]])
         chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
         tables: list[Table] = [self._layout]
         if known.has_distances:

@@ -1,0 +1,225 @@
+"""Rows on other servers: the tables of rows, partitioned by ranges of their keys.
+
+PostgreSQL does all of it. The tables of a layout's rows are declared partitioned; each partition is
+a foreign table of `postgres_fdw`, which leads to a schema of the environment's name on another
+server. Objects, surfaces and the log of changes stay where the environment is.
+
+A partition's ends lie between cells of 32 x 32 x 32 voxels, so the rows of a cell are on one
+server. postgres_fdw commits on the partitions before the environment commits; after a crash in
+between they hold rows that no object has, which no frame reads (`tables/statements`) and
+`check --repair` removes.
+"""
+
+from collections.abc import Callable, Sequence
+
+from psycopg import errors, sql
+
+from hapticdb.errors import AccessError, EnvironmentExistsError, UsageError
+from hapticdb.grid import Grid
+from hapticdb.store.base import Layout, Table, row_shift
+from hapticdb.store.postgres.address import Address, partition_urls
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.migrations import AUTOVACUUM, BAND, BRICK, VOXEL
+
+CELL_BITS = 15
+"""Bits of a key that name a voxel within its cell."""
+TABLES: dict[Layout, dict[Table, tuple[str, ...]]] = {
+    "voxel": {"voxel": VOXEL},
+    "brick": {"brick": BRICK, "band": BAND},
+}
+"""Tables whose rows lie on the partitions, and the statements that make one."""
+SIZE = """
+CREATE VIEW size AS
+SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0)::bigint AS bytes,
+       coalesce(sum(pg_relation_size(oid)) FILTER (WHERE relname = {index}), 0)::bigint
+         / current_setting('block_size')::int AS pages,
+       coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relname = 'band'), 0)::bigint AS band
+  FROM pg_class
+ WHERE relnamespace = quote_ident({name})::regnamespace"""
+"""On a partition: bytes of its tables and indexes, pages of the index of its rows, and the bytes of
+its distances."""
+SERVER = """
+CREATE SERVER {server} FOREIGN DATA WRAPPER postgres_fdw
+OPTIONS (host {host}, port {port}, dbname {database}, async_capable 'true', fetch_size '10000',
+         batch_size '1000')"""
+PARTITION = """
+CREATE FOREIGN TABLE {partition} PARTITION OF {table} FOR VALUES FROM ({low}) TO ({high})
+SERVER {server} OPTIONS (schema_name {schema}, table_name {name})"""
+SERVERS = """
+SELECT DISTINCT srvname::text
+  FROM pg_foreign_table JOIN pg_class ON pg_class.oid = ftrelid
+  JOIN pg_foreign_server ON pg_foreign_server.oid = ftserver
+ WHERE relnamespace = quote_ident(%s)::regnamespace AND srvname LIKE %s"""
+"""Servers that `spread` made for an environment."""
+
+
+def ends(grid: Grid, layout: Layout, table: Table, n: int) -> list[int]:
+    """Keys (n - 1,) at which the second to the last of n partitions begin.
+
+    Between cells, or, in a grid of fewer cells than partitions, between its rows.
+    """
+    shift = row_shift(layout)
+    within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
+    cells = 1 << max(3 * grid.bits - within, 0)
+    if cells < n:
+        raise UsageError(
+            f"a grid of {grid.bits} bits has {cells} rows of the table {table}, too few for {n} "
+            "partitions: give fewer partitions, or more bits"
+        )
+    return [(cells * i // n) << (within - shift) for i in range(1, n)]
+
+
+def spread(
+    address: Address,
+    connect: Callable[[str], ServerConnection],
+    grid: Grid,
+    layout: Layout,
+) -> "Callable[[ServerConnection], None]":
+    """Make the partitions of a new environment; returns what its own transaction does then.
+
+    Parameters
+    ----------
+    address : Address
+        Of the environment, with its `partitions`.
+    connect : callable
+        Connects to a partition's URL.
+    """
+    urls = partition_urls(address)
+    if not urls:
+        return lambda _: None
+    for table in TABLES[layout]:
+        ends(grid, layout, table, len(urls))
+    made: list[ServerConnection] = []
+    try:
+        for url in urls:
+            made.append(connect(url))
+            made[-1].write(lambda: _make_partition(made[-1], layout))
+    except BaseException:
+        _undo(made)
+        raise
+
+    def join(connection: ServerConnection) -> None:
+        try:
+            _join(connection, made, grid, layout)
+        except BaseException:
+            _undo(made)
+            raise
+        for one in made:
+            one.close()
+
+    return join
+
+
+def drop(connection: ServerConnection, connect: Callable[[str], ServerConnection]) -> None:
+    """Delete an environment's servers, and its partitions where the address names them."""
+    name = connection.address.environment
+    for (server,) in connection.rows(SERVERS, (name, _server_name(name, "%"))):
+        drop_server = sql.SQL("DROP SERVER {} CASCADE").format(sql.Identifier(server))
+        connection.write(lambda text=drop_server: connection.execute(text))  # type: ignore[misc]
+    _undo([connect(url) for url in partition_urls(connection.address)])
+
+
+def _server_name(environment: str, number: object) -> str:
+    return f"hapticdb {environment} {number}"
+
+
+def _undo(made: Sequence[ServerConnection]) -> None:
+    for one in made:
+        schema = sql.Identifier(one.address.environment)
+        text = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)
+        one.write(lambda one=one, text=text: one.execute(text))  # type: ignore[misc]
+        one.close()
+
+
+def _make_partition(connection: ServerConnection, layout: Layout) -> None:
+    """Make a partition's schema and tables, inside a transaction."""
+    name = connection.address.environment
+    try:
+        connection.execute(sql.SQL("CREATE SCHEMA {}").format(sql.Identifier(name)))
+    except errors.DuplicateSchema as error:
+        raise EnvironmentExistsError(
+            f"{connection.shown}: schema {name!r} exists already on this partition; name another "
+            "environment with ?environment=NAME, or drop it there"
+        ) from error
+    for statements in TABLES[layout].values():
+        for statement in statements:
+            connection.execute(statement)
+    index = sql.Literal(f"{layout}_key")
+    connection.execute(sql.SQL(SIZE).format(name=sql.Literal(name), index=index))
+
+
+def _join(
+    connection: ServerConnection, made: Sequence[ServerConnection], grid: Grid, layout: Layout
+) -> None:
+    """Exchange the tables of rows for partitioned ones, inside the environment's transaction."""
+    schema = connection.address.environment
+    try:
+        if not connection.execute(
+            "SELECT 1 FROM pg_extension WHERE extname = 'postgres_fdw'"
+        ).fetchone():
+            connection.execute("CREATE EXTENSION postgres_fdw")
+        servers = [_make_server(connection, one, n) for n, one in enumerate(made)]
+    except errors.InsufficientPrivilege as error:
+        raise AccessError(
+            f"{connection.shown}: this user may not use postgres_fdw; a superuser can allow it "
+            "with 'CREATE EXTENSION postgres_fdw' and 'GRANT USAGE ON FOREIGN DATA WRAPPER "
+            "postgres_fdw TO ...'"
+        ) from error
+    connection.execute("CREATE TABLE size (bytes bigint, pages bigint, band bigint)")
+    for n, server in enumerate(servers):
+        inherits = sql.SQL(
+            "CREATE FOREIGN TABLE {} () INHERITS (size) SERVER {}"
+            " OPTIONS (schema_name {}, table_name 'size')"
+        )
+        place = sql.Identifier(f"size_{n}"), server, sql.Literal(schema)
+        connection.execute(inherits.format(*place))
+    for table, statements in TABLES[layout].items():
+        connection.execute(f"DROP TABLE {table}")
+        for statement in statements:
+            if "INDEX" not in statement:
+                by_range = statement.replace(f"WITH ({AUTOVACUUM})", "PARTITION BY RANGE (z_val)")
+                connection.execute(by_range)
+        inner = map(str, ends(grid, layout, table, len(made)))
+        limits = ["MINVALUE", *inner, "MAXVALUE"]
+        for n, server in enumerate(servers):
+            connection.execute(
+                sql.SQL(PARTITION).format(
+                    partition=sql.Identifier(f"{table}_{n}"),
+                    table=sql.Identifier(table),
+                    low=sql.SQL(limits[n]),
+                    high=sql.SQL(limits[n + 1]),
+                    server=server,
+                    schema=sql.Literal(schema),
+                    name=sql.Literal(table),
+                )
+            )
+        connection.execute(f"SELECT count(*) FROM {table}")  # reaches each of them, or fails now
+
+
+def _make_server(
+    connection: ServerConnection, partition: ServerConnection, number: int
+) -> sql.Identifier:
+    """Make a foreign server with one login for everybody; only this owner may use it in tables."""
+    info = partition.driver.info
+    server = sql.Identifier(_server_name(connection.address.environment, number))
+    place = {"host": info.host, "port": str(info.port), "database": info.dbname}
+    values = {name: sql.Literal(value) for name, value in place.items()}
+    try:
+        connection.execute(sql.SQL(SERVER).format(server=server, **values))
+    except errors.DuplicateObject as error:
+        raise EnvironmentExistsError(
+            f"{connection.shown}: the server {server.as_string()} is left from an environment of "
+            "this name: drop it with DROP SERVER ... CASCADE"
+        ) from error
+    login = {"user": info.user, "password_required": "false"}
+    if info.password:
+        login = {"user": info.user, "password": info.password}
+    elif connection.execute("SHOW is_superuser").fetchone() != ("on",):
+        raise UsageError(
+            f"{partition.shown}: only a superuser may use a partition without a password: give "
+            "one in the partition's URL, or in ~/.pgpass"
+        )
+    pairs = [sql.SQL("{} {}").format(sql.Identifier(k), sql.Literal(v)) for k, v in login.items()]
+    text = sql.SQL("CREATE USER MAPPING FOR PUBLIC SERVER {} OPTIONS ({})")
+    connection.execute(text.format(server, sql.SQL(", ").join(pairs)))
+    return server

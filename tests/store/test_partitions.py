@@ -123,9 +123,10 @@ def test_frames_are_those_of_one_server(
             found = [felt(env, shell, pose, strategy) for pose in poses]
             assert found == [felt(one, shell, pose, strategy) for pose in poses]
             assert any(len(hits) for _, hits, _ in found)
-        cells = env.feeler(shell), one.feeler(shell)
-        both = [feeler.touch(np.array(poses)).forces.tobytes() for feeler in cells]
-        assert both[0] == both[1]
+        if layout == "brick":
+            cells = env.feeler(shell), one.feeler(shell)
+            both = [feeler.touch(np.array(poses)).forces.tobytes() for feeler in cells]
+            assert both[0] == both[1]
     dropped(url)
 
 
@@ -258,7 +259,7 @@ def test_wrong_use_is_one_line(made: str, spread: Spread, file: Path, run: Run) 
         hapticdb.create(where, Grid(0.005, (0, 0, 0), 6))
     with pytest.raises(UsageError, match="too few for 2 partitions"):
         hapticdb.create(
-            with_partitions(f"{one}&environment=few", f"{one},{one}"), Grid(0.1, (0, 0, 0), 4)
+            with_partitions(f"{one}&environment=few", f"{one},{one}"), Grid(0.1, (0, 0, 0), 3)
         )
     with psycopg.connect(one) as server:
         left = "SELECT count(*) FROM pg_namespace WHERE nspname IN ('balls2', 'few')"

@@ -16,6 +16,7 @@ from hapticdb.cli.options import (
     ConservativeOption,
     ExcludeOption,
     JsonOption,
+    LawName,
     LawOption,
     PointsOption,
     ToolOption,
@@ -194,8 +195,7 @@ def feel(
     """
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    drive = "direct" if law == "plane" else "coupling"
-    _begin_loop(drive, processor, policy, device, budget_points)
+    drive = _begin_loop(law, processor, policy, device, budget_points)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel", drive)
@@ -237,9 +237,16 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
 
 
 def _begin_loop(
-    drive: str, processor: int | None, policy: PolicyName, device: str, budget_points: int | None
-) -> None:
-    """Refuse what the loop cannot do; have its processes load kernels while this one does."""
+    law: LawName | None,
+    processor: int | None,
+    policy: PolicyName,
+    device: str,
+    budget_points: int | None,
+) -> str:
+    """Refuse what the loop cannot do; have its processes load kernels while this one does.
+
+    Returns the purpose of the kernels of the law.
+    """
     from hapticdb.pointshell.shell import checked_budget
     from hapticdb.realtime.deadlines import Timing
     from hapticdb.realtime.fork_server import prepare
@@ -248,7 +255,9 @@ def _begin_loop(
     Timing(processor=processor)
     if device in VENDORS and policy == "wait":
         raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
+    drive = "direct" if law == "plane" else "coupling"
     prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
+    return drive
 
 
 def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:

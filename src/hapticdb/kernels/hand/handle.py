@@ -11,9 +11,8 @@ FARTHEST = 1e6
 the device is wrong, and the hand is refused."""
 
 
-@entry(FLOATS2, FLOATS)
-def is_somewhere(pose, velocity):
-    """Whether a pose (4, 4) and a velocity (6,) are finite, and no number is beyond FARTHEST."""
+@leaf
+def _is_credible(pose, velocity):
     for row in range(3):
         for column in range(4):
             if not abs(pose[row, column]) <= FARTHEST:  # NaN fails, too
@@ -22,6 +21,12 @@ def is_somewhere(pose, velocity):
         if not abs(velocity[axis]) <= FARTHEST:
             return False
     return True
+
+
+@entry(FLOATS2, FLOATS)
+def is_somewhere(pose, velocity):
+    """Whether a pose (4, 4) and a velocity (6,) are finite, and no number is beyond FARTHEST."""
+    return _is_credible(pose, velocity)
 
 
 @leaf
@@ -79,7 +84,7 @@ def follow_reading(handle, pose, velocity, buttons, hand):
     Without a place of the hand the handle has none: its x is NaN.
     """
     position = hand.position
-    if not is_somewhere(pose, velocity):
+    if not _is_credible(pose, velocity):
         if not math.isnan(position[0]):
             handle.x = position[0]
             position[0] = math.nan

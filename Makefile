@@ -61,7 +61,7 @@ realtime: $(READY)
 feel: $(READY)
 	$(BIN)/python benchmarks/feeling.py $(ARGS)
 
-# docs/batches.md beside python-fcl, coal and Open3D, and large tools beside the flat loop: a quarter of an hour
+# docs/query.md, poses a second beside python-fcl, coal and Open3D, and large tools beside the flat loop: a quarter of an hour
 paths: $(READY) .venv/figures
 	$(BIN)/python benchmarks/batches.py $(ARGS)
 	$(BIN)/python benchmarks/large_shells.py $(ARGS)

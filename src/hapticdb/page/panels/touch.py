@@ -202,16 +202,15 @@ class TouchPanel:
                 "" if self._browser.has_moved else f": drag the {escaped(self._browser.tool.name)}"
             )
             said = f'<span style="opacity:0.6">Touches nothing{hint}</span>'
-        big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums"
+        big = "font-size:1.5em;font-weight:600;font-variant-numeric:tabular-nums;white-space:nowrap"
         small = "font-size:0.75em;opacity:0.65"
         limit = limit_text(force, self._browser.drawing.cap)
         return (
             f'<div style="margin:4px 12px 2px"><div style="{small}">{swatch(self._browser.colour)}'
             f"{escaped(who)}</div>"
             '<div style="display:flex;gap:24px;margin:4px 0">'
-            f'<div><div style="{small}">Force</div>'
-            f'<div style="{big}">{force_text(force)}'
-            f'<span style="{small}">{limit}</span></div></div>'
+            f'<div><div style="{small}">Force{limit}</div>'
+            f'<div style="{big}">{force_text(force)}</div></div>'
             f'<div><div style="{small}">Torque</div>'
             f'<div style="{big}">{torque_text(torque)}</div></div></div>'
             '<div style="font-size:0.82em;min-height:3.2em">'

@@ -1,9 +1,9 @@
-"""Fits: pegs drawn out of their holes at real tolerances, and what a hand off the axis feels.
+"""Fits: pegs drawn out of their holes, a nut turned on its bolt, and what a hand off the axis feels.
 
     HAPTICDB_TEST_DATA=... python benchmarks/fits.py     # the folder that holds fits/
 
 A round peg's nominal gap is half the difference of the diameters. A sweep draws each peg out along
-its axis. Then a hand holds the peg in the hole, beside the axis.
+its axis, and turns the nut by half a turn. Then a hand holds each where it began, beside the axis.
 """
 
 import argparse
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial.transform import Rotation
 
 import hapticdb
 import page_tables
@@ -27,14 +28,18 @@ SEATED, OUT = 1e-3, 60e-3
 """Where a peg begins and ends along its axis, metres; the holes are 9 mm deep."""
 ASIDE = 2e-5
 """Metres from the axis at which the hand holds the peg."""
+PITCH, TURN, STEPS = 2e-3, np.pi, 48
+"""Metres a turn of the thread, how far the nut is turned, radians, and in how many poses."""
 
 
 class Fit(NamedTuple):
-    """A hole and its peg: files, and the nominal gap in metres, if the diameters are known."""
+    """Files of a hole and its peg; metres: nominal gap, if known; start along the axis; pitch."""
 
     hole: str
     peg: str
     nominal_m: float | None = None
+    start_m: float = SEATED
+    pitch_m: float = 0.0
 
 
 FITS = {
@@ -47,18 +52,33 @@ FITS = {
     "rectangular 8 mm, tight": Fit(
         "rectangular_hole_8mm_subdiv_3x", "rectangular_peg_8mm_tight_subdiv_3x"
     ),
+    "M16 nut, half a turn": Fit(
+        "bolt_m16_loose", "nut_m16_loose_subdiv_3x", start_m=PITCH, pitch_m=PITCH
+    ),
 }
 
 
-def path(*places: tuple[float, float, float]) -> Floats:
-    """Poses (M, 4, 4) at places, metres."""
-    poses = np.tile(np.eye(4), (len(places), 1, 1))
-    poses[:, :3, 3] = places
+def path(fit: Fit) -> Floats:
+    """Poses (M, 4, 4): straight out along the axis, or a screw motion."""
+    poses = np.tile(np.eye(4), (STEPS + 1 if fit.pitch_m else 2, 1, 1))
+    if not fit.pitch_m:
+        poses[:, 2, 3] = fit.start_m, OUT
+        return poses
+    turns = np.linspace(0.0, TURN, len(poses))
+    poses[:, :3, :3] = Rotation.from_euler("z", turns[:, None]).as_matrix()
+    poses[:, 2, 3] = fit.start_m + fit.pitch_m * turns / (2.0 * np.pi)
     return poses
 
 
+def held_at(fit: Fit, aside: float) -> Floats:
+    """Pose (4, 4) at the start, so far beside the axis, metres."""
+    pose = np.eye(4)
+    pose[:3, 3] = aside, 0.0, fit.start_m
+    return pose
+
+
 def measured(folder: Path, data: Path, name: str, bits: int) -> dict[str, Any]:
-    """Draw a peg out twice, of which the second time counts, and hold it beside the axis."""
+    """Move a peg twice, of which the second time counts, and hold it beside the axis."""
     fit = FITS[name]
     url = folder / f"{fit.hole}.db"
     options = ImportOptions(grid=GridOptions(bits=bits))
@@ -67,9 +87,9 @@ def measured(folder: Path, data: Path, name: str, bits: int) -> dict[str, Any]:
     with hapticdb.open(url, read_only=True) as env:
         for _ in range(2):
             began = time.process_time()
-            found = hapticdb.sweep(env, shell, path((0, 0, SEATED), (0, 0, OUT)))
+            found = hapticdb.sweep(env, shell, path(fit), about=(0.0, 0.0, 0.0))
             spent = time.process_time() - began
-        held = [env.touch(shell, path((x, 0, SEATED))[0]).force for x in (0.0, ASIDE)]
+        held = [env.touch(shell, held_at(fit, x)).force for x in (0.0, ASIDE)]
         return {
             "fit": name,
             "nominal_m": fit.nominal_m,

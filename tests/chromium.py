@@ -84,7 +84,7 @@ def close_notes(page: Page) -> None:
 
 def force_on(page: Page) -> float | None:
     """Force that the tab Touch shows, newtons; None if it shows none."""
-    found = re.search(r"Force\s*([\d.]+) N", page.locator("body").inner_text())
+    found = re.search(r"Force\D*([\d.]+) N", page.locator("body").inner_text())
     return None if found is None else float(found.group(1))
 
 

@@ -170,10 +170,9 @@ def test_one_feels_a_part_until_another_moves_it_away(
     links = {role: f"{server.address}?token={token}" for token, role in TOKENS.items()}
     with chromium() as browser:
         ada = opened(new_page(browser, links[Role.TOUCHER]))
-        ben = opened(new_page(browser, links[Role.EDITOR]))
         eye = Eye(ada, aim.framing, aim.up)
         ada.get_by_text("Where the hand is").click()
-        before = picture(ben, "1-ben-before", tmp_path)
+        before = picture(ada, "1-ada-before", tmp_path)
 
         # one drags the ball into the bonnet, and reads a force
         pull_hand(ada, eye, aim, aim.contact)
@@ -181,7 +180,8 @@ def test_one_feels_a_part_until_another_moves_it_away(
         ada.get_by_text("Force", exact=True).scroll_into_view_if_needed()
         picture(ada, "2-ada-feels", tmp_path)
 
-        # the other sees that ball, and chooses the part by a click
+        # another, who comes now since two pages are drawn half as fast, sees that ball there
+        ben = opened(new_page(browser, links[Role.EDITOR]))
         spot = eye.pixel(aim.contact)
 
         def is_seen() -> bool:
@@ -189,6 +189,8 @@ def test_one_feels_a_part_until_another_moves_it_away(
             return float(np.abs(around(now, spot) - around(before, spot)).mean()) > 8.0
 
         until(is_seen, "the other's ball is seen", ben)
+
+        # chooses the part by a click
         ben.get_by_role("tab", name="Parts").click()
         ben.mouse.click(*eye.pixel(aim.seen))
         ben.get_by_text(str(aim.id), exact=True).wait_for()

@@ -209,7 +209,7 @@ class TouchPanel:
             f'<div style="margin:4px 12px 2px"><div style="{small}">{swatch(self._browser.colour)}'
             f"{escaped(who)}</div>"
             '<div style="display:flex;gap:24px;margin:4px 0">'
-            f'<div><div style="{small}">Force{limit}</div>'
+            f'<div><div style="{small}"><span>Force</span>{limit}</div>'
             f'<div style="{big}">{force_text(force)}</div></div>'
             f'<div><div style="{small}">Torque</div>'
             f'<div style="{big}">{torque_text(torque)}</div></div></div>'

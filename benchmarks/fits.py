@@ -1,4 +1,4 @@
-"""Fits: pegs drawn out of their holes, a nut turned on its bolt, and what a hand off the axis feels.
+"""Fits: pegs drawn out of holes, a nut turned on its bolt, and what a hand feels off the axis.
 
     HAPTICDB_TEST_DATA=... python benchmarks/fits.py     # the folder that holds fits/
 

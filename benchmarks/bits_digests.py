@@ -25,16 +25,20 @@ Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
 STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
 MEASURED = ("cbgroup", "auto")
 """Strategies whose statements depend on measured costs, and so differ between runs."""
-SESSION = "--rate 512 --speed 0.1 --policy wait --simulate --no-baseline --replace --record"
+SESSION = "--rate 512 --speed 0.1 --simulate --no-baseline --replace --record"
 CLOCK = '''"""A clock that counts its calls: whole ticks, of which 625 are a frame of 1/512 s.
 
-What is read in seconds stands still within a frame, however often the loop looks for its cells.
+What is read in seconds stands still within a frame. Each frame takes 2 ms, in which the cells that
+the hand heads for are fetched: its own time goes on more slowly.
 """
 import itertools, time
 calls, now = itertools.count(1), 0
 def perf_counter_ns():
     global now
-    now = 3125 * next(calls)
+    call = next(calls)
+    if call % 625 == 0:
+        time.sleep(2e-3)
+    now = 3125 * call
     return now
 def perf_counter():
     return now // 1953125 / 512

@@ -35,7 +35,7 @@ def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
         found = json.loads(run("sweep", scene, *path, "--where", f"box{n}")[1])
         assert [one["name"] for one in found["hits"]] == ["box1"] * (n == 1)
         assert found["tool"]["excluded"] == sorted({1, 2, 3} - {n + 1})
-    hand = ("--tool", "tool.npz", "--device", "path.csv", "--policy", "wait", "--rate", 200)
+    hand = ("--tool", "tool.npz", "--device", "path.csv", "--rate", 200)
     code, out, err = run("feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?")
     assert (code, json.loads(out)["hit_frames"]) == (0, 0), err
     for verb in (("touch", scene, *TOUCH), ("feel", scene, *hand), ("sweep", scene, *path)):

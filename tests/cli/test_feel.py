@@ -119,7 +119,7 @@ def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
 @pytest.mark.usefixtures("scene")
 def test_a_simulated_device_is_pushed_back(run: Run) -> None:
     args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
-    code, out, err = run(*feel(*args, "--policy", "wait", "--rate", 200, "--json"))
+    code, out, err = run(*feel(*args, "--rate", 200, "--json"))
     assert (code, err) == (0, "")
     report = json.loads(out)
     assert report["unknown_frames"] == report["held_frames"] == 0
@@ -139,7 +139,6 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "felt.hdbrec", "--speed", 1], ["--speed", "has its own"]),
         (["--device", "random", "--at", ABOVE, "--loop"], ["--loop", "random has no end"]),
         ([*PLAY, "--processor", 10**30], ["processor 1e+30 is not granted", "may run on"]),
-        (["--device", "haply", "--policy", "wait"], ["cannot wait"]),
         ([*PLAY, "--rate", 5], ["a rate of 5.0 Hz: give 10 to 20,000"]),
         ([*PLAY, "--seconds", -1], ["-1.0 seconds"]),
         ([*PLAY, "--scale", 0], ["a scale of 0.0"]),

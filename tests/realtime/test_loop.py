@@ -63,7 +63,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
                 descriptor=cells.table.descriptor, n_slots=cells.table.n_slots, row=row,
                 board=board.descriptor, n_ring=N_RING, grid=cells.grid, shell=sphere, device=device,
                 law=TangentPlane(), coupling=DIRECT, handle=Handle(), timing=Timing(rate),
-                seconds=0.3, staleness=60.0, is_waiting=False,
+                seconds=0.3, staleness=60.0,
             )  # fmt: skip
             heard = io.BytesIO()
             work(dataclasses.replace(request, **options), MessageSender(heard))  # type: ignore[arg-type]
@@ -165,9 +165,3 @@ def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> N
     answer, frames = run(still(0.010), staleness=-60.0)
     assert answer.counts.stale_frames == answer.counts.held_frames == len(frames)
     assert not frames["applied"][frames["time"] > 0.1].any()
-
-
-def test_waiting_frames_take_no_heed_of_silence(run: Run) -> None:
-    answer, frames = run(still(0.010), staleness=-60.0, is_waiting=True)
-    assert answer.counts.held_frames == answer.counts.unknown_frames == 0
-    assert frames["applied"][-1].any()

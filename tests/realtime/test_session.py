@@ -285,7 +285,6 @@ def test_a_session_ended_while_its_recording_is_made_leaves_none(
         ({"seconds": math.inf}, "inf seconds"),
         ({"processor": -1}, "processor -1 is not granted"),
         ({"staleness": 0.0}, "a staleness of 0.0 s"),
-        ({"policy": "Wait"}, "policy 'Wait': give 'hold' or 'wait'"),
     ],
 )
 def test_what_makes_no_sense_is_refused(

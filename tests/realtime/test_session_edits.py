@@ -8,7 +8,6 @@ import pytest
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.profiles import SCRIPTED
-from hapticdb.kernels.period.loop import ALWAYS
 from hapticdb.kernels.records import FRAME, SEAT
 from hapticdb.kernels.resident.cell_table import publish
 from hapticdb.query.law import PLANE, SMOOTH
@@ -57,7 +56,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         )
         station.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
         station.servo["hand"]["quaternion"][0] = station.servo["tool"]["quaternion"][0] = 1.0
-        station.row["is_running"], station.row["noted"] = True, ALWAYS
+        station.row["is_running"] = station.row["is_frame"] = True
         seats["is_recorded"] = True
         for revision in (7, 8, 9):
             publish(table.cells.control, revision - 6, revision, NO_KEYS)

@@ -18,7 +18,6 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.hosting.channel import Ask, Channel
 from hapticdb.kernels.compiling import load
-from hapticdb.kernels.period.loop import ALWAYS
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
@@ -122,7 +121,7 @@ class Worker:
         station.rest_at(pose)
         station.arrive_at(pose)
         station.set_spring(request.coupling.spring())
-        row["seat"], row["noted"] = request.seat, ALWAYS
+        row["seat"], row["is_frame"] = request.seat, True
         row["began"] = row["last"] = time.monotonic_ns()
         self._running[request.seat] = request, station
         row["is_running"] = 1

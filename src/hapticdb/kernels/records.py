@@ -391,7 +391,7 @@ STATION: Layout = _record(
         ("seat", "<i8"),  # row of the board
         ("reader", "<i8"),  # row of the table of cells
         ("source", "<i8"),  # of the hand: named in `kernels.period.loop`
-        ("noted", "<i8"),  # which periods are frames: named there, too
+        ("is_frame", "<i8"),  # its periods are noted and counted
         # addresses of the table's arrays and of its row SESSION, and sizes
         *((name, "<i8") for name in ("control", "readers", "keys", "slots", "words", "masks")),
         *((name, "<i8") for name in ("used", "payload", "near", "session")),

@@ -25,7 +25,7 @@ from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand.handle import is_somewhere
-from hapticdb.kernels.period.loop import ALWAYS, DEVICE, KNOWN, NEVER
+from hapticdb.kernels.period.loop import DEVICE
 from hapticdb.kernels.records import pose_numbers, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
@@ -66,7 +66,6 @@ class LoopRequest:
     timing: Timing
     seconds: float
     staleness: float
-    is_waiting: bool
     has_baseline: bool = True
     is_recorded: bool = True
     budget_points: int | None = None
@@ -98,16 +97,12 @@ class Loop:
         )
         self.station.set_spring(request.coupling.spring())
         self.station.row["source"], self.station.row["is_running"] = DEVICE, True
-        if not request.is_waiting:
-            self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
-        else:  # cells that are there are used on
-            self.station.row["staleness"] = np.iinfo(np.int64).max
+        self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
         seats["is_recorded"] = request.is_recorded
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])
-        self._noted = self.station.record["noted"]
-        self._before = self.tool.copy()
+        self._is_frame = self.station.record["is_frame"]
         self._is_asked_to_end = seats[0, ...]["is_asked_to_end"]
         self.bad_reading: str | None = None
         self.is_warm = False
@@ -134,7 +129,7 @@ class Loop:
                 asked = 0
             if not asked:  # a person's hand has moved while the loop waited
                 self._place()
-                self._step(1e-3, NEVER)
+                self._step(1e-3)
                 asked = int(session["sequence"])
             time.sleep(1e-3)
         self._place()
@@ -171,7 +166,7 @@ class Loop:
             self.device.open()
         self._place()
         for _ in range(3):
-            self._step(1e-3, NEVER)
+            self._step(1e-3)
         self.session["told"]["is_active"] = False
         self.device.apply(np.zeros(6))
 
@@ -182,43 +177,16 @@ class Loop:
         taken = self._reading
         taken.pose[:], taken.velocity[:], taken.buttons[()] = reading
 
-    def _step(self, dt: float, noted: int, due: int = 0, begun: int | None = None) -> None:
+    def _step(
+        self, dt: float, due: int = 0, begun: int | None = None, *, is_frame: bool = False
+    ) -> None:
         """Run a period of `dt` s; `sent` then has the wrench for the device.
 
-        noted : whether it is a frame, see `kernels.period.loop`; due, begun : ns.
+        is_frame : whether it is noted and counted; due, begun : ns.
         """
-        self._noted[()] = noted
+        self._is_frame[()] = is_frame
         now = time.perf_counter_ns() if begun is None else begun
         self.stations.step(due, now, dt)
-
-    def _step_exactly(self, dt: float, ends: int, due: int, begun: int) -> None:
-        """Run a period of `dt` s once all cells that it needs are resident.
-
-        After the coupling's `hold` seconds of waiting no force is sent. The wait ends at `ends`
-        (ns), the end of the session. Without force the hand moves meanwhile, so its latest reading
-        is used.
-        """
-        clock = time.perf_counter_ns
-        holds = clock() + round(min(self.request.coupling.hold, 1e9) * 1e9)
-        is_let_go = False
-        sent = self.sent
-        self._before[()] = self.tool
-        self._step(dt, KNOWN, due, begun)
-        while sent.unknown:
-            is_over = clock() >= ends or self._is_left()
-            if not is_let_go and clock() > holds:
-                self.device.apply(np.zeros(6))
-                is_let_go = True
-            self.tool[()] = self._before  # a coupling's own state stays, as its kernel asks
-            if is_let_go:  # the force rises again from zero
-                self.tool["risen"] = 0.0
-            if not is_over:
-                time.sleep(2e-4)
-            if is_let_go:
-                self._take(self.reader.read())
-            self._step(dt, ALWAYS if is_over else KNOWN, due, begun)
-            if is_over:
-                break
 
     def _is_stopped(self) -> bool:
         return bool(self.table.cells.control[STOP]) or bool(self._is_asked_to_end)
@@ -238,15 +206,11 @@ class Loop:
         deadlines = Deadlines(round(1e9 / rate), self.lateness, self.elapsed)
         self.station.row["began"] = deadlines.started
         applied, x = self.sent.wrench, self.hand["position"][:1]
-        over = deadlines.started + round(request.seconds * 1e9)
         while deadlines.passed < n_deadlines:
             at = deadlines.frames
             begun = deadlines.wait()
             self._take(reader.read())
-            if request.is_waiting:
-                self._step_exactly(deadlines.dt, over, deadlines.due, begun)
-            else:
-                self._step(deadlines.dt, ALWAYS, deadlines.due, begun)
+            self._step(deadlines.dt, deadlines.due, begun, is_frame=True)
             device.apply(applied)
             if math.isnan(x.item()) and self.bad_reading is None:
                 self.bad_reading = reader.complaint() or None

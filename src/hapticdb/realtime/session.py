@@ -4,7 +4,7 @@ import os
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from typing import Literal, Self, get_args
+from typing import Self
 
 import numpy as np
 
@@ -28,7 +28,6 @@ from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
 
-Policy = Literal["hold", "wait"]
 RING_SECONDS = 4.0
 """Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
 loses no frame over longer pauses of this process, and takes more memory."""
@@ -74,12 +73,9 @@ class Session:
         device holds: see `coupling.lowered`. Under the tangent plane it gives caps alone.
     handle : Handle or None
         Mapping of the hand to the scene: scale and clutch.
-    policy : {"hold", "wait"}
-        For a frame whose cells are not resident. "hold": keep the last wrench for a moment, then
-        let it fall to zero. "wait": wait for the cells; the frame is exact, but late.
     staleness : float
         Seconds without an answer of the database after which all frames act as if all cells were
-        unknown. With the policy "wait", resident cells are used on.
+        unknown.
     budget_points : int or None
         Most points near something that a frame looks at; None: all. A frame with more looks at
         one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has
@@ -124,7 +120,6 @@ class Session:
         law: ForceLaw | LawName | None = None,
         coupling: Coupling | None = None,
         handle: Handle | None = None,
-        policy: Policy = "hold",
         staleness: float = DEFAULT_STALENESS,
         budget_points: int | None = None,
         record: str | os.PathLike[str] | None = None,
@@ -136,7 +131,7 @@ class Session:
         has_baseline: bool = True,
     ) -> None:
         check_device(device)
-        _check_choices(rate, seconds, staleness, policy)
+        _check_choices(rate, seconds, staleness)
         self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
         self.timing = Timing(rate, is_fifo, processor)
@@ -165,7 +160,7 @@ class Session:
                 replace=replace_recording,
             )  # fmt: skip
         try:
-            self._begin(device, policy, staleness, seconds)
+            self._begin(device, staleness, seconds)
         except BaseException:
             try:
                 self.close()
@@ -203,7 +198,6 @@ class Session:
     def _begin(
         self,
         device: Device,
-        policy: Policy,
         staleness: float,
         seconds: float | None,
     ) -> None:
@@ -230,7 +224,6 @@ class Session:
             timing=self.timing,
             seconds=FOREVER if seconds is None else seconds,
             staleness=staleness,
-            is_waiting=policy == "wait",
             has_baseline=self._has_baseline,
             is_recorded=self._recording is not None,
             budget_points=self.budget_points,
@@ -435,12 +428,10 @@ class Session:
             self._board = None
 
 
-def _check_choices(rate: float, seconds: float | None, staleness: float, policy: str) -> None:
+def _check_choices(rate: float, seconds: float | None, staleness: float) -> None:
     if not 10.0 <= rate <= 20_000.0:
         raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
     if seconds is not None and not 0.0 < seconds <= 1e6:
         raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
     if not staleness > 0.0:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
-    if policy not in get_args(Policy):
-        raise UsageError(f"policy {policy!r}: give 'hold' or 'wait'")

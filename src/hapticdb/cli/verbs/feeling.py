@@ -2,7 +2,7 @@
 
 import signal
 from collections.abc import Sequence
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -10,7 +10,7 @@ import hapticdb
 from hapticdb.cli import fitting, render, session_page
 from hapticdb.cli.choosing import Felt, felt_objects
 from hapticdb.cli.forces import ForceOptions
-from hapticdb.cli.hands import VENDORS, HandOptions
+from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import (
     BudgetOption,
     ConservativeOption,
@@ -34,7 +34,6 @@ if TYPE_CHECKING:
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.session import Session
 
-PolicyName = Literal["hold", "wait"]
 LOOK_EVERY = 0.25
 """Seconds between two looks at the session: how late is told that its recording has ended, or that
 the tool lies in an object."""
@@ -98,13 +97,6 @@ BudgetPointsOption = Annotated[
         help="Most points near something that a frame looks at; a frame with more looks at one "
         "in 2, 4, 8 ... of them, and the report says how many it left out.",
         show_default="all",
-    ),
-]
-PolicyOption = Annotated[
-    PolicyName,
-    typer.Option(
-        help="What a frame does whose cells are not in memory yet: it holds the force for 20 ms "
-        "and lets it fall, or it waits."
     ),
 ]
 DeviceStiffnessOption = Annotated[
@@ -175,7 +167,6 @@ def feel(
     record_limit: RecordLimitOption = None,
     budget: BudgetOption = 256.0,
     budget_points: BudgetPointsOption = None,
-    policy: PolicyOption = "hold",
     law: LawOption = None,
     conservative: ConservativeOption = False,
     stiffness: DeviceStiffnessOption = None,
@@ -195,7 +186,7 @@ def feel(
     """
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    drive = _begin_loop(law, processor, policy, device, budget_points)
+    drive = _begin_loop(law, processor, budget_points)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel", drive)
@@ -203,8 +194,8 @@ def feel(
         chosen, coupling = force.law_and_coupling(cells)
         shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = hapticdb.Session(
-            cells, shell, hand, rate=rate, seconds=seconds, policy=policy, handle=handle,
-            law=chosen, coupling=coupling, budget_points=budget_points, processor=processor,
+            cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
+            coupling=coupling, budget_points=budget_points, processor=processor,
             record=record, append_recording=append, replace_recording=replace,
             record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
         )  # fmt: skip
@@ -236,13 +227,7 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
     return limit_bytes
 
 
-def _begin_loop(
-    law: LawName | None,
-    processor: int | None,
-    policy: PolicyName,
-    device: str,
-    budget_points: int | None,
-) -> str:
+def _begin_loop(law: LawName | None, processor: int | None, budget_points: int | None) -> str:
     """Refuse what the loop cannot do; have its processes load kernels while this one does.
 
     Returns the purpose of the kernels of the law.
@@ -253,8 +238,6 @@ def _begin_loop(
 
     checked_budget(budget_points)
     Timing(processor=processor)
-    if device in VENDORS and policy == "wait":
-        raise UsageError(f"--policy wait: a real hand, {device}, cannot wait; leave it out")
     drive = "direct" if law == "plane" else "coupling"
     prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
     return drive

@@ -4,8 +4,8 @@ A frame within the budget is that of the flat loop, bit for bit. A frame beyond 
 each 2, 4, 8 ... points of the runs near something (`sleeping`). Which points these are depends on
 the runs that are near, so it must not depend on what is in memory. An unknown cell counts as
 occupied, and would make runs near that are not. So a frame beyond its budget that has a listed run
-beside an unknown cell counts that run as an unknown point: the loop holds the frame or waits, and a
-replay leaves it out. Every frame that is compared has the same points in a session and in a replay.
+beside an unknown cell counts that run as an unknown point: the loop holds the frame, and a replay
+leaves it out. Every frame that is compared has the same points in a session and in a replay.
 """
 
 from typing import NamedTuple

@@ -58,8 +58,6 @@ from hapticdb.kernels.rigid import is_rigid, pose_of_quaternion
 GIVEN, BOARD, DEVICE = 0, 1, 2
 """Sources of a session's hand: the caller has written it; it arrives on the board; a device's
 reading is beside."""
-NEVER, KNOWN, ALWAYS = 0, 1, 2
-"""Which periods are frames, noted and counted: none; those without unknown cells; all."""
 TELL_EVERY_NS = 900_000
 """Nanoseconds between two reports of the tool's place. Larger: cells are requested later. Smaller:
 the loop computes more."""
@@ -177,14 +175,13 @@ def _run_period(law, station, seat, ring, pace):
         follow_reading(station.handle, reading.pose, reading.velocity, reading.buttons, hand)
     hand.is_stale = begun - heartbeat > station.staleness
     row, n_touching = _move(law, station, seat, shell, place, pace.dt, memory)
-    is_frame = station.noted == ALWAYS or (station.noted == KNOWN and sent.unknown == 0)
-    if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not is_frame:
+    if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not station.is_frame:
         station.told_at = begun
         tell(
             session, hand, station.is_let_go, memory.pose, shell.center, spring_of(station).radius,
             memory.missed,
         )  # fmt: skip
-    if not is_frame:
+    if not station.is_frame:
         return
     if begun - station.looked_at >= ASK_EVERY_NS:
         station.looked_at = begun

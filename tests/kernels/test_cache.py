@@ -6,6 +6,7 @@ import tempfile
 from collections.abc import Callable
 from pathlib import Path
 
+import numba
 import pytest
 
 from children import finished
@@ -101,3 +102,18 @@ def test_a_process_without_a_folder_says_so_in_a_line_and_removes_its_own(folder
     assert not Path(own).exists()
     assert done.stderr.startswith(f"hapticdb: compiled kernels are not kept in {folders}/cache/")
     assert done.stderr.count("\n") == 1
+
+
+LOADED = """
+import sys
+from hapticdb.kernels.compiling import load
+load(["rigid.first_not_rigid"])
+print("numba.np.linalg" in sys.modules)
+"""
+
+
+@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without JIT none is on disk")
+def test_a_kernel_on_disk_is_loaded_without_what_numba_compiles_with() -> None:
+    """Else each process would start half a second later."""
+    first, second = (finished([sys.executable, "-c", LOADED], check=True) for _ in range(2))
+    assert (first.stdout.strip(), second.stdout.strip()) == ("True", "False")

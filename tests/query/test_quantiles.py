@@ -10,11 +10,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.optimize import nnls
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
-from hapticdb.query.calibration import calibrate
+from hapticdb.query.calibration import _non_negative, calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import MAX_RESOLUTION, QuantileVector
@@ -113,6 +114,20 @@ def test_calibrated_figures_are_finite_and_not_negative(scene: Environment) -> N
     size = scene.size()
     assert model.rows_per_block == size.rows / size.leaf_blocks
     assert set(model.spread) <= set(vars(model))
+
+
+def test_figures_that_may_not_be_negative_are_fitted_as_scipy_fits_them() -> None:
+    rng = np.random.default_rng(4)
+    n_zero = 0
+    for _ in range(50):
+        design = rng.normal(size=(rng.integers(3, 40), 3))
+        wanted = design @ rng.normal(size=3) + rng.normal(size=len(design))
+        figures, left = _non_negative(design, wanted)
+        expected, expected_left = nnls(design, wanted)
+        np.testing.assert_allclose(figures, expected, atol=1e-12)
+        assert left == pytest.approx(expected_left)
+        n_zero += int((figures == 0.0).any())
+    assert n_zero > 10
 
 
 def test_cold_figures_are_measured_from_the_disk(scene: Environment) -> None:

@@ -61,12 +61,12 @@ class ForceOptions:
             raise UsageError(without_distances(cells.url))
         return self._law_and_coupling()
 
-    def inset(self, cells: "ResidentCells") -> float:
-        """How far a tool is drawn inward on those cells, metres."""
+    def inset(self, voxel_size: float) -> float:
+        """How far a tool is drawn inward among voxels of that size; metres."""
         from hapticdb.query.law import inset_of
 
         law = self.law_name or "smooth"
-        return 0.0 if self.is_conservative else inset_of(cells.grid.voxel_size, law)
+        return 0.0 if self.is_conservative else inset_of(voxel_size, law)
 
     def tell_lowered(self, session: "Session") -> None:
         """Tell in one line by what a stiffness that was asked for is lowered."""

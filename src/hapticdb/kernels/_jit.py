@@ -15,6 +15,7 @@ from typing import Any
 import numba
 from numba import config, types
 from numba.core.caching import FunctionCache
+from numba.core.runtime import rtsys
 from numba.core.sigutils import normalize_signature
 from numba.extending import overload
 from numba.np.numpy_support import from_dtype
@@ -71,12 +72,21 @@ def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
 class _Cache(FunctionCache):  # type: ignore[misc]
     """Machine code on disk of one entry.
 
+    What is loaded needs none of what numba compiles with, half a second of imports: a process that
+    has all its kernels on disk goes without.
+
     Machine code for a NamedTuple from outside this package stays in memory. The file that
     lists an entry's machine code names such types by their module, and a process that cannot
     import one of them could read nothing of that file.
     """
 
-    def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - numba's types
+    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401 - numba's types
+        """Load the machine code of a signature; None if it is not on disk."""
+        rtsys.initialize(target_context)
+        with self._guard_against_spurious_io_errors():
+            return self._load_overload(sig, target_context)
+
+    def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - likewise
         """Store the machine code, unless it is for types from outside this package."""
         given, _ = normalize_signature(sig)
         classes = [getattr(kind, "instance_class", None) for kind in given]

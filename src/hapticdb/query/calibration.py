@@ -4,9 +4,11 @@ import statistics
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.query import contact, grouping
@@ -15,6 +17,8 @@ from hapticdb.query.cost_model import CostModel
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Keys, Store, SupportsCaches, row_shift
+
+Floats = NDArray[np.float64]
 
 CAUTIONS = tuple(2.0**n for n in range(-2, 8))
 """Candidate values of `CostModel.caution`; the one with the least cost is used."""
@@ -199,17 +203,31 @@ def _least_squares(
 
     Rows are weighted by 1 / time, so that relative errors are minimised.
     """
-    from scipy.optimize import nnls  # noqa: PLC0415 - half of the package's import time
-
     table = np.array(measured, dtype=np.float64)
     design, times = table[:, :-1], table[:, -1]
     weights = 1 / times
     weighted = design * weights[:, None]
-    figures, residual = nnls(weighted, np.ones(len(times)))
+    figures, residual = _non_negative(weighted, np.ones(len(times)))
     freedom = max(len(times) - design.shape[1], 1)
     covariance = np.linalg.pinv(weighted.T @ weighted) * residual**2 / freedom
     errors = np.sqrt(np.diag(covariance)) / np.where(figures > 0, figures, np.inf)
     return tuple(map(float, figures)), tuple(map(float, errors))
+
+
+def _non_negative(design: Floats, wanted: Floats) -> tuple[Floats, float]:
+    """Figures >= 0 that fit best, and the length of what is left over.
+
+    They are the best of all choices of columns whose own fit has no figure below 0. To load the
+    function for that, ``scipy.optimize``, takes as long as all timings.
+    """
+    best, least = np.zeros(design.shape[1]), float(np.linalg.norm(wanted))
+    for chosen in product((False, True), repeat=design.shape[1]):
+        figures = np.zeros(design.shape[1])
+        figures[list(chosen)] = np.linalg.lstsq(design[:, chosen], wanted, rcond=None)[0]
+        residual = float(np.linalg.norm(design @ figures - wanted))
+        if figures.min() >= 0.0 and residual < least:
+            best, least = figures, residual
+    return best, least
 
 
 def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:

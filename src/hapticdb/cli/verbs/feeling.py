@@ -28,6 +28,7 @@ from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import compile_for, shell_of
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
+from hapticdb.realtime.fork_server import prepare
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
@@ -184,15 +185,16 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
+    drive = _begin_loop(law, processor, budget_points)
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    drive = _begin_loop(law, processor, budget_points)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel", drive)
-    with force.cells(url, budget_bytes(budget), _felt(url, where, exclude)) as cells:
+    felt, voxel_size = _looked_at(url, where, exclude)
+    shell = _shell(tool, tool_unit, points, seed, device, force.inset(voxel_size))
+    with force.cells(url, budget_bytes(budget), felt) as cells:
         chosen, coupling = force.law_and_coupling(cells)
-        shell = _shell(tool, tool_unit, points, seed, device, force.inset(cells))
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
             coupling=coupling, budget_points=budget_points, processor=processor,
@@ -228,27 +230,27 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
 
 
 def _begin_loop(law: LawName | None, processor: int | None, budget_points: int | None) -> str:
-    """Refuse what the loop cannot do; have its processes load kernels while this one does.
+    """Have what forks the processes load kernels while the tool is sampled here.
 
-    Returns the purpose of the kernels of the law.
+    It also refuses what the loop cannot do. Returns the purpose of the kernels of the law.
     """
+    drive = "direct" if law == "plane" else "coupling"
+    prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
+
     from hapticdb.pointshell.shell import checked_budget
     from hapticdb.realtime.deadlines import Timing
-    from hapticdb.realtime.fork_server import prepare
 
     checked_budget(budget_points)
     Timing(processor=processor)
-    drive = "direct" if law == "plane" else "coupling"
-    prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
     return drive
 
 
-def _felt(url: str, where: Sequence[str] | None, exclude: Sequence[str] | None) -> Felt:
-    """Words of the options, checked before a process is started."""
-    if not where and not exclude:
-        return Felt([], [], [])
+def _looked_at(
+    url: str, where: Sequence[str] | None, exclude: Sequence[str] | None
+) -> tuple[Felt, float]:
+    """Words of the options, checked before a process is started, and the edge of a voxel, m."""
     with hapticdb.open(url, read_only=True) as env:
-        return felt_objects(env, where, exclude)
+        return felt_objects(env, where, exclude), env.grid.voxel_size
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:

@@ -83,7 +83,7 @@ def test_the_postgresql_page_gives_the_settings_that_are_set() -> None:
 
 def test_the_docs_show_the_sql_that_runs() -> None:
     shown = SHOWN.findall((ROOT / "docs" / "query.md").read_text())
-    assert len(shown) == 9
+    assert len(shown) == 8
     for module, constant, layout, text in shown:
         runs = getattr(CODE[module], constant)[layout]
         assert text.split() == runs.split()

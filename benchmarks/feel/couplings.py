@@ -38,13 +38,12 @@ class Terms:
     """Terms of a session.
 
     stiffness, N/m, at the device; rate: periods a second; delay: seconds from sending a force until
-    it acts; scale: metres of the scene for one metre of the device.
+    it acts.
     """
 
     stiffness: float = STIFFNESS
     rate: float = RATE
     delay: float = 0.0
-    scale: float = 1.0
 
 
 class SmoothHand:
@@ -61,19 +60,19 @@ class SmoothHand:
             ground.residency.grid, held_tool(shell, ground.size, sleeps=False),
         )  # fmt: skip
         self._hand, self._sent = self._station.servo["hand"], self._station.servo["sent"]
-        self._handle = Handle(scale=terms.scale)
+        self._handle = Handle()
         self._period = 1.0 / terms.rate
         self._handle.start(Reading(pose, np.zeros(6), 0), self._hand)
         self._station.rest_at(pose_numbers(self._hand).copy())
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
-        lever = max(reach, ground.size) / terms.scale
+        lever = max(reach, ground.size)
         self._spring = DeviceSpring(
             stiffness=terms.stiffness,
             turn_stiffness=terms.stiffness * lever**2,
             cap=CAP,
             turn_cap=CAP * lever,
             damping=terms.stiffness * (0.5 / terms.rate + terms.delay),
-            scale=terms.scale,
+            scale=1.0,
             radius=reach,
             hold=0.02,
             fade=0.02,

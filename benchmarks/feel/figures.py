@@ -1,4 +1,4 @@
-"""Figures of a force over time or along a way: ripple, steps, overshoot, limit cycles, energy."""
+"""Figures of a force over time or along a way: ripple, steps, overshoot, limit cycles."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -51,14 +51,3 @@ def is_limit_cycle(values: ArrayLike, window: int) -> bool:
         return True
     before, last = np.ptp(array[-2 * window : -window]), np.ptp(array[-window:])
     return bool(last > CYCLE_N and last > CYCLE_SHARE * before)
-
-
-def energy_given(forces: ArrayLike, positions: ArrayLike) -> float:
-    """Energy that the device gives to the hand on a way, J; a passive wall gives less than 0.
-
-    forces (M, 3): sent at the end of each period, and held over the next one; positions (M, 3):
-    where the hand is when each force is sent.
-    """
-    force = np.asarray(forces, dtype=np.float64)
-    ways = np.diff(np.asarray(positions, dtype=np.float64), axis=0)
-    return float(np.sum(force[:-1] * ways))

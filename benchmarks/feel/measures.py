@@ -8,7 +8,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
-from page_tables import NONE, listed, table
+from page_tables import NONE, table
 
 Cell = Mapping[str, Any]
 LAWS = ("plane", "smooth")
@@ -21,8 +21,7 @@ class Measure:
 
     title : what is measured, with the cases that its values stand for; wanted : in words; limits :
     of each value, or one for all of them; none where nothing is demanded; unit : after the values;
-    percent : whether values are shares, shown as percentages; is_floor : whether limits are least
-    values.
+    percent : whether values are shares, shown as percentages.
     """
 
     title: str
@@ -30,15 +29,12 @@ class Measure:
     limits: Sequence[float] = ()
     unit: str = "N"
     percent: bool = False
-    is_floor: bool = False
 
     def missed(self, cell: Cell) -> bool:
         """Whether a cell has a value beyond its limit."""
         values = cell["values"]
         limits = list(self.limits) * (len(values) if len(self.limits) == 1 else 1)
         pairs = list(zip(values, limits, strict=True)) if limits else []
-        if self.is_floor:
-            return not all(value >= limit for value, limit in pairs)
         return not all(value <= limit for value, limit in pairs)
 
     def text(self, cell: Cell | None) -> str:
@@ -93,17 +89,8 @@ MEASURES: Mapping[str, Measure] = {
         (0.20, math.inf),
         percent=True,
     ),
-    "session_scale": Measure(
-        "session: difference at scale 0.1 to 100", "<= 1e-4 %", (1e-6,), percent=True
-    ),
-    "session_lift": Measure(
-        "session: least normal force at lift-off, 0.2 m/s", ">= 0 N", (0.0,), is_floor=True
-    ),
     "session_enter": Measure(
         "session: largest step a millisecond, entering at 10 mm/s", "<= 0.05 N", (0.05,)
-    ),
-    "session_energy": Measure(
-        "session: energy of a press and release, share of its bound", "<= 1", (1.0,), unit=""
     ),
     "tap": Measure("tap at 0.3 m/s, firm grip: overshoot", "<= 25 %", (0.25,), percent=True),
     "period": Measure(
@@ -123,19 +110,18 @@ def table_of(cells: Sequence[Cell]) -> str:
     rows = [
         [one.title, *(one.text(found.get((key, law))) for law in LAWS), one.wanted]
         for key, one in MEASURES.items()
+        if any(measure == key for measure, _ in found)
     ]
     return table(["measure", "plane, direct", "smooth", "wanted"], rows)
 
 
 def walls_of(cells: Sequence[Cell]) -> str:
-    """The stiffest walls of the smooth law: a line for each grip, rate and delay."""
+    """The stiffest walls of the smooth law, N/m: a line for each grip and rate, by the delay."""
     (found,) = [cell for cell in cells if cell["measure"] == "z_width"]
-    return listed(
-        found["cases"],
-        {
-            "grip": lambda case: case["grip"],
-            "rate, Hz": lambda case: f"{case['rate']:,.0f}",
-            "delay, ms": lambda case: f"{1e3 * case['delay']:g}",
-            "stiffest wall, N/m": lambda case: number_text(case["stiffness"]),
-        },
-    )
+    rows: dict[tuple[str, float], list[str]] = {}
+    for case in found["cases"]:
+        row = rows.setdefault((case["grip"], case["rate"]), [])
+        row.append(number_text(case["stiffness"]))
+    delays = sorted({1e3 * case["delay"] for case in found["cases"]})
+    head = ["grip, rate", *(f"delay {delay:g} ms" for delay in delays)]
+    return table(head, [[f"{g}, {rate:,.0f} Hz", *row] for (g, rate), row in rows.items()])

@@ -1,4 +1,4 @@
-"""Sessions whose hand is led: ripple, force, steps, an edge, scale, lift-off, energy, time."""
+"""Sessions whose hand is led: ripple, force, steps, an edge, time."""
 
 import time
 from pathlib import Path
@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from feel.couplings import RATE, STIFFNESS, Drive, SmoothHand, Terms, drive, posed, straight
-from feel.figures import energy_given, largest_step, ripple
+from feel.figures import largest_step, ripple
 from feel.ground import Ground
 from feel.scenes import Scene, convex_edge, plane, planes, slope_axes
 from feel.tools import ball, flat_tool
@@ -37,8 +37,6 @@ EDGE_DEPTHS = (0.4, 0.8)
 """Depths of the hand round the convex edge, voxels below the onset. At d the force k d turns with
 the hand, whose way has the radius 1.5 s - d: 0.1 mm of it change the force by k d 0.1 mm / (1.5 s -
 d), which passes 0.05 N at d = s / 2 for every voxel size s, and ends in a corner at 1.5 s."""
-SCALES = (0.1, 1.0, 10.0, 100.0)
-"""Metres of the scene for one metre of the device; the scenes are as many times as large."""
 
 
 class Stand(NamedTuple):
@@ -226,59 +224,6 @@ def round_edge(
 def point_tool(axes: Floats) -> PointShell:
     """A tool of one point, its inside at a scene's +z."""
     return PointShell(np.zeros((1, 3)), axes[:, 2][None], np.zeros(3), is_closed=False)
-
-
-# --- scale, lift-off, energy ----------------------------------------------------------------------
-
-
-def scales_of_sessions(folder: Path) -> dict[str, Any]:
-    """Greatest relative difference of the device's force at `SCALES` from that at scale 1."""
-    found = {}
-    for scale in SCALES:
-        scene = plane("20 degrees", slope_axes(20.0))
-        size = SIZE * scale
-        with Ground.of_scenes(folder, [scene], size, distances=True) as ground:
-            stand = stand_on(ground, scene)
-            device = Stand(stand.onset / scale, stand.axes)
-            shell = flat_tool(3, size, scene.axes)
-            terms = Terms(scale=scale)
-            hand = SmoothHand(ground, shell, posed(device.at(-ABOVE)), terms)
-            down = straight(device.at(-ABOVE), device.at(0.010), SPEED)
-            along = straight(device.at(0.010), device.at(0.010, SLIDE), SPEED)
-            path = np.concatenate([down, along[1:]])
-            found[scale] = drive(hand, path).forces
-    largest = float(np.linalg.norm(found[1.0], axis=1).max())
-    worst = {
-        scale: float(np.linalg.norm(forces - found[1.0], axis=1).max()) / largest
-        for scale, forces in found.items()
-    }
-    return {"values": [max(worst.values())], "cases": worst}
-
-
-def lift_and_press(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Least normal force at lift-off with 0.2 m/s, and energy of a press-and-release.
-
-    The energy is a share of its bound K (T/2) times the integral of v^2 dt in contact.
-    """
-    scene = plane("20 degrees", slope_axes(20.0))
-    with Ground.of_scenes(folder, [scene], SIZE, distances=True) as ground:
-        stand = stand_on(ground, scene)
-        shell = flat_tool(3, SIZE, scene.axes)
-        hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
-        drive(hand, straight(stand.at(-ABOVE), stand.at(0.005), SPEED))
-        drive(hand, np.repeat(stand.at(0.005)[None], 100, axis=0))
-        lifted = drive(hand, straight(stand.at(0.005), stand.at(-0.04), 0.2))
-        least = float(normal_force(lifted, stand.normal).min())
-        hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
-        times = np.arange(0.0, 0.5, 1.0 / RATE)
-        depths = 0.0015 - 0.0035 * np.cos(2.0 * np.pi * times / 0.5)
-        way = drive(hand, np.array([stand.at(depth) for depth in depths]))
-    given = energy_given(way.forces, way.positions)
-    touching = np.linalg.norm(way.forces[:-1], axis=1) > 0.0
-    squares = (np.diff(depths)[touching] * RATE) ** 2
-    bound = STIFFNESS * 0.5 / RATE * float(squares.sum()) / RATE
-    share = given / bound if bound > 0.0 else 0.0
-    return {"values": [least]}, {"values": [share], "joules": given, "bound": bound}
 
 
 # --- computing time -------------------------------------------------------------------------------

@@ -49,11 +49,11 @@ figures realtime feel paths clashes: export HAPTICDB_TEST_DATA ?= $(wildcard ../
 figures: $(READY)
 	$(BIN)/python benchmarks/figures.py $(ARGS)
 
-# its chapter on 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk
+# its growth from 1.4 million to 1.4 billion voxels: five minutes, 10 GB of disk
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py $(ARGS)
 
-# docs/realtime.md: frames in memory beside a dense bitmap, sessions beside an empty loop: five minutes
+# docs/realtime.md: frames in memory beside a dense bitmap, sessions beside an empty loop: four minutes
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
 
@@ -61,10 +61,9 @@ realtime: $(READY)
 feel: $(READY)
 	$(BIN)/python benchmarks/feeling.py $(ARGS)
 
-# docs/query.md, poses a second beside python-fcl, coal and Open3D, and large tools beside the flat loop: a quarter of an hour
+# the evaluation's speed: poses beside python-fcl, coal and Open3D: five minutes
 paths: $(READY) .venv/figures
 	$(BIN)/python benchmarks/batches.py $(ARGS)
-	$(BIN)/python benchmarks/large_shells.py $(ARGS)
 
 # docs/clashes.md: every pair of 4,284 parts
 clashes: $(READY)

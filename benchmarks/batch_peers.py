@@ -13,11 +13,9 @@ from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
 Mesh = tuple[Floats, NDArray[np.int64]]
-
+"""Vertices (V, 3), metres, and faces (F, 3)."""
 MM = 1e3
 """python-fcl and coal are asked in millimetres: in metres they are wrong for small triangles."""
-"""Vertices (V, 3), metres, and faces (F, 3)."""
-
 POINTS_AT_ONCE = 1 << 20
 """Points in one question to Open3D."""
 INSTALL = "not measured: pip install --no-deps -r requirements/figures.txt"

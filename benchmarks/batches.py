@@ -32,6 +32,7 @@ from hapticdb.batches.feeler import Feeler
 from hapticdb.mesh import read_file
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
+from paper.tables import speed
 from slide_paths import write_along
 
 Floats = NDArray[np.float64]
@@ -58,7 +59,6 @@ ROUNDS = 3
 """Turns of each side. The result is the median of its rates."""
 OWN, OWN_ONE = "hapticdb", "hapticdb, one thread"
 FORCE, FORCE_ONE = "hapticdb, with force", "hapticdb, with force, one thread"
-ALL_OWN = frozenset({OWN, OWN_ONE, FORCE, FORCE_ONE})
 
 Answers = NDArray[Any]
 Side = Callable[[Floats], Answers]
@@ -106,13 +106,11 @@ def poses_by_situation(
     return {name: poses[which][:most] for name, which in chosen.items()}
 
 
-def turn(side: Side, poses: Floats, n_poses: int) -> tuple[float, float, Answers]:
-    """Poses a second of wall time and of processor time, and the answers, of one turn."""
-    part = poses[:n_poses]
-    wall, busy = time.perf_counter(), time.process_time()
+def turn(side: Side, poses: Floats, n_poses: int) -> tuple[float, Answers]:
+    """Poses a second of wall time, and the answers, of one turn."""
+    part, began = poses[:n_poses], time.perf_counter()
     answers = side(part)
-    busy, wall = time.process_time() - busy, time.perf_counter() - wall
-    return n_poses / wall, n_poses / max(busy, 1e-9), answers
+    return n_poses / (time.perf_counter() - began), answers
 
 
 def poses_for(side: Side, poses: Floats, seconds: float) -> int:
@@ -120,7 +118,7 @@ def poses_for(side: Side, poses: Floats, seconds: float) -> int:
     n_poses = min(FIRST_POSES, len(poses))
     side(poses[:n_poses])
     while n_poses < len(poses):
-        rate, _, _ = turn(side, poses, n_poses)
+        rate, _ = turn(side, poses, n_poses)
         if n_poses / rate >= 0.5 * seconds:
             break
         n_poses = min(2 * n_poses, len(poses))
@@ -133,28 +131,21 @@ def compare(
 ) -> dict[str, Any]:
     """Rates of all sides, in turns, and how far each agrees with hapticdb."""
     counts = {name: poses_for(side, poses, seconds) for name, side in sides.items()}
-    rates: dict[str, list[tuple[float, float]]] = {name: [] for name in sides}
+    rates: dict[str, list[float]] = {name: [] for name in sides}
     answers: dict[str, Answers] = {}
     for _ in range(ROUNDS):
         for name, side in sides.items():
-            wall, busy, answers[name] = turn(side, poses, counts[name])
-            rates[name].append((wall, busy))
+            rate, answers[name] = turn(side, poses, counts[name])
+            rates[name].append(rate)
     cells = {}
-    for name, pairs in rates.items():
-        wall, busy = np.median(np.array(pairs), axis=0).tolist()
+    for name, found in rates.items():
         n_both = min(counts[name], counts[OWN])
         cells[name] = {
             "poses": counts[name],
-            "poses_per_s": wall,
-            "poses_per_processor_s": busy,
+            "poses_per_s": float(np.median(found)),
             "agree": agree(answers[OWN][:n_both], answers[name][:n_both]),
         }
-    best = max((c["poses_per_s"] for n, c in cells.items() if n not in ALL_OWN), default=0.0)
-    return {
-        "sides": cells,
-        "times_best_peer": cells[OWN]["poses_per_s"] / best if best else None,
-        "times_best_peer_one_thread": cells[OWN_ONE]["poses_per_s"] / best if best else None,
-    }
+    return {"sides": cells}
 
 
 def measure_tool(
@@ -252,20 +243,20 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
 
 
 def main() -> None:
-    """Measure, and fill the table of docs/query.md."""
+    """Measure, and fill the table of docs/evaluation.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="short turns, into results-quick/")
     given = parser.parse_args()
     out = Path("results-quick" if given.quick else "results")
     real = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), MODEL)
     model = real if real.is_file() else None
-    settings = Settings(0.1, 256, POINTS[:2]) if given.quick else Settings(2.0)
+    settings = Settings(0.1, 256, POINTS[:2]) if given.quick else Settings(0.4)
     with tempfile.TemporaryDirectory(prefix="hapticdb-batches-") as folder:
         found = measure(Path(folder), model, BITS, settings)
     records.write(out, {"batches": found})
-    print(page_tables.batch_ratios({"batches": found}), *found["notes"], sep="\n")
+    print(speed({"batches": found}), *found["notes"], sep="\n")
     if not given.quick:
-        page_tables.refill("docs/query.md", out)
+        page_tables.refill("docs/evaluation.md", out)
 
 
 if __name__ == "__main__":

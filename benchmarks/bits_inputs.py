@@ -24,9 +24,6 @@ Layout = Literal["brick", "voxel"]
 CAR = Path("demo_vintage_car", "vintage_car.glb")
 """The car's file, below the folder that HAPTICDB_TEST_DATA names."""
 GRID = hapticdb.GridOptions(bits=11, extent=1.6)
-HAS_WISH = "distances" in hapticdb.ImportOptions.__dataclass_fields__
-WITHOUT_DISTANCES: dict[str, Any] = {"distances": False} if HAS_WISH else {}
-"""Commits from before distances have no such option."""
 N_POINTS, SEED = 300, 13
 ON_PATH, ANYWHERE = 0.1, 0.1
 """Shares of poses on the sample's path and anywhere in the grid; the others are at surfaces."""
@@ -82,7 +79,7 @@ def import_car(folder: Path) -> list[Place]:
     def place_of(url: str, layout: Layout) -> Place:
         if not done.exists():
             file = Path(os.environ["HAPTICDB_TEST_DATA"]) / CAR
-            options = hapticdb.ImportOptions(grid=GRID, layout=layout, **WITHOUT_DISTANCES)
+            options = hapticdb.ImportOptions(grid=GRID, layout=layout, distances=False)
             (report,) = hapticdb.import_files(url, [file], options)
             if report.error is not None:
                 raise report.error

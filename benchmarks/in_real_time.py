@@ -4,8 +4,8 @@
     make realtime ARGS=--quick                 # short sessions, into results-quick/
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
-same poses, and so do both laws. Sessions: `hapticdb feel` as a user runs it, on SQLite and on a
-private server. Edits: the time until a session feels a commit of another process.
+same poses, and so do the smooth law and a budget of points. Sessions: `hapticdb feel` as a user
+runs it, on SQLite and on a private server. Edits: how soon a session feels another one's commit.
 """
 
 import argparse
@@ -34,7 +34,7 @@ from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
 from hapticdb.poses import read_poses, write_poses
-from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
+from hapticdb.query.law import DistanceField
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -47,43 +47,57 @@ from slide_paths import write_along
 CAR = "demo_vintage_car/vintage_car.glb"
 EXTENT = 1.6
 """Edge of the grid as a multiple of the model's longest side."""
-ROUNDS = 15
+ROUNDS = 7
 """Number of timed passes over all poses; the result is their median."""
-RUNS = {"flat": 0, "clusters": None}
-"""Argument `run` of `ResidentFrames` (points of a cluster): 0 for none, None for the default."""
-LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
+BUDGET = 10_000
+"""Points near something that a frame with a budget looks at, at most."""
+WAYS: dict[str, dict[str, Any]] = {
+    "flat": {"run": 0},
+    "session": {"sleeps": None},
+    "budget": {"sleeps": None, "budget_points": BUDGET},
+}
+"""Options of `ResidentFrames`: no clusters; as a session has it; with a budget."""
+EXACT = ("dense", "flat", "session")
 RATES = (1000, 5000)
 """Frames a second of the sessions."""
 FRAMES = 1000
 """Poses of the path over a model."""
-LARGE = 100_000
-"""Number of points of the large shells."""
+SHELLS = ((300, 1000), (100_000, 200), (1_000_000, 50))
+"""Points of a shell, and poses of the path at which it is felt, one after another."""
+CELL_BYTES = 1 << 30
+"""Bytes for cells."""
 PATIENCE = 600.0
 """Seconds beyond its own duration after which a command is killed."""
 
 
 @dataclass(frozen=True)
 class Effort:
-    """Seconds of a session, edits that it feels, and bits of the grid on each axis."""
+    """Seconds of a session, edits that it feels, bits of the grid on each axis, sizes of shells."""
 
-    seconds: float = 60.0
-    edits: int = 60
+    seconds: float = 15.0
+    edits: int = 30
     bits: int = 11
+    shells: int = len(SHELLS)
 
 
-QUICK = Effort(2.0, 5, 8)
+QUICK = Effort(2.0, 5, 8, 1)
 SETTINGS = {"shared_buffers": "256MB"}
 
 
 def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]) -> dict[str, Any]:
-    """Medians, in us a frame, of the flat loop, clusters and the dense bitmap, in turns."""
-    with hapticdb.open(database, read_only=True) as env, CellTable.create() as table:
+    """Medians, in us a frame, of all ways and the dense bitmap, in turns; the smooth law's, too."""
+    with (
+        hapticdb.open(database, read_only=True) as env,
+        CellTable.create(CELL_BYTES, distances=True) as table,
+    ):
         residency = Residency(env.store, table)
-        frames = {name: ResidentFrames(residency, shell, run=run) for name, run in RUNS.items()}
-        frames["flat"].feel(poses)
+        frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
+        frames["smooth"] = ResidentFrames(residency, shell, DistanceField(), sleeps=None)
+        left_out = frames["budget"].feel(poses).left_out
+        frames["smooth"].feel(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]
-        times: dict[str, list[float]] = {"dense": [], **{name: [] for name in RUNS}}
+        times: dict[str, list[float]] = {"dense": [], **{name: [] for name in frames}}
         found: dict[str, NDArray[np.float64]] = {}
         with table.reading() as row, awake():
             for _ in range(ROUNDS + 1):
@@ -91,15 +105,8 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                     out = np.zeros((len(poses), RESULTS))
                     started = time.perf_counter()
                     if name == "dense":
-                        dense_feel(
-                            bitmap,
-                            first.clusters,
-                            poses,
-                            residency.place,
-                            first.law,
-                            first.hits,
-                            out,
-                        )
+                        place, hits = residency.place, first.hits
+                        dense_feel(bitmap, first.clusters, poses, place, first.law, hits, out)
                     else:
                         one = frames[name]
                         feel_kernel(
@@ -108,39 +115,17 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out
-        assert all(np.array_equal(out, found["dense"]) for out in found.values()), "bit for bit"
+        assert all(np.array_equal(found[name], found["dense"]) for name in EXACT), "bit for bit"
         medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
         return {
             "points": len(shell),
             "poses": len(poses),
             "hits": float(found["dense"][:, 6].mean()),
+            "frames_beyond_budget": int((left_out > 0).sum()),
             "cells": residency.writer.n_resident,
             "bitmap_mb": bitmap.nbytes / 1e6,
             "us_per_frame": medians,
-            "ratio": {name: medians[name] / medians["dense"] for name in RUNS},
-        }
-
-
-def measure_laws(database: Path, shell: PointShell, poses: NDArray[np.float64]) -> dict[str, Any]:
-    """Medians, in us a frame, of both laws over the same cells, in turns."""
-    with (
-        hapticdb.open(database, read_only=True) as env,
-        CellTable.create(distances=True) as table,
-        awake(),
-    ):
-        residency = Residency(env.store, table)
-        frames = {name: ResidentFrames(residency, shell, law) for name, law in LAWS.items()}
-        times: dict[str, list[float]] = {name: [] for name in LAWS}
-        for _ in range(ROUNDS + 1):
-            for name, spent in times.items():
-                started = time.perf_counter()
-                frames[name].feel(poses)
-                spent.append((time.perf_counter() - started) / len(poses) * 1e6)
-        medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
-        return {
-            "points": len(shell),
-            "us_per_frame": medians,
-            "ratio": medians["smooth"] / medians["plane"],
+            "ratio": {name: medians[name] / medians["dense"] for name in frames},
         }
 
 
@@ -173,7 +158,7 @@ def environments(folder: Path, model: Path, bits: int) -> Iterator[dict[str, str
 
 
 def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
-    """Measure frames, laws, sessions and edits; results as records for JSON."""
+    """Measure frames, sessions and edits; results as records for JSON."""
     sample = write_sample(folder)
     results = records.conditions() | {"seconds": effort.seconds}
     with environments(folder, model or sample.car, effort.bits) as urls:
@@ -186,12 +171,10 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
         poses = read_poses(path)
         round_trip = folder / "round_trip.csv"  # a loop without a jump back
         write_poses(round_trip, np.concatenate([poses, poses[::-1]]))
-        results |= {"frames": [], "laws": [], "sessions": [], "edits": []}
-        for points, step in ((300, 1), (LARGE, 20)):
+        results |= {"frames": [], "sessions": [], "edits": []}
+        for points, count in SHELLS[: effort.shells]:
             shell = PointShell.from_file(tool, points)
-            for kind, one in (("frames", measure_frames), ("laws", measure_laws)):
-                found = one(database, shell, poses[::step])
-                results[kind].append({"part": "wrench, sliding"} | found)
+            results["frames"].append(measure_frames(database, shell, poses[:count]))
         for engine, url in urls.items():
             for rate in RATES:
                 found = session(url, tool, round_trip, rate, effort.seconds)
@@ -201,7 +184,7 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
 
 
 def main() -> None:
-    """Measure, and fill the tables of docs/evaluation.md."""
+    """Measure, and fill the tables of docs/realtime.md."""
     parser = argparse.ArgumentParser(description=(__doc__ or "").partition("\n")[0])
     parser.add_argument("--quick", action="store_true", help="short sessions, a coarse sample")
     given = parser.parse_args()
@@ -212,11 +195,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory(prefix="hapticdb-realtime-") as folder:
         results = measure(Path(folder), model, QUICK if given.quick else Effort())
     records.write(out, {"realtime": results})
-    made = {"realtime": results}
-    for one in (page_tables.frames, page_tables.laws, page_tables.sessions, page_tables.edits):
-        print(one(made), end="\n\n")
     if not given.quick:
-        page_tables.refill("docs/evaluation.md", out)
+        page_tables.refill("docs/realtime.md", out)
 
 
 if __name__ == "__main__":

@@ -53,7 +53,6 @@ PACKAGES = ("numpy", "numba", "numba-cuda")
 REPEATS = 1000
 """Frames whose times are sorted."""
 SEARCHES = ("resident.first_hits.find_first_hits", "resident.clearance.cells_near")
-LAUNCHES = 64
 PATIENCE = 5.0
 """Seconds of the processors' frames of one shell, at most about."""
 
@@ -151,23 +150,7 @@ def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
         on_processor(feeler, one)
         cpu.append(time.perf_counter() - began)
     found = {"points": n_points, "equal": equality, "gpu": percentiles(times)}
-    return found | {"kernel_ms": kernel_time(gpu, poses[0]), "one_processor": percentiles(cpu)}
-
-
-def kernel_time(gpu: GpuFrames, pose: Floats) -> float:
-    """Milliseconds of a frame's kernel alone, or of its launch if that takes longer."""
-    gpu.feel(pose)
-    stream = gpu._stream  # noqa: SLF001 - measured
-    begin, end = cuda.event(), cuda.event()
-    begin.record(stream)
-    for _ in range(LAUNCHES):
-        gpu._one(  # noqa: SLF001
-            gpu._frames.law, gpu._frames.residency.place, gpu._shell,  # noqa: SLF001
-            tuple(pose[:3].ravel().tolist()), *gpu.mirror.arrays, gpu._sums, gpu._end, gpu._out,  # noqa: SLF001
-        )  # fmt: skip
-    end.record(stream)
-    end.synchronize()
-    return float(cuda.event_elapsed_time(begin, end) / LAUNCHES)
+    return found | {"one_processor": percentiles(cpu)}
 
 
 def batches_of(

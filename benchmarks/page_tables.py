@@ -43,12 +43,14 @@ def us_text(value: float | None) -> str:
     return f"{value:.1f}" if value >= 9.95 else f"{value:.2g}"
 
 
-def facts(found: Result) -> str:
-    """Commit, machine, versions and inputs of a result."""
-    said = [("commit", found["commit"])]
-    for part in ("machine", "versions", "inputs"):
-        said += found.get(part, {}).items()
-    return table(["", ""], [(key, f"{value}") for key, value in said])
+def facts(found: Result, *inputs: str) -> str:
+    """Commit, machine, versions and inputs of a result, or some of the inputs, a line each."""
+    lines = [f"- commit: {found['commit']}"]
+    for part in ("machine", "versions"):
+        said = ", ".join(f"{key} {value}" for key, value in found[part].items())
+        lines.append(f"- {part}: {said}")
+    about = found["inputs"]
+    return "\n".join([*lines, *(f"- {key}: {about[key]}" for key in inputs or about)])
 
 
 # --- in real time --------------------------------------------------------------------------------
@@ -82,28 +84,18 @@ def sessions(results: Results) -> str:
 
 def frames(results: Results) -> str:
     """Microseconds of the dense bitmap, and the others' times as multiples of it."""
+    heads = {"flat": "cells, flat loop", "session": "as a session", "budget": "with a budget"}
+    heads |= {"smooth": "smooth law"}
     return listed(
         results["realtime"]["frames"],
         {
-            "frame": lambda one: one["part"],
             "points": lambda one: f"{one['points']:,}",
-            "dense bitmap in memory, us": lambda one: f"{one['us_per_frame']['dense']:,.1f}",
-            "flat loop over cells": lambda one: f"{one['ratio']['flat']:.2f}",
-            "with clusters": lambda one: f"{one['ratio']['clusters']:.2f}",
-        },
-    )
-
-
-def laws(results: Results) -> str:
-    """Microseconds a frame under both laws, and their ratio."""
-    return listed(
-        results["realtime"]["laws"],
-        {
-            "frame": lambda one: one["part"],
-            "points": lambda one: f"{one['points']:,}",
-            "plane, us": lambda one: f"{one['us_per_frame']['plane']:,.1f}",
-            "smooth, us": lambda one: f"{one['us_per_frame']['smooth']:,.1f}",
-            "smooth / plane": lambda one: f"{one['ratio']:.2f}",
+            "hits": lambda one: f"{one['hits']:,.0f}",
+            "dense bitmap in memory, us": lambda one: us_text(one["us_per_frame"]["dense"]),
+            **{
+                head: lambda one, name=name: f"{one['ratio'][name]:.2f}"  # type: ignore[misc]
+                for name, head in heads.items()
+            },
         },
     )
 
@@ -123,40 +115,7 @@ def edits(results: Results) -> str:
     return table(head, rows)
 
 
-def large_shells(results: Results) -> str:
-    """Medians of the loops and p99 of the sleeping ones, without and with a budget, us."""
-
-    def within(one: Result, share: str) -> str:
-        return f"{one['us']['budget'][share]:,.0f}" if one["us"].get("budget") else NONE
-
-    return listed(
-        results["large_shells"]["lines"],
-        {
-            "points": lambda one: f"{one['points']:,}",
-            "near": lambda one: f"{100 * one['near_share']:.{int(one['near_share'] < 0.1)}f} %",
-            "law": lambda one: one["law"],
-            "flat, us": lambda one: f"{one['us']['flat']['p50']:,.0f}",
-            "sleeping, us": lambda one: f"{one['us']['sleeping']['p50']:,.0f}",
-            "p99": lambda one: f"{one['us']['sleeping']['p99']:,.0f}",
-            "of the flat loop": lambda one: f"{one['ratio']['sleeping']:.2f}",
-            "budget, us": lambda one: within(one, "p50"),
-            "budget, p99": lambda one: within(one, "p99"),
-        },
-    )
-
-
-# --- docs/query.md, docs/paths.md, docs/protocol.md -----------------------------------------------
-
-
-def batch_ratios(results: Results) -> str:
-    """How many times as many poses a second as the fastest of the others, of wall time."""
-    rows: dict[tuple[str, str], list[str]] = {}
-    for cell in results["batches"]["cells"]:
-        row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
-        for ratio in (cell["times_best_peer_one_thread"], cell["times_best_peer"]):
-            row.append(f"{ratio:.{0 if ratio >= 9.95 else 1}f}" if ratio else NONE)
-    head = ["tool is", "points", "touch, one thread", "all threads", "how far, one thread"]
-    return table([*head, "all threads"], [[*place, *row] for place, row in rows.items()])
+# --- others --------------------------------------------------------------------------------------
 
 
 def gpu_frames(results: Results) -> str:
@@ -216,27 +175,6 @@ def fits(results: Results) -> str:
     return table([*head, "on the axis, N", "beside it, N"], rows)
 
 
-def contact_proxies(results: Results) -> str:
-    """Round trips (median), ages (p50 / p99) and errors, with their shares of the force."""
-
-    def error(one: Result, kind: str, digits: int) -> str:
-        size = one["error"][kind]
-        return f"{size:.2f} ({100 * size / one['force'][kind]:.{digits}f} %)"
-
-    return listed(
-        results["contact_proxies"]["lines"],
-        {
-            "path": lambda one: one["path"],
-            "added, ms": lambda one: f"{1e3 * one['added']:.0f}",
-            "round trip, ms": lambda one: f"{1e3 * one['round_trip']:.1f}",
-            "age, ms": lambda one: " / ".join(f"{1e3 * one['age'][p]:.0f}" for p in ("p50", "p99")),
-            "RMS error, N": lambda one: error(one, "rms", 1),
-            "largest, N": lambda one: error(one, "max", 0),
-            "bytes": lambda one: f"{one['bytes']:.0f}",
-        },
-    )
-
-
 # --- pages ----------------------------------------------------------------------------------------
 
 
@@ -248,15 +186,11 @@ def tables() -> dict[str, Callable[[Results], str]]:
     return {
         "sessions": sessions,
         "frames": frames,
-        "laws": laws,
         "edits": edits,
-        "large-shells": large_shells,
-        "batch-ratios": batch_ratios,
         "gpu-frames": gpu_frames,
         "gpu-batches": gpu_batches,
         "ways-out": ways_out,
         "fits": fits,
-        "contact-proxies": contact_proxies,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),
         "feel-conditions": lambda results: facts(results["feel"]),

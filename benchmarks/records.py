@@ -29,13 +29,10 @@ def conditions() -> dict[str, Any]:
 
 
 def result(
-    name: str,
-    cells: Sequence[Mapping[str, Any]],
-    inputs: Mapping[str, Any],
-    notes: Sequence[str] = (),
+    name: str, cells: Sequence[Mapping[str, Any]], inputs: Mapping[str, Any]
 ) -> dict[str, Any]:
     """One experiment as its file holds it."""
-    about = {"inputs": dict(inputs), "notes": list(notes), "cells": list(cells)}
+    about = {"inputs": dict(inputs), "cells": list(cells)}
     return {"name": name} | conditions() | about
 
 

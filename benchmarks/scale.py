@@ -35,24 +35,18 @@ from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import find_binaries
 from paper.measure import Alternative, Cell, in_turns
 from paper.plots import draw
-from paper.subject import CURVES, PAPER_CACHE, limited
+from paper.subject import with_papers_cache
 from paper.workload import SEED, random_poses, slide_poses, sphere_shell
 from places import serving
 
 EXTENT = 1.6
 """Edge of one car's grid as a multiple of the car's longest side."""
 SETTINGS = {"shared_buffers": "4MB", "max_wal_size": "2GB"}
-STRATEGIES: tuple[Strategy, ...] = ("array", "cbgroup", "auto")
+STRATEGIES: tuple[Strategy, ...] = ("array", "cbgroup")
 ROUNDS = 5
 """Turns of every size: a short disturbance of the machine then affects all sizes alike."""
 LIMIT_S = 60.0
 """Seconds of frames that a strategy may take in one environment."""
-NOTES = (
-    "The sample car repeated by shifting keys; the smallest size is some of its objects.",
-    "Sliding poses go over the copy in the middle, random ones over all copies.",
-    "In every size of whole cars the shell meets the same surfaces, poses and hits are the same.",
-    "import_s is the time to write the copies and their statistics, without voxelizing.",
-)
 Poses = NDArray[np.float64]
 
 
@@ -86,7 +80,6 @@ class ScaleSize(NamedTuple):
         return {
             "environment": "sample",
             "layout": self.plan.source.layout,
-            "curve": CURVES[self.plan.grid.curve],
             "bits": self.plan.grid.bits,
             "copies": self.copies,
             "object_voxels": self.plan.voxels,
@@ -186,9 +179,9 @@ def measure(urls: Sequence[str], sizes: Sequence[ScaleSize]) -> list[Cell]:
         for url, size, stored in zip(urls, sizes, storage, strict=True):
             shell = sphere_shell(size.plan.grid.voxel_size)
             env = opened.enter_context(hapticdb.open(url, read_only=True))
-            limited(env, PAPER_CACHE)
+            with_papers_cache(env)
             env.calibrate(keep=False)
-            conditions = {"cache": "4 MB", "file": "cached", "shell": "sphere"}
+            conditions = {"file": "cached"}
             for kind, poses in size.parked_poses().items():
                 cell = stored | conditions | {"points": len(shell), "poses": kind}
                 runs.append(Run(env, shell, cell, poses))
@@ -210,7 +203,7 @@ def evaluate(folder: Path, effort: Effort) -> dict[str, Any]:
         "poses": f"{effort.poses} of each kind, seed {SEED}",
         "PostgreSQL": ", ".join(f"{name} = {value}" for name, value in SETTINGS.items()),
     }
-    return records.result("scale", cells, inputs, NOTES)
+    return records.result("scale", cells, inputs)
 
 
 def main() -> None:

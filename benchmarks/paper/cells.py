@@ -11,25 +11,19 @@ Results = Mapping[str, Mapping[str, Any]]
 
 FRAME_US = 1000.0
 """Microseconds that a frame may take at 1000 frames a second."""
-ALL_CACHED = "all cached"
-ONE_STATEMENT = "one statement"
-IN_THE_SERVER = "loop in the server"
-WHERE = ("engine", "layout", "curve", "cache", "file", "poses", "shell", "points", "region")
+WHERE = ("engine", "layout", "law", "file", "poses", "points", "region")
 """Conditions of a cell. Times are compared only where all of these are equal."""
 ORDERS: Mapping[str, Sequence[object]] = {
     "layout": ("brick", "voxel"),
-    "curve": ("z-order", "hilbert", "lexicographic"),
-    "cache": ("4 MB", ALL_CACHED),
-    "poses": ("slide", "random", "recorded"),
+    "poses": ("slide", "random"),
+    "law": ("plane", "smooth"),
+    "file": ("cached", "cold"),
     "region": ("low", "middle", "high"),
-    "strategy": ("points", "statement", "array", "maxgap", "cbgroup", "auto"),
-    "form": (ONE_STATEMENT, IN_THE_SERVER),
+    "strategy": ("points", "statement", "array", "maxgap", "cbgroup"),
 }
 NAMES: Mapping[object, str] = {
     "brick": "bricks",
     "voxel": "voxels",
-    "z-order": "Z-order",
-    "hilbert": "Hilbert",
     "maxgap": "MaxGap",
     "cbgroup": "CBGroup",
 }
@@ -76,17 +70,11 @@ def grouped(
     return dict(sorted(groups.items(), key=lambda item: place(item[0])))
 
 
-def with_paper_cache(cells: Sequence[Cell]) -> Sequence[Cell]:
-    """Cells measured with the paper's cache; all cells where that holds the whole environment."""
-    return [cell for cell in cells if cell["cache"] != ALL_CACHED] or cells
-
-
 def by_strategy(cells: Iterable[Cell]) -> dict[str, Cell]:
-    """The fastest cell of each strategy, all ranges in one statement."""
+    """The fastest cell of each strategy."""
     found: dict[str, Cell] = {}
     for cell in sorted(cells, key=typical):
-        if cell.get("form", ONE_STATEMENT) == ONE_STATEMENT:
-            found.setdefault(cell["strategy"], cell)
+        found.setdefault(cell["strategy"], cell)
     return found
 
 
@@ -103,5 +91,5 @@ def place_of(cell: Cell, among: Iterable[Cell]) -> str:
 
 def _spoken(key: str, value: object) -> str:
     text = f"{value:,}" if isinstance(value, int) else named(value)
-    words = {"points": "{} points", "region": "{} density", "cache": "cache {}", "file": "file {}"}
+    words = {"points": "{} points", "region": "{} density", "file": "file {}"}
     return words.get(key, "{}").format(text)

@@ -1,46 +1,54 @@
-"""The paper's Figures 8 to 10 and what it leaves out, each as a function from subject to cells."""
+"""The paper's claim and Figures 8 to 10, each as a function from subject to cells."""
 
 import time
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hapticdb.query.frame import STRATEGIES, Strategy
+from dense_frame import dense_bitmap, dense_feel
+from hapticdb import Environment
+from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
+from hapticdb.query.frame import Query, Strategy
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
-from paper.cells import IN_THE_SERVER
+from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import CellTable
 from paper.measure import Alternative, Cell, in_turns
-from paper.subject import Subject
-from paper.workload import RADIUS_VOXELS, SEED, Region, Task, random_poses, sphere_shell
+from paper.subject import LAWS, Subject
+from paper.workload import POINTS, RADIUS_VOXELS, Region, Task, sphere_shell
+
+Floats = NDArray[np.float64]
 
 GAPS = (0, 10, 30, 100, 300, 500, 1000, 3000, 10_000, 30_000, 100_000, 1_000_000)
 """MAXGAP of Figure 9, in voxel keys; 500 is the paper's."""
 RESOLUTIONS = (10, 20, 50, 100, 200, 500, 1000, 2000, 5000, 10_000, 20_000, 50_000, 100_000)
 """Buckets of the quantile vectors of Figure 8. All divide the largest number, so that each vector's
 bounds are among those of the finest."""
-SHELLS = (300, 1000, 10_000, 100_000)
-"""Points of the shells whose size is varied."""
-MOST_POINTS: dict[Strategy, int] = {"points": 1000, "statement": 10_000}
-"""Points of the largest shell that a strategy is measured with; a larger one would take seconds a
-frame. Strategies that are not listed have no limit."""
-PAPERS_GAP = 500
-"""The paper's MAXGAP, voxel keys."""
+SHELLS = (100, 1000, 10_000, 100_000, 1_000_000)
+"""Points of the shells whose keys are grouped."""
+COMPARED: tuple[Strategy, ...] = ("points", "statement", "array", "maxgap", "cbgroup")
+"""Strategies that are compared; `auto`, the default, is `array` or `cbgroup`."""
+RESIDENT_BYTES = 256 << 20
+"""Bytes for the cells that a bitmap is made of. They are given back before it is measured."""
+LEAST_GROUPED = 5
+"""Least number of times that keys are grouped; the first does not count."""
+NOTHING_ASKED = Query("bitmap", 0, 0, 0, 0.0)
 
 
 @dataclass(frozen=True)
 class Budget:
     """How much is measured.
 
-    cell_s : seconds of frames that one alternative may take; frames : poses of a task; tail :
-    frames of the experiment on the slowest frames; cold : frames with empty caches; windows :
-    windows whose density is measured to choose regions; gaps, resolutions, shells : values of the
-    experiments.
+    cell_s : seconds of frames that one alternative may take; frames : poses of a task; cold :
+    frames with empty caches; windows : windows whose density is measured to choose regions; gaps,
+    resolutions, shells : values of the experiments.
     """
 
     cell_s: float = 1.5
     frames: int = 1000
-    tail: int = 10_000
     cold: int = 40
     windows: int = 400
     gaps: tuple[int, ...] = GAPS
@@ -48,16 +56,7 @@ class Budget:
     shells: tuple[int, ...] = SHELLS
 
 
-QUICK = Budget(
-    cell_s=0.1,
-    frames=100,
-    tail=400,
-    cold=5,
-    windows=60,
-    gaps=(0, 100, 500, 3000, 100_000),
-    resolutions=(10, 100, 1000, 10_000),
-    shells=(300, 1000, 10_000),
-)
+QUICK = Budget(0.1, 100, 5, 60, (0, 100, 500, 3000, 100_000), RESOLUTIONS[::3], SHELLS[:3])
 
 
 def figure_8(subject: Subject, task: Task, finest: QuantileVector, budget: Budget) -> list[Cell]:
@@ -104,16 +103,8 @@ def _grouping_us(subject: Subject, vector: QuantileVector, task: Task) -> float:
 
 
 def figure_9(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
-    """MaxGap over MAXGAP, CBGroup, and `array`; on a server also by its own loop."""
-    alternatives = _maxgap_and_others(subject, task, budget)
-    query = subject.looping_query
-    if query is not None:
-        alternatives += [
-            subject.alternative(task, "maxgap", gap=gap, query=query, form=IN_THE_SERVER)
-            for gap in budget.gaps
-        ]
-        alternatives.append(subject.alternative(task, "cbgroup", query=query, form=IN_THE_SERVER))
-    return _measure(subject, task, alternatives, budget)
+    """MaxGap over MAXGAP, CBGroup, and `array`."""
+    return _measure(subject, task, _maxgap_and_others(subject, task, budget), budget)
 
 
 def figure_10(
@@ -122,9 +113,7 @@ def figure_10(
     """Figure 9's strategies in regions of low, middle and high density."""
     cells = []
     for region in regions:
-        task = Task(
-            "random", shell_task.tool, shell_task.shell, region.poses, region.name, region.density
-        )
+        task = Task("random", shell_task.shell, region.poses, region.name, region.density)
         cells += _measure(subject, task, _maxgap_and_others(subject, task, budget), budget)
     return cells
 
@@ -132,79 +121,93 @@ def figure_10(
 def _maxgap_and_others(subject: Subject, task: Task, budget: Budget) -> list[Alternative]:
     """MaxGap for each MAXGAP, and the strategies that it is compared with."""
     gaps = [subject.alternative(task, "maxgap", gap=gap) for gap in budget.gaps]
-    return gaps + [subject.alternative(task, name) for name in ("cbgroup", "array", "auto")]
+    return gaps + [subject.alternative(task, name) for name in ("cbgroup", "array")]
 
 
-def strategies(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[Cell]:
-    """Every strategy over every task."""
+def claim(subject: Subject, tasks: Sequence[Task], budget: Budget) -> list[Cell]:
+    """Every strategy over every task, under each law that the environment can answer."""
     cells = []
     for task in tasks:
-        cells += _measure(subject, task, _each(subject, task, STRATEGIES), budget)
+        for law in list(LAWS)[: 1 + subject.env.has_distances]:
+            names = [n for n in COMPARED if law == "plane" or n != "statement"]
+            cells += _measure(subject, task, _each(subject, task, names, law=law), budget)
+            cells += cold(subject, task, names, law, budget)
     return cells
 
 
-def points(subject: Subject, budget: Budget) -> list[Cell]:
-    """Spheres of more points at the same density: the radius grows with their number's root."""
-    cells = []
-    grid = subject.env.grid
-    for n_points in budget.shells:
-        radius = RADIUS_VOXELS * (n_points / budget.shells[0]) ** 0.5
-        if 2 * radius > grid.side:
-            continue
-        shell = sphere_shell(grid.voxel_size, n_points, radius)
-        count = max(budget.frames * budget.shells[0] // n_points, budget.frames // 10)
-        poses = random_poses(subject.env, count, SEED, radius)
-        task = Task("random", "sphere", shell, poses)
-        wanted: tuple[Strategy, ...] = ("auto", "array", "cbgroup", "statement", "points")
-        alternatives = [
-            subject.alternative(task, name, radius_voxels=radius)
-            for name in wanted
-            if n_points <= MOST_POINTS.get(name, n_points)
-        ]
-        cells += _measure(subject, task, alternatives, budget)
-    return cells
-
-
-def tail(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
-    """Enough frames for the slowest in a thousand: the poses are repeated."""
-    times = -(-budget.tail // len(task.poses))
-    poses = np.tile(task.poses, (times, 1, 1))[: budget.tail]
-    often = Task(task.name, task.tool, task.shell, poses)
-    alternatives = [subject.alternative(often, name) for name in ("array", "cbgroup", "auto")]
-    # a higher limit: this experiment needs all its frames
-    return in_turns(alternatives, poses, limit_s=20 * budget.cell_s)
-
-
-COMPARED: tuple[Strategy, ...] = ("array", "maxgap", "cbgroup", "auto")
-"""Strategies that are compared under several caches, layouts and curves."""
-
-
-def cached(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
-    """The compared strategies with the file in the operating system's cache."""
-    alternatives = _each(subject, task, COMPARED)
-    return in_turns(alternatives, task.poses, limit_s=budget.cell_s)
-
-
-def cold(subject: Subject, task: Task, budget: Budget) -> list[Cell]:
+def cold(
+    subject: Subject, task: Task, names: Sequence[Strategy], law: str, budget: Budget
+) -> list[Cell]:
     """A few frames, each with empty caches: the connection's and the operating system's."""
     if subject.drop is None:
         return []
     step = max(1, len(task.poses) // budget.cold)
-    few = Task(task.name, task.tool, task.shell, task.poses[::step][: budget.cold])
-    alternatives = _each(subject, few, COMPARED, file="cold")
+    few = replace(task, poses=task.poses[::step][: budget.cold])
+    alternatives = _each(subject, few, names, law=law, file="cold")
     for alternative in alternatives:
         alternative.before = subject.drop
     return in_turns(alternatives, few.poses, limit_s=4 * budget.cell_s, warm=2)
 
 
+def in_memory(env: Environment, tasks: Sequence[Task], budget: Budget) -> list[Cell]:
+    """The same frames, called one by one, against one dense bitmap: what no database can beat."""
+    cells = []
+    for task in tasks:
+        with CellTable.create(RESIDENT_BYTES) as table:
+            residency = Residency(env.store, table)
+            frames = ResidentFrames(residency, task.shell, run=0)
+            frames.feel(task.poses)
+            bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
+        cell: Cell = {
+            "engine": "memory",
+            "layout": "dense bitmap",
+            "file": "cached",
+            "law": "plane",
+        }
+        cell |= {"strategy": "bitmap", "poses": task.name, "points": len(task.shell)}
+        cells += in_turns(
+            [Alternative(cell, _against(bitmap, frames))], task.poses, limit_s=budget.cell_s
+        )
+    return cells
+
+
+def _against(bitmap: NDArray[np.uint32], frames: ResidentFrames) -> Callable[[Floats], Query]:
+    """Frames against a bitmap; nothing is asked."""
+    out, place = np.zeros((1, RESULTS)), frames.residency.place
+
+    def frame(pose: Floats) -> Query:
+        dense_feel(bitmap, frames.clusters, pose[None], place, frames.law, frames.hits, out)
+        return NOTHING_ASKED
+
+    return frame
+
+
+def grouping(subject: Subject, budget: Budget) -> list[Cell]:
+    """Time of CBGroup alone against the number of points; spheres of the same density of points."""
+    cells = []
+    grid, query = subject.env.grid, subject.query()
+    for n_points in budget.shells:
+        radius = min(RADIUS_VOXELS * (n_points / POINTS) ** 0.5, 0.45 * grid.side)
+        shell = sphere_shell(grid.voxel_size, n_points, radius)
+        pose = np.eye(4)
+        pose[:3, 3] = np.array(grid.origin) + 0.5 * grid.edge
+        keys = query.locate(shell, pose).keys
+        us: list[float] = []
+        while len(us) < LEAST_GROUPED or sum(us) < 1e6 * budget.cell_s / 4:
+            start = time.perf_counter_ns()
+            ranges = cbgroup(keys, subject.quantiles, subject.costs)
+            us.append((time.perf_counter_ns() - start) / 1000)
+        about = {"engine": subject.env.engine, "layout": subject.env.layout, "points": n_points}
+        about |= {"keys": len(keys), "ranges": len(ranges.lows)}
+        cells.append(about | {"grouping_us": float(np.median(us[1:]))})
+    return cells
+
+
 def _each(
-    subject: Subject, task: Task, names: Sequence[Strategy], file: str = "cached"
+    subject: Subject, task: Task, names: Sequence[Strategy], law: str, file: str = "cached"
 ) -> list[Alternative]:
     """Strategies by name, MaxGap with the paper's MAXGAP."""
-    return [
-        subject.alternative(task, name, gap=PAPERS_GAP if name == "maxgap" else None, file=file)
-        for name in names
-    ]
+    return [subject.alternative(task, name, law=law, file=file) for name in names]
 
 
 def _measure(

@@ -1,7 +1,6 @@
 """Timing alternatives in turns, so that a slow phase of the machine slows all of them alike."""
 
 import time
-from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any
@@ -11,8 +10,6 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.query.frame import Query
 
-FRAMES_FOR_P999 = 10_000
-"""Frames that a cell needs for its p99.9: then ten frames are slower than that."""
 CHUNK = 20
 """Poses that an alternative runs in one turn. More poses warm the processor's caches better and let
 the machine drift further between turns."""
@@ -79,8 +76,6 @@ class Alternative:
         if asked_rows is not None:
             asked = float(np.mean([asked_rows[index] for index in self.poses]))
             found["false_rows"] = found["rows"] - asked
-        if found.get("strategy") == "auto":
-            found["chosen"] = dict(Counter(query.strategy for query in queries))
         return found
 
 
@@ -124,24 +119,19 @@ def in_turns(
     return cells
 
 
-def summary(times_us: ArrayLike) -> dict[str, float | None]:
+def summary(times_us: ArrayLike) -> dict[str, float]:
     """Mean, percentiles and worst of frame times (N,), microseconds.
 
     `typical` is the mean of the times between the 5th and the 95th percentile. It varies as little
     as a median between runs, and counts every kind of pose by its share, as a mean does.
-    `p99.9` is None below 10,000 frames.
     """
     times = np.sort(np.asarray(times_us, dtype=np.float64))
-    if not times.size:
-        return dict.fromkeys(("mean", "typical", "p10", "p50", "p90", "p99", "p99.9", "max"))
     cut = len(times) // 20
-    found: dict[str, float | None] = {
+    found: dict[str, float] = {
         "mean": float(times.mean()),
         "typical": float(times[cut : len(times) - cut].mean()),
     }
     for share in (10, 50, 90, 99):
         found[f"p{share}"] = float(np.percentile(times, share))
-    is_enough = len(times) >= FRAMES_FOR_P999
-    found["p99.9"] = float(np.percentile(times, 99.9)) if is_enough else None
     found["max"] = float(times[-1])
     return found

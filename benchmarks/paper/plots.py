@@ -1,8 +1,9 @@
-"""The plots of docs/evaluation.md: the paper's Figures 8, 9 and 10, shells and scale."""
+"""The plots of docs/evaluation.md: the claim, the paper's figures, users and scale."""
 
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
+import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -16,8 +17,8 @@ from paper.cells import (
     grouped,
     named,
     typical,
-    with_paper_cache,
 )
+from paper.tables import fitted
 
 SMALLEST_GAP = 3.0
 """Where MAXGAP 0 stands on a logarithmic axis."""
@@ -46,7 +47,7 @@ def panels(count: int) -> Figure:
     rows = 2 if count > 3 else 1
     figure = Figure(figsize=(4.2 * count / rows, 3.4 * rows), layout="constrained")
     FigureCanvasAgg(figure)
-    figure.subplots(rows, count // rows, sharey="row")
+    figure.subplots(rows, count // rows, sharey="row" if count != 2 else False)
     return figure
 
 
@@ -79,8 +80,8 @@ def against_maxgap(cells: Sequence[Cell], by: Sequence[str]) -> Figure:
 
 
 def figure_9(cells: Sequence[Cell]) -> Figure:
-    """MaxGap against CBGroup with the paper's cache, in both forms."""
-    return against_maxgap(with_paper_cache(cells), ("form",))
+    """MaxGap against CBGroup."""
+    return against_maxgap(cells, ("law",))
 
 
 def figure_10(cells: Sequence[Cell]) -> Figure:
@@ -88,14 +89,71 @@ def figure_10(cells: Sequence[Cell]) -> Figure:
     return against_maxgap(cells, ("region",))
 
 
-def points(cells: Sequence[Cell]) -> Figure:
-    """Time a frame against the shell's points."""
-    groups = grouped(cells, ("layout", "engine"))
-    figure = panels(len(groups))
-    for axes, ((layout, engine), own) in zip(figure.axes, groups.items(), strict=True):
-        axes.set_title(f"{engine}, {named(layout)}", fontsize=9)
-        lines(axes, own, ("strategy",), "points")
-    finish(figure, "points of the shell")
+def claim(cells: Sequence[Cell]) -> Figure:
+    """Frames a second: a panel a kind of poses, a column of marks a place, a mark a strategy."""
+    kinds = distinct(cells, "poses")
+    figure = Figure(figsize=(10.0, 4.2), layout="constrained")
+    FigureCanvasAgg(figure)
+    figure.subplots(1, len(kinds), sharey="row")
+    for axes, kind in zip(figure.axes, kinds, strict=True):
+        own = [c for c in cells if c["poses"] == kind and c["strategy"] != "bitmap"]
+        places = list(grouped(own, ("engine", "layout", "law", "file")))
+        for strategy in distinct(own, "strategy"):
+            marks = [c for c in own if c["strategy"] == strategy]
+            x = [
+                places.index(tuple(c[k] for k in ("engine", "layout", "law", "file")))
+                for c in marks
+            ]
+            axes.plot(
+                x, [1e6 / typical(c) for c in marks], "o", markersize=4, label=named(strategy)
+            )
+        for cell in cells:
+            if (cell["strategy"], cell["poses"]) == ("bitmap", kind):
+                axes.axhline(1e6 / typical(cell), color="black", label="dense bitmap in memory")
+        axes.axhline(1e6 / FRAME_US, color="grey", linestyle="--", label="the paper: 1,000")
+        names = [
+            f"{engine.rpartition('.')[0]}\n{named(layout)}, {law}" + ", cold" * (file == "cold")
+            for engine, layout, law, file in places
+        ]
+        axes.set(yscale="log", title=f"{kind} poses")
+        axes.set_xticks(range(len(places)), names, rotation=90, fontsize=6)
+        axes.grid(visible=True, linewidth=0.3)
+    figure.axes[0].set_ylabel("frames a second")
+    figure.axes[-1].legend(fontsize=6)
+    return figure
+
+
+def grouping(cells: Sequence[Cell]) -> Figure:
+    """Time of CBGroup against the number of keys, with a fit in proportion to it."""
+    figure = panels(1)
+    (axes,) = figure.axes
+    for (layout,), own in grouped(cells, ("layout",)).items():
+        n, us = zip(*sorted((c["keys"], c["grouping_us"]) for c in own), strict=True)
+        axes.plot(n, us, "o", markersize=4, label=named(layout))
+        a, b = fitted(own)
+        axes.plot(
+            n, [a + b * k for k in n], linewidth=0.8, label=f"{a:.1f} us + {1e3 * b:.1f} ns n"
+        )
+    finish(figure, "distinct keys of a frame")
+    axes.set_ylabel("grouping, us")
+    return figure
+
+
+def many(cells: Sequence[Cell]) -> Figure:
+    """Frames a second of all readers, and how stale they are."""
+    figure = panels(2)
+    left, right = figure.axes
+    for (engine, writers), own in grouped(cells, ("engine", "writers")).items():
+        own.sort(key=lambda cell: float(cell["readers"]))
+        label, n = f"{engine}, {writers} writers", [cell["readers"] for cell in own]
+        left.plot(n, [c["frames_per_s"] for c in own], "o-", markersize=3, label=label)
+        if writers:
+            stale = [c.get("stale_p99_ms", np.nan) for c in own]
+            right.plot(n, stale, "o-", markersize=3, label=label)
+    for axes, title in ((left, "frames a second, all readers"), (right, "staleness, p99, ms")):
+        axes.set(xscale="log", yscale="log", xlabel="readers", title=title)
+        axes.grid(visible=True, linewidth=0.3)
+        axes.legend(fontsize=6)
     return figure
 
 
@@ -114,7 +172,9 @@ PLOTS: dict[str, Callable[[Sequence[Cell]], Figure]] = {
     "figure8": figure_8,
     "figure9": figure_9,
     "figure10": figure_10,
-    "points": points,
+    "claim": claim,
+    "grouping": grouping,
+    "many": many,
     "scale": scale,
 }
 

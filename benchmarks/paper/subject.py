@@ -10,30 +10,27 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import HapticQuery, Query, Strategy
+from hapticdb.query.grouping import DEFAULT_MAXGAP
+from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.store import SQLiteStore
-from paper.cells import ALL_CACHED, ONE_STATEMENT
-from paper.looping import looping, server_cache
 from paper.measure import Alternative, Cell, Pose
 from paper.workload import Task
 
 PAPER_CACHE = 4 << 20
 """Bytes of the paper's database cache: 500 blocks of 8 KB."""
-CURVES = {"z": "z-order", "hilbert": "hilbert", "lexicographic": "lexicographic"}
+LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
 
 
 @dataclass
 class Subject:
     """An opened environment under stated conditions.
 
-    name : the environment's; cache : size of the database's cache, as plots show it; drop : empties
-    all caches, or None where this process cannot.
+    name : the environment's; drop : empties all caches, or None where this process cannot.
     """
 
     env: Environment
     name: str
-    cache: str
     drop: Callable[[], None] | None = None
 
     @cached_property
@@ -52,11 +49,8 @@ class Subject:
             "environment": self.name,
             "engine": self.env.engine,
             "layout": self.env.layout,
-            "curve": CURVES[self.env.grid.curve],
-            "cache": self.cache,
             "file": "cached",
             "poses": task.name,
-            "shell": task.tool,
             "points": len(task.shell),
             "resolution": self.quantiles.resolution,
             **({"region": task.region, "density": task.density} if task.region else {}),
@@ -67,15 +61,6 @@ class Subject:
         statistics = (quantiles or self.quantiles, self.costs)
         return HapticQuery(self.env.store, lambda: statistics)
 
-    @cached_property
-    def looping_query(self) -> HapticQuery | None:
-        """Frames whose ranges a loop inside the server scans, with costs fitted to that loop."""
-        if not isinstance(self.env.store, PostgresStore):
-            return None
-        loop = looping(self.env.store)
-        statistics = (self.quantiles, calibrate(loop))
-        return HapticQuery(loop, lambda: statistics)
-
     def alternative(
         self,
         task: Task,
@@ -83,17 +68,18 @@ class Subject:
         *,
         gap: int | None = None,
         query: HapticQuery | None = None,
+        law: str = "plane",
         **more: Any,  # noqa: ANN401 - what a cell says is JSON's
     ) -> Alternative:
         """A strategy over a task. `gap` is MAXGAP, for the strategy maxgap alone."""
         cell = {
             **self.conditions(task),
             "strategy": strategy,
-            "form": ONE_STATEMENT,
+            "law": law,
             **({"maxgap": gap} if gap is not None else {}),
             **more,
         }
-        return Alternative(cell, asking(query or self.query(), task.shell, strategy, gap))
+        return Alternative(cell, asking(query or self.query(), task.shell, strategy, law, gap))
 
     def asked_rows(self, task: Task) -> list[int]:
         """Rows under each pose's own keys."""
@@ -102,21 +88,14 @@ class Subject:
 
 
 def asking(
-    query: HapticQuery, shell: PointShell, strategy: Strategy, gap: int | None = None
+    query: HapticQuery, shell: PointShell, strategy: Strategy, law: str, gap: int | None
 ) -> Callable[[Pose], Query]:
     """Frames of one shell by one strategy."""
-    if gap is None:
-        return lambda pose: query.run(shell, pose, strategy).query
-    return lambda pose: query.run(shell, pose, strategy, gap).query
+    gap = DEFAULT_MAXGAP if gap is None else gap
+    return lambda pose: query.run(shell, pose, strategy, gap, law=LAWS[law]).query
 
 
-def limited(env: Environment, size_bytes: int) -> str:
-    """Limit the connection's cache, and return how plots name its size.
-
-    A server has one cache for all connections: it is not changed, and its size is named.
-    """
+def with_papers_cache(env: Environment) -> None:
+    """Limit the connection's cache on SQLite. A server has one cache for all connections."""
     if isinstance(env.store, SQLiteStore):
-        env.store._connection.fetch(f"PRAGMA cache_size = -{size_bytes >> 10}")  # noqa: SLF001 - no user limits it
-    elif isinstance(env.store, PostgresStore):
-        size_bytes = server_cache(env.store)
-    return ALL_CACHED if size_bytes >= env.size().bytes else f"{size_bytes / (1 << 20):.0f} MB"
+        env.store._connection.fetch(f"PRAGMA cache_size = -{PAPER_CACHE >> 10}")  # noqa: SLF001 - no user limits it

@@ -36,7 +36,6 @@ INPUTS = {
     "sphere": f"{POINTS} points spread evenly over a sphere, radius {RADIUS_VOXELS:g} voxels",
     "slide": "poses that slide the shell over the largest objects, from above",
     "random": f"poses turned at random, near voxels drawn evenly over the index, seed {SEED}",
-    "recorded": "the recorded path, with the tool that belongs to it",
     "regions": f"windows of {WINDOW}^3 around drawn surface voxels: the 10th, 50th and 90th "
     "percentile of their share of occupied voxels (low, middle, high)",
 }
@@ -49,12 +48,11 @@ Poses = NDArray[np.float64]
 class Task:
     """A shell and where it goes.
 
-    name : ``slide``, ``random`` or ``recorded``; tool : ``sphere``, or what the shell was made
-    from; region, density : name and density of the window that the poses stay in, if any.
+    name : ``slide`` or ``random``; region, density : name and density of the window that the poses
+    stay in, if any.
     """
 
     name: str
-    tool: str
     shell: PointShell
     poses: Poses
     region: str = ""

@@ -1,0 +1,120 @@
+"""What an environment costs: time and memory of an import, bytes of a voxel, and the first start.
+
+Each import runs in a process of its own, with every kernel compiled.
+"""
+
+import argparse
+import json
+import os
+import re
+import subprocess
+import sys
+import time
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import hapticdb
+from hapticdb import Environment, GridOptions, ImportOptions
+from hapticdb.mesh import read_file
+from hapticdb.sample import SampleFiles
+from hapticdb.store.base import BRICK_BYTES
+
+PEAK = re.compile(r"VmHWM:\s+(\d+) kB")
+LONGEST_S = 1800.0
+"""Seconds after which a command counts as hung."""
+FIRST = {
+    "import": ("import", "{turn}.db", "{car}", "--bits", "8", "--extent", "1.6"),
+    "touch": ("touch", "{turn}.db", "--tool", "{tool}", "--poses", "{path}"),
+}
+"""Commands of a first start."""
+
+
+class Model(NamedTuple):
+    """A model: name, file, edge of the grid as a multiple of the model's longest side."""
+
+    name: str
+    file: Path
+    extent: float
+
+
+def models(sample: Path, *, real: bool) -> list[Model]:
+    """Real assemblies in the folder that HAPTICDB_TEST_DATA names, then the sample car."""
+    data = Path(os.environ.get("HAPTICDB_TEST_DATA", ""))
+    found = [
+        Model("vintage car", data / "demo_vintage_car" / "vintage_car.glb", 1.6),
+        Model("van", data / "assembly_vw_t1" / "vw_t1.glb", 2.4),
+    ]
+    return [one for one in found if real and one.file.is_file()] + [
+        Model("sample car", sample, 1.6)
+    ]
+
+
+def distinct_voxels(env: Environment) -> int:
+    """Voxels of an environment in bricks, each once, of whatever objects."""
+    rows = env.store.scan(np.array([0]), np.array([8**env.grid.bits]))
+    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
+    bricks = np.bitwise_or.reduceat(rows.occupancy.reshape(-1, BRICK_BYTES), starts, axis=0)
+    return int(np.bitwise_count(bricks).sum())
+
+
+def imported(url: str, file: str, bits: int, extent: float, distances: int) -> dict[str, Any]:
+    """Import in this process: wall and processor time, and the peak of memory."""
+    options = ImportOptions(grid=GridOptions(bits=bits, extent=extent), distances=bool(distances))
+    began, busy = time.perf_counter(), time.process_time()
+    (report,) = hapticdb.import_files(url, [file], options)
+    if report.error is not None:
+        raise report.error
+    return {
+        "s": time.perf_counter() - began,
+        "cpu_s": time.process_time() - busy,
+        "peak_mb": int(PEAK.findall(Path("/proc/self/status").read_text())[0]) / 1e3,
+    }
+
+
+def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
+    """Import a model with and without distances; what it holds, and what it takes on disk."""
+    cell: dict[str, Any] = {"environment": model.name, "bits": bits, "extent": model.extent}
+    parts = read_file(model.file).parts
+    cell["triangles"] = sum(len(part.triangles()) for part in parts)
+    for name, distances in (("plain", 0), ("smooth", 1)):
+        url = folder / f"cost-{name}.db"
+        words = [str(url), str(model.file), str(bits), str(model.extent), str(distances)]
+        done = subprocess.run(
+            [sys.executable, __file__, *words], check=True, capture_output=True, timeout=LONGEST_S
+        )
+        cell[name] = json.loads(done.stdout)
+        with hapticdb.open(url, read_only=True) as env:
+            size, objects = env.size(), env.objects()
+            cell[name] |= {"bytes": size.bytes, "rows": size.rows}
+            cell |= {"objects": len(objects), "object_voxels": sum(obj.voxels for obj in objects)}
+            cell |= {"voxel_size": env.grid.voxel_size, "distinct_voxels": distinct_voxels(env)}
+        url.unlink()
+    return cell
+
+
+def first_start(folder: Path, sample: SampleFiles) -> list[dict[str, Any]]:
+    """Seconds of first commands, with nothing compiled, and of the same commands again."""
+    places = {"car": sample.car, "tool": sample.wrench, "path": sample.path}
+    variables = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
+    cells = []
+    for name, words in FIRST.items():
+        cell: dict[str, Any] = {"command": name}
+        for turn in ("first", "again"):
+            line = [word.format(turn=turn, **places) for word in words]
+            began = time.perf_counter()
+            subprocess.run(
+                [sys.executable, "-m", "hapticdb", *line],
+                cwd=folder, env=variables, check=True, capture_output=True, timeout=LONGEST_S,
+            )  # fmt: skip
+            cell[f"{turn}_s"] = time.perf_counter() - began
+        cells.append(cell)
+    return cells
+
+
+if __name__ == "__main__":
+    parser = argparse.ArgumentParser()
+    for word, kind in {"url": str, "file": str, "bits": int, "extent": float, "d": int}.items():
+        parser.add_argument(word, type=kind)
+    print(json.dumps(imported(*vars(parser.parse_args()).values())))

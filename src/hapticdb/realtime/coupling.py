@@ -160,8 +160,19 @@ class Coupling:
         )
 
 
+class _Rendered:
+    """What a device renders of a session, for kernels."""
+
+    torque_cap: float
+
+    def spring(self) -> DeviceSpring:
+        """Return the numbers in the kernel's form; those of a spring that is not there are 0."""
+        numbers = {name: float(getattr(self, name, 0.0)) for name in DeviceSpring._fields}
+        return DeviceSpring(**numbers | {"turn_cap": float(self.torque_cap)})
+
+
 @dataclass(frozen=True)
-class SettledCoupling:
+class SettledCoupling(_Rendered):
     """A `Coupling` of one session: every number is settled. A recording has these.
 
     Attributes
@@ -196,23 +207,9 @@ class SettledCoupling:
     hold: float = HOLD
     fade: float = FADE
 
-    def spring(self) -> DeviceSpring:
-        """Return the numbers in the kernel's form."""
-        return DeviceSpring(
-            stiffness=float(self.stiffness),
-            turn_stiffness=float(self.turn_stiffness),
-            cap=float(self.cap),
-            turn_cap=float(self.torque_cap),
-            damping=float(self.damping),
-            scale=float(self.scale),
-            radius=float(self.radius),
-            hold=float(self.hold),
-            fade=float(self.fade),
-        )
-
 
 @dataclass(frozen=True)
-class DirectRendering:
+class DirectRendering(_Rendered):
     """Rendering without a coupling: the tool is at the hand, and feels what the device renders.
 
     This is the loop of the paper (section 4, Figure 4). The wrench of the tangent-plane law goes to
@@ -235,20 +232,6 @@ class DirectRendering:
     radius: float
     hold: float = HOLD
     fade: float = FADE
-
-    def spring(self) -> DeviceSpring:
-        """Return the numbers in the kernel's form, of a spring that is not there."""
-        return DeviceSpring(
-            stiffness=0.0,
-            turn_stiffness=0.0,
-            cap=float(self.cap),
-            turn_cap=float(self.torque_cap),
-            damping=0.0,
-            scale=float(self.scale),
-            radius=float(self.radius),
-            hold=float(self.hold),
-            fade=float(self.fade),
-        )
 
 
 def radius_of(shell: PointShell, voxel_size: float) -> float:

@@ -21,6 +21,8 @@ from hapticdb.store.base import (
 KINDS = """
 SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END
   FROM sqlite_master"""
+NO_VOXEL = bytes(BRICK_BYTES)
+"""Occupancy of a brick that holds no voxel of the object."""
 
 
 def rows_of(url: str, found: list[Any], *, has_bricks: bool) -> Rows:
@@ -59,7 +61,7 @@ def _bricks(
 
 
 def rows_with_distances(url: str, found: list[Any]) -> Rows:
-    """Rows from the tuples (key, id, occupancy, distances) of a statement."""
+    """Rows from the tuples (key, id, occupancy or None, distances) of a statement."""
     if not found:
         return NO_DISTANCES
     keys, ids, bricks, packed = zip(*found, strict=True)
@@ -71,7 +73,8 @@ def rows_with_distances(url: str, found: list[Any]) -> Rows:
     lengths = list(map(len, packed))
     believed.check_lengths(url, min(lengths), max(lengths))
     ends = np.fromiter(accumulate(lengths), np.int64, len(lengths))
-    return _bricks(url, keys, ids, bricks, Band(np.frombuffer(joined, np.uint8), ends))
+    bits = [NO_VOXEL if brick is None else brick for brick in bricks]
+    return _bricks(url, keys, ids, bits, Band(np.frombuffer(joined, np.uint8), ends))
 
 
 def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:

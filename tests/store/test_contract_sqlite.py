@@ -22,6 +22,7 @@ from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import backup_environment
 from hapticdb.store.schema import FORMAT_VERSION
+from hapticdb.store.sqlite import place
 from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.sqlite.store import SQLiteStore
@@ -35,6 +36,7 @@ from hapticdb.testing import (
 )
 
 GRID = Grid(0.005, (0, 0, 0), 6)
+ALL_KEYS = np.array([0]), np.array([1 << 9])
 
 
 class TestSQLiteStore(StoreContract):
@@ -312,6 +314,35 @@ def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(
     for read_only in (True, False):
         with pytest.raises(hapticdb.errors.ReadOnlyError, match="copy both files"):
             SQLiteStore.open(other, read_only=read_only)
+
+
+def test_loading_fills_the_pages_and_readers_go_on(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(place, "LOOK_SECONDS", 0.0)
+    rng = np.random.default_rng(1)
+    parts = [np.unique(rng.integers(0, 64, (2000, 3)), axis=0) for _ in range(30)]
+    fold = "PRAGMA wal_checkpoint(TRUNCATE)"
+    with (
+        closing(SQLiteStore.create(tmp_path / "q.db", GRID)) as store,
+        closing(SQLiteStore.open(tmp_path / "q.db", read_only=True)) as reader,
+    ):
+        with store.loading():
+            for n, voxels in enumerate(parts):
+                write_voxels(store, voxels, f"part {n}")
+            store._connection.driver.execute(fold)
+            rows, before = reader.scan(*ALL_KEYS), store.path.stat().st_size
+            assert reader.revision() == len(parts)
+        store._connection.driver.execute(fold)
+        assert store.path.stat().st_size < 0.95 * before
+        for one in (store, reader):
+            assert one.revision() == len(parts)
+            again = one.scan(*ALL_KEYS)
+            assert np.array_equal(again.keys, rows.keys)
+            assert np.array_equal(again.ids, rows.ids)
+            assert np.array_equal(again.occupancy, rows.occupancy)
+        write_voxels(store, parts[0], "another")
+        assert reader.revision() == len(parts) + 1
 
 
 def test_environments_left_open_end_without_a_word(tmp_path: Path) -> None:

@@ -10,7 +10,14 @@ import apsw
 from hapticdb.store.refusals import check_outside
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
+from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.threads import check_thread, this_thread
+
+MOST_COMPACTED = 1 << 29
+"""Bytes of a file up to which `compact` writes it anew. A larger value lets other writers wait
+longer, 1 s for 100 MB, and takes as much room for temporary files."""
+NO_ROOM = (apsw.BusyError, apsw.FullError)
+"""Errors on which `compact` leaves the file as it is."""
 
 
 class FileConnection:
@@ -89,6 +96,17 @@ class FileConnection:
                 raise
             self.driver.execute("COMMIT")
             self.file.look(has_committed=True)
+
+    def compact(self) -> None:
+        """Write the file anew with full pages, unless it is large, in use, or the disk is full."""
+        with self.writing():  # a log of the new pages must not follow a copy of the old ones
+            pages = self.driver.pragma("page_count")
+        if pages * PAGE_BYTES > MOST_COMPACTED:
+            return
+        self.driver.pragma("temp_store", "file")
+        with sqlite_file.named_errors(self.url), contextlib.suppress(*NO_ROOM):
+            self.driver.execute("VACUUM")
+        self.driver.pragma("temp_store", "memory")
 
     def version(self) -> int:
         """SQLite's data version: changes when another connection's commit has been seen."""

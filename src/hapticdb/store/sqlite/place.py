@@ -17,7 +17,7 @@ import apsw
 from hapticdb.errors import BusyError, ConnectionLostError, DamagedError
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.raw import PAGE_BYTES
+from hapticdb.store.sqlite.raw import PAGE_BYTES, PAGE_COUNT_AT
 
 LOOK_SECONDS = 0.25
 """Longest time until a reader notices that its path leads to another file. A smaller value costs
@@ -165,6 +165,14 @@ class OpenedFile:
                 raise sqlite_log.not_its_log(self._real)
             self._mark = mark
 
+    def _is_cut(self, size: int) -> bool:
+        """Whether a file of that size lacks pages that its header counts; a VACUUM leaves all."""
+        if self._connection is None:
+            return True
+        _, count = self._connection.read("main", 0, PAGE_COUNT_AT, 4)
+        pages = int.from_bytes(count, "big")
+        return not pages or size < pages * PAGE_BYTES
+
     def _found(self) -> Identity:
         try:
             status = self._path.stat()
@@ -172,7 +180,7 @@ class OpenedFile:
             raise ConnectionLostError(
                 f"{self._path} cannot be reached any more ({error.strerror}): put it back"
             ) from error
-        if status.st_size < self._size:
+        if status.st_size < self._size and self._is_cut(status.st_size):
             raise ConnectionLostError(
                 f"{self._path} has become shorter ({status.st_size} bytes of {self._size}): open "
                 "it again"

@@ -31,10 +31,9 @@ INSERT = {
 INSERT_BAND = """
 INSERT INTO band SELECT value, ?2, substr(?3, nth(?4, rowid, 0), nth(?5, rowid, 0))
   FROM carray(?1)"""
-CHUNK = 1 << 22
-"""Rows that one statement inserts. A larger value takes more memory, up to 80 bytes a row."""
-BAND_CHUNK = 1 << 17
-"""Rows of distances that one statement inserts, a value of at most 256 MiB."""
+CHUNK = 1 << 14
+"""Rows that one statement inserts. A larger value takes more memory: to undo the statement, up to a
+page for each row."""
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
 SELECT CASE WHEN ?9 > 0 AND NOT EXISTS (SELECT 1 FROM object WHERE id = ?9) THEN ?9 END,
@@ -137,8 +136,8 @@ class SQLiteWriter:
             else:
                 part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
                 self._connection.execute(INSERT["brick"], (keys, object_id, part.tobytes()))
-        for at in range(0, len(union) if union.distances is not None else 0, BAND_CHUNK):
-            band = union.part(at, at + BAND_CHUNK)
+        for at in range(0, len(union) if union.distances is not None else 0, CHUNK):
+            band = union.part(at, at + CHUNK)
             assert band.distances is not None  # noqa: S101 - a part of what has some
             data, ends = band.distances
             lengths = band.distances.lengths

@@ -178,6 +178,24 @@ def fits(results: Results) -> str:
 # --- pages ----------------------------------------------------------------------------------------
 
 
+def scale_ahead(results: Results) -> str:
+    """What more voxels take, by the rates of the largest environment of each engine."""
+    stored = [one for one in results["scale"]["cells"] if "poses" not in one]
+    largest = {one["engine"]: one for one in stored}  # sizes ascend
+    rows = []
+    for engine, one in largest.items():
+        rate = one["object_voxels"] / one["import_s"]
+        sizes = [
+            text
+            for n in (1e10, 1e12)
+            for text in (f"{n * one['bytes_per_voxel'] / 1e9:,.0f}", f"{n / rate / 3600:.1f}")
+        ]
+        rows.append([engine, f"{one['bytes_per_voxel']:.2f}", f"{rate / 1e6:.1f}", *sizes])
+    head = ["engine", "bytes a voxel", "million voxels written a second"]
+    ahead = ["10^10 voxels, GB", "hours", "10^12 voxels, GB", "hours"]
+    return table([*head, *ahead], rows)
+
+
 def tables() -> dict[str, Callable[[Results], str]]:
     """Every table by its name."""
     from feel.measures import table_of, walls_of  # noqa: PLC0415 - both use this module
@@ -191,6 +209,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "gpu-batches": gpu_batches,
         "ways-out": ways_out,
         "fits": fits,
+        "scale-ahead": scale_ahead,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),
         "feel-conditions": lambda results: facts(results["feel"]),

@@ -28,6 +28,7 @@ from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.refusals import check_unwritten, wants_distances
+from hapticdb.store.urls import scheme_of
 
 
 class Environment(Queries):
@@ -36,9 +37,11 @@ class Environment(Queries):
     Use `hapticdb.open` and `hapticdb.create` to make one. It is also a context manager.
     """
 
-    def __init__(self, store: Store) -> None:
+    def __init__(self, store: Store, address: str | os.PathLike[str] | None = None) -> None:
+        given = store.url if address is None else os.fspath(address)
+        whole = given if scheme_of(given) else os.path.abspath(given)  # noqa: PTH100 - as text
         self._figures = QueryFigures(store)
-        super().__init__(store, self._figures)
+        super().__init__(store, self._figures, whole)
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -401,7 +404,7 @@ def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment
     EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError, DamagedError
         If there is no environment, something else, or one that cannot be read.
     """
-    return Environment(open_store(url, read_only=read_only))
+    return Environment(open_store(url, read_only=read_only), url)
 
 
 def create(
@@ -428,4 +431,4 @@ def create(
         Bricks in lexicographic order, or distances on the layout voxel.
     """
     wish = wants_distances(layout, distances)
-    return Environment(create_store(url, grid, layout, distances=wish))
+    return Environment(create_store(url, grid, layout, distances=wish), url)

@@ -12,6 +12,7 @@
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
     ├── ProtocolError (ConnectionError)       a message that is none, or breaks a limit
+    ├── ClusterError (ConnectionError)        a scheduler of tasks, or its workers, cannot be used
     └── DatabaseError                         the database cannot do what was asked
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
@@ -87,6 +88,10 @@ class DeviceError(HapticDBError, OSError):
 
 class ProtocolError(HapticDBError, ConnectionError):
     """A message of another machine that cannot be decoded or breaks a limit."""
+
+
+class ClusterError(HapticDBError, ConnectionError):
+    """A scheduler of tasks that is not there, or whose workers cannot do what is asked."""
 
 
 class DatabaseError(HapticDBError):

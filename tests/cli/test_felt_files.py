@@ -11,8 +11,8 @@ from numba import cuda
 
 import hapticdb
 from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from hapticdb.batches import feeler
 from hapticdb.cli.csv_files import WRENCH
-from hapticdb.cli.verbs import touching
 
 TOUCH = ("touch", "scene.db", "--tool", "tool.npz", "--poses")
 
@@ -29,7 +29,7 @@ def mapped(scene: Path) -> Path:
 def test_a_batch_is_written_to_the_last_bit(
     run: Run, mapped: Path, monkeypatch: pytest.MonkeyPatch, suffix: str
 ) -> None:
-    monkeypatch.setattr(touching, "PIECE", 3)
+    monkeypatch.setattr(feeler, "PIECE", 3)
     code, out, err = run(*TOUCH, "poses.npy", "--out", f"felt{suffix}")
     if suffix == ".parquet" and importlib.util.find_spec("pyarrow") is None:
         refused((code, out, err), "pip install", ".npz")

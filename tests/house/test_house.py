@@ -35,7 +35,7 @@ FLOORS: list[set[str]] = [
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},
-    {"query"},
+    {"cluster", "query"},
     {"pointshell", "mesh", "poses"},
     {"store"},
     {"grid", "ready"},

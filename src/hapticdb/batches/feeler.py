@@ -1,6 +1,7 @@
 """Feeler: a tool whose cells stay in memory, asked at batches of poses."""
 
 from collections.abc import Callable, Iterator
+from contextlib import closing
 from functools import partial
 from typing import TYPE_CHECKING, Literal, Self, TypeVar, get_args
 
@@ -11,6 +12,7 @@ from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch, first_hits_at
 from hapticdb.batches.order import order_of
 from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
 from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
+from hapticdb.cluster.place import Whereabouts
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.law import reads_distances
@@ -32,6 +34,9 @@ if TYPE_CHECKING:
 PIECE_CHUNKS = 32
 """Chunks of poses, for each thread, in a piece: cells are fetched between pieces, and `progress` is
 called. A larger value takes more memory and fetches more cells by one statement."""
+PIECE, TASK = 1 << 18, 1 << 16
+"""Poses of a long batch that are felt at once here, 60 MB, and by one task of a worker. Larger:
+cells are read less often, and more memory is taken, or fewer workers share."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -348,6 +353,14 @@ class Feeler:
         if self._gpu is not None:
             return np.empty(0, dtype=np.int64)
         return order_of(places, self.shell.center, self._residency.grid)
+
+
+def touch_at(
+    there: Whereabouts, shell: PointShell, felt: Filter, law: ForceLaw, poses: Floats
+) -> TouchBatch:
+    """Touch at a piece: the task of a worker, which runs one for each of its threads."""
+    with closing(there.open()) as store, Feeler(store, shell, felt, law, jobs=1) as feeler:
+        return feeler.touch(poses)
 
 
 def reach_of(reach: float | None, voxel_size: float) -> float:

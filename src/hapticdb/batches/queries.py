@@ -1,6 +1,8 @@
 """What an opened environment is asked about a tool: at one pose, or at many."""
 
-from typing import TYPE_CHECKING, overload
+from collections.abc import Generator, Iterator
+from functools import partial
+from typing import TYPE_CHECKING, cast, overload
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -25,8 +27,10 @@ if TYPE_CHECKING:
 class Queries:
     """The haptic queries of `hapticdb.environment.Environment`, which is one of these."""
 
-    def __init__(self, store: Store, figures: QueryFigures) -> None:
+    def __init__(self, store: Store, figures: QueryFigures, address: str) -> None:
         self._store = store
+        self.address = address
+        """What opens it in another process: the URL as given, or a whole path."""
         self._touching = Touching(store, figures)
         self._filters = FiltersOfWords()
 
@@ -117,6 +121,48 @@ class Queries:
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
         with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
             return feeler.touch(poses, objects=objects, progress=progress)  # type: ignore[arg-type]
+
+    def touch_pieces(
+        self,
+        shell: PointShell,
+        poses: NDArray[np.float64],
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        law: ForceLaw | LawName | None = None,
+        on: str = "cpu",
+    ) -> Generator["TouchBatch", None, None]:
+        """Touch at more poses than fit into memory, piece by piece, in their order.
+
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            It may lie in a file.
+        shell, where, exclude, law
+            As for `touch`.
+        on : str
+            ``cpu``, ``cuda``, or a scheduler of dask.distributed, ``tcp://host:8786``. Its workers
+            reach the environment by the URL that opened it. They feel the same, bit for bit.
+        """
+        from hapticdb.batches import feeler as feeling  # noqa: PLC0415 - loads numba
+        from hapticdb.cluster.place import Whereabouts  # noqa: PLC0415
+        from hapticdb.cluster.workers import connected  # noqa: PLC0415
+
+        def pieces(size: int) -> Iterator[NDArray[np.float64]]:
+            return (np.asarray(poses[at : at + size]) for at in range(0, len(poses), size))
+
+        if "://" not in on:
+            device = cast("BatchDevice", on)
+            with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
+                yield from map(feeler.touch, pieces(feeling.PIECE))
+            return
+        felt, chosen = self._filters.of(where, exclude), self._touching.law_now(as_law(law))
+        with connected(on) as workers:
+            assert workers is not None  # noqa: S101 - there is an address
+            work = partial(
+                feeling.touch_at, Whereabouts.of(self._store, self.address), shell, felt, chosen
+            )
+            yield from workers.each(work, pieces(feeling.TASK))
 
     def collides(
         self,

@@ -13,9 +13,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.shapes import BuiltShape
+from hapticdb.clashes.shapes import BuiltShape, Shapes
 from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.store.base import Object
 from hapticdb.store.pairs import Kind
 from hapticdb.sweeps.contact import SHIFT
 from hapticdb.sweeps.cut import Cut, cut
@@ -41,6 +42,20 @@ class Judged(NamedTuple):
     at_most: float
     on_a: Floats
     on_b: Floats
+
+
+class PlacedPair(NamedTuple):
+    """A pair of objects; pose (4, 4) : of the second one's shape in the frame of the first's."""
+
+    one: Object
+    other: Object
+    pose: Floats
+
+
+def judge_placed(shapes: Shapes, pair: PlacedPair, within: float, contact: float) -> Judged | None:
+    """Judge a pair of objects; None if one was written meanwhile."""
+    a, b = shapes.placed(pair.one), shapes.placed(pair.other)
+    return None if a is None or b is None else judge(a[0], b[0], pair.pose, within, contact)
 
 
 def judge(a: BuiltShape, b: BuiltShape, pose: Floats, within: float, contact: float) -> Judged:

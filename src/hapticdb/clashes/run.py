@@ -8,20 +8,23 @@ measured, so a call that was stopped goes on where it was.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import closing, contextmanager
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.judge import Judged, judge
+from hapticdb.clashes.judge import Judged, PlacedPair, judge_placed
 from hapticdb.clashes.near import near_pairs
 from hapticdb.clashes.result import Clash, Clashes, gravity
 from hapticdb.clashes.shapes import Shapes
+from hapticdb.cluster.place import Whereabouts
+from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Object, Store
+from hapticdb.store.base import Object
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import PairRow, Status
 
@@ -38,8 +41,9 @@ SAME = 1e-9
 ROUNDING = 2.0**-40
 """Metres, and share of one in a rotation, to which the placement of two shapes is rounded. Coarser:
 more pairs are found to be placed alike, and lengths are less exact."""
-MOST_KNOWN = 1 << 15
-"""Pairs of shapes whose answer is kept for others that are placed alike. More: more memory."""
+PIECE = 128
+"""Pairs of one task of a worker, which reads the shapes anew. More: fewer reads, and a lost worker
+costs more."""
 SECONDS_BETWEEN = 2.0
 """Seconds of work that an end without warning loses at most, but for the pair under way."""
 
@@ -54,6 +58,7 @@ def find_clashes(
     seconds: float | None = None,
     budget: int = BUDGET,
     progress: ClashCallback | None = None,
+    on: str | None = None,
 ) -> Clashes:
     """Find every pair of objects that are near one another, and what they are.
 
@@ -75,11 +80,16 @@ def find_clashes(
         Bytes for shapes in memory.
     progress : callable or None
         Called with the number of pairs measured, and of all that have to be.
+    on : str or None
+        Scheduler of dask.distributed, ``tcp://host:8786``, whose workers measure, and reach the
+        environment by the URL that opened it.
 
     Raises
     ------
     UsageError
         If a number is out of range.
+    ClusterError, MissingExtraError
+        If there are no workers, or they do not reach the environment.
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
@@ -93,7 +103,8 @@ def find_clashes(
     began = time.monotonic()
     until = np.inf if seconds is None else began + seconds
     asked = _Asked(within, contact, tuple(of), tuple(against), until, budget, progress)
-    return _Search(env.store, asked).found(began)
+    with connected(on) as workers:
+        return _Search(env, asked, workers).found(began)
 
 
 def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> list[PairRow]:
@@ -144,14 +155,15 @@ class _Asked(NamedTuple):
 class _Search:
     """State of one search."""
 
-    def __init__(self, store: Store, asked: _Asked) -> None:
+    def __init__(self, env: Environment, asked: _Asked, workers: Cluster | None) -> None:
+        store = env.store
         self._store, self._asked = store, asked
+        self._address, self._workers = env.address, workers
         self._is_kept = not store.is_read_only
         self._waiting: list[PairRow] = []
         self._wrote = time.monotonic()
         self._shapes = Shapes(store, asked.budget)
         self._setting = asked.setting
-        self._known: dict[tuple[object, ...], Judged] = {}
 
     def found(self, began: float) -> Clashes:
         """Search."""
@@ -204,45 +216,63 @@ class _Search:
         revision: int,
     ) -> Iterator[PairRow]:
         """Measure pairs, and keep each; leaves out what was written meanwhile."""
-        # threads on two processors gained a tenth: most of the time holds the interpreter's lock
-        for n, (one, other) in enumerate(stale):
-            if time.monotonic() > self._asked.until:
-                return
-            judged = self._judged(one, other)
-            if judged is not None:
-                world_from_a = self._shapes.placement(one)[1]
-                on_a, on_b = (
-                    world_from_a[:3, :3] @ place + world_from_a[:3, 3]
-                    for place in (judged.on_a, judged.on_b)
-                )
-                row = PairRow(
-                    one.id, other.id, judged.kind, judged.at_least,
-                    judged.at_most if np.isfinite(judged.at_most) else None,
-                    (*on_a.tolist(), *on_b.tolist()), "new", revision, self._setting,
-                )  # fmt: skip
-                row = _compared(row, rows.get((one.id, other.id)))
-                self._waiting.append(row)
-                yield row
-                if time.monotonic() - self._wrote > SECONDS_BETWEEN:
-                    self._write()
-            if self._asked.progress is not None:
-                self._asked.progress(n + 1, len(stale))
+        alike: dict[object, list[tuple[Object, Object]]] = {}
+        placed = []
+        for one, other in stale:
+            (a, world_from_a), (b, world_from_b) = map(self._shapes.placement, (one, other))
+            pose = _rounded(_inverse(world_from_a) @ world_from_b)
+            group = alike.setdefault((a, b, pose.tobytes()), [])
+            if not group:
+                placed.append(PlacedPair(one, other, pose))
+            group.append((one, other))
+        n_done = 0
+        for judged, pairs in zip(self._judged(placed), alike.values(), strict=False):
+            for one, other in pairs:
+                n_done += 1
+                if judged is not None:
+                    row = _compared(
+                        self._row(one, other, judged, revision), rows.get((one.id, other.id))
+                    )
+                    self._waiting.append(row)
+                    yield row
+                    if time.monotonic() - self._wrote > SECONDS_BETWEEN:
+                        self._write()
+                if self._asked.progress is not None:
+                    self._asked.progress(n_done, len(stale))
 
-    def _judged(self, one: Object, other: Object) -> Judged | None:
-        """Judge a pair, unless it was judged elsewhere; None if one was written meanwhile."""
-        (a, world_from_a), (b, world_from_b) = map(self._shapes.placement, (one, other))
-        pose = _rounded(_inverse(world_from_a) @ world_from_b)
-        key = a, b, pose.tobytes()
-        if key not in self._known:
-            placed, moved = self._shapes.placed(one), self._shapes.placed(other)
-            if placed is None or moved is None:
-                return None
-            if len(self._known) >= MOST_KNOWN:
-                self._known.clear()
-            self._known[key] = judge(
-                placed[0], moved[0], pose, self._asked.within, self._asked.contact
-            )
-        return self._known[key]
+    def _row(self, one: Object, other: Object, judged: Judged, revision: int) -> PairRow:
+        """What the table keeps of a pair."""
+        world_from_a = self._shapes.placement(one)[1]
+        on_a, on_b = (
+            world_from_a[:3, :3] @ place + world_from_a[:3, 3]
+            for place in (judged.on_a, judged.on_b)
+        )
+        return PairRow(
+            one.id, other.id, judged.kind, judged.at_least,
+            judged.at_most if np.isfinite(judged.at_most) else None,
+            (*on_a.tolist(), *on_b.tolist()), "new", revision, self._setting,
+        )  # fmt: skip
+
+    def _judged(self, placed: Sequence[PlacedPair]) -> Iterator[Judged | None]:
+        """Judge pairs, here or by workers, as long as there is time."""
+        # threads on two processors gained a tenth: most of the time holds the interpreter's lock
+        asked = self._asked
+        work = partial(judge_placed, within=asked.within, contact=asked.contact)
+        if self._workers is None:
+            for one in placed:
+                if time.monotonic() > asked.until:
+                    return
+                yield work(self._shapes, one)
+            return
+        there = Whereabouts.of(self._store, self._address)
+        pieces = [placed[first : first + PIECE] for first in range(0, len(placed), PIECE)]
+        with closing(
+            self._workers.each(partial(_piece, there, asked.budget, work), pieces)
+        ) as done:
+            for judged in done:
+                yield from judged
+                if time.monotonic() > asked.until:
+                    return
 
     @contextmanager
     def _keeping(self) -> Iterator[None]:
@@ -314,6 +344,19 @@ class _Search:
             else:
                 gone.append(key)
         self._write(gone)
+
+
+def _piece(
+    there: Whereabouts,
+    budget: int,
+    work: Callable[[Shapes, PlacedPair], Judged | None],
+    placed: Sequence[PlacedPair],
+) -> list[Judged | None]:
+    """Judge pairs: the task of a worker."""
+    make_ready("clashes")
+    with closing(there.open()) as store:
+        shapes = Shapes(store, budget)
+        return [work(shapes, one) for one in placed]
 
 
 def _key(one: Object, other: Object) -> tuple[int, int]:

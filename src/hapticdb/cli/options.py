@@ -29,6 +29,15 @@ SameLayoutOption = Annotated[
 ]
 SameCurveOption = Annotated[CurveName | None, typer.Option(help=_CURVE, show_default="that of SRC")]
 
+ClusterOption = Annotated[
+    str | None,
+    typer.Option(
+        "--on",
+        metavar="ADDRESS",
+        help="Have workers of dask.distributed do it: its scheduler, tcp://host:8786.",
+    ),
+]
+
 # -- objects --------------------------------------------------------------------------------------
 
 _WORDS = "7 or 3,4, 'wheel*', attribute=value"

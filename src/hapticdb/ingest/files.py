@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple, Self
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.errors import (
     EnvironmentExistsError,
     FileError,
@@ -90,6 +91,8 @@ class ImportOptions:
     """Bricks unless given."""
     jobs: int | None = None
     """Threads that voxelize; one for each processor unless given."""
+    on: str | None = None
+    """Scheduler of dask.distributed, ``tcp://host:8786``, whose workers voxelize instead."""
     keep_removed: bool = False
     """Skip parts that were removed from the environment; otherwise they are added again."""
     time_limit: float | None = None
@@ -108,6 +111,8 @@ class ImportOptions:
                 raise UsageError(f"a limit of {limit} {name}: give a number above 0")
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"{self.jobs} jobs: give 1 or more")
+        if self.jobs is not None and self.on is not None:
+            raise UsageError(f"{self.jobs} jobs on {self.on}: workers have threads of their own")
         if self.layout is not None and self.grid.curve is not None:
             check_curve(self.grid.curve, self.layout)
 
@@ -158,10 +163,10 @@ def import_files(
     if not files:
         raise UsageError("no files: name at least one to import")
     reports: list[FileReport] = []
-    with _Target(url, chosen) as target:
+    with connected(chosen.on) as workers, _Target(url, chosen) as target:
         with target.loading:
             for file in files:
-                reports.append(_import_file(target, file, chosen, progress))
+                reports.append(_import_file(target, file, chosen, progress, workers))
                 target.is_first_file = False
                 target.has_written |= bool(reports[-1].added)
         if target.store is not None and target.store.revision():
@@ -174,11 +179,13 @@ def _import_file(
     file: str | os.PathLike[str],
     options: ImportOptions,
     progress: ImportCallback | None,
+    workers: Cluster | None,
 ) -> FileReport:
     """Import one file; if it cannot be used, the report says why."""
     try:
         mesh_file = read_file(file, unit=options.unit, **options.limits)
-        return ingest_file(target.store_for(mesh_file), mesh_file, options, progress)
+        store = target.store_for(mesh_file)
+        return ingest_file(store, mesh_file, options, progress, workers)
     except (FileError, MissingExtraError) as error:
         return FileReport(os.fspath(file), "failed", error=error)
 
@@ -254,6 +261,7 @@ def ingest_file(
     mesh_file: MeshFile,
     options: ImportOptions,
     progress: ImportCallback | None = None,
+    workers: Cluster | None = None,
 ) -> FileReport:
     """Write the parts of a file that the environment does not have yet.
 
@@ -265,7 +273,7 @@ def ingest_file(
         If a part has another geometry than the object of its name, which is not to be replaced.
     """
     plan = _planned(store, mesh_file, options)
-    jobs = options.jobs or os.cpu_count() or 1
+    jobs = workers or options.jobs or os.cpu_count() or 1
     id_of = {part.name: i for i, part in plan.changed.items()}
     anew = voxelize_parts(plan.changed.values(), mesh_file, store, options.unit, jobs)
     with contextlib.closing(anew):
@@ -321,7 +329,7 @@ def _add_missing(
     store: Store,
     mesh_file: MeshFile,
     plan: _Plan,
-    unit_and_jobs: tuple[str | None, int],
+    unit_and_jobs: tuple[str | None, int | Cluster],
     progress: ImportCallback | None,
 ) -> set[int]:
     """Add the missing parts, except those that another process adds meanwhile; returns the ids."""

@@ -1,15 +1,17 @@
-"""Voxelizes parts into rows: a part in pieces of bounded size, several parts at once in threads."""
+"""Voxelizes parts into rows: a part in pieces of bounded size, several parts at once."""
 
 from collections import deque
-from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from collections.abc import Callable, Generator, Iterable, Iterator
 from concurrent.futures import CancelledError, Future, ThreadPoolExecutor, wait
+from contextlib import closing
 from functools import partial
 from threading import Event
-from typing import TypeVar
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.cluster.workers import Cluster
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
 from hapticdb.ingest.geometry import packed_surface
@@ -183,27 +185,69 @@ def check_room(n_bytes: int, what: str) -> None:
         )
 
 
+class Recipe(NamedTuple):
+    """What the rows of a part depend on beside the part."""
+
+    link: str
+    attributes: dict[str, object]
+    grid: Grid
+    layout: Layout
+    distances: bool
+
+    def object_of(
+        self, item: tuple[Part, bool], progress: ShareCallback | None = None
+    ) -> tuple[Object, Rows, bytes | None]:
+        """Object and rows of a part at its placement in the file; with its surface, if wanted."""
+        part, is_wanted = item
+        try:
+            rows, n_voxels = rows_of_part(
+                part, self.grid, self.layout, progress=progress, distances=self.distances
+            )
+            surface = packed_surface(part) if is_wanted else None
+        except FileError as error:
+            raise FileError(f"{self.link}: {error}") from None
+        made = Object(
+            name=part.name, link=self.link, digest=part.digest, transform=part.world_from_part,
+            voxels=n_voxels, bounds=part.bounds, attributes=self.attributes,
+        )  # fmt: skip
+        return made, rows, surface
+
+
 def voxelize_parts(
     parts: Iterable[Part],
     file: MeshFile,
     store: Store,
     unit: str | None,
-    jobs: int,
+    jobs: int | Cluster,
     progress: ShareCallback = lambda _share: None,
 ) -> Generator[tuple[Object, Rows, bytes], None, None]:
-    """Yield objects, rows and packed surfaces of parts, in order; threads work a few in advance.
+    """Yield objects, rows and packed surfaces of parts, in order, a few of them made in advance.
 
     Threads suffice because the voxelizer runs without the interpreter lock. unit : in which the
-    file was read, stored with the objects; progress : as for `in_threads`.
+    file was read, stored with the objects; jobs : threads here, or workers elsewhere; progress : as
+    for `in_threads`.
     """
     given = {"unit": unit, "up": file.up}
-    attributes = {name: value for name, value in given.items() if value}
+    attributes: dict[str, object] = {name: value for name, value in given.items() if value}
+    recipe = Recipe(file.link, attributes, store.grid, store.layout, store.wants_distances)
     surfaces: dict[str, bytes] = {}
+    asked: set[str] = set()
 
-    def voxelize_part(part: Part, share: ShareCallback) -> tuple[Object, Rows, bytes]:
-        return _object_of(part, file, store, attributes, surfaces, share)
+    def items() -> Iterator[tuple[Part, bool]]:
+        for part in parts:
+            yield part, part.digest not in asked  # instances share a surface
+            asked.add(part.digest)
 
-    yield from in_threads(parts, voxelize_part, jobs, progress)
+    made = (
+        in_threads(items(), recipe.object_of, jobs, progress)
+        if isinstance(jobs, int)
+        else jobs.each(recipe.object_of, items())
+    )
+    with closing(made):
+        for obj, rows, surface in made:
+            if surface is not None:
+                surfaces[obj.digest] = surface
+            yield obj, rows, surfaces[obj.digest]
 
 
 def in_threads(
@@ -249,38 +293,3 @@ def in_threads(
     finally:
         ended.set()
         pool.shutdown(wait=True, cancel_futures=True)
-
-
-def _object_of(
-    part: Part,
-    file: MeshFile,
-    store: Store,
-    attributes: Mapping[str, object],
-    surfaces: dict[str, bytes],
-    progress: ShareCallback,
-) -> tuple[Object, Rows, bytes]:
-    """Object, rows and surface of a part at its placement in the file.
-
-    surfaces : those that are packed already, by their digests: instances share one.
-    """
-    try:
-        rows, n_voxels = rows_of_part(
-            part, store.grid, store.layout, progress=progress, distances=store.wants_distances
-        )
-        if part.digest not in surfaces:
-            surfaces[part.digest] = packed_surface(part)
-    except FileError as error:
-        raise FileError(f"{file.link}: {error}") from None
-    return (
-        Object(
-            name=part.name,
-            link=file.link,
-            digest=part.digest,
-            transform=part.world_from_part,
-            voxels=n_voxels,
-            bounds=part.bounds,
-            attributes=attributes,
-        ),
-        rows,
-        surfaces[part.digest],
-    )

@@ -8,7 +8,7 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
-from hapticdb.cli.options import CsvOption, JsonOption, UrlArgument
+from hapticdb.cli.options import ClusterOption, CsvOption, JsonOption, UrlArgument
 from hapticdb.cli.values import numbers_of
 from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import ReadOnlyError, UsageError
@@ -134,6 +134,7 @@ def clashes(
     kind: KindOption = None,
     seconds: SecondsOption = None,
     budget: BudgetOption = 256.0,
+    on: ClusterOption = None,
     accept: AcceptOption = None,
     because: BecauseOption = None,
     csv: CsvOption = None,
@@ -153,7 +154,7 @@ def clashes(
         return
     if poses is not None or turn is not None:
         motion = _Motion(of or [], poses, turn, about, from_, to)
-        is_more = bool(csv or html or kind or seconds)
+        is_more = bool(csv or html or kind or seconds or on)
         raise typer.Exit(_moved(url, motion, against, contact, is_more=is_more, json=json))
     render.compile_kernels("clashes")
     from hapticdb.clashes.run import find_clashes
@@ -167,7 +168,7 @@ def clashes(
     ):
         found = find_clashes(
                 env, within=MM * within, contact=MM * contact, of=of or (), against=against or (),
-                seconds=seconds, budget=int(budget * 2**20), progress=progress,
+                seconds=seconds, budget=int(budget * 2**20), progress=progress, on=on,
             )  # fmt: skip
         told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
         if table:
@@ -208,7 +209,9 @@ def _moved(
     from hapticdb.poses import read_poses
 
     if is_more or not motion.of:
-        raise UsageError("--poses and --turn take --of, and no --csv, --html, --kind, --seconds")
+        raise UsageError(
+            "--poses and --turn take --of, and no --csv, --html, --kind, --seconds, --on"
+        )
     if (motion.poses is None) == (motion.turn is None) or motion.turn not in {None, *AXES}:
         raise UsageError("give either --poses CSV, or --turn x, y or z")
     center = None

@@ -10,6 +10,7 @@ from hapticdb.cli import render
 from hapticdb.cli.choosing import felt_objects, ids_of
 from hapticdb.cli.options import (
     BudgetOption,
+    ClusterOption,
     ExcludeOption,
     JsonOption,
     ObjectsArgument,
@@ -147,6 +148,7 @@ def extract(
     where: WhereOption = None,
     exclude: ExcludeOption = None,
     budget: BudgetOption = 256.0,
+    on: ClusterOption = None,
     path: WayOption = None,
     picture: PictureOption = None,
     animation: AnimationOption = None,
@@ -160,8 +162,8 @@ def extract(
 
     check_picture(picture)
     _check_animation(animation)
-    if not disassemble and (depth is not None or keep):
-        raise UsageError("--depth and --keep go with --disassemble")
+    if not disassemble and (depth is not None or keep or on):
+        raise UsageError("--depth, --keep and --on go with --disassemble")
     if to and (disassemble or out or screw):
         raise UsageError("--to goes with none of --disassemble, --out and --screw")
     goal = _goal(to) if to else None
@@ -169,8 +171,8 @@ def extract(
     options: dict[str, Any] = {
         "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
         "contact": MM * contact, "budget_bytes": budget_bytes(budget),
+        **({} if seconds is None else {"seconds": seconds}),
     }  # fmt: skip
-    options |= {} if seconds is None else {"seconds": seconds}
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")
         felt = felt_objects(env, where, exclude, ids)
@@ -179,10 +181,9 @@ def extract(
         with render.bar("pulling", "pulls", lambda *now: now) as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:
-                chain = orders.DEFAULT_DEPTH if depth is None else depth
-                order = orders.disassemble(
-                    env, *ids, exclude=exclude or (), keep=kept, depth=chain, **options
-                )
+                options |= {} if depth is None else {"depth": depth}
+                options |= {"exclude": exclude or (), "keep": kept, "on": on}
+                order = orders.disassemble(env, *ids, **options)
             else:
                 found = run.extract(env, *ids, exclude=felt.exclude, to=goal, **options)
         if disassemble:

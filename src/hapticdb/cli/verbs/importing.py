@@ -7,7 +7,14 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import CurveOption, JsonOption, LayoutOption, UnitName, UrlArgument
+from hapticdb.cli.options import (
+    ClusterOption,
+    CurveOption,
+    JsonOption,
+    LayoutOption,
+    UnitName,
+    UrlArgument,
+)
 from hapticdb.cli.root import Interrupted
 from hapticdb.cli.values import numbers_of
 
@@ -103,6 +110,7 @@ def import_(
     layout: LayoutOption = None,
     curve: CurveOption = None,
     jobs: JobsOption = None,
+    on: ClusterOption = None,
     keep_removed: KeepRemovedOption = False,
     time_limit: TimeLimitOption = None,
     memory_limit: MemoryLimitOption = None,
@@ -136,7 +144,7 @@ def import_(
     corner = None if origin is None else numbers_of(origin, 3, "--origin", "X,Y,Z in metres")
     grid = GridOptions(bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve)
     options = ImportOptions(
-        unit=unit, grid=grid, layout=layout, jobs=jobs, keep_removed=keep_removed,
+        unit=unit, grid=grid, layout=layout, jobs=jobs, on=on, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
         replace=replace, distances=distances,
     )  # fmt: skip

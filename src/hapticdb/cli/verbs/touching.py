@@ -1,12 +1,12 @@
 """The verb touch."""
 
 from collections import Counter
-from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Generator, Iterator, Sequence
+from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
@@ -46,7 +46,7 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
-    from hapticdb.batches.feeler import Feeler
+    from hapticdb.batches.result import TouchBatch
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Misfit
@@ -57,8 +57,6 @@ if TYPE_CHECKING:
 
 MOST_TOUCHED = 8
 """Objects in the table of those that were touched in most frames."""
-PIECE = 1 << 18
-"""Poses of a batch that are felt, and written, at once: 60 MB. A larger value takes more memory."""
 MOST_COMPARED = 10_000
 """Poses of a batch whose places are compared with the scene's. Larger: a stray pose is seen."""
 FEW_POSES = 500
@@ -89,8 +87,12 @@ OutOption = Annotated[
     ),
 ]
 OnOption = Annotated[
-    Literal["cpu", "cuda"],
-    typer.Option(help="With --out, what computes: the processors, or a GPU of NVIDIA."),
+    str,
+    typer.Option(
+        metavar="cpu|cuda|ADDRESS",
+        help="With --out, what computes: the processors, a GPU of NVIDIA, or workers of "
+        "dask.distributed, by their scheduler, tcp://host:8786.",
+    ),
 ]
 ContactsCsvOption = Annotated[
     str | None,
@@ -146,10 +148,10 @@ def touch(
             tool=tool, tool_unit=tool_unit, path_unit=path_unit, is_moving=False, reach=reach,
         )  # fmt: skip
         if out is not None:
-            feeler = env.feeler(
-                shell, where=felt.where, exclude=felt.exclude, law=chosen, device=on
+            pieces = env.touch_pieces(
+                shell, path, where=felt.where, exclude=felt.exclude, law=chosen, on=on
             )
-            _touch_into(Path(out), feeler, path)
+            _touch_into(Path(out), shell, pieces)
             return
         touch_at = partial(
             env.touch, shell, strategy=_strategy_of(strategy, env, len(path)), where=felt.where,
@@ -181,19 +183,21 @@ def _some_of(path: "NDArray[np.float64]") -> "NDArray[np.float64]":
     return path[:: max(1, len(path) // MOST_COMPARED)]
 
 
-def _touch_into(out: Path, feeler: "Feeler", path: "NDArray[np.float64]") -> None:
-    """Feel a path piece by piece, into a file."""
+def _touch_into(
+    out: Path, shell: "PointShell", pieces: "Generator[TouchBatch, None, None]"
+) -> None:
+    """Write what is felt, piece by piece, into a file."""
     import numpy as np
 
-    n_touching = 0
-    with feeler, open_felt(out) as write:
-        for first in range(0, len(path), PIECE):
-            felt = feeler.touch(np.asarray(path[first : first + PIECE]))
+    first = n_touching = 0
+    with open_felt(out) as write, closing(pieces):
+        for felt in pieces:
             write(columns_of(first, felt))
+            first += len(felt)
             n_touching += int(np.count_nonzero(felt.n_contacts))
     render.facts([
-        ("shell", shell_text(feeler.shell)),
-        ("poses", f"{len(path):,}: {n_touching:,} in contact"),
+        ("shell", shell_text(shell)),
+        ("poses", f"{first:,}: {n_touching:,} in contact"),
         ("results", str(out)),
     ])  # fmt: skip
 

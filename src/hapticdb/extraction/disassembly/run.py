@@ -8,8 +8,11 @@ import math
 import time
 from collections.abc import Iterator
 from dataclasses import replace
+from functools import partial
 from typing import Any, NamedTuple
 
+from hapticdb.cluster.place import Whereabouts
+from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
 from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Removal, ids_of
@@ -48,6 +51,7 @@ def disassemble(
     keep: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
     progress: SweepCallback | None = None,
+    on: str | None = None,
 ) -> Disassembly:
     """Search an order in which objects are taken off so that parts come out.
 
@@ -68,6 +72,9 @@ def disassemble(
         Length of the longest chain of objects that block one another; 0: as `extract`.
     keep : iterable of int or str
         Objects that are never taken off, but are felt: what stands on the ground, for example.
+    on : str or None
+        Scheduler of dask.distributed, ``tcp://host:8786``, whose workers search at the same time
+        for all that may go next; `progress` is not called then.
 
     Raises
     ------
@@ -77,25 +84,23 @@ def disassemble(
         If straight pulls lead to no order, and the planner is not installed.
     """
     began = time.monotonic()
-    if not (math.isfinite(seconds) and seconds > 0.0):
-        raise UsageError(f"a search of {seconds} seconds: give more than 0")
-    if depth < 0:
-        raise UsageError(f"depth {depth}: give 0 or more")
+    if not (math.isfinite(seconds) and seconds > 0.0) or depth < 0:
+        raise UsageError(f"{seconds} seconds, depth {depth}: give more than 0, and 0 or more")
     parts = tuple(env.find(*words))
     stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
     left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
-    options = {
-        "out": out, "screw": screw, "contact": contact, "seed": seed,
-        "budget_bytes": budget_bytes, "progress": progress,
-    }  # fmt: skip
+    options = {"out": out, "screw": screw, "contact": contact, "seed": seed,
+               "budget_bytes": budget_bytes, "progress": progress}  # fmt: skip
     asked = _Asked(parts, left_out, kept, seconds, motions, options)
-    return replace(_ordered(env, asked, depth), seconds=time.monotonic() - began)
+    with connected(on) as workers:
+        found = _ordered(env, asked, depth, workers)
+    return replace(found, seconds=time.monotonic() - began)
 
 
-def _ordered(env: Environment, asked: "_Asked", depth: int) -> Disassembly:
+def _ordered(env: Environment, asked: "_Asked", depth: int, workers: Cluster | None) -> Disassembly:
     """Search by straight pulls of what blocks, then with the planner; without the time it took."""
-    search = _OrderSearch(env, asked, time.monotonic() + asked.seconds)
+    search = _OrderSearch(env, asked, time.monotonic() + asked.seconds, workers)
     is_found = False
     for motions in dict.fromkeys((0, asked.motions)):
         search.motions_of_others = motions
@@ -127,6 +132,12 @@ class _Asked(NamedTuple):
     options: dict[str, Any]
 
 
+def _search_there(there: Whereabouts, ids: tuple[int, ...], options: dict[str, Any]) -> Extraction:
+    """Search a way out: the task of a worker."""
+    with Environment(there.open()) as env:
+        return extract(env, *ids, **options)
+
+
 class _Known(NamedTuple):
     """A failed search: steps before it, motions of its planner, ids that its pulls depend on."""
 
@@ -153,7 +164,9 @@ class _OrderSearch:
         Whether a search was left out because the time was over.
     """
 
-    def __init__(self, env: Environment, asked: _Asked, until: float) -> None:
+    def __init__(
+        self, env: Environment, asked: _Asked, until: float, workers: Cluster | None
+    ) -> None:
         self.steps: list[Removal] = []
         self.failed: list[FailedSearch] = []
         self.motions_of_others = 0
@@ -161,6 +174,8 @@ class _OrderSearch:
         self.is_spent = False
         self._env, self._asked, self._until = env, asked, until
         self._known: dict[tuple[int, ...], _Known] = {}
+        self._workers = workers
+        self._ahead: dict[tuple[object, ...], Any] = {}
 
     def clear(self, parts: tuple[Object, ...], depth: int, waiting: frozenset[int]) -> bool:
         """Take parts off, if necessary after what blocks them; returns whether they are off.
@@ -180,11 +195,26 @@ class _OrderSearch:
         """Take off something of what blocks; what comes out at once goes first."""
         before = len(self.steps)
         for less in range(depth):
+            if self._workers is not None and less == 0:
+                self._search_ahead(self._workers, failed, waiting)
             for obj in self._candidates(failed, waiting):
                 self.clear((obj,), less, waiting)
                 if len(self.steps) > before:
                     return True
         return False
+
+    def _search_ahead(
+        self, workers: Cluster, failed: FailedSearch, waiting: frozenset[int]
+    ) -> None:
+        """Have workers search ways out for all that block, instead of one after the other."""
+        workers.cancel(self._ahead.values())  # what was taken off since lets them through
+        motions = 0 if self.missing is not None else self.motions_of_others
+        wanted = [(obj.id,) for obj in self._candidates(failed, waiting)]
+        self._ahead = {
+            (ids, self._excluded(), motions): self._given(workers, ids, motions)
+            for ids in wanted
+            if ids not in self._known
+        }
 
     def _candidates(self, failed: FailedSearch, waiting: frozenset[int]) -> Iterator[Object]:
         left_out = waiting | self._gone() | self._asked.keep
@@ -202,6 +232,10 @@ class _OrderSearch:
         """Ids of what was taken off so far."""
         return frozenset(i for step in self.steps for i in step.ids)
 
+    def _excluded(self) -> tuple[int, ...]:
+        """Ids of all that is not felt now."""
+        return (*self._asked.exclude, *sorted(self._gone()))
+
     def _take_off(self, parts: tuple[Object, ...]) -> FailedSearch | None:
         """Search a way out, and take the parts off if it is proved; else say what failed."""
         ids = ids_of(parts)
@@ -211,7 +245,7 @@ class _OrderSearch:
         if known is not None and self._still_holds(known, motions):
             return known.failed
         n_gone, met = len(self.steps), frozenset[int]()
-        excluded = (*self._asked.exclude, *sorted(self._gone()))
+        excluded = self._excluded()
         try:
             if not is_wanted:
                 self._check_something_stands({*excluded, *ids})
@@ -256,14 +290,14 @@ class _OrderSearch:
     def _searched(
         self, ids: tuple[int, ...], excluded: tuple[int, ...], motions: int
     ) -> Extraction:
-        asked = self._asked
-        left = min(self._until - time.monotonic(), SHARE * asked.seconds)
-
         def search(motions: int) -> Extraction:
-            return extract(
-                self._env, *ids, exclude=excluded, seconds=max(left, LEAST), motions=motions,
-                **asked.options,
-            )  # fmt: skip
+            if self._workers is None:
+                return extract(self._env, *ids, **self._options(motions))
+            task = self._ahead.pop((ids, excluded, motions), None)
+            found: Extraction = self._workers.result(
+                task or self._given(self._workers, ids, motions)
+            )
+            return found
 
         if self.missing is None:
             try:
@@ -271,6 +305,18 @@ class _OrderSearch:
             except MissingExtraError as error:
                 self.missing = error
         return search(0)
+
+    def _options(self, motions: int) -> dict[str, Any]:
+        """Options of a search that begins now."""
+        left = min(self._until - time.monotonic(), SHARE * self._asked.seconds)
+        now = {"exclude": self._excluded(), "seconds": max(left, LEAST), "motions": motions}
+        return self._asked.options | now
+
+    def _given(self, workers: Cluster, ids: tuple[int, ...], motions: int) -> Any:  # noqa: ANN401 - dask's future
+        """A search that was given to a worker."""
+        there = Whereabouts.of(self._env.store, self._env.address)
+        options = self._options(motions) | {"progress": None}
+        return workers.submit(partial(_search_there, there, ids, options))
 
     def drop_needless(self) -> None:
         """Drop steps without which all later steps are proved as well, the latest ones first."""

@@ -1,0 +1,44 @@
+"""An opened environment as workers elsewhere find it."""
+
+from typing import NamedTuple
+
+from hapticdb.errors import ClusterError, DatabaseError
+from hapticdb.store.base import Store
+from hapticdb.store.connect import open_store
+
+
+class Whereabouts(NamedTuple):
+    """Where workers read the environment that is open here.
+
+    url : opens it, there as here; revision, write : its last write, by which it is known.
+    """
+
+    url: str
+    revision: int
+    write: tuple[object, ...]
+
+    @classmethod
+    def of(cls, store: Store, url: str) -> "Whereabouts":
+        """Where an opened environment is."""
+        revision = store.revision()
+        return cls(url, revision, _write(store, revision))
+
+    def open(self) -> Store:
+        """Open it in a worker, to read; ClusterError where it is not there, or another one is."""
+        try:
+            store = open_store(self.url, read_only=True)
+        except DatabaseError as error:
+            raise ClusterError(
+                f"a worker does not reach the environment: {error}; name it so that every worker "
+                "reaches it, on a server or by a path on one machine"
+            ) from None
+        if store.revision() < self.revision or _write(store, self.revision) != self.write:
+            store.close()
+            raise ClusterError(f"a worker finds another environment at {store.url}")
+        return store
+
+
+def _write(store: Store, revision: int) -> tuple[object, ...]:
+    for change in store.changes(revision - 1):
+        return change.action, change.id, change.ranges.tobytes()
+    return ()

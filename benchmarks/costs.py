@@ -13,13 +13,10 @@ import time
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import numpy as np
-
 import hapticdb
-from hapticdb import Environment, GridOptions, ImportOptions
+from hapticdb import GridOptions, ImportOptions
 from hapticdb.mesh import read_file
 from hapticdb.sample import SampleFiles
-from hapticdb.store.base import BRICK_BYTES
 
 PEAK = re.compile(r"VmHWM:\s+(\d+) kB")
 LONGEST_S = 1800.0
@@ -49,14 +46,6 @@ def models(sample: Path, *, real: bool) -> list[Model]:
     return [one for one in found if real and one.file.is_file()] + [
         Model("sample car", sample, 1.6)
     ]
-
-
-def distinct_voxels(env: Environment) -> int:
-    """Voxels of an environment in bricks, each once, of whatever objects."""
-    rows = env.store.scan(np.array([0]), np.array([8**env.grid.bits]))
-    starts = np.flatnonzero(np.diff(rows.keys, prepend=-1))
-    bricks = np.bitwise_or.reduceat(rows.occupancy.reshape(-1, BRICK_BYTES), starts, axis=0)
-    return int(np.bitwise_count(bricks).sum())
 
 
 def imported(url: str, file: str, bits: int, extent: float, distances: int) -> dict[str, Any]:
@@ -89,7 +78,6 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
             size, objects = env.size(), env.objects()
             cell[name] |= {"bytes": size.bytes, "rows": size.rows}
             cell |= {"objects": len(objects), "object_voxels": sum(obj.voxels for obj in objects)}
-            cell |= {"voxel_size": env.grid.voxel_size, "distinct_voxels": distinct_voxels(env)}
         url.unlink()
     return cell
 

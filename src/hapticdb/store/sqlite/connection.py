@@ -16,8 +16,8 @@ from hapticdb.store.threads import check_thread, this_thread
 MOST_COMPACTED = 1 << 29
 """Bytes of a file up to which `compact` writes it anew. A larger value lets other writers wait
 longer, 1 s for 100 MB, and takes as much room for temporary files."""
-NO_ROOM = (apsw.BusyError, apsw.FullError)
-"""Errors on which `compact` leaves the file as it is."""
+NO_ROOM = (apsw.BusyError, apsw.FullError, apsw.CantOpenError, apsw.IOError)
+"""Errors on which `compact` leaves the file as it is: also where no temporary file can be made."""
 
 
 class FileConnection:

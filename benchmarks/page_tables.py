@@ -53,9 +53,6 @@ def facts(found: Result, *inputs: str) -> str:
     return "\n".join([*lines, *(f"- {key}: {about[key]}" for key in inputs or about)])
 
 
-# --- in real time --------------------------------------------------------------------------------
-
-
 def _times(spread: Mapping[str, float]) -> str:
     """Median and 99th percentile of times, microseconds."""
     return " / ".join(f"{1e6 * spread[share]:,.0f}" for share in ("p50", "p99"))
@@ -113,9 +110,6 @@ def edits(results: Results) -> str:
     ]
     head = ["engine", "moves", "voxels", "median, ms", "90 % within, ms", "worst, ms"]
     return table(head, rows)
-
-
-# --- others --------------------------------------------------------------------------------------
 
 
 def gpu_frames(results: Results) -> str:

@@ -217,9 +217,6 @@ def contest_counts(name: str) -> Callable[[Results], str]:
     return of
 
 
-# --- scale ----------------------------------------------------------------------------------------
-
-
 def growth(results: Results) -> str:
     """Microseconds a frame, bytes a voxel and seconds by the number of object voxels."""
     cells = cells_of(results, "scale")
@@ -249,9 +246,6 @@ def scale_growth(results: Results) -> str:
         said = f"{min(growths):.2f} to {max(growths):.2f}"
         lines.append(f"- {poses} poses: {most:,} times the voxels take {said} times the time.")
     return "\n".join(lines)
-
-
-# --- beside others -------------------------------------------------------------------------------
 
 
 def speed(results: Results) -> str:

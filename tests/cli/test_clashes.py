@@ -94,6 +94,9 @@ def test_a_turn_and_a_path_say_when_parts_meet(run: Run, tmp_path: Path) -> None
     assert (code, one["name"], one["kind"]) == (1, "cube0", "overlapping")
     assert one["begin"] + one["end"] == pytest.approx(360.0, abs=0.05)
     assert "1 meeting" in run("clashes", path, *hinge)[1]
+    table = list(csv.DictReader(run("clashes", path, *hinge, "--csv", "-")[1].splitlines()))
+    assert [(row["name"], float(row["begin"])) for row in table] == [("cube0", one["begin"])]
+    assert run("clashes", path, *hinge, "--kind", "inside")[:2] == (0, "0 meetings on the way\n")
     (tmp_path / "way.csv").write_text("x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0.1,0,0,1,0,0,0\n")
     code, out, _ = run("clashes", path, "--of", "cube0", "--poses", tmp_path / "way.csv")
     assert (code, out) == (0, "0 meetings on the way\n")

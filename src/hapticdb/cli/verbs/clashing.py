@@ -15,6 +15,7 @@ from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
+    from hapticdb.clashes.moving import Meeting
     from hapticdb.clashes.result import Clash, Clashes
     from hapticdb.environment import Environment
     from hapticdb.store.pairs import Kind
@@ -28,6 +29,8 @@ COLUMNS = (
     "a_z_m", "b_x_m", "b_y_m", "b_z_m", "status", "because",
 )  # fmt: skip
 """Columns of `clashes --csv`: a row for each pair, the gravest first."""
+MEETING_COLUMNS = ("id", "name", "begin", "end", "kind", "at_least_m", "x_m", "y_m", "z_m")
+"""Columns with --poses or --turn: a row for each meeting, in the order of the motion."""
 
 WithinOption = Annotated[
     float, typer.Option(metavar="MM", help="Millimetres: pairs that are so near are told.")
@@ -150,16 +153,16 @@ def clashes(
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
     if accept is not None or because is not None:
-        _accept(url, accept, because, json=json)
-        return
+        raise typer.Exit(_accept(url, accept, because, json=json))
+    kinds = _checked(kind)
     if poses is not None or turn is not None:
-        motion = _Motion(of or [], poses, turn, about, from_, to)
-        is_more = bool(csv or html or kind or seconds or on)
-        raise typer.Exit(_moved(url, motion, against, contact, is_more=is_more, json=json))
+        if html or seconds or on or not of:
+            raise UsageError("--poses and --turn take --of, and no --html, --seconds, --on")
+        motion = _Motion(of, poses, turn, about, from_, to)
+        raise typer.Exit(_moved(url, motion, against, contact, kinds, csv, json=json))
     render.compile_kernels("clashes")
     from hapticdb.clashes.run import find_clashes
 
-    kinds = _checked(kind)
     with (
         open_csv(csv, "--csv", COLUMNS) as table,
         nullcontext() if html is None else new_file(Path(html), "--html") as page,
@@ -198,20 +201,38 @@ class _Motion(NamedTuple):
 
 
 def _moved(
-    url: str, motion: _Motion, against: list[str] | None, contact: float, *,
-    is_more: bool, json: bool,
+    url: str, motion: _Motion, against: list[str] | None, contact: float,
+    kinds: "tuple[Kind, ...]", csv: str | None, *, json: bool,
 ) -> int:  # fmt: skip
     """Print when parts that move meet others; returns the exit code."""
+    with open_csv(csv, "--csv", MEETING_COLUMNS) as table:
+        met = _meetings(url, motion, against, contact)
+        told = [one for one in met if not kinds or one.kind in kinds]
+        if table:
+            table.write([one.id, text_cell(one.name), *one[2:6], *one.place] for one in told)
+    if json:
+        for one in told:
+            render.say_json(one._asdict())
+    elif csv != STDOUT:
+        rows = [(str(one.id), one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
+                 length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
+        unit = "pose" if motion.turn is None else "degrees"
+        if rows:
+            render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
+        render.say(f"{render.counted(len(told), 'meeting')} on the way")
+    return int(any(one.kind in (kinds or ("overlapping",)) for one in told))
+
+
+def _meetings(
+    url: str, motion: _Motion, against: list[str] | None, contact: float
+) -> "list[Meeting]":
+    """When parts that move meet others: numbers of poses, or degrees."""
     import numpy as np
 
     import hapticdb
     from hapticdb.clashes.moving import find_meetings, hinge
     from hapticdb.poses import read_poses
 
-    if is_more or not motion.of:
-        raise UsageError(
-            "--poses and --turn take --of, and no --csv, --html, --kind, --seconds, --on"
-        )
     if (motion.poses is None) == (motion.turn is None) or motion.turn not in {None, *AXES}:
         raise UsageError("give either --poses CSV, or --turn x, y or z")
     center = None
@@ -230,30 +251,15 @@ def _moved(
             center = middle.tolist() if center is None else center
             poses = hinge(AXES.index(motion.turn or "x"), center, motion.begin, motion.end)
         found = find_meetings(
-            env,
-            motion.of,
-            poses,
-            about=center,
-            against=against or (),
-            contact=MM * contact,
-            progress=progress,
-        )
-    start, step = 0.0, 1.0
-    if motion.turn is not None:
-        start, step = motion.begin, (motion.end - motion.begin) / (len(poses) - 1)
-    told = [
+                env, motion.of, poses, about=center, against=against or (), contact=MM * contact,
+                progress=progress,
+            )  # fmt: skip
+    if motion.turn is None:
+        return found
+    start, step = motion.begin, (motion.end - motion.begin) / (len(poses) - 1)
+    return [
         one._replace(begin=start + step * one.begin, end=start + step * one.end) for one in found
     ]
-    for one in told if json else ():
-        render.say_json(one._asdict())
-    if not json:
-        rows = [(str(one.id), one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
-                 length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
-        unit = "pose" if motion.turn is None else "degrees"
-        if rows:
-            render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
-        render.say(f"{render.counted(len(told), 'meeting')} on the way")
-    return int(any(one.kind == "overlapping" for one in told))
 
 
 def _exit_code(found: "Clashes", kinds: "tuple[Kind, ...]") -> int:
@@ -282,7 +288,7 @@ def _opened(url: str) -> "Environment":
         return hapticdb.open(url, read_only=True)
 
 
-def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> None:
+def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> int:
     import hapticdb
     from hapticdb.clashes.run import accept_clash
 
@@ -293,9 +299,10 @@ def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json
     if json:
         for row in rows:
             render.say_json({"a": row.a, "b": row.b, "because": because or None})
-        return
+        return 0
     what = "accepted until a part changes its shape" if because else "no longer accepted"
     render.say(f"{render.counted(len(rows), 'pair')} {what}")
+    return 0
 
 
 def _row(one: "Clash") -> list[object]:

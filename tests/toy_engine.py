@@ -38,8 +38,8 @@ from hapticdb.store.base import (
     joined,
     touched_ranges,
 )
-from hapticdb.store.believed import distances_crc, rows_crc
 from hapticdb.store.pairs import PairRow
+from hapticdb.store.parsing import distances_crc, rows_crc
 from hapticdb.store.refusals import (
     check_distances,
     check_unwritten,

@@ -24,9 +24,9 @@ from hapticdb.store.base import (
     Store,
     row_shift,
 )
-from hapticdb.store.believed import Checksum
 from hapticdb.store.connect import open_store
 from hapticdb.store.engines import DropsRows
+from hapticdb.store.parsing import Checksum
 
 ROWS_AT_ONCE = 1 << 17
 """Rows that are read at a time. A larger value takes more memory and hardly less time."""

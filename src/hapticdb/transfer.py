@@ -23,8 +23,8 @@ from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Rows, Store, joined
-from hapticdb.store.believed import distances_crc
 from hapticdb.store.connect import create_store, exists, open_store
+from hapticdb.store.parsing import distances_crc
 
 MOST_ROWS = 1 << 19
 """Rows of the index that one statement may read, whatever objects they belong to. It takes far less

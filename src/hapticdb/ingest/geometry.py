@@ -10,7 +10,7 @@ from hapticdb.errors import FileError, NoSurfaceError, UsageError
 from hapticdb.mesh import Part, packing
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, Store
-from hapticdb.store.believed import damaged
+from hapticdb.store.parsing import damaged
 
 AT_ONCE = 16
 """Surfaces that one statement reads. A larger value needs fewer statements and more memory."""

@@ -18,7 +18,7 @@ from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.law import PLANE, ForceLaw, TangentPlane
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
-from hapticdb.store.believed import damaged
+from hapticdb.store.parsing import damaged
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell

@@ -6,8 +6,8 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
 from hapticdb.store.base import Keys, Layout, Object, Store
-from hapticdb.store.believed import damaged
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
+from hapticdb.store.parsing import damaged
 
 
 class KnownObjects:

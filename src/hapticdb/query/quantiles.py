@@ -6,7 +6,7 @@ from functools import cached_property
 from hapticdb.errors import UsageError
 from hapticdb.kernels.query import grouping
 from hapticdb.store.base import Keys, Store, row_shift
-from hapticdb.store.believed import damaged
+from hapticdb.store.parsing import damaged
 
 DEFAULT_RESOLUTION = 10_000
 """Buckets of the quantile vector: the paper's best value. Larger: more exact, slower to make."""

@@ -8,7 +8,7 @@ import pytest
 from hapticdb.errors import EnvironmentExistsError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
 from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import EVERYWHERE, blob, covering, voxel_object, with_distances
@@ -139,8 +139,8 @@ class DistancesContract(StoreCase):
         assert [obj.has_distances for obj in band.objects()] == [True, False, True]
         for obj in band.objects():
             rows = self.rows(band, obj.id)
-            assert obj.distances_crc == believed.distances_crc(rows)
-            assert obj.rows_crc == believed.rows_crc(rows.occupied())
+            assert obj.distances_crc == parsing.distances_crc(rows)
+            assert obj.rows_crc == parsing.rows_crc(rows.occupied())
             assert obj.attributes == {"made": True}
 
     def test_a_refused_write_leaves_no_distances(self, band: Store) -> None:

@@ -17,7 +17,7 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import Grid
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import partitions
 from hapticdb.store.postgres.address import Address, parse
@@ -127,7 +127,7 @@ def check(connection: ServerConnection) -> None:
     found = connection.rows("SELECT format FROM environment")
     version = int(found[0][0]) if found else 0
     if not version >= 1:
-        raise believed.damaged(shown, f"format {version}")
+        raise parsing.damaged(shown, f"format {version}")
     if version > FORMAT_VERSION:
         raise NewerVersionError(
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
@@ -189,15 +189,15 @@ def read_environment(connection: ServerConnection) -> Made:
             "copy it to one server with the version that made it"
         )
     # a reader may have opened an environment of an older format
-    wish = "wants_distances" if believed.BAND in kinds else "false"
+    wish = "wants_distances" if parsing.BAND in kinds else "false"
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
         f" tableoid::bigint, {wish}, (SELECT relkind = 'p' FROM pg_class"
         "  WHERE oid = to_regclass(layout)) FROM environment"
     )
-    grid, layout = believed.grid_of(connection.shown, rows)
-    believed.check_tables(connection.shown, kinds)
-    wants = believed.wish_of(connection.shown, rows[0][8])
+    grid, layout = parsing.grid_of(connection.shown, rows)
+    parsing.check_tables(connection.shown, kinds)
+    wants = parsing.wish_of(connection.shown, rows[0][8])
     return Made(grid, layout, wants, rows[0][7], bool(rows[0][9]))
 
 

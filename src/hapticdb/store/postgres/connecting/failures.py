@@ -19,7 +19,7 @@ from hapticdb.errors import (
     StuckError,
     UsageError,
 )
-from hapticdb.store.believed import damaged
+from hapticdb.store.parsing import damaged
 
 IS_STANDBY = "server is in hot standby mode"
 """What libpq says of a standby where it was asked for a primary."""

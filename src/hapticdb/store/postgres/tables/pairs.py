@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Sequence
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.pairs import COLUMNS, UNLESS_LATER, PairRow
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.reading import PostgresReader
@@ -28,10 +28,10 @@ class PostgresPairs:
 
     def pairs(self) -> list[PairRow]:
         """All rows, ordered by a and b."""
-        if not self._reader.has_table(believed.PAIR):
+        if not self._reader.has_table(parsing.PAIR):
             return []
         found = self._connection.rows(f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b")
-        return [believed.pair_of(self._connection.shown, row) for row in found]
+        return [parsing.pair_of(self._connection.shown, row) for row in found]
 
     def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
         """Write rows, unless a later revision's are there, and delete others."""
@@ -58,6 +58,6 @@ class PostgresPairs:
         )
 
     def _write(self, work: Callable[[], object]) -> None:
-        if not self._reader.has_table(believed.PAIR):
+        if not self._reader.has_table(parsing.PAIR):
             raise older_format(self._connection.shown)
         self._connection.write(work)

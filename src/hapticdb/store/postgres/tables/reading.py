@@ -5,7 +5,7 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import (
     NO_KEYS,
     NO_OCCUPANCY,
@@ -74,7 +74,7 @@ class PostgresReader:
         rows = Rows(keys, ids, occupancy)
         if distances:
             lengths = wire.read_int8s(found[4])
-            rows = rows.having(believed.band_of(self._url, found[3] or b"", lengths))
+            rows = rows.having(parsing.band_of(self._url, found[3] or b"", lengths))
         return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
     def has_table(self, name: str) -> bool:
@@ -91,7 +91,7 @@ class PostgresReader:
         is_nothing: bool = False,
     ) -> Rows:
         """Rows by the statement of the table that answers; none if that table is not there."""
-        if is_nothing or (distances and not self.has_table(believed.BAND)):
+        if is_nothing or (distances and not self.has_table(parsing.BAND)):
             return no_rows(distances=distances)
         text = texts["band" if distances else self._layout]
         return self.unpacked(self._connection.fetch(text, *parameters), distances=distances)
@@ -169,7 +169,7 @@ class PostgresReader:
         """All objects, ordered by id."""
         self.revision()  # first: a write between the two statements is noticed by the next read
         return [
-            believed.object_of(self._url, row)
+            parsing.object_of(self._url, row)
             for row in self._connection.rows(f"{OBJECTS} ORDER BY id")
         ]
 
@@ -178,7 +178,7 @@ class PostgresReader:
         rows = self._connection.rows(f"{OBJECTS} WHERE id = %s", (object_id,))
         if not rows:
             raise no_object(object_id, self._url)
-        return believed.object_of(self._url, rows[0])
+        return parsing.object_of(self._url, rows[0])
 
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
@@ -192,25 +192,25 @@ class PostgresReader:
             "SELECT revision, action, id, ranges FROM change WHERE revision > %s ORDER BY revision",
             (since,),
         ):
-            yield believed.change_of(self._url, row)
+            yield parsing.change_of(self._url, row)
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
         """Packed surfaces of the digests that have one, in one statement."""
-        if not self.has_table(believed.SURFACE):
+        if not self.has_table(parsing.SURFACE):
             return {}
         text = "SELECT digest, geometry FROM surface WHERE digest = ANY (%s)"
 
         def read() -> list[tuple[object, ...]]:
             return self._connection.driver.execute(text, (list(digests),), binary=True).fetchall()
 
-        return believed.surfaces_of(self._url, self._connection.again(read))
+        return parsing.surfaces_of(self._url, self._connection.again(read))
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""
-        if not self.has_table(believed.SURFACE):
+        if not self.has_table(parsing.SURFACE):
             return set()
         found = self._connection.rows("SELECT digest FROM surface")
-        return believed.digests_of(self._url, found)
+        return parsing.digests_of(self._url, found)
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:

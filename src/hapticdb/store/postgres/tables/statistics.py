@@ -4,7 +4,7 @@ import json
 from collections.abc import Iterator, Mapping, Sequence
 from typing import Any
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import Freshness, Histogram, Keys, Layout, Size
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.histogram import (
@@ -48,12 +48,12 @@ class PostgresStatistics:
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
-            if self._reader.has_table(believed.BAND):
+            if self._reader.has_table(parsing.BAND):
                 (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
             if self._is_spread:
                 ((more, index, of_band),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
                 total, index, band = total + int(more), int(index), (band[0], of_band)
-            if self._reader.has_table(believed.SURFACE):
+            if self._reader.has_table(parsing.SURFACE):
                 (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
             return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
 
@@ -73,7 +73,7 @@ class PostgresStatistics:
             (resolution,),
         )
         if kept:
-            return believed.histogram_of(self._connection.shown, *kept[0])
+            return parsing.histogram_of(self._connection.shown, *kept[0])
         return Histogram(*self._exact(resolution), "computed")
 
     def freshness(self, resolution: int) -> Freshness:
@@ -115,14 +115,14 @@ class PostgresStatistics:
         """What is wrong with kept statistics, a line each; the server checks its own pages."""
         kept = self._connection.rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
         costs = self._connection.rows("SELECT figures::text FROM cost")
-        yield from believed.findings_of_kept(self._connection.shown, kept, costs)
+        yield from parsing.findings_of_kept(self._connection.shown, kept, costs)
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
         kept = self._connection.rows(
             "SELECT figures::text FROM cost WHERE machine = %s", (machine,)
         )
-        return believed.figures_of(self._connection.shown, kept[0][0]) if kept else None
+        return parsing.figures_of(self._connection.shown, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
         """Keep the fitted cost figures of a machine."""

@@ -7,7 +7,7 @@ import numpy as np
 from psycopg import errors
 
 from hapticdb.grid import Grid
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import NO_KEYS, Covering, Keys, Layout, Object, Rows, Table, touched_ranges
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -129,7 +129,7 @@ class PostgresWriter:
             self._execute("SELECT 1 FROM environment WHERE id = 1 FOR UPDATE")  # the write lock
             self._put_surface(digest, surface)
 
-        if not self._reader.has_table(believed.SURFACE):
+        if not self._reader.has_table(parsing.SURFACE):
             raise older_format(self._connection.shown)
         self._connection.write(work)
 
@@ -201,14 +201,14 @@ class PostgresWriter:
 
     def _put_surface(self, digest: str, surface: bytes | None) -> None:
         """Write a surface; an editor of an older environment, whose owner makes the table, none."""
-        if surface is None or not self._reader.has_table(believed.SURFACE):
+        if surface is None or not self._reader.has_table(parsing.SURFACE):
             return
         if self._execute(LACKS_SURFACE, {"digest": digest}) == [(True,)]:
             self._execute("INSERT INTO surface VALUES (%s, %b)", (digest, surface))
 
     def _drop_surface(self, digest: str) -> None:
         """Delete a surface that no object has any more."""
-        if self._reader.has_table(believed.SURFACE):
+        if self._reader.has_table(parsing.SURFACE):
             self._execute(DROP_SURFACE, {"digest": digest})
 
     def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
@@ -250,6 +250,6 @@ def _contents(record: Object, rows: Rows, revision: int) -> dict[str, Any]:
         "transform": np.asarray(record.transform, dtype=np.float64).reshape(-1).tolist(),
         "voxels": int(record.voxels),
         "bounds": np.asarray(record.bounds, dtype=np.float64).reshape(-1).tolist(),
-        "attributes": believed.attributes_text(record, rows),
+        "attributes": parsing.attributes_text(record, rows),
         "revision": revision,
     }

@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import Grid
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.query import refining
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, Keys, Layout, LocatedShell, row_shift
 
 WRENCH = {
@@ -64,7 +64,7 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
 
     def get_bit(occupancy: bytes, bit: int) -> int:
         if not isinstance(occupancy, bytes) or len(occupancy) != BRICK_BYTES:
-            raise believed.damaged(connection.filename, "a brick of the wrong length")
+            raise parsing.damaged(connection.filename, "a brick of the wrong length")
         return occupancy[bit >> 3] >> (bit & 7) & 1  # as PostgreSQL's function of that name
 
     is_felt = _LastExcluded().is_felt

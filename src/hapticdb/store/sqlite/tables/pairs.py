@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.pairs import COLUMNS, UNLESS_LATER, PairRow
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
@@ -20,10 +20,10 @@ class SQLitePairs:
 
     def pairs(self) -> list[PairRow]:
         """All rows, ordered by a and b."""
-        if not self._reader.has_table(believed.PAIR):
+        if not self._reader.has_table(parsing.PAIR):
             return []
         found = self._connection.fetch(f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b")
-        return [believed.pair_of(self._connection.url, row) for row in found]
+        return [parsing.pair_of(self._connection.url, row) for row in found]
 
     def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
         """Write rows, unless a later revision's are there, and delete others."""

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import (
     Change,
     Keys,
@@ -61,15 +61,15 @@ SELECT {columns} FROM {TABLES[table]}
 def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
     """Grid and layout of an environment, and whether it wants distances, all checked."""
     kinds = dict(connection.fetch(sqlite_rows.KINDS))
-    believed.check_tables(connection.url, kinds)
+    parsing.check_tables(connection.url, kinds)
     # a reader may have opened a file of an older format
-    wish = "wants_distances" if believed.BAND in kinds else "0"
+    wish = "wants_distances" if parsing.BAND in kinds else "0"
     rows = connection.fetch(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, "
         f"{wish} FROM environment"
     )
-    grid, layout = believed.grid_of(connection.url, rows)
-    return grid, layout, believed.wish_of(connection.url, rows[0][7])
+    grid, layout = parsing.grid_of(connection.url, rows)
+    return grid, layout, parsing.wish_of(connection.url, rows[0][7])
 
 
 class SQLiteReader:
@@ -87,7 +87,7 @@ class SQLiteReader:
         """Number of the last committed write; 0 for an empty environment."""
         self._connection.file.check()
         found = self._connection.fetch("SELECT coalesce(max(revision), 0) FROM change")
-        return believed.number_of(self._connection.url, found[0][0], "the revision")
+        return parsing.number_of(self._connection.url, found[0][0], "the revision")
 
     # -- rows -----------------------------------------------------------------------------------
 
@@ -106,7 +106,7 @@ class SQLiteReader:
 
     def _table(self, *, distances: bool, is_nothing: bool = False) -> Table | None:
         """Table that answers a read; None if it is not there, or nothing is asked for."""
-        if is_nothing or (distances and not self.has_table(believed.BAND)):
+        if is_nothing or (distances and not self.has_table(parsing.BAND)):
             return None
         return "band" if distances else self._layout
 
@@ -189,7 +189,7 @@ class SQLiteReader:
     def _objects(self, condition: str, *bindings: int) -> list[Object]:
         self._connection.file.check()
         return [
-            believed.object_of(self._connection.url, row)
+            parsing.object_of(self._connection.url, row)
             for row in self._connection.fetch(
                 "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
                 f"FROM object WHERE {condition} ORDER BY id",
@@ -208,21 +208,21 @@ class SQLiteReader:
             "SELECT revision, action, id, ranges FROM change WHERE revision > ? ORDER BY revision",
             (since,),
         ):
-            yield believed.change_of(self._connection.url, row)
+            yield parsing.change_of(self._connection.url, row)
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
         """Packed surfaces of the digests that have one, in one statement."""
-        if not self.has_table(believed.SURFACE):
+        if not self.has_table(parsing.SURFACE):
             return {}
         found = self._connection.fetch(
             "SELECT digest, geometry FROM surface WHERE digest IN (SELECT value FROM json_each(?))",
             (json.dumps(list(digests)),),
         )
-        return believed.surfaces_of(self._connection.url, found)
+        return parsing.surfaces_of(self._connection.url, found)
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""
-        if not self.has_table(believed.SURFACE):
+        if not self.has_table(parsing.SURFACE):
             return set()
         found = self._connection.fetch("SELECT digest FROM surface")
-        return believed.digests_of(self._connection.url, found)
+        return parsing.digests_of(self._connection.url, found)

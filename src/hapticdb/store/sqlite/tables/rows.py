@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import (
     BRICK_BYTES,
     NO_DISTANCES,
@@ -54,9 +54,9 @@ def _bricks(
             distances,
         )
     except (TypeError, ValueError, OverflowError) as error:
-        raise believed.damaged(url, f"a row of another kind: {error}") from error
+        raise parsing.damaged(url, f"a row of another kind: {error}") from error
     if len(joined) != BRICK_BYTES * count:
-        raise believed.damaged(url, "a brick of the wrong length")
+        raise parsing.damaged(url, "a brick of the wrong length")
     return rows
 
 
@@ -68,10 +68,10 @@ def rows_with_distances(url: str, found: list[Any]) -> Rows:
     try:
         joined = b"".join(packed)
     except TypeError as error:
-        raise believed.damaged(url, f"distances of another kind: {error}") from error
+        raise parsing.damaged(url, f"distances of another kind: {error}") from error
     # by Python's own functions: a frame has few rows, and each call of NumPy takes 2 us
     lengths = list(map(len, packed))
-    believed.check_lengths(url, min(lengths), max(lengths))
+    parsing.check_lengths(url, min(lengths), max(lengths))
     ends = np.fromiter(accumulate(lengths), np.int64, len(lengths))
     bits = [NO_VOXEL if brick is None else brick for brick in bricks]
     return _bricks(url, keys, ids, bits, Band(np.frombuffer(joined, np.uint8), ends))
@@ -82,7 +82,7 @@ def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
     try:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
     except (TypeError, ValueError, OverflowError) as error:
-        raise believed.damaged(url, f"a row of another kind: {error}") from error
+        raise parsing.damaged(url, f"a row of another kind: {error}") from error
 
 
 def contents(record: Object, rows: Rows) -> tuple[Any, ...]:
@@ -92,5 +92,5 @@ def contents(record: Object, rows: Rows) -> tuple[Any, ...]:
         np.ascontiguousarray(record.transform, dtype="<f8").tobytes(),
         int(record.voxels),
         np.ascontiguousarray(record.bounds, dtype="<f8").tobytes(),
-        believed.attributes_text(record, rows),
+        parsing.attributes_text(record, rows),
     )

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.store import believed
+from hapticdb.store import parsing
 from hapticdb.store.base import Freshness, Histogram, Keys, Layout, Size
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
@@ -33,9 +33,9 @@ class SQLiteStatistics:
             blocks = self._connection.fetch(
                 "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self._layout,)
             )
-            if self._reader.has_table(believed.BAND):
+            if self._reader.has_table(parsing.BAND):
                 (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
-            if self._reader.has_table(believed.SURFACE):
+            if self._reader.has_table(parsing.SURFACE):
                 (surfaces,) = self._connection.fetch(SIZE_OF_SURFACES)
         wal = Path(f"{self._connection.path}-wal")
         total = self._connection.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
@@ -50,7 +50,7 @@ class SQLiteStatistics:
         with self._connection.snapshot():
             kept = self._kept_quantiles(resolution)
             if kept:
-                return believed.histogram_of(self._connection.url, *kept[0])
+                return parsing.histogram_of(self._connection.url, *kept[0])
             bounds, n_rows = _exact_quantiles(self._connection, self._layout, resolution)
             return Histogram(bounds, n_rows, "computed")
 
@@ -93,12 +93,12 @@ class SQLiteStatistics:
                 yield " ".join(str(line).split())
         kept = self._connection.fetch("SELECT bounds, n_rows FROM quantile")
         costs = self._connection.fetch("SELECT figures FROM cost")
-        yield from believed.findings_of_kept(self._connection.url, kept, costs)
+        yield from parsing.findings_of_kept(self._connection.url, kept, costs)
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
         """Figures that `save_costs` kept for that machine."""
         kept = self._connection.fetch("SELECT figures FROM cost WHERE machine = ?", (machine,))
-        return believed.figures_of(self._connection.url, kept[0][0]) if kept else None
+        return parsing.figures_of(self._connection.url, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
         """Keep the fitted cost figures of a machine."""
@@ -122,7 +122,7 @@ def _exact_quantiles(
     def row_of(sql: str, *bindings: int) -> tuple[int, int]:
         found = connection.fetch(sql, bindings)
         if not found:
-            raise believed.damaged(connection.url, "fewer rows than are counted")
+            raise parsing.damaged(connection.url, "fewer rows than are counted")
         key, object_id = found[0]
         return key, object_id
 

@@ -5,7 +5,7 @@ import contextlib
 import multiprocessing
 from collections.abc import Iterator
 from functools import partial
-from multiprocessing.connection import Connection
+from multiprocessing.queues import Queue
 from pathlib import Path
 
 READY_WITHIN = 30.0
@@ -19,29 +19,28 @@ def delayed(socket: Path, seconds: float) -> Iterator[int]:
     seconds : latency added to a round trip, half of it each way.
     """
     spawn = multiprocessing.get_context("spawn")
-    here, there = spawn.Pipe()
-    process = spawn.Process(target=_run, args=(socket, seconds, there), daemon=True)
+    told = spawn.Queue()
+    process = spawn.Process(target=_run, args=(socket, seconds, told), daemon=True)
     process.start()
     try:
-        assert here.poll(READY_WITHIN), "the relay does not begin"
-        yield here.recv()
+        yield told.get(timeout=READY_WITHIN)
     finally:
         process.kill()
         process.join(READY_WITHIN)
 
 
-def _run(socket: Path, seconds: float, told: Connection) -> None:
+def _run(socket: Path, seconds: float, told: Queue[int]) -> None:
     asyncio.run(_relay(socket, 0.5 * seconds, told))
 
 
-async def _relay(socket: Path, wait: float, told: Connection) -> None:
+async def _relay(socket: Path, wait: float, told: Queue[int]) -> None:
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         far_reader, far_writer = await asyncio.open_unix_connection(socket)
         ways = (reader, far_writer), (far_reader, writer)
         await asyncio.gather(*(_carry(*way, wait) for way in ways))
 
     async with await asyncio.start_server(accept, "127.0.0.1", 0) as server:
-        told.send(server.sockets[0].getsockname()[1])
+        told.put(server.sockets[0].getsockname()[1])
         await server.serve_forever()
 
 

@@ -52,6 +52,7 @@ def test_the_worked_example_of_contacts_is_right() -> None:
         assert result[:6] == pytest.approx(wrench, abs=1e-4)
 
 
+@pytest.mark.long
 def test_the_client_of_the_page_feels_a_surface(tmp_path: Path) -> None:
     block = re.search(r"```python\n(.*?)```", PAGE.read_text().split("## Contacts")[1], re.DOTALL)
     assert block is not None

@@ -191,6 +191,7 @@ def test_what_nobody_has_foreseen_is_told_without_its_words() -> None:
     assert error_text(DatabaseError("busy"), ()) == "busy"
 
 
+@pytest.mark.long
 def test_the_part_in_hand_is_the_only_one_that_is_unseen(scene: Path) -> None:
     with page_of(scene) as (site, person, browser):
         box = choose(browser, "box.stl")

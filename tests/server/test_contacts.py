@@ -171,6 +171,7 @@ def test_a_flood_of_malformed_messages_leaves_others_alone(served: Served) -> No
     assert served.process.poll() is None
 
 
+@pytest.mark.long
 def test_a_client_that_sends_nothing_is_dropped(tmp_path: Path) -> None:
     with serving(tmp_path, idle=0.5) as server:
         with granted(server) as connection:

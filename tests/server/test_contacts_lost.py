@@ -146,6 +146,7 @@ def test_a_connection_that_is_made_while_the_proxy_closes_is_closed(
             connection.receive()
 
 
+@pytest.mark.long
 def test_the_force_comes_back_after_a_server_that_talks_nonsense(mortal: Served) -> None:
     with ContactProxy(mortal.url()) as proxy:
         pressed(mortal, proxy)

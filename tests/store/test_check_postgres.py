@@ -2,6 +2,7 @@
 
 import numpy as np
 import psycopg
+import pytest
 from psycopg import sql
 
 import hapticdb
@@ -31,6 +32,7 @@ CRAFTED = {
 }
 
 
+@pytest.mark.long
 def test_a_crafted_schema_is_told_and_found(place: Place, sphere: hapticdb.PointShell) -> None:
     pose = np.eye(4)
     pose[:3, 3] = 0.06, 0.06, 0.21

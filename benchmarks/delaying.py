@@ -29,11 +29,11 @@ def delayed(socket: Path, seconds: float) -> Iterator[int]:
         process.join(READY_WITHIN)
 
 
-def _run(socket: Path, seconds: float, told: Queue[int]) -> None:
+def _run(socket: Path, seconds: float, told: "Queue[int]") -> None:
     asyncio.run(_relay(socket, 0.5 * seconds, told))
 
 
-async def _relay(socket: Path, wait: float, told: Queue[int]) -> None:
+async def _relay(socket: Path, wait: float, told: "Queue[int]") -> None:
     async def accept(reader: asyncio.StreamReader, writer: asyncio.StreamWriter) -> None:
         far_reader, far_writer = await asyncio.open_unix_connection(socket)
         ways = (reader, far_writer), (far_reader, writer)

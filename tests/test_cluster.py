@@ -107,7 +107,13 @@ def test_an_order_by_workers_is_that_of_one_process(scheduler: str, tmp_path: Pa
     with hapticdb.open(made_of(tmp_path, STACK), read_only=True) as env:
         asked: dict[str, Any] = {"motions": 0, "keep": ["pot"]}
         here = disassemble(env, "content", **asked)
-        there = disassemble(env, "content", on=scheduler, **asked)
+        told: list[tuple[int, int]] = []
+        there = disassemble(
+            env, "content", on=scheduler, progress=lambda *now: told.append(now), **asked
+        )
+    assert [done for done, _ in told] == list(range(1, len(told) + 1))
+    assert len(told) >= len(there.steps)
+    assert all(done <= known for done, known in told)
     assert [step.excluded for step in there.steps] == [step.excluded for step in here.steps]
     for one, other in zip(here.steps, there.steps, strict=True):
         assert one.found.way is not None

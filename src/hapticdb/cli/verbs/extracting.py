@@ -178,7 +178,8 @@ def extract(
         felt = felt_objects(env, where, exclude, ids)
         kept = ids_of(env, keep, "--keep") if keep else []
         render.compile_kernels("extract")
-        with render.bar("pulling", "pulls", lambda *now: now) as progress:
+        told = ("searching", "ways out") if on else ("pulling", "pulls")
+        with render.bar(*told, lambda *now: now) as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:
                 options |= {} if depth is None else {"depth": depth}

@@ -74,7 +74,7 @@ def disassemble(
         Objects that are never taken off, but are felt: what stands on the ground, for example.
     on : str or None
         Scheduler of dask.distributed, ``tcp://host:8786``, whose workers search at the same time
-        for all that may go next; `progress` is not called then.
+        for all that may go next; `progress` is then called with the searches done, and known of.
 
     Raises
     ------
@@ -176,6 +176,7 @@ class _OrderSearch:
         self._known: dict[tuple[int, ...], _Known] = {}
         self._workers = workers
         self._ahead: dict[tuple[object, ...], Any] = {}
+        self._n_searched = 0
 
     def clear(self, parts: tuple[Object, ...], depth: int, waiting: frozenset[int]) -> bool:
         """Take parts off, if necessary after what blocks them; returns whether they are off.
@@ -297,6 +298,9 @@ class _OrderSearch:
             found: Extraction = self._workers.result(
                 task or self._given(self._workers, ids, motions)
             )
+            self._n_searched += 1
+            if (progress := self._asked.options["progress"]) is not None:
+                progress(self._n_searched, self._n_searched + len(self._ahead))
             return found
 
         if self.missing is None:

@@ -24,7 +24,7 @@ from hapticdb.cluster import workers as cluster
 from hapticdb.errors import ClusterError, UsageError
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.transfer import copy_environment
-from scheduling import kill_a_worker, scheduling
+from scheduling import bare_worker, kill_a_worker, scheduling, stop_scheduler
 from servers import Place
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
@@ -244,3 +244,32 @@ def test_a_scheduler_that_goes_away_or_has_no_worker_is_told(
 
         with pytest.raises(ClusterError, match="the scheduler went away"):
             hapticdb.import_files(tmp_path / "there.db", [file], on(address), leave)
+
+
+@pytest.mark.long
+def test_a_scheduler_that_stands_still_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(cluster, "LONGEST_S", 2.0)
+    file, there = balls(tmp_path, 24), tmp_path / "there.db"
+    with scheduling() as address:
+
+        def stop(now: ImportProgress) -> None:
+            if now.parts_done == 3:
+                stop_scheduler(address)
+
+        with pytest.raises(ClusterError, match="the scheduler went away"):
+            hapticdb.import_files(there, [file], on(address), stop)
+    with hapticdb.open(there, read_only=True) as env:
+        assert len(env.objects()) >= 3
+
+
+@pytest.mark.long
+def test_a_worker_without_hapticdb_is_told(scene: Path, tmp_path: Path) -> None:
+    with (
+        scheduling(0) as address,
+        bare_worker(tmp_path / "bare", address),
+        hapticdb.open(scene) as env,
+        pytest.raises(ClusterError, match=r"has no hapticdb: install 0\.1\.0 there, as here"),
+    ):
+        find_clashes(env, within=0.2, on=address)

@@ -94,7 +94,12 @@ class Cluster:
 
     def _threads(self) -> int:
         with self._telling():
-            n_threads: int = sum(self._client.nthreads().values())
+            try:
+                ask = self._client.scheduler.ncores
+                threads: dict[str, int] = self._client.sync(ask, callback_timeout=LONGEST_S)
+            except TimeoutError as error:  # its process or its machine stands still
+                raise OSError(error) from error
+        n_threads = sum(threads.values())
         now = time.monotonic()
         self._there = now if n_threads else self._there
         if now - self._there > LONGEST_S:

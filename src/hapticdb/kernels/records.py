@@ -165,8 +165,7 @@ FOLLOWER: Layout = _record(
         ("right", "<f8", 6),  # their right-hand side: N, N m
         ("step", "<f8", 6),  # of the tool's centre: m, rad
         ("pull", "<f8", 6),  # from tool to hand: m, rad
-        ("spring", "<f8"),  # stiffness along the pull, N/m of the scene
-        ("turn_spring", "<f8"),  # N m/rad of the scene
+        ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
         ("last_hand", "<f8", 3),  # the handle's place in the last period, m
         ("trail", "<f8", (MOST_TRAIL, 4)),  # time s and place m of the handle, in turns
         ("n_trail", "<i8"),  # places written since the handle was last lost

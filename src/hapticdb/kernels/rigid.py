@@ -80,6 +80,13 @@ def moment(rx, ry, rz, fx, fy, fz):
 
 
 @leaf
+def length_at(numbers, start):
+    """Length of the vector in three numbers from `start` on."""
+    x, y, z = numbers[start], numbers[start + 1], numbers[start + 2]
+    return math.sqrt(x * x + y * y + z * z)
+
+
+@leaf
 def product(aw, ax, ay, az, bw, bx, by, bz):
     """Quaternion of turning by b, then by a."""
     return (

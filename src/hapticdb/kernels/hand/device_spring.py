@@ -8,7 +8,7 @@ import math
 from typing import NamedTuple
 
 from hapticdb.kernels._jit import FLOAT, fields_of, leaf
-from hapticdb.kernels.rigid import moment, product, turn, turn_of, turned_by
+from hapticdb.kernels.rigid import length_at, moment, product, turn, turn_of, turned_by
 
 BEYOND_CAP = 1.2
 """Most force of the spring, in caps of the device. Larger: the tool is pressed harder than the hand
@@ -53,31 +53,36 @@ def contact_stiffness(spring, size):
 
 @leaf
 def measure_pull(spring, tool, hand, pose, center, follower):
-    """Stretch and turn from tool to hand into follower.pull (6,), and their stiffnesses.
+    """Stretch and turn from tool to hand: see `stretch`.
 
-    m and rad in the scene, at the tool's centre (3,), given in the tool's frame. A stiffness is
-    lower where the spring reaches its cap.
+    center (3,): the tool's, in the tool's frame.
     """
     hw, hx, hy, hz = hand.quaternion[0], hand.quaternion[1], hand.quaternion[2], hand.quaternion[3]
     rx, ry, rz = lever_in_hand(hand, center)
     x, y, z = center[0], center[1], center[2]
-    pull, position = follower.pull, hand.position
+    pull, position, turned = follower.pull, hand.position, tool.quaternion
     for axis in range(3):
         at = turn(pose[axis, 0], pose[axis, 1], pose[axis, 2], x, y, z) + pose[axis, 3]
         pull[axis] = position[axis] + (rx if axis == 0 else (ry if axis == 1 else rz)) - at
-    turn_w, turn_x, turn_y, turn_z = (
-        tool.quaternion[0], tool.quaternion[1], tool.quaternion[2], tool.quaternion[3],
-    )  # fmt: skip
-    pull[3], pull[4], pull[5] = turn_of(*product(hw, hx, hy, hz, turn_w, -turn_x, -turn_y, -turn_z))
-    way = math.sqrt(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2])
-    angle = math.sqrt(pull[3] * pull[3] + pull[4] * pull[4] + pull[5] * pull[5])
-    stiffness = follower.share * spring.stiffness / spring.scale
-    turn_stiffness = follower.share * spring.turn_stiffness * spring.scale
-    most, most_turn = BEYOND_CAP * spring.cap, BEYOND_CAP * spring.turn_cap * spring.scale
-    follower.spring = most / way if stiffness * way > most else stiffness
-    follower.turn_spring = (
-        most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
+    pull[3], pull[4], pull[5] = turn_of(
+        *product(hw, hx, hy, hz, turned[0], -turned[1], -turned[2], -turned[3])
     )
+    stretch(
+        follower, follower.share * spring.stiffness / spring.scale,
+        follower.share * spring.turn_stiffness * spring.scale, BEYOND_CAP * spring.cap,
+        BEYOND_CAP * spring.turn_cap * spring.scale,
+    )  # fmt: skip
+
+
+@leaf
+def stretch(one, stiffness, turn_stiffness, most, most_turn):
+    """Stiffnesses along one.pull (6,), m and rad in the scene, into one.pulls (2,).
+
+    one: of FOLLOWER or CONTACT_MODEL. The spring pulls by `most` N and `most_turn` N m at most.
+    """
+    way, angle = length_at(one.pull, 0), length_at(one.pull, 3)
+    one.pulls[0] = most / way if stiffness * way > most else stiffness
+    one.pulls[1] = most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
 
 
 @leaf
@@ -93,20 +98,21 @@ def push_of(spring, hand, center, follower):
 
     The force is at most `cap`, and the torque about the tool's centre at most `turn_cap`.
     """
-    pull = follower.pull
-    fx, fy, fz = shortened(
-        -follower.spring * pull[0], -follower.spring * pull[1], -follower.spring * pull[2],
-        spring.cap,
-    )  # fmt: skip
-    tx, ty, tz = shortened(
-        -follower.turn_spring * pull[3], -follower.turn_spring * pull[4],
-        -follower.turn_spring * pull[5], spring.turn_cap * spring.scale,
-    )  # fmt: skip
+    fx, fy, fz, tx, ty, tz = wrench_of(follower, spring.cap, spring.turn_cap * spring.scale)
     rx, ry, rz = lever_in_hand(hand, center)
     mx, my, mz = moment(rx, ry, rz, fx, fy, fz)
     return (
         fx, fy, fz, (tx + mx) / spring.scale, (ty + my) / spring.scale, (tz + mz) / spring.scale,
     )  # fmt: skip
+
+
+@leaf
+def wrench_of(one, cap, turn_cap):
+    """Force and torque against one.pull, about the tool's centre: N and N m, at most the caps."""
+    pull, k, r = one.pull, one.pulls[0], one.pulls[1]
+    x, y, z = shortened(-k * pull[0], -k * pull[1], -k * pull[2], cap)
+    a, b, c = shortened(-r * pull[3], -r * pull[4], -r * pull[5], turn_cap)
+    return x, y, z, a, b, c
 
 
 @leaf

@@ -8,9 +8,9 @@ import numpy as np
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import lever_in_hand, shortened
-from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD, is_somewhere, share_of_wrench
+from hapticdb.kernels.hand.holding import is_somewhere, send
 from hapticdb.kernels.records import RESULTS
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, UNKNOWNS, WRENCH
+from hapticdb.kernels.resident.cells import UNKNOWNS, WRENCH
 from hapticdb.kernels.rigid import moment
 
 
@@ -24,7 +24,7 @@ def render(terms, center, servo, frame, dt):
     the tool stays, and its wrench is kept for `hold` seconds and then falls to zero within `fade`
     seconds.
     """
-    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    tool, hand = servo.tool, servo.hand
     is_lost = hand.is_stale or not is_somewhere(hand)
     unknown = 0 if is_lost else np.int64(frame[UNKNOWNS])
     is_held = is_lost or unknown > 0
@@ -46,11 +46,5 @@ def render(terms, center, servo, frame, dt):
         kept[3], kept[4], kept[5] = (
             (tx + mx) / terms.scale, (ty + my) / terms.scale, (tz + mz) / terms.scale,
         )  # fmt: skip
-    share, is_fading = share_of_wrench(terms, tool, hand, is_held, max(dt, 0.0))
-    for n in range(6):
-        sent.wrench[n] = share * tool.kept[n]
-    sent.marks = (IS_HELD if is_held else 0) | (IS_FADING if is_fading else 0)
-    sent.hits = np.int64(tool.felt[HITS])
-    sent.contacts = np.int64(tool.felt[CONTACTS])
-    sent.unknown = unknown
-    sent.deepest = tool.felt[DEEPEST]
+    send(terms, servo, is_held, 0, max(dt, 0.0))
+    servo.sent.unknown = unknown

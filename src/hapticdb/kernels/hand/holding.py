@@ -2,8 +2,11 @@
 
 import math
 
+import numpy as np
+
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.records import RESULTS
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT = 1, 2, 8, 16
 """Marks of a period: the last wrench was kept; the kept wrench falls or is zero; part of the period
@@ -57,7 +60,19 @@ def place_lost(tool, hand, is_hand):
 
 
 @leaf
-def share_of_wrench(terms, tool, hand, is_held, dt):
+def send(terms, servo, is_held, marks, dt):
+    """Send the tool's kept wrench, as far as it has not faded, its counts, and the marks."""
+    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    share, is_fading = _share_of_wrench(terms, tool, hand, is_held, dt)
+    for n in range(6):
+        sent.wrench[n] = share * tool.kept[n]
+    sent.marks = marks | (IS_HELD if is_held else 0) | (IS_FADING if is_fading else 0)
+    sent.hits, sent.contacts = np.int64(tool.felt[HITS]), np.int64(tool.felt[CONTACTS])
+    sent.deepest = tool.felt[DEEPEST]
+
+
+@leaf
+def _share_of_wrench(terms, tool, hand, is_held, dt):
     """Share of the wrench that is sent: it fades while cells are unknown, and rises again.
 
     terms: hold and fade, s. While the clutch is open the share falls to zero.

@@ -11,7 +11,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.near_points import NOT_KNOWN, OPEN, SHUT, look, settle
-from hapticdb.kernels.rigid import pose_of_quaternion, product, quaternion_by, turn
+from hapticdb.kernels.rigid import length_at, pose_of_quaternion, product, quaternion_by, turn
 
 STRIDE = 0.98
 """Length of a stride, in lower bounds of the least distance. Larger: fewer looks; below 1, or the
@@ -63,10 +63,7 @@ def place_on_way(tool, center, follower, done):
 @leaf
 def way_of_step(follower, radius, size):
     """Way that no point exceeds in the whole step, voxels."""
-    step = follower.step
-    way = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-    angle = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
-    return (way + radius * angle) / size
+    return (length_at(follower.step, 0) + radius * length_at(follower.step, 3)) / size
 
 
 @leaf

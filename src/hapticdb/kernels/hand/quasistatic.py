@@ -24,12 +24,10 @@ from hapticdb.kernels.hand.device_spring import (
 from hapticdb.kernels.hand.holding import (
     IS_CUT,
     IS_DROPPED,
-    IS_FADING,
-    IS_HELD,
     is_finite,
     is_somewhere,
     place_lost,
-    share_of_wrench,
+    send,
 )
 from hapticdb.kernels.hand.near_points import (
     ABOUT,
@@ -287,11 +285,10 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
 
 
 @leaf
-def finish(spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, wrench):
-    """Wrench for the device into wrench (6,), contacts into tool.felt -> flags of the period."""
-    flags, kept = 0, tool.kept
+def finish(spring, shell, place, servo, follower, field, met, is_held, found, dt):
+    """Send the wrench and the marks of the period; contacts into tool.felt."""
+    flags, tool, hand, wrench = 0, servo.tool, servo.hand, servo.sent.wrench
     if is_held:
-        flags |= IS_HELD
         follower.n_trail = 0  # a speed over a gap says nothing
     else:
         remember_hand(follower, hand, dt)
@@ -300,17 +297,13 @@ def finish(spring, shell, place, tool, hand, follower, field, met, is_held, foun
         is_felt = is_felt and not follower.is_loose
         flags |= _push_hand(spring, tool, hand, shell.center, follower, is_felt, dt, wrench)
         for n in range(6):
-            kept[n] = wrench[n] if is_finite(wrench) else 0.0
+            tool.kept[n] = wrench[n] if is_finite(wrench) else 0.0
         _record_felt(
             follower, field, met, place.size, contact_stiffness(spring, place.size), tool.felt
         )
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
         flags |= IS_LOOSE if follower.is_loose else 0
-    share, is_fading = share_of_wrench(spring, tool, hand, is_held, dt)
-    flags |= IS_FADING if is_fading else 0
-    for n in range(6):
-        wrench[n] = share * kept[n]
-    return flags
+    send(spring, servo, is_held, flags, dt)
 
 
 @leaf
@@ -374,13 +367,8 @@ def advance(cells, which, version, shell, place, spring, servo, follower, dt, fi
             cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
         )
     is_held = is_held or found == NOT_KNOWN
-    sent.marks = finish(
-        spring, shell, place, tool, hand, follower, field, met, is_held, found, dt, sent.wrench
-    )
-    sent.hits = np.int64(tool.felt[HITS])
-    sent.contacts = np.int64(tool.felt[CONTACTS])
+    finish(spring, shell, place, servo, follower, field, met, is_held, found, dt)
     sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
-    sent.deepest = tool.felt[DEEPEST]
     sent.left_out = follower.most_left_out
     if follower.n_active > 0:  # a period in contact without a look rests on the last look
         sent.left_out = max(sent.left_out, follower.n_left_out)

@@ -88,17 +88,17 @@ def factor(follower):
 
 
 @leaf
-def _begin_equations(follower, extra, turn_extra):
+def begin_equations(follower, extra, turn_extra):
     """Set the step's equations to the springs alone, and `extra` stiffness that only brakes."""
-    matrix, right, pull = follower.matrix, follower.right, follower.pull
+    matrix, right, pull, pulls = follower.matrix, follower.right, follower.pull, follower.pulls
     for row in range(6):
         for column in range(row):
             matrix[row, column] = 0.0
     for axis in range(3):
-        matrix[axis, axis] = follower.spring + extra
-        matrix[3 + axis, 3 + axis] = follower.turn_spring + turn_extra
-        right[axis] = follower.spring * pull[axis]
-        right[3 + axis] = follower.turn_spring * pull[3 + axis]
+        matrix[axis, axis] = pulls[0] + extra
+        matrix[3 + axis, 3 + axis] = pulls[1] + turn_extra
+        right[axis] = pulls[0] * pull[axis]
+        right[3 + axis] = pulls[1] * pull[3 + axis]
 
 
 @leaf
@@ -149,8 +149,7 @@ def _add_bends(follower, weight, field, rows, m):
 def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
-    stiffness: of a contact, N/m. follower.pull has e and theta, follower.spring and turn_spring
-    their stiffnesses, lowered where a cap is reached.
+    stiffness: of a contact, N/m. follower.pull has e and theta, follower.pulls their stiffnesses.
     """
     step = follower.step
     base = NEAR + follower.side * NEAR_ROWS
@@ -160,7 +159,7 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
         step[axis] = 0.0
     _predict_contacts(follower, field, met, size)
     for _ in range(ROUNDS):
-        _begin_equations(follower, extra, turn_extra)
+        begin_equations(follower, extra, turn_extra)
         for m in range(follower.n_near):
             if field[ACTIVE, m] == 0.0:
                 continue

@@ -23,7 +23,7 @@ from hapticdb.kernels.period.memory import TOUCHING
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH
 from hapticdb.kernels.resident.fence import fence
-from hapticdb.kernels.rigid import moved, transform_of, turn, turned
+from hapticdb.kernels.rigid import length_at, moved, transform_of, turn, turned
 
 HELD, FADING, CLUTCH_OPEN, IN_OBJECT = 1, 2, 4, 8
 """Bits of a frame's state, as `hapticdb.recording.frame.State` names them."""
@@ -133,19 +133,12 @@ def note(ring, at, time, dt, lateness, elapsed, servo, buttons):
 
 
 @leaf
-def _norm(wrench, start):
-    """Length of three axes of a wrench (6,)."""
-    x, y, z = wrench[start], wrench[start + 1], wrench[start + 2]
-    return math.sqrt(x * x + y * y + z * z)
-
-
-@leaf
 def count(seat, servo, follower):
     """Add a frame to the session's counts."""
     sent, hand = servo.sent, servo.hand
     marks, wrench = sent.marks, sent.wrench
-    seat.peak_force = max(seat.peak_force, _norm(wrench, 0))
-    seat.peak_torque = max(seat.peak_torque, _norm(wrench, 3))
+    seat.peak_force = max(seat.peak_force, length_at(wrench, 0))
+    seat.peak_torque = max(seat.peak_torque, length_at(wrench, 3))
     seat.hit_frames += sent.hits > 0
     if sent.contacts > 0:
         seat.contact_frames += 1

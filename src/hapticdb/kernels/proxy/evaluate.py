@@ -13,8 +13,9 @@ alone, not on earlier periods.
 import math
 
 from hapticdb.kernels._jit import FLOATS, entry, leaf, record_of
-from hapticdb.kernels.hand.device_spring import BEYOND_CAP, shortened
-from hapticdb.kernels.hand.step import add_row, factor
+from hapticdb.kernels.hand.device_spring import BEYOND_CAP, stretch, wrench_of
+from hapticdb.kernels.hand.path import way_of_step
+from hapticdb.kernels.hand.step import add_row, begin_equations, factor
 from hapticdb.kernels.records import CONTACT_MODEL
 from hapticdb.kernels.rigid import moment, product, quaternion_by, turn_of, turned_by
 
@@ -34,7 +35,7 @@ that push."""
 
 @leaf
 def measure_pull(model, hand, rx, ry, rz):
-    """Stretch and turn from tool to hand into model.pull, their stiffnesses into model.pulls.
+    """Stretch and turn from tool to hand: see `device_spring.stretch`.
 
     r: lever from the handle's origin to the tool's centre in the hand.
     """
@@ -43,13 +44,8 @@ def measure_pull(model, hand, rx, ry, rz):
     pull[3], pull[4], pull[5] = turn_of(
         *product(hand[3], hand[4], hand[5], hand[6], turned[0], -turned[1], -turned[2], -turned[3])
     )
-    way = math.sqrt(pull[0] * pull[0] + pull[1] * pull[1] + pull[2] * pull[2])
-    angle = math.sqrt(pull[3] * pull[3] + pull[4] * pull[4] + pull[5] * pull[5])
     most, most_turn = BEYOND_CAP * model.cap, BEYOND_CAP * model.turn_cap
-    model.pulls[0] = most / way if model.spring * way > most else model.spring
-    model.pulls[1] = most_turn / angle if model.turn_spring * angle > most_turn else (
-        model.turn_spring
-    )  # fmt: skip
+    stretch(model, model.spring, model.turn_spring, most, most_turn)
 
 
 @leaf
@@ -112,17 +108,6 @@ def _predict(model):
 
 
 @leaf
-def _begin_step(model):
-    """Set the step's equations to the springs alone."""
-    for row in range(6):
-        for column in range(row):
-            model.matrix[row, column] = 0.0
-        stiffness = model.pulls[0] if row < 3 else model.pulls[1]
-        model.matrix[row, row] = stiffness
-        model.right[row] = stiffness * model.pull[row]
-
-
-@leaf
 def _add_hollow(model, n):
     """Add what a hollow surface resists across the normal of contact n that is in depth."""
     row, lever = model.rows[n], model.levers[n]
@@ -146,7 +131,7 @@ def solve(model):
         model.step[axis] = 0.0
     _predict(model)
     for _ in range(ROUNDS):
-        _begin_step(model)
+        begin_equations(model, 0.0, 0.0)
         for n in range(model.n_planes):
             if model.is_active[n] == 1:
                 row = model.rows[n]
@@ -172,9 +157,7 @@ def _take_step(model):
     )
     length = math.sqrt(w * w + x * x + y * y + z * z)
     turned[0], turned[1], turned[2], turned[3] = w / length, x / length, y / length, z / length
-    way = math.sqrt(step[0] * step[0] + step[1] * step[1] + step[2] * step[2])
-    angle = math.sqrt(step[3] * step[3] + step[4] * step[4] + step[5] * step[5])
-    return way + model.radius * angle
+    return way_of_step(model, model.radius, 1.0)
 
 
 @leaf
@@ -222,11 +205,7 @@ def evaluate(model_record, hand, result):
     if count == 0:
         return
     measure_pull(model, hand, rx, ry, rz)
-    pull, pulls = model.pull, model.pulls
-    x, y, z = shortened(-pulls[0] * pull[0], -pulls[0] * pull[1], -pulls[0] * pull[2], model.cap)
-    a, b, c = shortened(
-        -pulls[1] * pull[3], -pulls[1] * pull[4], -pulls[1] * pull[5], model.turn_cap
-    )
+    x, y, z, a, b, c = wrench_of(model, model.cap, model.turn_cap)
     mx, my, mz = moment(rx, ry, rz, x, y, z)
     result[WRENCH], result[WRENCH + 1], result[WRENCH + 2] = x, y, z
     result[WRENCH + 3], result[WRENCH + 4], result[WRENCH + 5] = a + mx, b + my, c + mz

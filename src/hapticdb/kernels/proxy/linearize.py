@@ -11,8 +11,6 @@ which is symmetric, and never stiffer than the spring (two springs in series; Ma
 planes for that reason, Otaduy and Lin 2006 the linear model).
 """
 
-import math
-
 from hapticdb.kernels._jit import (
     FLOATS2,
     INT,
@@ -25,7 +23,7 @@ from hapticdb.kernels.hand.device_spring import (
     DEVICE_SPRING,
     contact_stiffness,
     lever_in_hand,
-    shortened,
+    wrench_of,
 )
 from hapticdb.kernels.hand.holding import IS_CUT, IS_HELD
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE
@@ -48,7 +46,7 @@ from hapticdb.kernels.resident.cells import (
     begin_frame,
     end_frame,
 )
-from hapticdb.kernels.rigid import moment, moved, transform_of
+from hapticdb.kernels.rigid import length_at, moment, moved, transform_of
 
 MOST_BULGE = 0.5
 """Share of the spring's stiffness up to which bulging surfaces lower K6. There the force turns with
@@ -78,14 +76,13 @@ def _write_hand(spring, shell, tool, hand, follower, flags, model):
     for axis in range(6):
         model.pull[axis] = follower.pull[axis]
     is_felt = (follower.n_active > 0 or flags & IS_CUT) and not flags & (IS_LOOSE | IS_HELD)
+    wrench = model.wrench
     for axis in range(6):
-        model.wrench[axis] = 0.0
+        wrench[axis] = 0.0
     if is_felt:
-        pull, k, r = follower.pull, follower.spring, follower.turn_spring
-        x, y, z = shortened(-k * pull[0], -k * pull[1], -k * pull[2], model.cap)
-        model.wrench[0], model.wrench[1], model.wrench[2] = x, y, z
-        x, y, z = shortened(-r * pull[3], -r * pull[4], -r * pull[5], model.turn_cap)
-        model.wrench[3], model.wrench[4], model.wrench[5] = x, y, z
+        wrench[0], wrench[1], wrench[2], wrench[3], wrench[4], wrench[5] = wrench_of(
+            follower, model.cap, model.turn_cap
+        )
     return is_felt
 
 
@@ -96,17 +93,11 @@ def _add_spring(model, start, stiffness, cap):
     A spring at its cap gives way along its pull and turns across it.
     """
     wrench = model.wrench
-    x, y, z = wrench[start], wrench[start + 1], wrench[start + 2]
-    size = math.sqrt(x * x + y * y + z * z)
+    size = length_at(wrench, start)
     is_capped = size >= cap * (1.0 - 1e-9)
     across = stiffness
     if is_capped:
-        pull = model.pull
-        way = math.sqrt(
-            pull[start] * pull[start] + pull[start + 1] * pull[start + 1]
-            + pull[start + 2] * pull[start + 2]
-        )  # fmt: skip
-        across = min(stiffness, cap / max(way, 1e-12))
+        across = min(stiffness, cap / max(length_at(model.pull, start), 1e-12))
     for row in range(3):
         for column in range(3):
             value = across if row == column else 0.0

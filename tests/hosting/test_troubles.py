@@ -16,11 +16,11 @@ from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.channel import Channel
+from hapticdb.hosting.channel import AskingChannel
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.session_recording import SessionRecording
+from hapticdb.recording.ring import SessionRecording
 from realtime.hands import at
 
 ABOVE = at(0.0, 0.0, 0.02)
@@ -81,7 +81,7 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     board = Board.create(1)
     thread = threading.Thread(target=serve_attached, args=(ours, board, begin, call))
     thread.start()
-    channel = Channel(theirs)
+    channel = AskingChannel(theirs)
     try:
         channel.receive()
         with pytest.raises(HapticDBError, match="its log says why") as found:

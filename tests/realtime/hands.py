@@ -3,7 +3,7 @@
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import cast
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hapticdb.devices.protocol import Reading
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
+from hapticdb.realtime.processes import MessageSender
 
 Floats = NDArray[np.float64]
 
@@ -32,6 +33,16 @@ def stroking(low: float, seconds: float = 1.0, loops: bool = False) -> Player:
     places = [(0.0, 0.02), (0.0, low), (0.02, low), (-0.02, low), (-0.02, 0.02), (0.0, 0.02)]
     times = np.linspace(0.0, seconds, len(places))
     return Player(times, [at(x, 0.0, z) for x, z in places], loops=loops)
+
+
+class Heard(MessageSender):
+    """Keeps what a loop's process sends."""
+
+    def __init__(self) -> None:
+        self.said: list[tuple[str, Any]] = []
+
+    def send(self, word: str, content: object = None) -> None:
+        self.said.append((word, content))
 
 
 class Slow:

@@ -1,8 +1,6 @@
 """The loop, run in this process on a fetching process's cells: its counts and refusals."""
 
 import dataclasses
-import io
-import pickle
 from collections.abc import Callable, Iterator
 from typing import NamedTuple
 
@@ -20,12 +18,11 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, work
-from hapticdb.realtime.processes import Message, MessageSender
 from hapticdb.realtime.report import LoopAnswer
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.frame import State
 from hapticdb.testing import floor_voxels, write_voxels
-from realtime.hands import Clutched, Lost, Odd, Slow, Unplugged, still, stroking
+from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, still, stroking
 from realtime.worlds import make
 
 N_RING = 4096
@@ -65,23 +62,15 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
                 law=TangentPlane(), coupling=DIRECT, handle=Handle(), timing=Timing(rate),
                 seconds=0.3, staleness=60.0,
             )  # fmt: skip
-            heard = io.BytesIO()
-            work(dataclasses.replace(request, **options), MessageSender(heard))  # type: ignore[arg-type]
-            said = list(messages(heard.getvalue()))
-            assert [message.word for message in said] == ["running", "done"]
-            answer = said[-1].content
+            heard = Heard()
+            work(dataclasses.replace(request, **options), heard)  # type: ignore[arg-type]
+            (_, (word, answer)) = heard.said
+            assert word == "done"
             frames = board.rings[0, : answer.loop.frames].copy()
             board.close()
             return Ran(answer, frames)
 
         yield ran
-
-
-def messages(content: bytes) -> Iterator[Message]:
-    while content:
-        size = int.from_bytes(content[:8], "little")
-        yield pickle.loads(content[8 : 8 + size])  # noqa: S301 - what was just said
-        content = content[8 + size :]
 
 
 def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:

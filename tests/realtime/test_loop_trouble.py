@@ -1,6 +1,5 @@
 """The loop, frame by frame, when cells are lost, the hand leaves, or its process must end."""
 
-import io
 import os
 import signal
 import tempfile
@@ -27,11 +26,10 @@ from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCouplin
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, work
-from hapticdb.realtime.processes import MessageSender
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable
 from hapticdb.testing import write_voxels
-from realtime.hands import at
+from realtime.hands import Heard, at
 from realtime.sessions import floor_points
 from realtime.worlds import block, cells_of
 
@@ -129,7 +127,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
             return len(self.sent) > 120
 
     hand = Leaving(0.02)
-    work(requested(world, hand, seconds=60.0), MessageSender(io.BytesIO()))
+    work(requested(world, hand, seconds=60.0), Heard())
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
     assert not world.table.desk.sessions["n_asked"].any()
@@ -185,6 +183,6 @@ def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
     signal.signal(signal.SIGTERM, end)
     hand = Told(0.02)
     with pytest.raises(DeviceError, match="unplugged"):
-        work(requested(world, hand), MessageSender(io.BytesIO()))
+        work(requested(world, hand), Heard())
     assert hand.is_closed
     assert not hand.sent[-1].any()

@@ -6,6 +6,7 @@ import os
 import pickle
 import resource
 import signal
+import socket
 import sys
 from pathlib import Path
 from types import ModuleType
@@ -114,14 +115,16 @@ def test_one_asked_to_end_by_the_system_tidies_up_and_says_no_more() -> None:
 
 
 @pytest.mark.parametrize("share", [0.0, 0.5])
-def test_a_request_that_is_cut_ends_it_quietly(share: float, tmp_path: Path) -> None:
-    content = pickle.dumps(("echo", list(range(1000))))
-    request = tmp_path / "request"
-    request.write_bytes(content[: round(share * len(content))])
+def test_a_request_that_is_cut_ends_it_quietly(share: float) -> None:
     start = f"run({WORKERS.partition(':')[0]!r}, 'work', os.pidfd_open(os.getppid()))"
     script = f"import os; from {module.__name__} import run; {start}"
-    with request.open("rb") as cut:
-        done = finished([sys.executable, "-c", script], stdin=cut.fileno())
+    content = pickle.dumps(pickle.dumps(("echo", list(range(1000)))))
+    whole = len(content).to_bytes(8, "little") + content
+    ours, theirs = socket.socketpair()
+    with theirs:
+        with ours:
+            ours.sendall(whole[: round(share * len(whole))])
+        done = finished([sys.executable, "-c", script], stdin=theirs.fileno())
     assert (done.returncode, done.stdout, done.stderr) == (0, "", "")
 
 
@@ -148,7 +151,7 @@ time.sleep(1000)
 
 @pytest.mark.parametrize("forks", [False, True])
 def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
-    """Also when a process forked from the session holds the pipe open."""
+    """Also when a process forked from the session holds the channel open."""
     args = [sys.executable, "-c", SCRIPT.format(forks=forks)]
     with child(args, stderr=None) as session:
         assert session.stdout is not None

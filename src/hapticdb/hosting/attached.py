@@ -8,7 +8,7 @@ from typing import Any, Self
 from numpy.typing import ArrayLike
 
 from hapticdb.errors import HapticDBError
-from hapticdb.hosting.channel import Ask, Channel
+from hapticdb.hosting.channel import Ask, AskingChannel
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell
@@ -33,7 +33,7 @@ class AttachedHost:
 
     def __init__(self, sock: socket.socket) -> None:
         sock.settimeout(None)
-        self._channel = Channel(sock)
+        self._channel = AskingChannel(sock)
         try:
             _, (descriptor,) = self._channel.receive()
         except (EOFError, OSError, ValueError) as error:
@@ -75,7 +75,7 @@ def serve_attached(
     sock: socket.socket, board: Board, begin: Callable[..., HostedSession], call: Calls
 ) -> None:
     """Serve an `AttachedHost` until it leaves, by a host's methods; then end its sessions."""
-    channel = Channel(sock)
+    channel = AskingChannel(sock)
     begun: set[int] = set()
 
     def do(ask: Ask, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request

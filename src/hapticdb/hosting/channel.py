@@ -1,25 +1,16 @@
-"""Channel: pickled messages between processes of one host, with file descriptors beside them.
+"""Requests between processes of one host, and their answers, over a `Channel`."""
 
-The processes trust one another: one of them started the others, and the socket between them is a
-pair that has no name. Nothing of a client from outside goes through a channel unparsed.
-"""
-
-import contextlib
 import logging
 import os
-import pickle
 import socket
 import threading
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
 from hapticdb.errors import HapticDBError
+from hapticdb.realtime.channel import Channel
 
 LOG = logging.getLogger("hapticdb.hosting")
-MOST_DESCRIPTORS = 4
-"""Most file descriptors beside one message."""
-HEADER = 8
-"""Bytes of a message's length."""
 
 
 class Ask(NamedTuple):
@@ -36,37 +27,12 @@ class Reply(NamedTuple):
     error: Exception | None = None
 
 
-class Channel:
-    """Messages over one end of a pair of sockets of the family AF_UNIX, which it owns."""
+class AskingChannel(Channel):
+    """A channel of requests, one at a time, and their answers."""
 
     def __init__(self, sock: socket.socket) -> None:
-        self.sock = sock
+        super().__init__(sock)
         self._asking = threading.Lock()
-
-    def send(self, content: object, descriptors: Sequence[int] = ()) -> None:
-        """Send a message, and file descriptors with it."""
-        packed = pickle.dumps(content)
-        header = len(packed).to_bytes(HEADER, "little")
-        sent = socket.send_fds(self.sock, [header], list(descriptors))
-        self.sock.sendall(header[sent:] + packed)
-
-    def receive(self) -> tuple[Any, list[int]]:
-        """Next message and the descriptors with it; EOFError if the other process has gone."""
-        header, descriptors, _, _ = socket.recv_fds(self.sock, HEADER, MOST_DESCRIPTORS)
-        if not header:
-            raise EOFError
-        header += self._receive_exactly(HEADER - len(header))
-        packed = self._receive_exactly(int.from_bytes(header, "little"))
-        return pickle.loads(packed), descriptors  # noqa: S301 - from a process of our own
-
-    def _receive_exactly(self, size: int) -> bytes:
-        parts = bytearray()
-        while len(parts) < size:
-            part = self.sock.recv(min(size - len(parts), 1 << 20))
-            if not part:
-                raise EOFError
-            parts += part
-        return bytes(parts)
 
     def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
         """Send a request and return the answer of the other process; one request at a time.
@@ -114,9 +80,3 @@ class Channel:
             for descriptor in descriptors:
                 os.close(descriptor)
         self.send(answer)
-
-    def close(self) -> None:
-        """Close the socket; the other process then reads the end."""
-        with contextlib.suppress(OSError):
-            self.sock.shutdown(socket.SHUT_RDWR)
-        self.sock.close()

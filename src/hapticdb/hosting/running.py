@@ -10,9 +10,9 @@ from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import WorkerProcess
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.recording.file import DEFAULT_LIMIT
 from hapticdb.recording.header import Header
+from hapticdb.recording.ring import SessionRecording
 
 FRAMES_UNTIL_RECORDED = 2
 """Frames after which every frame has what a recording needs."""

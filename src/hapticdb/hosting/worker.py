@@ -16,7 +16,7 @@ import numpy as np
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.hosting.channel import Ask, Channel
+from hapticdb.hosting.channel import Ask, AskingChannel
 from hapticdb.kernels.compiling import load
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
@@ -72,7 +72,7 @@ class Worker:
 
     def __init__(self, request: WorkerRequest) -> None:
         self._board = Board(request.board)
-        self._channel = Channel(socket.socket(fileno=request.sock))
+        self._channel = AskingChannel(socket.socket(fileno=request.sock))
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         seats = self._board.seats

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.hosting.channel import Channel
+from hapticdb.hosting.channel import AskingChannel
 from hapticdb.hosting.worker import WorkerRequest
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.processes import Process
@@ -36,7 +36,7 @@ class WorkerProcess:
                 ["host"],
             )
         ours.settimeout(ANSWER_PATIENCE)
-        self._channel = Channel(ours)
+        self._channel = AskingChannel(ours)
         if self._process.receive(START_PATIENCE) is None:
             self._channel.close()
             raise start_error(self._process, "worker's", START_PATIENCE)

@@ -11,7 +11,6 @@ import errno
 import fcntl
 import gc
 import os
-import pickle
 import resource
 import select
 import signal
@@ -26,12 +25,11 @@ from pathlib import Path
 from typing import NamedTuple
 
 from hapticdb.errors import HapticDBError
+from hapticdb.realtime.channel import Channel
 
 ANSWER_PATIENCE = 300.0
 """Seconds that the server has for an answer: it may load numba and compile. Larger: a caller waits
 longer for a server that hangs."""
-MOST_DESCRIPTORS = 16
-"""Descriptors that a process can be given."""
 
 
 class Order(NamedTuple):
@@ -70,8 +68,9 @@ class _ForkServer:
     """The fork server of this process, from its own side."""
 
     def __init__(self) -> None:
-        self._channel, theirs = socket.socketpair()
-        self._channel.settimeout(ANSWER_PATIENCE)
+        ours, theirs = socket.socketpair()
+        ours.settimeout(ANSWER_PATIENCE)
+        self.channel = Channel(ours)
         call = f"from {__name__} import serve; serve({theirs.fileno()}, {os.getpid()})"
         with theirs:
             self._popen = subprocess.Popen(  # noqa: S603 - our own module, by this interpreter
@@ -83,25 +82,9 @@ class _ForkServer:
                 start_new_session=True,
             )
 
-    def give(self, wanted: Order, descriptors: Sequence[int] = ()) -> None:
-        """Give an order, with the descriptors of its process."""
-        content = pickle.dumps(wanted)
-        socket.send_fds(self._channel, [len(content).to_bytes(8, "little")], descriptors)
-        self._channel.sendall(content)
-
-    def started(self) -> tuple[int, int]:
-        """Process id of what the last order has started, and a descriptor that stands for it.
-
-        A negative number of an error, and -1, where the machine has no room for the process.
-        """
-        answer, descriptors, *_ = socket.recv_fds(self._channel, 8, 1)
-        if len(answer) < 8:
-            raise ConnectionResetError(errno.ECONNRESET, "the fork server has ended")
-        return int.from_bytes(answer, "little", signed=True), (*descriptors, -1)[0]
-
     def end(self) -> None:
         """End the server at once; what it has started goes on."""
-        self._channel.close()
+        self.channel.close()
         self._popen.kill()
         self._popen.wait()
 
@@ -142,7 +125,7 @@ def prepare(work: str, purposes: Sequence[str]) -> None:
     """
     with _lock:
         try:
-            _known().give(_order(work, purposes, None))
+            _known().channel.send(_order(work, purposes, None))
         except OSError:  # `start` tries again, and tells what is wrong
             _end()
 
@@ -167,28 +150,28 @@ def start(
     wanted = _order(work, purposes, numbers)
     folder = os.open(".", os.O_PATH)
     try:
-        pid, standing = _answered(wanted, [*streams, folder, *numbers])
+        number, standing = _answered(wanted, [*streams, folder, *numbers])
     finally:
         os.close(folder)
-    if pid < 0:
-        raise OSError(-pid, os.strerror(-pid))
-    return pid, standing
+    if not standing:
+        raise OSError(number, os.strerror(number))
+    return number, standing[0]
 
 
-def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, int]:
+def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, list[int]]:
     """Give an order and wait for the answer; a server that was killed is replaced once."""
     with _lock:
         for is_last in (False, True):
             try:
-                server = _known()
-                server.give(wanted, descriptors)
-                return server.started()
+                channel = _known().channel
+                channel.send(wanted, descriptors)
+                return channel.receive()
             except TimeoutError as error:
                 _end()
                 raise HapticDBError(
                     f"no process was started in {ANSWER_PATIENCE:g} s: this machine is too slow now"
                 ) from error
-            except ConnectionError as error:
+            except (ConnectionError, EOFError) as error:
                 _end()
                 if is_last:
                     raise HapticDBError(
@@ -209,13 +192,13 @@ def serve(descriptor: int, owner: int) -> None:
     with contextlib.suppress(ProcessLookupError):
         owning = os.pidfd_open(owner)
         if os.getppid() == owner:
-            _serve(socket.socket(fileno=descriptor), owning)
+            _serve(Channel(socket.socket(fileno=descriptor)), owning)
 
 
-def _serve(channel: socket.socket, owning: int) -> None:
+def _serve(channel: Channel, owning: int) -> None:
     children: dict[int, int] = {}
     events = select.poll()
-    for number in (channel.fileno(), owning):
+    for number in (channel.sock.fileno(), owning):
         events.register(number, select.POLLIN)
     while True:
         for number, _ in events.poll():
@@ -224,10 +207,12 @@ def _serve(channel: socket.socket, owning: int) -> None:
                 events.unregister(number)
                 os.close(number)
                 continue
-            taken = None if number == owning else _taken(channel)
-            if taken is None:
+            if number == owning:
                 return
-            wanted, descriptors = taken
+            try:
+                wanted, descriptors = channel.receive()
+            except (EOFError, OSError):
+                return
             if wanted.purposes:
                 _load(wanted.work, wanted.purposes, compiles=wanted.numbers is not None)
             if wanted.numbers is None:
@@ -235,23 +220,13 @@ def _serve(channel: socket.socket, owning: int) -> None:
             try:
                 pid, child = _forked(wanted, descriptors, owning)
             except OSError as error:
-                channel.sendall((-(error.errno or errno.EAGAIN)).to_bytes(8, "little", signed=True))
+                channel.send(error.errno or errno.EAGAIN)
             else:
                 children[child] = pid
                 events.register(child, select.POLLIN)
-                socket.send_fds(channel, [pid.to_bytes(8, "little")], [child])
+                channel.send(pid, [child])
             for received in descriptors:
                 os.close(received)
-
-
-def _taken(channel: socket.socket) -> tuple[Order, list[int]] | None:
-    """Next order and its descriptors; None where the channel is closed."""
-    head, descriptors, *_ = socket.recv_fds(channel, 8, MOST_DESCRIPTORS)
-    n_bytes = int.from_bytes(head, "little")
-    content = channel.recv(n_bytes, socket.MSG_WAITALL) if n_bytes else b""
-    if len(content) < n_bytes or not content:
-        return None
-    return pickle.loads(content), descriptors  # noqa: S301 - from our owner
 
 
 def _load(work: str, purposes: Sequence[str], *, compiles: bool) -> None:

@@ -1,7 +1,7 @@
-"""Processes of a real-time session: each gets a request and sends messages over a pipe.
+"""Processes of a real-time session: each gets a request and sends messages over a `Channel`.
 
 Each process is a copy of the fork server (`fork_server`) and calls one function. The request and
-the messages are pickles, exchanged only between a process and what it has started.
+the messages go only between a process and what it has started.
 """
 
 import contextlib
@@ -9,21 +9,24 @@ import os
 import pickle
 import select
 import signal
+import socket
 import sys
-import time
 import weakref
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import IO, Any, BinaryIO, NamedTuple, Self
+from typing import Any, NamedTuple, Self
 
 from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.realtime.channel import Channel
 from hapticdb.realtime.fork_server import start
 
 END_PATIENCE = 5.0
 """Seconds that a process has to end by itself before it is killed. Larger: slower devices can
 close, a hanging process delays the end longer."""
 _ends = select.poll()
-"""Tells that the process that started this one has ended, or has closed the pipe."""
+"""Tells that the process that started this one has ended, or has closed its channel."""
+_parent: Channel | None = None
+"""Of a process that was started: to the one that started it."""
 
 
 class Message(NamedTuple):
@@ -54,24 +57,19 @@ class Process:
         self, work: str, request: object, descriptors: Sequence[int], purposes: Sequence[str] = ()
     ) -> None:
         content = pickle.dumps(request)
-        self._buffer = b""
-        (theirs, ours), (received, sent) = os.pipe(), os.pipe()
+        sock, theirs = socket.socketpair()
+        channel = self._channel = Channel(sock)
         try:
-            self.pid, self._standing = start(work, purposes, [theirs, sent, 2], descriptors)
+            self.pid, self._standing = start(work, purposes, [theirs.fileno(), 2, 2], descriptors)
         except BaseException:
-            os.close(ours)
-            os.close(received)
+            channel.close()
             raise
         finally:
-            os.close(theirs)
-            os.close(sent)
-        self._input, self._output = os.fdopen(ours, "wb"), os.fdopen(received, "rb", buffering=0)
-        with contextlib.suppress(BrokenPipeError):  # the child died at once; `receive` reports that
-            self._input.write(content)
-            self._input.flush()
-        # The input stays open: when it closes, the child knows that this process has ended. The
-        # pipes of an unreferenced object would stay open, so the finalizer closes them.
-        weakref.finalize(self, _close, self._input, self._output)
+            theirs.close()
+        with contextlib.suppress(OSError):  # the child died at once; `receive` reports that
+            channel.send(content)
+        # the channel of an unreferenced object would stay open, and its process would go on
+        weakref.finalize(self, channel.close)
         weakref.finalize(self, os.close, self._standing)
 
     def __enter__(self) -> Self:
@@ -93,42 +91,23 @@ class Process:
         HapticDBError
             If the process ended with this error.
         """
-        descriptor = self._output.fileno()
-        until = time.monotonic() + seconds
         arrived = select.poll()  # `select` refuses descriptors from 1024 on
-        arrived.register(descriptor, select.POLLIN)
-        while True:
-            message = self._take()
-            if message is not None:
-                break
-            left = until - time.monotonic()
-            if not arrived.poll(max(1000.0 * left, 0.0)):
-                return None
-            read = os.read(descriptor, 1 << 16)
-            if not read:
-                return None
-            self._buffer += read
+        arrived.register(self._channel.sock, select.POLLIN)
+        if not arrived.poll(max(1000.0 * seconds, 0.0)):
+            return None
+        try:
+            message, _ = self._channel.receive()
+        except (EOFError, OSError):
+            return None
+        assert isinstance(message, Message)  # noqa: S101 - nothing else is sent
         if message.word == "error":
             raise message.content
         return message
 
-    def _take(self) -> Message | None:
-        """Take the first message out of the buffer, if it is complete."""
-        if len(self._buffer) < 8:
-            return None
-        size = int.from_bytes(self._buffer[:8], "little")
-        if len(self._buffer) < 8 + size:
-            return None
-        content, self._buffer = self._buffer[8 : 8 + size], self._buffer[8 + size :]
-        message = pickle.loads(content)  # noqa: S301 - from our own child
-        assert isinstance(message, Message)  # noqa: S101 - nothing else is sent
-        return message
-
     def send(self, content: object) -> None:
         """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
-        with contextlib.suppress(OSError, ValueError):  # `receive` reports that
-            self._input.write(pickle.dumps(content))
-            self._input.flush()
+        with contextlib.suppress(OSError):  # `receive` reports that
+            self._channel.send(content)
 
     def wait(self, seconds: float) -> bool:
         """Wait for the end of the process; returns whether it ended in `seconds`."""
@@ -137,19 +116,12 @@ class Process:
         return bool(ended.poll(1000.0 * seconds))
 
     def end(self) -> None:
-        """End the process: close its input, and kill it if it does not end then."""
-        _close(self._input, self._output)
+        """End the process: close its channel, and kill it if it does not end then."""
+        self._channel.close()
         if not self.wait(END_PATIENCE):
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._standing, signal.SIGKILL)
             self.wait(END_PATIENCE)
-
-
-def _close(*pipes: IO[bytes]) -> None:
-    """Close the pipes to a process, which ends when its input is closed."""
-    for pipe in pipes:
-        with contextlib.suppress(OSError):
-            pipe.close()
 
 
 class _EndQuietly(SystemExit):
@@ -163,15 +135,13 @@ class _EndQuietly(SystemExit):
 class MessageSender:
     """Sends messages from a process to the one that started it."""
 
-    def __init__(self, stream: BinaryIO) -> None:
-        self._stream = stream
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
 
     def send(self, word: str, content: object = None) -> None:
         """Send a message; does nothing if no process can receive it any more."""
-        packed = pickle.dumps(Message(word, content))
-        with contextlib.suppress(OSError, ValueError):
-            self._stream.write(len(packed).to_bytes(8, "little") + packed)
-            self._stream.flush()
+        with contextlib.suppress(OSError):
+            self._channel.send(Message(word, content))
 
 
 def run(module: str, name: str, starter: int) -> None:
@@ -179,12 +149,13 @@ def run(module: str, name: str, starter: int) -> None:
 
     `starter` is a descriptor that stands for the process that used `Process`.
     """
-    for descriptor in (0, starter):
-        _ends.register(descriptor, select.POLLIN)
+    global _parent  # noqa: PLW0603 - one a process
+    _parent = Channel(socket.socket(fileno=os.dup(0)))
+    _ends.register(_parent.sock, 0)  # its end, which is always told
+    _ends.register(starter, select.POLLIN)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     status = 0
-    sender = MessageSender(os.fdopen(os.dup(1), "wb"))
-    os.dup2(2, 1)  # output of drivers must not mix with messages
+    sender = MessageSender(_parent)
     try:
         signal.signal(signal.SIGTERM, _end)
         function: Callable[[Any, MessageSender], None] = getattr(import_module(module), name)
@@ -211,26 +182,19 @@ def _end(number: int, _: object) -> None:
     raise _EndQuietly(128 + number)
 
 
-def _load() -> Any:  # noqa: ANN401 - whatever was sent
-    """Read the next object that the parent has sent."""
-    try:
-        return pickle.load(sys.stdin.buffer)  # noqa: S301 - from our own parent
-    except (EOFError, pickle.UnpicklingError):  # the parent ended while it was sending
-        raise _EndQuietly(0) from None
-
-
 def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
-    """Next object that the parent has sent by `Process.send`; a SystemExit if the parent ended.
-
-    A process that waits for objects cannot ask `parent_is_gone`.
-    """
-    return _load()
+    """Next object that the parent has sent by `Process.send`; a SystemExit if the parent ended."""
+    assert _parent is not None  # noqa: S101 - `run` was called
+    try:
+        return _parent.receive()[0]
+    except (EOFError, OSError):  # it may have ended while it was sending
+        raise _EndQuietly(0) from None
 
 
 def _request() -> object:
     """Read the request of the process; a UsageError if a module that it names cannot be found."""
     try:
-        return _load()
+        return pickle.loads(receive_from_parent())  # noqa: S301 - from our own parent
     except (AttributeError, ImportError) as error:
         raise UsageError(
             f"a session's process cannot find what it was given ({error}): define devices in a "
@@ -239,8 +203,8 @@ def _request() -> object:
 
 
 def parent_is_gone() -> bool:
-    """Whether the process that started this one has ended, or has closed the pipe.
+    """Whether the process that started this one has ended, or has closed its channel.
 
-    Processes that were forked from it may still hold the pipe open.
+    Processes that were forked from it may still hold the channel open.
     """
     return bool(_ends.poll(0))

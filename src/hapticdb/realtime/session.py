@@ -23,10 +23,10 @@ from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report
 from hapticdb.realtime.resident_cells import ResidentCells, start_error, without_distances
-from hapticdb.realtime.session_recording import SessionRecording
 from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
+from hapticdb.recording.ring import SessionRecording
 
 RING_SECONDS = 4.0
 """Seconds of frames that the ring in shared memory holds until they are recorded. A larger value

@@ -59,7 +59,7 @@ def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
     for made in EVALUATION.values():
         assert made(kept | results)
     draw(results, tmp_path)
-    assert len(list(tmp_path.glob("*.svg"))) == 7
+    assert len(list(tmp_path.glob("*.svg"))) == 5
 
 
 def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: SampleFiles) -> None:

@@ -3,7 +3,6 @@
 from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 
-import numpy as np
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
@@ -18,7 +17,6 @@ from paper.cells import (
     named,
     typical,
 )
-from paper.tables import fitted
 
 SMALLEST_GAP = 3.0
 """Where MAXGAP 0 stands on a logarithmic axis."""
@@ -123,40 +121,6 @@ def claim(cells: Sequence[Cell]) -> Figure:
     return figure
 
 
-def grouping(cells: Sequence[Cell]) -> Figure:
-    """Time of CBGroup against the number of keys, with a fit in proportion to it."""
-    figure = panels(1)
-    (axes,) = figure.axes
-    for (layout,), own in grouped(cells, ("layout",)).items():
-        n, us = zip(*sorted((c["keys"], c["grouping_us"]) for c in own), strict=True)
-        axes.plot(n, us, "o", markersize=4, label=named(layout))
-        a, b = fitted(own)
-        axes.plot(
-            n, [a + b * k for k in n], linewidth=0.8, label=f"{a:.1f} us + {1e3 * b:.1f} ns n"
-        )
-    finish(figure, "distinct keys of a frame")
-    axes.set_ylabel("grouping, us")
-    return figure
-
-
-def many(cells: Sequence[Cell]) -> Figure:
-    """Frames a second of all readers, and how stale they are."""
-    figure = panels(2)
-    left, right = figure.axes
-    for (engine, writers), own in grouped(cells, ("engine", "writers")).items():
-        own.sort(key=lambda cell: float(cell["readers"]))
-        label, n = f"{engine}, {writers} writers", [cell["readers"] for cell in own]
-        left.plot(n, [c["frames_per_s"] for c in own], "o-", markersize=3, label=label)
-        if writers:
-            stale = [c.get("stale_p99_ms", np.nan) for c in own]
-            right.plot(n, stale, "o-", markersize=3, label=label)
-    for axes, title in ((left, "frames a second, all readers"), (right, "staleness, p99, ms")):
-        axes.set(xscale="log", yscale="log", xlabel="readers", title=title)
-        axes.grid(visible=True, linewidth=0.3)
-        axes.legend(fontsize=6)
-    return figure
-
-
 def scale(cells: Sequence[Cell]) -> Figure:
     """Time a frame against the environment's size, a panel a kind of poses."""
     groups = grouped((cell for cell in cells if "us" in cell), ("poses",))
@@ -173,8 +137,6 @@ PLOTS: dict[str, Callable[[Sequence[Cell]], Figure]] = {
     "figure9": figure_9,
     "figure10": figure_10,
     "claim": claim,
-    "grouping": grouping,
-    "many": many,
     "scale": scale,
 }
 

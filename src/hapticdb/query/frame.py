@@ -126,7 +126,10 @@ class HapticQuery:
     ) -> Answer:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
         started = time.perf_counter_ns()
-        _check_options(strategy, gap)
+        if strategy not in STRATEGIES:
+            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+        if gap < 0:
+            raise UsageError(f"MAXGAP {gap}: give 0 or more")
         located = self.locate(shell, as_floats(world_from_tool, "a pose"))
         if strategy == "statement":
             return self._by_statement(located, exclude, law, started)
@@ -326,13 +329,6 @@ class HapticQuery:
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         order = np.lexsort((ids, ordinals))
         return Answer(wrench, hits, depths, touched, lambda: pairs[order], query, placed, law)
-
-
-def _check_options(strategy: Strategy, gap: int) -> None:
-    if strategy not in STRATEGIES:
-        raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
-    if gap < 0:
-        raise UsageError(f"MAXGAP {gap}: give 0 or more")
 
 
 def as_poses(poses: ArrayLike) -> NDArray[np.float64]:

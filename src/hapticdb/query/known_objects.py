@@ -5,7 +5,7 @@ from collections.abc import Iterable
 from hapticdb.errors import UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
-from hapticdb.store.base import Keys, Layout, Object, Store
+from hapticdb.store.base import Keys, Object, Store
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
 from hapticdb.store.parsing import damaged
 
@@ -19,6 +19,8 @@ class KnownObjects:
         The objects; replaced as a whole, so that a result that holds it does not change.
     have_distances : bool
         Whether there is an object, and every object has distances.
+    own_law : ForceLaw
+        The law of a frame that is given none: the smooth one where they have distances.
     version : int or None
         The store's version when the objects were listed; None before that, and after an edit
         through the same environment.
@@ -28,6 +30,7 @@ class KnownObjects:
         self._store = store
         self.by_id: dict[int, Object] = {}
         self.have_distances = False
+        self.own_law: ForceLaw = PLANE
         self.version: int | None = None
         self._unfelt: dict[Filter, Unfelt] = {}
 
@@ -44,6 +47,7 @@ class KnownObjects:
         self.by_id = {obj.id: obj for obj in objects}
         self._unfelt = {}
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
+        self.own_law = SMOOTH if self.have_distances else PLANE
 
     def forget(self) -> None:
         """Make the next frame list the objects again."""
@@ -91,38 +95,23 @@ class KnownObjects:
         """Whether the objects have what the law reads."""
         return law is None or self.have_distances or not laws.reads_distances(law.for_kernels)
 
-    def law_of(self, law: ForceLaw | None) -> ForceLaw:
-        """The law of a frame; where None is given, the one for these objects.
+    def check_distances(self) -> None:
+        """Refuse a law that reads distances where an object has none.
 
         Raises
         ------
         UsageError
-            If the law reads distances, and an object has none.
+            It says what to do.
         """
-        if law is None:
-            return SMOOTH if self.have_distances else PLANE
-        if not self.fits(law):
-            check_distances(self._store.url, self._store.layout, self.by_id.values())
-        return law
-
-
-def check_distances(url: str, layout: Layout, objects: Iterable[Object]) -> None:
-    """Refuse a law that reads distances where an object has none.
-
-    Raises
-    ------
-    UsageError
-        It says what to do.
-    """
-    known = list(objects)
-    if layout != "brick":
-        raise UsageError(
-            f"{url} has the layout {layout}, which stores no distances to surfaces: give the law "
-            "'plane', or import into the layout brick"
-        )
-    lacking = [obj.name for obj in known if not obj.has_distances]
-    if lacking:
-        raise UsageError(
-            f"{len(lacking)} of {len(known)} objects of {url} have no distances to their surfaces "
-            f"({lacking[0]}): run 'hapticdb upgrade {url}', or give the law 'plane'"
-        )
+        url, layout = self._store.url, self._store.layout
+        if layout != "brick":
+            raise UsageError(
+                f"{url} has the layout {layout}, which stores no distances to surfaces: give the "
+                "law 'plane', or import into the layout brick"
+            )
+        lacking = [obj.name for obj in self.by_id.values() if not obj.has_distances]
+        if lacking:
+            raise UsageError(
+                f"{len(lacking)} of {len(self.by_id)} objects of {url} have no distances to their "
+                f"surfaces ({lacking[0]}): run 'hapticdb upgrade {url}', or give the law 'plane'"
+            )

@@ -1,8 +1,5 @@
 """Frames of an opened environment: the law, the objects and the revision that belong to each."""
 
-from collections.abc import Callable
-from typing import TypeVar
-
 from numpy.typing import ArrayLike
 
 from hapticdb.errors import ConnectionLostError
@@ -15,8 +12,6 @@ from hapticdb.query.touches import Touch
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import Filter
-
-_Felt = TypeVar("_Felt")
 
 
 class Touching:
@@ -43,12 +38,12 @@ class Touching:
 
     def law_now(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame at the newest revision, whose objects are loaded."""
-
-        def chosen() -> ForceLaw:
+        try:
             with self._store.snapshot():
                 return self._law_of_snapshot(law)
-
-        return _twice(chosen)
+        except ConnectionLostError:  # inside a snapshot all is repeated, once
+            with self._store.snapshot():
+                return self._law_of_snapshot(law)
 
     def touch(
         self,
@@ -61,8 +56,12 @@ class Touching:
     ) -> Touch:
         """Compute one frame."""
         make_ready("touch")
-        answer = _twice(lambda: self._answer(shell, pose, strategy, maxgap, felt, law))
-        self.known.check_words(felt)
+        try:
+            answer = self._answer(shell, pose, strategy, maxgap, felt, law)
+        except ConnectionLostError:
+            answer = self._answer(shell, pose, strategy, maxgap, felt, law)
+        if not felt.is_empty:
+            self.known.check_words(felt)
         self.known.check_answer(answer.ids)
         return Touch(answer, self.known.by_id)
 
@@ -77,10 +76,10 @@ class Touching:
     ) -> Answer:
         """Answer of a frame; also loads the objects of the revision that the frame read."""
         known = self.known
-        fitting = known.fits(law)
-        chosen = known.law_of(law) if fitting else PLANE
+        is_fitting = known.fits(law)
+        chosen = (law or known.own_law) if is_fitting else PLANE
         answer = self._query.run(shell, pose, strategy, maxgap, known.left_out(felt), chosen)
-        if not fitting or self._store.version() != known.version:
+        if not is_fitting or self._store.version() != known.version:
             with self._store.snapshot():
                 chosen = self._law_of_snapshot(law)
                 answer = self._query.run(
@@ -89,16 +88,13 @@ class Touching:
         return answer
 
     def _law_of_snapshot(self, law: ForceLaw | None) -> ForceLaw:
-        """The law of a frame in this snapshot; also loads the snapshot's objects."""
+        """The law of a frame in this snapshot; also loads the snapshot's objects.
+
+        UsageError if the law reads distances, and an object has none.
+        """
         self._store.revision()  # `version` then tells of this snapshot
         if self.known.learn():
             self._figures.drop_empty_statistics()
-        return self.known.law_of(law)
-
-
-def _twice(work: Callable[[], _Felt]) -> _Felt:
-    """Result of `work`; if a connection is lost inside its snapshot, all of it is repeated once."""
-    try:
-        return work()
-    except ConnectionLostError:
-        return work()
+        if not self.known.fits(law):
+            self.known.check_distances()
+        return law or self.known.own_law

@@ -44,6 +44,8 @@ class Filter:
     ----------
     where, exclude : tuple of int or str
         The words; texts of digits have become ids.
+    is_empty, is_fixed : bool
+        Whether every object is felt; whether the same ids are left out, whatever objects there are.
 
     Raises
     ------
@@ -54,6 +56,8 @@ class Filter:
     def __init__(self, where: Words = (), exclude: Words = ()) -> None:
         self.where = checked_words(where, "where")
         self.exclude = checked_words(exclude, "exclude")
+        self.is_empty = not self.where and not self.exclude
+        self.is_fixed = not self.where and all(isinstance(word, int) for word in self.exclude)
 
     def __eq__(self, other: object) -> bool:
         return self is other or (
@@ -68,16 +72,6 @@ class Filter:
     @cached_property
     def _hash(self) -> int:
         return hash((self.where, frozenset(self.exclude)))
-
-    @property
-    def is_empty(self) -> bool:
-        """Whether every object is felt."""
-        return not self.where and not self.exclude
-
-    @property
-    def is_fixed(self) -> bool:
-        """Whether the same ids are left out, whatever objects there are."""
-        return not self.where and all(isinstance(word, int) for word in self.exclude)
 
     @cached_property
     def fixed_ids(self) -> Keys:

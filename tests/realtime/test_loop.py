@@ -2,7 +2,7 @@
 
 import dataclasses
 from collections.abc import Callable, Iterator
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import pytest
@@ -18,7 +18,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, work
-from hapticdb.realtime.report import LoopAnswer
+from hapticdb.realtime.report import LoopAnswer, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.frame import State
 from hapticdb.testing import floor_voxels, write_voxels
@@ -33,6 +33,7 @@ Floats = NDArray[np.float64]
 
 class Ran(NamedTuple):
     answer: LoopAnswer
+    counts: dict[str, Any]
     frames: NDArray[np.void]
 
 
@@ -67,8 +68,9 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
             (_, (word, answer)) = heard.said
             assert word == "done"
             frames = board.rings[0, : answer.loop.frames].copy()
+            counts = counts_of(board.seats[0])
             board.close()
-            return Ran(answer, frames)
+            return Ran(answer, counts, frames)
 
         yield ran
 
@@ -77,17 +79,17 @@ def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     applied: list[Floats] = []
     hand = stroking(0.010, 0.2)
     hand.apply = applied.append  # type: ignore[assignment]
-    answer, frames = run(hand, seconds=1e9)
+    answer, counts, frames = run(hand, seconds=1e9)
     # a frame's time is its deadline; a late frame reads the device later than that, and whether
     # there is one at the very end is a matter of nanoseconds
     period = 1.0 / 500.0
     assert frames["time"][-1] >= 0.2 - period - answer.loop.lateness.worst - 1e-6
-    assert answer.counts.peak_force > 0.0
+    assert counts["peak_force"] > 0.0
     assert not applied[-1].any()
 
 
 def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
-    answer, frames = run(Slow(still(0.03), every=10, seconds=0.011), seconds=0.5, rate=250.0)
+    answer, _, frames = run(Slow(still(0.03), every=10, seconds=0.011), seconds=0.5, rate=250.0)
     loop = answer.loop
     assert loop.missed >= len(frames) // 10
     assert loop.frames + loop.missed >= 125
@@ -99,7 +101,7 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
     hand = Clutched(stroking(0.010, 0.5), 1 << 30, 0.0)
-    _, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
+    _, _, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
     is_open = frames["state"] & State.CLUTCH_OPEN > 0
     assert is_open.any()
     assert not is_open.all()
@@ -118,9 +120,9 @@ def test_a_hand_that_fails_is_let_go_without_force(run: Run) -> None:
 
 
 def test_a_hand_that_does_not_know_its_place_at_once_is_asked_again(run: Run) -> None:
-    answer, frames = run(Lost(still(0.010), 20, 0.0))
+    answer, counts, frames = run(Lost(still(0.010), 20, 0.0))
     assert np.isfinite(frames["tool"]).all()
-    assert answer.counts.hit_frames == len(frames)
+    assert counts["hit_frames"] == len(frames)
     assert answer.is_warm
 
 
@@ -135,10 +137,9 @@ def test_a_hand_that_never_knows_its_place_is_an_error(
 def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: Run) -> None:
     nowhere = np.full(6, np.nan)
     hand = Odd(still(0.010), lambda r: r._replace(velocity=nowhere), first=60, n_reads=50)
-    answer, frames = run(hand, seconds=0.5)
-    counts = answer.counts
-    assert counts.nowhere_frames == 50
-    assert str(counts.bad_reading).startswith("Odd.read() returned numbers that are not finite")
+    answer, counts, frames = run(hand, seconds=0.5)
+    assert counts["nowhere_frames"] == 50
+    assert str(answer.bad_reading).startswith("Odd.read() returned numbers that are not finite")
     assert np.isfinite(frames["tool"]).all()
     forces = np.linalg.norm(frames["applied"][:, :3], axis=1)
     assert forces[-1] > 0.0
@@ -151,6 +152,6 @@ def test_a_start_without_cells_is_told(run: Run, monkeypatch: pytest.MonkeyPatch
 
 
 def test_a_database_that_is_silent_for_too_long_makes_frames_hold(run: Run) -> None:
-    answer, frames = run(still(0.010), staleness=-60.0)
-    assert answer.counts.stale_frames == answer.counts.held_frames == len(frames)
+    _, counts, frames = run(still(0.010), staleness=-60.0)
+    assert counts["stale_frames"] == counts["held_frames"] == len(frames)
     assert not frames["applied"][frames["time"] > 0.1].any()

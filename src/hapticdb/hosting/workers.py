@@ -10,7 +10,6 @@ from hapticdb.hosting.channel import AskingChannel
 from hapticdb.hosting.worker import WorkerRequest
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.processes import Process
-from hapticdb.realtime.resident_cells import start_error
 
 START_PATIENCE = 120.0
 """Seconds in which a worker must be ready: it loads every kernel of a frame."""
@@ -37,9 +36,11 @@ class WorkerProcess:
             )
         ours.settimeout(ANSWER_PATIENCE)
         self._channel = AskingChannel(ours)
-        if self._process.receive(START_PATIENCE) is None:
+        try:
+            self._process.await_ready("worker's", START_PATIENCE)
+        except BaseException:
             self._channel.close()
-            raise start_error(self._process, "worker's", START_PATIENCE)
+            raise
 
     @property
     def pid(self) -> int:

@@ -34,7 +34,7 @@ from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
-from hapticdb.realtime.report import Counts, LoopAnswer, LoopFigures, Times
+from hapticdb.realtime.report import LoopAnswer, LoopFigures, Times
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import LOST, STOP, CellTable
@@ -246,13 +246,12 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
                 empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
             warm_up = loop.prepare()
             compiled = n_compiled()
-            sender.send("running", warm_up)
+            sender.send("running")
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
-        counts = Counts.of_seat(loop.board.seats[0], loop.bad_reading)
-        counts.conditions.update(granted)
-        sender.send("done", LoopAnswer(figures, empty, counts, warm_up, loop.is_warm))
+        answer = LoopAnswer(figures, empty, loop.bad_reading, granted, warm_up, loop.is_warm)
+        sender.send("done", answer)
     finally:
         try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely
             before = signal.signal(signal.SIGTERM, signal.SIG_IGN)

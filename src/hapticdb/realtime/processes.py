@@ -104,6 +104,29 @@ class Process:
             raise message.content
         return message
 
+    def await_ready(self, name: str, seconds: float) -> None:
+        """Wait for the first message; where none comes the process is ended.
+
+        Raises
+        ------
+        HapticDBError
+            That says why, or with which the process ended.
+        """
+        try:
+            is_ready, is_slow = self.receive(seconds) is not None, self.is_alive
+        except BaseException:
+            self.end()
+            raise
+        if is_ready:
+            return
+        self.end()
+        raise HapticDBError(
+            f"the {name} process was not ready after {seconds:g} s: the database or this machine "
+            "is too slow now; try again"
+            if is_slow
+            else f"the {name} process did not start: its errors are above"
+        )
+
     def send(self, content: object) -> None:
         """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
         with contextlib.suppress(OSError):  # `receive` reports that

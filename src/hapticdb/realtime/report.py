@@ -1,7 +1,7 @@
 """Report of a session: its rate, lateness and computing time, and those of an empty loop."""
 
-from dataclasses import asdict, dataclass, field, fields
-from typing import NamedTuple
+from dataclasses import asdict, dataclass, fields
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -81,12 +81,54 @@ class LoopFigures:
         return self.frames / self.seconds if self.seconds else 0.0
 
 
+class LoopAnswer(NamedTuple):
+    """Last message of a loop's process; with the counts on the board a `Report` is made of it."""
+
+    loop: LoopFigures
+    empty: LoopFigures | None
+    bad_reading: str | None
+    conditions: dict[str, str]
+    warm_up: float
+    is_warm: bool
+
+
 @dataclass(kw_only=True)
-class Counts:
-    """Counts of a loop over its frames; of these, what a report tells.
+class Report:
+    """Report of a session.
 
     Attributes
     ----------
+    rate : float
+        Frames a second that the session was set to.
+    loop, empty : LoopFigures
+        Timing of the session's loop, and of an empty loop at the same rate on this machine just
+        before. The empty loop shows the machine's own lateness; None if it was not run.
+    points : int
+        Points looked up in all frames.
+    law : str
+        The force law: "plane" or "smooth".
+    coupling : SettledCoupling or DirectRendering
+        The coupling between hand and tool, with what lowered its stiffness; under the plane law
+        what bounded the wrench, which went to the device directly.
+    budget_points : int or None
+        Most points near something that a frame looks at; None: all.
+    warm_up : float
+        Seconds until all wanted cells were resident, before the first frame; after
+        `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
+    is_warm : bool
+        Whether all wanted cells were resident before the first frame.
+    cache : CacheFigures
+        Figures of the fetching process.
+    objects, loose_objects : tuple of int
+        Ids of objects touched, and of those that the tool lay in; sampled a hundred times a second.
+    recorded_frames, lost_records : int
+        Frames in the recording, and frames that were overwritten before they were recorded.
+    recording_ended : str or None
+        One line: why the recording ended before the session; None if it did not.
+    database_lost : str or None
+        One line: why the database could not be read at the end; None if it could.
+    proportions : Proportions
+        Sizes and places of tool, path and scene at the start, and their misfits.
     hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
         Numbers of frames: with a hit (a point in a voxel or, with distances, near a surface); with
         a contact (a point below its tangent plane or, with distances, below the onset); with a
@@ -122,88 +164,6 @@ class Counts:
         Conditions of the measurement: points, scheduling, processor.
     """
 
-    hit_frames: int = 0
-    contact_frames: int = 0
-    unknown_frames: int = 0
-    held_frames: int = 0
-    stale_frames: int = 0
-    unknown_points: int = 0
-    cut_frames: int = 0
-    nowhere_frames: int = 0
-    bad_reading: str | None = None
-    peak_force: float = 0.0
-    peak_torque: float = 0.0
-    deepest: float = 0.0
-    loose_frames: int = 0
-    first_loose_frame: int = -1
-    ended_loose: bool = False
-    snapping_frames: int = 0
-    guard_actions: int = 0
-    least_share: float = 1.0
-    left_out_frames: int = 0
-    most_left_out: int = 0
-    conditions: dict[str, str] = field(default_factory=dict)
-
-    @classmethod
-    def of_seat(cls, seat: NDArray[np.void], bad_reading: str | None) -> "Counts":
-        """Counts of a session's seat, a row of `SEAT`."""
-        names = set(seat.dtype.names or ()) & {one.name for one in fields(cls)}
-        counts = cls(bad_reading=bad_reading, **{name: seat[name].item() for name in names})
-        counts.ended_loose = bool(counts.ended_loose)
-        if not counts.loose_frames:
-            counts.first_loose_frame = -1
-        return counts
-
-
-class LoopAnswer(NamedTuple):
-    """Last message of a loop's process."""
-
-    loop: LoopFigures
-    empty: LoopFigures | None
-    counts: Counts
-    warm_up: float
-    is_warm: bool
-
-
-@dataclass(kw_only=True)
-class Report(Counts):
-    """Report of a session: the counts of its frames, and what is told besides.
-
-    Attributes
-    ----------
-    rate : float
-        Frames a second that the session was set to.
-    loop, empty : LoopFigures
-        Timing of the session's loop, and of an empty loop at the same rate on this machine just
-        before. The empty loop shows the machine's own lateness; None if it was not run.
-    points : int
-        Points looked up in all frames.
-    law : str
-        The force law: "plane" or "smooth".
-    coupling : SettledCoupling or DirectRendering
-        The coupling between hand and tool, with what lowered its stiffness; under the plane law
-        what bounded the wrench, which went to the device directly.
-    budget_points : int or None
-        Most points near something that a frame looks at; None: all.
-    warm_up : float
-        Seconds until all wanted cells were resident, before the first frame; after
-        `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
-    is_warm : bool
-        Whether all wanted cells were resident before the first frame.
-    cache : CacheFigures
-        Figures of the fetching process.
-    objects, loose_objects : tuple of int
-        Ids of objects touched, and of those that the tool lay in; sampled a hundred times a second.
-    recorded_frames, lost_records : int
-        Frames in the recording, and frames that were overwritten before they were recorded.
-    recording_ended : str or None
-        One line: why the recording ended before the session; None if it did not.
-    database_lost : str or None
-        One line: why the database could not be read at the end; None if it could.
-    proportions : Proportions
-        Sizes and places of tool, path and scene at the start, and their misfits.
-    """
-
     rate: float
     loop: LoopFigures
     empty: LoopFigures | None
@@ -221,6 +181,27 @@ class Report(Counts):
     recording_ended: str | None
     database_lost: str | None
     proportions: Proportions
+    hit_frames: int
+    contact_frames: int
+    unknown_frames: int
+    held_frames: int
+    stale_frames: int
+    unknown_points: int
+    cut_frames: int
+    nowhere_frames: int
+    bad_reading: str | None
+    peak_force: float
+    peak_torque: float
+    deepest: float
+    loose_frames: int
+    first_loose_frame: int
+    ended_loose: bool
+    snapping_frames: int
+    guard_actions: int
+    least_share: float
+    left_out_frames: int
+    most_left_out: int
+    conditions: dict[str, str]
 
     def __repr__(self) -> str:
         return (
@@ -249,3 +230,12 @@ class Report(Counts):
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = self.proportions.record()
         return plain
+
+
+def counts_of(seat: NDArray[np.void]) -> dict[str, Any]:
+    """Counts of a session's seat, a row of `SEAT`, by their names in a `Report`."""
+    told = {one.name for one in fields(Report)}
+    names = [n for n in seat.dtype.names or () if n in told and not seat.dtype[n].shape]
+    counts = {name: seat[name].item() for name in names}
+    counts["ended_loose"] = bool(seat["ended_loose"])
+    return counts if seat["loose_frames"] else counts | {"first_loose_frame": -1}

@@ -57,18 +57,6 @@ class CacheFigures(NamedTuple):
     lag: float | None = None
 
 
-def start_error(process: Process, name: str, seconds: float) -> HapticDBError:
-    """End a process that was not ready in `seconds`; returns the error that says why."""
-    is_slow = process.is_alive
-    process.end()
-    if is_slow:
-        return HapticDBError(
-            f"the {name} process was not ready after {seconds:g} s: the database or this machine "
-            "is too slow now; try again"
-        )
-    return HapticDBError(f"the {name} process did not start: its errors are above")
-
-
 def without_distances(url: str) -> str:
     """Words for a coupling in an environment without distances: what may be done."""
     return (
@@ -140,7 +128,8 @@ class ResidentCells:
             url, self.table.descriptor, self.table.n_slots, self.grid, self.filter, wrap
         )
         try:
-            self._process = self._start_process()
+            self._process = self._begun()
+            self._process.await_ready("fetching", START_PATIENCE)
         except BaseException:
             self.table.close()
             raise
@@ -179,17 +168,6 @@ class ResidentCells:
 
     def _begun(self) -> Process:
         return Process(FETCH, self._request, [self.table.descriptor], PURPOSES)
-
-    def _start_process(self) -> Process:
-        process = self._begun()
-        try:
-            is_ready = process.receive(START_PATIENCE) is not None
-        except BaseException:
-            process.end()
-            raise
-        if not is_ready:
-            raise start_error(process, "fetching", START_PATIENCE)
-        return process
 
     def __enter__(self) -> Self:
         return self

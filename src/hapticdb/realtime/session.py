@@ -21,8 +21,8 @@ from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand
 from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
-from hapticdb.realtime.report import LoopAnswer, Report
-from hapticdb.realtime.resident_cells import ResidentCells, start_error, without_distances
+from hapticdb.realtime.report import LoopAnswer, Report, counts_of
+from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
@@ -235,8 +235,7 @@ class Session:
             purposes,
         )
         table.desk.pids[self._row] = self._process.pid
-        if self._process.receive(START_PATIENCE) is None:
-            raise start_error(self._process, "loop's", START_PATIENCE)
+        self._process.await_ready("loop's", START_PATIENCE)
 
     def _header(self) -> Header:
         return Header(
@@ -372,8 +371,6 @@ class Session:
     def _report(self) -> Report:
         answer = self._answer
         assert answer is not None  # noqa: S101 - asked before
-        counts = asdict(answer.counts)
-        counts["conditions"] = {"points": str(len(self.shell)), **answer.counts.conditions}
         recording = self._recording
         if recording is not None:
             recording.finish()
@@ -381,6 +378,8 @@ class Session:
             rate=self.timing.rate,
             loop=answer.loop,
             empty=answer.empty,
+            bad_reading=answer.bad_reading,
+            conditions={"points": str(len(self.shell)), **answer.conditions},
             points=answer.loop.frames * len(self.shell),
             warm_up=answer.warm_up,
             is_warm=answer.is_warm,
@@ -395,7 +394,7 @@ class Session:
             law="smooth" if is_smooth(self.law) else "plane",
             coupling=self.coupling,
             budget_points=self.budget_points,
-            **counts,
+            **counts_of(self._open_board.seats[0]),
         )
 
     def close(self) -> None:

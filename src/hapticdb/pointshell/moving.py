@@ -21,8 +21,7 @@ class MovingSurface:
     """A shell's surface, tool frame: triangles, or a ball about the origin.
 
     tree : its triangles, or the ball's middle as one without area; corners (V, 3) : whose box holds
-    it; radius : of the ball, 0 of a surface; stretched : trees that a
-    sweep keeps, by their reach; metres.
+    it; radius : of the ball, 0 of a surface; metres.
 
     Raises `UsageError` if the shell has no surface.
     """
@@ -38,7 +37,6 @@ class MovingSurface:
             self.radius, triangles = 0.0, self.surface.triangles
             self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
         self.tree = tree_of(triangles)
-        self.stretched: dict[float, list[TriangleTree]] = {}
 
     def nearest(
         self, other: TriangleTree, poses: Floats, farthest: Floats, enough: float = 0.0

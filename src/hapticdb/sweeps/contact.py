@@ -31,6 +31,9 @@ SHIFT = 0.05
 DEEP = 0.06
 """Share of the start's cut by which it may grow, if that is more than the tolerance: measurements
 differ by half as much where places and corners are few. Larger: more of it is allowed."""
+FLOOR = 0.9
+"""Share of the last cut below which the next one is not measured. Less: slower looks, and longer
+ways between them where a cut gets less."""
 BLOCK = 64
 """Looks whether surfaces are apart that are done together."""
 REACH = 0.9
@@ -158,6 +161,7 @@ class _Following:
         gap = self._gaps(np.array([way]))[0]
         if gap > 0.0:
             return NONE, gap > self._contact
+        self._pair.check_time()
         most = self._allowed + self._contact
         pose = self._pair.way.at([way])[0]
         return self._cut(pose, most, enough if is_nearest else np.inf), False
@@ -165,4 +169,6 @@ class _Following:
     def _cut(self, pose: Floats, most: float, enough: float) -> Cut:
         """Cut at a pose, up to `most` metres; `enough` ends its search."""
         known = min(max(self._depth, self._contact), enough)
-        return cut(self._object, self._tool, pose, most, SHIFT * self._contact, enough, known)
+        floor = FLOOR * known if known > self._contact else 0.0
+        shift = SHIFT * self._contact
+        return cut(self._object, self._tool, pose, most, shift, enough, known, floor)

@@ -25,13 +25,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.parting import components, depths_of
+from hapticdb.kernels.triangles.parting import components, depths_of, farthest_of
 from hapticdb.kernels.triangles.piercing import piercing
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 JOIN = 1e-6
 """Share of a surface's diagonal up to which corners are one, and places of an edge, too."""
@@ -47,7 +47,7 @@ class Mesh:
     """A surface with its corners joined.
 
     tree : its triangles; points (V, 3); edges (E, 2), faces (T, 3) : numbers of points, the faces
-    in the order of the tree; lows, highs (E, 3) : boxes of the edges; near : length up to which
+    in the order of the tree; lows, highs (3, E) : boxes of the edges; near : length up to which
     places are one, metres.
     """
 
@@ -66,8 +66,8 @@ class Mesh:
         sides.sort(axis=1)
         keys, which = np.unique(sides @ np.array([len(first), 1]), return_inverse=True)
         self.edges = np.stack(np.divmod(keys, len(first)), axis=1)
-        ends = self.points[self.edges]
-        self.lows, self.highs = ends.min(axis=1), ends.max(axis=1)
+        a, b = self.points.T[:, self.edges.T].swapaxes(0, 1)
+        self.lows, self.highs = np.minimum(a, b), np.maximum(a, b)
         which = which.reshape(-1)
         order = np.argsort(which, kind="stable")
         self._faces_at = order // 3
@@ -93,20 +93,20 @@ NONE = Cut(0.0, np.zeros(3))
 
 def cut(
     one: Mesh, other: Mesh, one_from_other: Floats, most: float, shift: float, enough: float,
-    known: float = 0.0,
+    known: float = 0.0, floor: float = 0.0,
 ) -> Cut:  # fmt: skip
     """Greatest cut of two surfaces, up to `most` metres: deeper ones are told as `most`.
 
     one_from_other (4, 4) : rigid. It is the least one of `WAYS` by which the other surface is
     shifted, until one is `enough`: where surfaces coincide, rounding decides what goes through, and
     a shift of many times that makes it plain. So it is exact to `shift` metres. Of a cut of
-    `known` or less, it is only told that it is no more.
+    `known` or less, it is only told that it is no more; one below `floor` is told as `floor`.
     """
     found: Cut | None = None
     for way in WAYS:
         pose = one_from_other.copy()
         pose[:3, 3] += shift * way
-        here = _cut(one, other, pose, most, known)
+        here = _cut(one, other, pose, most, known, floor)
         found = here if found is None or here.depth < found.depth else found
         if found.depth <= enough:
             break
@@ -114,7 +114,9 @@ def cut(
     return found
 
 
-def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, known: float) -> Cut:
+def _cut(
+    one: Mesh, other: Mesh, one_from_other: Floats, most: float, known: float, floor: float
+) -> Cut:
     """Greatest cut without a shift."""
     other_from_one: Floats = np.asarray(np.linalg.inv(one_from_other), dtype=np.float64)
     mine, theirs = _Parted(one, other, other_from_one), _Parted(other, one, one_from_other)
@@ -123,22 +125,23 @@ def _cut(one: Mesh, other: Mesh, one_from_other: Floats, most: float, known: flo
     spots = mine.spots(), theirs.spots()
     mine.add(*spots[1], one_from_other)
     theirs.add(*spots[0], other_from_one)
-    return _deepest(mine, theirs, one_from_other, most, known)
+    return _deepest(mine, theirs, one_from_other, most, known, floor)
 
 
 def _deepest(
-    mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float, known: float
-) -> Cut:
+    mine: "_Parted", theirs: "_Parted", one_from_other: Floats, most: float, known: float,
+    floor: float,
+) -> Cut:  # fmt: skip
     """The deepest of all curves: at each the lesser of what either surface gets through.
 
-    The smaller surface is measured first, the other one where that gets farther than `known`.
+    The smaller surface is measured first, the other one only where that gets farther than `known`.
     """
     own, at_own = mine.crossings()
     other, at_other = theirs.crossings()
     pairs = np.concatenate([own, other[:, ::-1]])  # triangles that cross: of one, of the other
     n_own, n_all = len(mine.shares), len(mine.shares) + len(theirs.shares)
     place = np.concatenate([at_own, n_own + at_other])
-    _, pair = np.unique(pairs, axis=0, return_inverse=True)
+    _, pair = np.unique(pairs @ np.array([len(theirs.faces), 1]), return_inverse=True)
     pair = pair.reshape(-1)
     size = n_all + (int(pair.max()) + 1 if len(pair) else 0)
     links = np.stack([place, n_all + pair], axis=1)
@@ -148,8 +151,10 @@ def _deepest(
     through, is_open = np.full((2, n_curves), -1.0), np.ones(n_curves, dtype=bool)
     for n in (0, 1) if mine.size <= theirs.size else (1, 0):
         surface, curves = parted[n]
-        if is_open[curves].any():
-            np.maximum.at(through[n], curves, surface.depths(most))
+        is_asked = is_open[curves]
+        if is_asked.any():
+            far = surface.depths(is_asked, floor, most)
+            np.maximum.at(through[n], curves[is_asked], far[is_asked])
         is_open = (through[n] < 0.0) | (through[n] > known)
     lesser = np.where(
         through[0] < 0.0, through[1], np.where(through[1] < 0.0, through[0], np.minimum(*through))
@@ -180,8 +185,11 @@ class _Parted:
         )
         back = np.linalg.inv(other_from_mesh)
         middle, half = back[:3, :3] @ middle + back[:3, 3], np.abs(back[:3, :3]) @ half + mesh.near
-        off = np.maximum(mesh.lows - (middle + half), (middle - half) - mesh.highs)
-        near = np.flatnonzero(off.max(axis=1) <= 0.0)
+        is_near = np.ones(len(mesh.edges), dtype=np.bool_)
+        for axis in range(3):
+            is_near &= mesh.lows[axis] <= middle[axis] + half[axis]
+            is_near &= mesh.highs[axis] >= middle[axis] - half[axis]
+        near = np.flatnonzero(is_near)
         self._pierce(mesh.edges[near], near)
 
     def _pierce(self, edges: Ints, numbers: Ints) -> None:
@@ -197,6 +205,11 @@ class _Parted:
         self.shares = np.concatenate([self.shares, shares[is_next]])
         self._triangles = np.concatenate([self._triangles, triangles])
         self._place_of = np.concatenate([self._place_of, place_of])
+
+    @property
+    def faces(self) -> Ints:
+        """Triangles, without those that were added."""
+        return self._mesh.faces
 
     @property
     def size(self) -> int:
@@ -222,10 +235,8 @@ class _Parted:
         within = np.arange(len(which)) - starts[which]
         others = starts[which][:, None] + (within[:, None] + steps) % counts[which][:, None]
         middles = 0.5 * (places[:, None] + places[others])
-        far = distances_to(self._mesh.tree, middles.reshape(-1, 3)).reshape(middles.shape[:2])
-        best = np.argmax(far, axis=1)
-        chosen = np.lexsort((-far[np.arange(len(which)), best], which))[starts]
-        return triangles, middles[chosen, best[chosen]]
+        best = farthest_of(self._mesh.tree, middles, np.append(starts, len(which)))
+        return triangles, middles[best[:, 0], best[:, 1]]
 
     def add(self, triangles: Ints, spots: Floats, mesh_from_other: Floats) -> None:
         """Add edges from spots (S, 3), other frame, on triangles (S,) to their corners."""
@@ -247,8 +258,10 @@ class _Parted:
         mine = np.concatenate([faces, self._spotted[edges[spots] - n_edges]])
         return np.stack([mine, self._triangles[at]], axis=1), self._place_of[at]
 
-    def depths(self, most: float) -> Floats:
-        """How far (P,) the surface gets through at each place."""
+    def depths(self, is_asked: Flags, floor: float, most: float) -> Floats:
+        """How far (P,) the surface gets through at each place that is asked (P,)."""
+        n_asked = np.bincount(self.edges, is_asked, len(self._edges))
         return depths_of(
-            self._points, self._edges, self.edges, self.shares, self._other.tree, self._pose, most
-        )
+            self._points, self._edges, self.edges, self.shares, n_asked[self.edges] > 0.0,
+            self._other.tree, self._pose, floor, most,
+        )  # fmt: skip

@@ -26,11 +26,14 @@ MOST_TRIED = 3
 
 
 class Eased(NamedTuple):
-    """The surfaces after a motion: a shift (3,) of the tool, world frame, and both trees."""
+    """A motion: a shift (3,) of the tool, world frame; and a map (4, 4) of one surface, own frame.
+
+    is_object : whether it is the object's surface, not the tool's.
+    """
 
     shift: Floats
-    object: TriangleTree
-    tool: TriangleTree
+    stretch: Floats
+    is_object: bool
 
 
 class Easing:
@@ -47,7 +50,7 @@ class Easing:
         """Way from `begin` on up to which one of the motions keeps the surfaces apart, at most."""
         best, length = begin, self._pair.length
         for _, eased in zip(range(MOST_TRIED), self._freeing(begin), strict=False):
-            met = self._pair.first_met(begin, *eased)
+            met = self._pair.first_met(begin, eased.shift, *self._trees(eased))
             if met > best:
                 best, self._known = met, eased
             if best >= length:
@@ -59,36 +62,41 @@ class Easing:
         pose = self._pair.way.at([way])[0]
         if self._known is not None and self._are_free(pose, *self._known)[0]:
             yield self._known
-        theirs, own = self._pair.tree, self._pair.tool.tree
         shifts = self.reach * np.concatenate([self._normals(pose), WAYS])
-        for shift in shifts[self._are_free(pose, shifts, theirs, own)]:
-            yield Eased(shift, theirs, own)
+        for shift in shifts[self._are_free(pose, shifts, np.eye(4), is_object=False)]:
+            yield Eased(shift, np.eye(4), is_object=False)
         for eased in self._stretched:
             if self._are_free(pose, *eased)[0]:
                 yield eased
 
     @cached_property
     def _stretched(self) -> list[Eased]:
-        still, theirs, own = np.zeros(3), self._pair.tree, self._pair.tool.tree
+        trees = (self._pair.tool.tree, False), (self._pair.tree, True)
         return [
-            *(Eased(still, theirs, tree) for tree in self._of_tool()),
-            *(Eased(still, tree, own) for tree in _stretched_trees(theirs, self.reach)),
+            Eased(np.zeros(3), stretch, is_object)
+            for tree, is_object in trees
+            for stretch in _full_stretches(tree, self.reach)
         ]
 
-    def _of_tool(self) -> list[TriangleTree]:
-        """The tool's trees, kept for its next contact."""
-        kept = self._pair.tool.stretched
-        if self.reach not in kept:
-            kept[self.reach] = list(_stretched_trees(self._pair.tool.tree, self.reach))
-        return kept[self.reach]
+    def _trees(self, eased: Eased) -> tuple[TriangleTree, TriangleTree]:
+        """The trees of object and tool after a motion, but for its shift."""
+        theirs, own = self._pair.tree, self._pair.tool.tree
+        scale, shift = np.diag(eased.stretch)[:3], eased.stretch[:3, 3]
+        tree = theirs if eased.is_object else own
+        tree = tree._replace(corners=tree.corners * scale + shift, boxes=tree.boxes * scale + shift)
+        return (tree, own) if eased.is_object else (theirs, tree)
 
     def _are_free(
-        self, pose: Floats, shifts: Floats, theirs: TriangleTree, own: TriangleTree
+        self,
+        pose: Floats,
+        shifts: Floats,
+        stretch: Floats,
+        is_object: bool,  # noqa: FBT001 - of an `Eased`
     ) -> NDArray[np.bool_]:
         """Whether surfaces are apart with the tool at a pose after each of shifts (n, 3)."""
         poses = np.tile(pose, (len(np.atleast_2d(shifts)), 1, 1))
         poses[:, :3, 3] += shifts
-        return self._pair.are_apart(poses, theirs, own, 2.0 * MEETING)
+        return self._pair.are_apart(poses, 2.0 * MEETING, stretch, is_object=is_object)
 
     def _normals(self, pose: Floats) -> Floats:
         """Unit normals (4, 3) of the triangles that are nearest, both ways, world frame."""
@@ -105,18 +113,18 @@ def normal(triangle: Floats) -> Floats:
     return found / length if length > 0.0 else np.zeros(3)
 
 
-def _stretched_trees(tree: TriangleTree, reach: float) -> Iterator[TriangleTree]:
-    """A tree stretched along the axes of its frame so that its farthest place moves by `reach`."""
+def _full_stretches(tree: TriangleTree, reach: float) -> Floats:
+    """Maps (N, 4, 4) that stretch a tree so that its farthest place moves by `reach`."""
     low, high = tree.boxes[0]
-    corners = tree.corners.reshape(-1, 3)
-    for made in stretches(low, high, reach):
-        scale, shift = np.diag(made)[:3] - 1.0, made[:3, 3]
-        more = reach / max(float(np.linalg.norm(corners * scale + shift, axis=1).max()), THIN)
-        scale, shift = 1.0 + more * scale, more * shift
-        if (scale >= LEAST_STRETCH).all():
-            yield tree._replace(
-                corners=tree.corners * scale + shift, boxes=tree.boxes * scale + shift
-            )
+    middle = 0.5 * (low + high)
+    maps = stretches(low, high, reach) - np.eye(4)  # what they move by
+    scales = np.einsum("nii->ni", maps)[:, :3]
+    shifts = maps[:, :3, 3] + scales * middle
+    corners = tree.corners.reshape(-1, 3) - middle
+    squares = corners**2 @ (scales**2).T + 2.0 * corners @ (scales * shifts).T
+    farthest = np.sqrt(np.maximum(squares.max(axis=0) + (shifts**2).sum(axis=1), 0.0))
+    maps = np.eye(4) + maps * (reach / np.maximum(farthest, THIN))[:, None, None]
+    return np.asarray(maps[(np.einsum("nii->ni", maps) >= LEAST_STRETCH).all(axis=1)])
 
 
 def stretches(low: Floats, high: Floats, reach: float) -> Floats:

@@ -54,7 +54,7 @@ class Pair:
 
     def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
         """Measure at ways (n,), as `kernels.triangles.nearest`."""
-        self._check_time()
+        self.check_time()
         self.looks += len(ways)
         return self.tool.nearest(self.tree, self.way.at(ways), farthest, enough)
 
@@ -63,12 +63,19 @@ class Pair:
         return self.tool.nearest(self.tree, pose[None], np.array([np.inf]))
 
     def are_apart(
-        self, poses: Floats, theirs: TriangleTree, own: TriangleTree, far: float
+        self, poses: Floats, far: float, stretch: Floats, *, is_object: bool
     ) -> NDArray[np.bool_]:
-        """Whether surfaces that are eased keep `far` metres apart at poses (n, 4, 4)."""
+        """Whether the surfaces keep `far` metres apart at poses (n, 4, 4), one of them stretched.
+
+        stretch (4, 4) : affine, in the frame of its surface: the object's, or the tool's.
+        """
+        self.check_time()
         self.looks += len(poses)
         least = far + self.tool.radius
-        found = nearest(theirs, own, poses, np.full(len(poses), least), least)
+        one, other, moved = self.tree, self.tool.tree, poses @ stretch
+        if is_object:
+            one, other, moved = other, one, np.linalg.inv(poses) @ stretch
+        found = nearest(one, other, moved, np.full(len(poses), least), least)
         return np.asarray(found.pairs[:, 0] < 0)
 
     def first_met(
@@ -117,13 +124,14 @@ class Pair:
             search.found.distance[0], search.found.way[0] = MEETING, self.length
         is_over = False
         while not is_over:
-            self._check_time()
+            self.check_time()
             is_over = search.go_on(STEPS)
         self.looks += search.looks
         if self.length < self.way.length and search.found.way[0] >= self.length:
             search.found.way[0] = -1.0
 
-    def _check_time(self) -> None:
+    def check_time(self) -> None:
+        """End the sweep by OverTimeError if its time is over."""
         if time.monotonic() > self.until:
             raise OverTimeError
 

@@ -303,18 +303,24 @@ class _Sweep:
     def _holds(self, triangles: Floats, obj: Object) -> bool:
         """Whether the object is in a closed body of the tool, or around it, at the start.
 
-        Both are apart there.
+        Both are apart there, so a triangle is inside if one of its corners is.
         """
         pose = self._way.at([0.0])[0]
-        corners = np.unique(triangles.reshape(-1, 3), axis=0)
-        inside = Interior(self._tool.surface)
-        if inside and inside.holds((corners - pose[:3, 3]) @ pose[:3, :3]).any():
+        low, high = self._tool.corners.min(axis=0), self._tool.corners.max(axis=0)
+        corners = (triangles[:, 0] - pose[:3, 3]) @ pose[:3, :3]
+        corners = corners[((corners >= low) & (corners <= high)).all(axis=1)]
+        if len(corners) and self._interior and self._interior.holds(corners).any():
             return True
         tool = self._tool.corners @ pose[:3, :3].T + pose[:3, 3]
         if not ((tool >= obj.bounds[0]) & (tool <= obj.bounds[1])).all():
             return False
         around = Interior(orient(triangles))
         return bool(around and around.holds(tool).any())
+
+    @cached_property
+    def _interior(self) -> Interior:
+        """Insides of the tool's closed bodies."""
+        return Interior(self._tool.surface)
 
 
 def _told(

@@ -4,15 +4,18 @@ A surface is points, and edges between them. Places on some of its edges are whe
 the other surface; `sweeps.cut` says what a depth is.
 """
 
+import math
+
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INTS, INTS2, entry, leaf
+from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, INTS2, entry, leaf
 from hapticdb.kernels.surfaces.nearest import distance_at
 from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
+Flags = NDArray[np.bool_]
 
 SAMPLES = 4
 """Steps in which a part of an edge is measured. More: deeper cuts of curved surfaces."""
@@ -68,11 +71,14 @@ def _far(tree, pose, x, y, z, enough, most, waiting, squares):
 
 
 @leaf
-def _part_far(points, edges, edge, begin, end, tree, pose, most, waiting, squares):
-    """Greatest distance on a part of an edge, from share to share."""
+def _part_far(points, edges, edge, begin, end, known, tree, pose, most, waiting, squares):
+    """Greatest distance on a part of an edge, from share to share; `known` if none is greater.
+
+    Where the edge goes through the other surface, the distance is 0.
+    """
     a, b = edges[edge, 0], edges[edge, 1]
-    found = 0.0
-    for k in range(SAMPLES + 1):
+    found = known
+    for k in range(0 if begin == 0.0 else 1, SAMPLES + 1 if end == 1.0 else SAMPLES):
         share = begin + (end - begin) * k / SAMPLES
         x = points[a, 0] + share * (points[b, 0] - points[a, 0])
         y = points[a, 1] + share * (points[b, 1] - points[a, 1])
@@ -83,19 +89,22 @@ def _part_far(points, edges, edge, begin, end, tree, pose, most, waiting, square
 
 @leaf
 def _measure_parts(
-    points, edges, cuts, shares, tree, pose, most, pieces, parts, far, piece_far, waiting, squares
-):
-    """Measure the parts of edges between places, far (2 P,), and note the piece of each, parts.
+    points, edges, cuts, shares, asked, tree, pose, floor, most, pieces, parts, far, piece_far,
+    waiting, squares,
+):  # fmt: skip
+    """Measure the parts of edges between places, and note the piece of each, parts (2 P,).
 
-    A part at an end of its edge is passed over if its piece is known to get far enough, and the
-    other end is of another piece.
+    Where both parts of an edge are of one piece, they count by themselves, far (2 P,). Else a part
+    is passed over if its piece is known to get far enough.
     """
     n_points, n_places, n_parts = points.shape[0], cuts.shape[0], 0
     for p in range(n_places):
         edge = cuts[p]
         one, other = pieces[edges[edge, 0]], pieces[edges[edge, 1]]
+        is_first = p == 0 or cuts[p - 1] != edge
         is_last = p + 1 == n_places or cuts[p + 1] != edge
-        for k in range(0 if p == 0 or cuts[p - 1] != edge else 1, 2):
+        is_one = one == other and is_first and is_last
+        for k in range(0 if is_first else 1, 2):
             if k == 0:
                 begin, end, part = 0.0, shares[p], one
             elif is_last:
@@ -103,11 +112,12 @@ def _measure_parts(
             else:
                 begin, end, part = shares[p], shares[p + 1], n_points + n_parts
             parts[n_parts] = part
-            far[n_parts] = most
-            if one == other or piece_far[part] < most:
+            far[n_parts] = floor if is_one else max(piece_far[part], floor)
+            if asked[p] and far[n_parts] < most:
                 far[n_parts] = _part_far(
-                    points, edges, edge, begin, end, tree, pose, most, waiting, squares
-                )
+                    points, edges, edge, begin, end, far[n_parts], tree, pose, most, waiting,
+                    squares,
+                )  # fmt: skip
             piece_far[part] = max(piece_far[part], far[n_parts])
             n_parts += 1
     return n_parts
@@ -145,13 +155,14 @@ def _through(parts, far, piece_far, at, k, n_parts):
     return max(beside, min(piece_far[left], piece_far[right]))
 
 
-@entry(FLOATS2, INTS2, INTS, FLOATS, TREE, FLOATS2, FLOAT, INTS, FLOATS)
-def depths_kernel(points, edges, cuts, shares, tree, pose, most, parents, out):
-    """Find how far out (P,) a surface gets through another one at each place, up to `most`.
+@entry(FLOATS2, INTS2, INTS, FLOATS, BOOLS, TREE, FLOATS2, FLOAT, FLOAT, INTS, FLOATS)
+def depths_kernel(points, edges, cuts, shares, asked, tree, pose, floor, most, parents, out):
+    """Find how far out (P,) a surface gets through another one at each place, `floor` to `most`.
 
     points (V, 3), edges (E, 2): the surface; cuts (P,), shares (P,): edge of each place and share
-    of the edge, ascending by both; pose (4, 4) leads into the tree's frame. parents (V,) begins as
-    0 .. V - 1; afterwards the piece of each point.
+    of the edge, ascending by both; asked (P,): where it is asked, the same for all places of an
+    edge; pose (4, 4) leads into the tree's frame. parents (V,) begins as 0 .. V - 1; afterwards the
+    piece of each point.
     """
     n_points, n_places = points.shape[0], cuts.shape[0]
     p = 0
@@ -165,12 +176,14 @@ def depths_kernel(points, edges, cuts, shares, tree, pose, most, parents, out):
     parts, far = np.empty(2 * n_places, dtype=np.int64), np.empty(2 * n_places)
     piece_far = np.full(n_points + 2 * n_places, -1.0)
     for p in range(n_places):
-        piece_far[parents[edges[cuts[p], 0]]] = piece_far[parents[edges[cuts[p], 1]]] = 0.0
+        if asked[p]:
+            piece_far[parents[edges[cuts[p], 0]]] = floor
+            piece_far[parents[edges[cuts[p], 1]]] = floor
     waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
     _measure_pieces(points, tree, pose, most, parents, piece_far, waiting, squares)
     _measure_parts(
-        points, edges, cuts, shares, tree, pose, most, parents, parts, far, piece_far, waiting,
-        squares,
+        points, edges, cuts, shares, asked, tree, pose, floor, most, parents, parts, far, piece_far,
+        waiting, squares,
     )  # fmt: skip
     first, at = 0, 0
     while first < n_places:
@@ -184,16 +197,38 @@ def depths_kernel(points, edges, cuts, shares, tree, pose, most, parents, out):
 
 
 def depths_of(
-    points: Floats, edges: Ints, cuts: Ints, shares: Floats, tree: TriangleTree, pose: Floats,
-    most: float,
+    points: Floats, edges: Ints, cuts: Ints, shares: Floats, asked: Flags, tree: TriangleTree,
+    pose: Floats, floor: float, most: float,
 ) -> Floats:  # fmt: skip
     """How far (P,) a surface gets through at each place, as `depths_kernel` says."""
     out = np.empty(len(cuts))
     depths_kernel(
-        np.ascontiguousarray(points), np.ascontiguousarray(edges), cuts, shares, tree,
-        np.ascontiguousarray(pose), float(most), np.arange(len(points)), out,
+        np.ascontiguousarray(points), np.ascontiguousarray(edges), cuts, shares, asked, tree,
+        np.ascontiguousarray(pose), float(floor), float(most), np.arange(len(points)), out,
     )  # fmt: skip
     return out
+
+
+@entry(TREE, FLOATS3, INTS, INTS2)
+def farthest_kernel(tree, places, starts, best):
+    """Find the place that is farthest from a surface in each group; its index, best (G, 2).
+
+    places (N, K, 3), tree's frame; group g is starts[g] .. starts[g + 1] - 1 of them, at least one.
+    """
+    waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
+    nowhere = (0.0, 0.0, 0.0)
+    for g in range(best.shape[0]):
+        known = 0.0
+        best[g, 0], best[g, 1] = starts[g], 0
+        for n in range(starts[g], starts[g + 1]):
+            for k in range(places.shape[1]):
+                place = (places[n, k, 0], places[n, k, 1], places[n, k, 2])
+                found = distance_at(
+                    tree, place, np.int64(-1), nowhere, -1.0, known, math.inf, waiting, squares
+                )
+                if found > known:
+                    known = found
+                    best[g, 0], best[g, 1] = n, k
 
 
 def components(links: Ints, count: int) -> Ints:
@@ -201,3 +236,10 @@ def components(links: Ints, count: int) -> Ints:
     parents = np.arange(count)
     components_kernel(np.ascontiguousarray(links), parents)
     return parents
+
+
+def farthest_of(tree: TriangleTree, places: Floats, starts: Ints) -> Ints:
+    """Index (G, 2) of the farthest one of places (N, K, 3) in each group, as `farthest_kernel`."""
+    best = np.empty((len(starts) - 1, 2), dtype=np.int64)
+    farthest_kernel(tree, np.ascontiguousarray(places), starts, best)
+    return best

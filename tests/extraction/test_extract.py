@@ -2,6 +2,8 @@
 
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
 import pytest
@@ -34,6 +36,8 @@ from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Exit, problem_of
 from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
+from hapticdb.sweeps.result import Swept
+from hapticdb.sweeps.run import sweep
 
 # --- straight pulls ------------------------------------------------------------------------------
 
@@ -71,7 +75,7 @@ def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:
 def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
     """Pulled across, the walls of the upper one pass through the stud of the lower one."""
     with hapticdb.open(studded(tmp_path), read_only=True) as env:
-        problem = problem_of(env, ("upper",), (), (), seed=0, contact=5e-5, seconds=500.0)
+        problem = problem_of(env, ("upper",), (), (), seed=0, contact=5e-5)
         along, across = (
             judge(problem, np.stack([np.eye(4), shifted(0.2 * axis)]), "pull")
             for axis in np.eye(3)[[2, 0]]
@@ -183,6 +187,23 @@ def test_the_time_ends_the_planner(tmp_path: Path) -> None:
     found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=3.0)
     assert found.way is None
     assert time.monotonic() - began < 200.0
+
+
+def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Each sweep takes all the time that it is given, and decides nothing."""
+    now = [0.0]
+
+    def slow(*args: Any, seconds: float, **options: Any) -> Swept:  # noqa: ANN401
+        now[0] += seconds
+        return sweep(*args, seconds=1e-9, **options)
+
+    monkeypatch.setattr("hapticdb.extraction.judge.sweep", slow)
+    for module in ("judge", "pulls", "run"):
+        clock = SimpleNamespace(monotonic=lambda: now[0])
+        monkeypatch.setattr(f"hapticdb.extraction.{module}.time", clock)
+    found = found_in(lid(tmp_path, 0.03), "lid", motions=0, seconds=10.0)
+    assert found.verdict == "not decided"
+    assert now[0] <= 10.5
 
 
 def test_a_missing_planner_is_said_with_what_is_in_the_way(

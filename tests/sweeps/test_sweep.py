@@ -1,7 +1,9 @@
 """Sweeps in an environment, decided on surfaces: what is hit, touched, left and enclosed."""
 
 from collections.abc import Iterator
+from itertools import count
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -285,6 +287,22 @@ def test_time_that_is_over_leaves_it_undecided(env: Environment) -> None:
     found = sweep(env, TOOL, line((0.0, 0.0, 0.05), (0.05, 0.0, 0.05)), seconds=1e-9)
     assert found.verdict == "not decided"
     assert found.gap.at_least == 0.0
+
+
+def test_time_ends_a_contact_that_is_followed(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The tool is stuck through a plate and slides in it: each look takes a second of the clock."""
+    seconds = count()
+    clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
+    monkeypatch.setattr("hapticdb.sweeps.gap.time", clock)
+    monkeypatch.setattr("hapticdb.sweeps.run.time", clock)
+    path = line((0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
+    with imported(tmp_path, {"plate": box_at((0.3, 0.3, 0.02), (0.0, 0.0, 0.0))}) as env:
+        found = sweep(env, TOOL, path, contact=1e-6, seconds=20.0)
+    assert found.verdict == "not decided"
+    assert next(seconds) <= 25
+    assert found.looks <= 100
 
 
 def test_progress_counts_objects(env: Environment) -> None:

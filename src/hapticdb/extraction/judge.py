@@ -22,7 +22,7 @@ BACK = 0.1
 
 def judge(problem: Problem, poses: Floats, how: How, until: float = math.inf) -> WayOut:
     """Sweep the parts along a path of displacements (M, 4, 4), until a time of `monotonic`."""
-    left = max(min(problem.seconds, until - time.monotonic()), LEAST)
+    left = max(min(problem.until, until) - time.monotonic(), LEAST)
     found = sweep(
         problem.env, problem.shell, poses, where=problem.where, exclude=problem.exclude,
         contact=problem.contact, seconds=left, until_hit=True,

@@ -40,6 +40,8 @@ MOST_OUT = 8
 """Greatest number of straight pulls that are judged of those that lead out by voxels."""
 SHARE_OF_LIKELY = 0.3
 """Greatest share of the time for sweeps of likely pulls, before voxels say what else leads out."""
+SHARE_OF_PROOF = 0.2
+"""Share of the time that is left for sweeps of what pulls by voxels and the planner find."""
 MOST_PLANS = 3
 """Greatest number of planned paths that are judged, until one is not refuted. Larger: more ways are
 found past places that the search overlooks."""
@@ -81,7 +83,7 @@ def extract(
     screw : float or None
         Pitch of a thread, metres a turn: screw motions of both hands are tried after the pulls.
     seconds : float
-        Time of the search; each sweep that judges a path has as much.
+        Time of the search with the sweeps that judge its paths, which have a fifth of it at least.
     seed : int
         The same seed gives the same path, unless the time ends the search.
     motions : int
@@ -104,7 +106,7 @@ def extract(
     asked = _Asked(None, seconds, seed, motions, out, screw, budget_bytes)
     asked.check()
     began = time.monotonic()
-    problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, seconds=seconds)
+    problem = problem_of(env, words, where, exclude, seed=seed, contact=contact)
     goal = None if to is None else _checked_goal(problem, to, asked)
     found = _searched(problem, asked._replace(to=goal), progress)
     return replace(found, seconds=time.monotonic() - began)
@@ -158,7 +160,8 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
         problem.radius + problem.voxel_size,
         asked.out,
     )
-    until = time.monotonic() + asked.seconds
+    problem = problem._replace(until=time.monotonic() + asked.seconds)
+    until = problem.until - SHARE_OF_PROOF * asked.seconds
     n_motions, is_planned = 0, False
     way = None if asked.to is None else judge(problem, np.stack([np.eye(4), asked.to]), "pull")
     refuting = () if way is None else way.in_way
@@ -166,7 +169,7 @@ def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -
     with FreeSpace(problem, asked.budget_bytes) as space:
         pulls = Pulls(problem, space, leaving, asked.seed)
         if way is None or way.verdict == "not decided":
-            pulled = pulls.sweep(until - (1.0 - SHARE_OF_LIKELY) * asked.seconds)
+            pulled = pulls.sweep(problem.until - (1.0 - SHARE_OF_LIKELY) * asked.seconds)
             if pulled is None or asked.to is not None:
                 pulls.run(until, progress)
                 pulled = _best_pull(problem, pulls)
@@ -213,6 +216,8 @@ def _best_pull(problem: Problem, pulls: Pulls) -> WayOut | None:
     outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
     undecided: WayOut | None = None
     for n in outs[:MOST_OUT]:
+        if undecided is not None and time.monotonic() > problem.until:
+            break
         pull = pulls.done[n]
         way = judge(problem, pull.poses(np.array([0.0, pull.length])), "pull")
         if way.swept.is_free:

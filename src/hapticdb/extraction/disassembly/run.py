@@ -250,7 +250,7 @@ class _OrderSearch:
         try:
             if not is_wanted:
                 self._check_something_stands({*excluded, *ids})
-            found = self._searched(ids, excluded, motions)
+            found = self._searched(ids, motions)
         except (NoSurfaceError, UsageError) as error:
             if is_wanted:
                 raise
@@ -288,13 +288,11 @@ class _OrderSearch:
         if all(obj.id in excluded for obj in self._env.objects()):
             raise UsageError("it is the last object that stands beside what is to come out")
 
-    def _searched(
-        self, ids: tuple[int, ...], excluded: tuple[int, ...], motions: int
-    ) -> Extraction:
+    def _searched(self, ids: tuple[int, ...], motions: int) -> Extraction:
         def search(motions: int) -> Extraction:
             if self._workers is None:
                 return extract(self._env, *ids, **self._options(motions))
-            task = self._ahead.pop((ids, excluded, motions), None)
+            task = self._ahead.pop((ids, self._excluded(), motions), None)
             found: Extraction = self._workers.result(
                 task or self._given(self._workers, ids, motions)
             )
@@ -341,9 +339,11 @@ class _OrderSearch:
             found, way = step.found, step.found.way
             assert way is not None  # noqa: S101 - steps are proved
             excluded = tuple(i for i in step.excluded if i not in self.steps[n].ids)
+            left = max(self._until - time.monotonic(), LEAST)
             again = sweep(
-                self._env, found.shell, way.poses, exclude=excluded, contact=way.swept.contact
-            )
+                self._env, found.shell, way.poses, exclude=excluded, contact=way.swept.contact,
+                seconds=left,
+            )  # fmt: skip
             if not again.is_free:
                 return None
             proved.append(Removal(replace(found, way=replace(way, swept=again)), excluded))

@@ -76,7 +76,9 @@ def claim_laws(results: Results) -> str:
             ]
             ratios.append(best[0] / best[1])
         said = f"{min(ratios):.1f} to {max(ratios):.1f}"
-        lines.append(f"- {poses} poses: a smooth frame takes {said} times a plane one.")
+        lines.append(
+            f"- {poses} poses: the fastest smooth frame takes {said} times the fastest plane one."
+        )
     return "\n".join(lines)
 
 
@@ -256,7 +258,7 @@ def speed(results: Results) -> str:
         row = rows.setdefault((cell["situation"], f"{cell['points']:,}"), [])
         row += [us_text(ns[name]) for name in own if name in ns]
         row.append(f"{us_text(ns[best])} ({best})")
-    head = ["tool is", "points", "first hit", "force", "best other", "how far", "best other"]
+    head = ["tool is", "points", "first hit", "force", "other's hit", "how far", "other's"]
     return table(head, [[*place, *row] for place, row in rows.items()])
 
 

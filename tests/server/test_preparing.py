@@ -5,6 +5,8 @@ import signal
 import sys
 from pathlib import Path
 
+import pytest
+
 from children import PATIENCE, child, until
 from hapticdb.kernels._cache import IN_WORKER, LENT
 from page_person import PagePerson
@@ -19,6 +21,7 @@ if os.environ.get("{IN_WORKER}"):
 """A `sitecustomize` that keeps processes from compiling anything."""
 
 
+@pytest.mark.long
 def test_the_page_is_there_before_the_kernels_and_a_closed_server_compiles_no_more(
     environment: Path, tmp_path: Path
 ) -> None:

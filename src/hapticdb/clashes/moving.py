@@ -22,13 +22,11 @@ from hapticdb.poses import rotation_of
 from hapticdb.ready import make_ready
 from hapticdb.store.finding import Words
 from hapticdb.store.pairs import Kind
-from hapticdb.sweeps.gap import Pair
+from hapticdb.sweeps.gap import Pair, box_gaps
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 
-STRETCHES = 256
-"""Stretches of a motion on which boxes are compared. More: fewer objects are looked at."""
 STEP, MOST_STEPS = 1.5, 4096
 """Contact tolerances from one look of a meeting to the next, or the motion's share if that is
 more. Longer steps: a parting between two of them is not seen."""
@@ -96,10 +94,7 @@ def find_meetings(
         way = Way.of(poses, tool.corners, center)
         own = {obj.id for obj in env.find(*of)}
         objects = [obj for obj in env.felt(against, ()) if obj.id not in own]
-        edges = np.linspace(0.0, way.length, STRETCHES + 1)
-        bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
-        middles = way.at(0.5 * (edges[:-1] + edges[1:]))
-        gaps = tool.box_gaps(bounds, middles, 0.5 * np.diff(edges)).min(axis=1, initial=np.inf)
+        gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
         shapes, moved = Shapes(env.store, BUDGET), BuiltShape(tool.tree.corners, is_cloud=False)
         found = []

@@ -1,6 +1,7 @@
 """Distances of the tool and one object along a path, and where they meet first."""
 
 import time
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
 from hapticdb.kernels.triangles.sweeping import MEETING, Search
 from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.store.base import Object
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -19,6 +21,8 @@ COARSE, FINE = 9e-6, 1e-6
 it is soon found."""
 EASY = 20_000
 """Looks up to which that is soon."""
+STRETCHES = 256
+"""Stretches of a path on which boxes are compared. More: fewer objects are looked at."""
 STEPS = 1 << 16
 """Entries of a search between two looks at the clock: some hundredths of a second. Larger: a limit
 of time is overrun by more."""
@@ -134,6 +138,14 @@ class Pair:
         """End the sweep by OverTimeError if its time is over."""
         if time.monotonic() > self.until:
             raise OverTimeError
+
+
+def box_gaps(tool: MovingSurface, way: Way, objects: Sequence[Object]) -> tuple[Floats, Floats]:
+    """Ways (N + 1,) between stretches of a path; distances (O, N) of boxes, never too large."""
+    edges = np.linspace(0.0, way.length, (STRETCHES if way.length else 1) + 1)
+    bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
+    middles = way.at(0.5 * (edges[:-1] + edges[1:]))
+    return edges, tool.box_gaps(bounds, middles, 0.5 * np.diff(edges))
 
 
 def error_of(distance: float) -> float:

@@ -27,7 +27,7 @@ from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import FollowedContact, follow
 from hapticdb.sweeps.cut import Mesh
-from hapticdb.sweeps.gap import OverTimeError, Pair, error_of
+from hapticdb.sweeps.gap import OverTimeError, Pair, box_gaps, error_of
 from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
 from hapticdb.sweeps.way import Way
 
@@ -35,9 +35,6 @@ CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
 WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
-
-STRETCHES = 256
-"""Stretches of a path on which boxes are compared. More: fewer objects are looked at."""
 
 Floats = NDArray[np.float64]
 SweepCallback = Callable[[int, int], None]
@@ -195,10 +192,7 @@ class _Sweep:
 
     def _decide(self, objects: list[Object]) -> int:
         """Look at objects, the nearest boxes first; returns how many were looked at."""
-        edges = np.linspace(0.0, self._way.length, (STRETCHES if self._way.length else 1) + 1)
-        bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
-        poses = self._way.at(0.5 * (edges[:-1] + edges[1:]))
-        gaps = self._tool.box_gaps(bounds, poses, 0.5 * np.diff(edges))
+        edges, gaps = box_gaps(self._tool, self._way, objects)
         nearest = gaps.min(axis=1, initial=np.inf)
         order = np.argsort(nearest, kind="stable").tolist()
         n_near = int((nearest < self._asked.limit).sum())

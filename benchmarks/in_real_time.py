@@ -31,11 +31,12 @@ from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.kernels.large.budget import feel_kernel
+from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query.law import DistanceField
 from hapticdb.resident.frames import ResidentFrames
+from hapticdb.resident.held import counts_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
@@ -53,8 +54,8 @@ BUDGET = 10_000
 """Points near something that a frame with a budget looks at, at most."""
 WAYS: dict[str, dict[str, Any]] = {
     "flat": {"run": 0},
-    "session": {"sleeps": None},
-    "budget": {"sleeps": None, "budget_points": BUDGET},
+    "session": {},
+    "budget": {"budget_points": BUDGET},
 }
 """Options of `ResidentFrames`: no clusters; as a session has it; with a budget."""
 EXACT = ("dense", "flat", "session")
@@ -92,7 +93,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
     ):
         residency = Residency(env.store, table)
         frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
-        frames["smooth"] = ResidentFrames(residency, shell, DistanceField(), sleeps=None)
+        frames["smooth"] = ResidentFrames(residency, shell, DistanceField())
         left_out = frames["budget"].feel(poses).left_out
         frames["smooth"].feel(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
@@ -111,7 +112,7 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                         one = frames[name]
                         feel_kernel(
                             table.cells, row, one.clusters, poses, residency.place, one.law,
-                            one.hits, one.missed, out, one.asleep,
+                            one.hits, one.missed, out, one.budget, counts_of(1),
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out

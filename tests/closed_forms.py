@@ -29,7 +29,7 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.stations import Station, Stations
-from hapticdb.resident.held import PreparedTool, asleep_of, spheres_of
+from hapticdb.resident.held import PreparedTool, budget_of, spheres_of
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -204,7 +204,7 @@ def tool_of(points: ArrayLike, size: float, run: int = 64) -> PreparedTool:
         both, at.mean(axis=0), *spheres_of(both, size, run), run, np.ascontiguousarray(at.T),
         np.zeros((SCRATCH_ROWS, run)),
     )  # fmt: skip
-    return PreparedTool(clusters, asleep_of(np.zeros((0, 4)), None, len(at)))
+    return PreparedTool(clusters, budget_of(clusters.spheres, None, len(at)))
 
 
 class Hand:

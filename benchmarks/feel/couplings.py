@@ -57,7 +57,7 @@ class SmoothHand:
         self._periods = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
         self._station = Station(
             self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
-            ground.residency.grid, held_tool(shell, ground.size, sleeps=False),
+            ground.residency.grid, held_tool(shell, ground.size),
         )  # fmt: skip
         self._hand, self._sent = self._station.servo["hand"], self._station.servo["sent"]
         self._handle = Handle()

@@ -142,12 +142,12 @@ def test_objects_that_a_session_leaves_out_are_not_felt(
     assert len(host.cells) == 1
 
 
-def test_a_cell_that_changes_beside_a_sleeping_tool_is_felt(
+def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
     host: SessionHost, env: Environment, tmp_path: Path
 ) -> None:
-    """The tool rests above the floor, all asleep, and something is put where it is."""
+    """The tool rests above the floor, and something is put where it is."""
     session = host.begin(standing_plate(), ABOVE)
-    session.record(tmp_path / "s.hdbrec")  # only recorded frames sleep
+    session.record(tmp_path / "s.hdbrec")
     until(lambda: session.figures().frames > 20)
     last = session.latest()
     assert last is not None

@@ -16,12 +16,12 @@ from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field import law as field
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
-from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.query import contact, refining
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cells as resident
+from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import counts_of, held_tool
 from naive_frame import NaiveTouch, distance_at, touch_distances
 
 ORIGIN = (-0.31, 0.17, -0.05)
@@ -181,9 +181,9 @@ def on_cells(cells: resident.Cells, shell: PointShell, pose: Array, run: int | N
     """Result (RESULTS,) of a frame on resident cells."""
     out, met = np.zeros((1, resident.RESULTS)), np.empty(len(shell), dtype=np.int64)
     place = resident.Place(*ORIGIN, SIZE, float(1 << BITS))
-    clusters, asleep = held_tool(shell, SIZE, run=run)
+    clusters, budget = held_tool(shell, SIZE, run=run)
     missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-    feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out, asleep)
+    feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out, budget, counts_of(1))
     return out[0]  # type: ignore[no-any-return]
 
 

@@ -13,9 +13,9 @@ from hapticdb import Environment, PointShell
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
+from hapticdb.realtime.stations import LARGE_FROM
 from hapticdb.recording.file import Recording
 from hapticdb.recording.replay import touching
-from hapticdb.resident.held import LARGE_FROM
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0

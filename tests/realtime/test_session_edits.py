@@ -17,7 +17,6 @@ from hapticdb.realtime.stations import Station, Stations
 from hapticdb.recording.frame import State
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
-from hapticdb.store.base import NO_KEYS
 from hapticdb.testing import floor_voxels
 from realtime.hands import stroking
 from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
@@ -59,7 +58,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         station.row["is_running"] = station.row["is_frame"] = True
         seats["is_recorded"] = True
         for revision in (7, 8, 9):
-            publish(table.cells.control, revision - 6, revision, NO_KEYS)
+            publish(table.cells.control, revision - 6, revision)
             periods.step(0, 0, 1e-3)
         assert rings["revision"][0].tolist() == [7, 8, 9, 0]
 

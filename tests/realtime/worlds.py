@@ -12,11 +12,11 @@ import naive_frame
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.kernels.large.budget import feel_kernel
 from hapticdb.kernels.law import TangentPlaneLaw
+from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
 from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import counts_of, held_tool
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
 from hapticdb.testing import voxel_object, write_voxels
@@ -146,7 +146,7 @@ class Reader:
         self.table = table
         self.cells: Cells = table.cells
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        self.clusters, self.asleep = held_tool(shell, grid.voxel_size)
+        self.clusters, self.budget = held_tool(shell, grid.voxel_size)
         self.row = table.join()
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.missed = np.zeros(64, dtype=np.int64)
@@ -156,7 +156,8 @@ class Reader:
         """Hits, wrench and number of unknown points."""
         feel_kernel(
             self.cells, self.row, self.clusters, pose[None], self.place,
-            TangentPlaneLaw(1000.0), self.hits, self.missed, self.out, self.asleep,
+            TangentPlaneLaw(1000.0), self.hits, self.missed, self.out, self.budget,
+            counts_of(1),
         )  # fmt: skip
         row = self.out[0]
         wrench = row[WRENCH : WRENCH + 6] + 0.0  # turns -0.0 into 0.0

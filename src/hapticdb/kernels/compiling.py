@@ -34,7 +34,7 @@ ENTRIES = {
     "surfaces.voxelize": "voxelize_kernel",
     "resident.nearest": "find_nearest",
     "resident.first_hits": "find_first_hits",
-    "large.budget": "feel_kernel feel_kernel@distances",
+    "resident.budget": "feel_kernel feel_kernel@distances",
     "query.refining": (
         "refine_kernel refine_kernel@distances pairs_of_points pairs_of_points@distances "
         "unpack_asked_kernel wrench_of_addresses depths_of_hits"
@@ -69,7 +69,7 @@ that take longest to compile come first. The names are listed here so that a pro
 compiled entries without loading numba."""
 NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
 TOGETHER = {
-    "large.budget": "period.direct",
+    "resident.budget": "period.direct",
     "proxy.linearize": "period.loop",
     "resident.clearance": "resident.nearest",
 }
@@ -107,7 +107,7 @@ _RESIDENT = (
     "query.grouping.group_spans_by_cost",
     *_COST,
 )
-_FRAMES = "large.budget.feel_kernel"
+_FRAMES = "resident.budget.feel_kernel"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "move": (*_VOXELIZE, *_RANGES),

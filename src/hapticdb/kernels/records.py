@@ -370,19 +370,15 @@ WAY: Layout = _record(
 )
 """The way of a hand to the pose that arrived last."""
 
-SLEEPING: Layout = _record(
+BUDGET: Layout = _record(
     [
-        # addresses of the arrays of `kernels.large.sleeping.Sleepers`, by their names
-        *((name, "<i8") for name in ("boxes", "block_rests", "run_rests", "state", "changed")),
-        *((name, "<i8") for name in ("listed", "skips", "nothing")),
-        *((name, "<i8") for name in ("chosen", "columns", "indices")),
-        ("counts", "<i8"),  # address of the counts of a period's frames
-        ("n_blocks", "<i8"),
-        ("n_chosen", "<i8"),  # room for the points of a frame beyond its budget
-        ("budget", "<i8"),  # most points near something that a frame looks at
+        ("most", "<i8"),  # points near something that a frame looks at
+        # addresses of the arrays of `kernels.resident.budget.Budget`, by their names, and sizes
+        *((name, "<i8") for name in ("listed", "skips", "chosen", "columns", "indices")),
+        *((name, "<i8") for name in ("n_runs", "n_chosen")),
     ]
 )
-"""The sleeping clusters of a session's tool: where their memory is."""
+"""The budget of a session's tool: where its memory is."""
 
 STATION: Layout = _record(
     [
@@ -403,7 +399,8 @@ STATION: Layout = _record(
         # of the tool's pose, the law's frame there, and the unknown cells that were met
         *((name, "<i8") for name in ("pose", "felt", "missed")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
-        ("sleeping", SLEEPING),  # of a large tool; zeros of all others
+        ("budget", BUDGET),
+        ("counts", "<i8", 2),  # of the last frame: `kernels.resident.budget.LOOKED_AT`
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code

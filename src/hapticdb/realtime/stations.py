@@ -22,6 +22,9 @@ from hapticdb.resident.table import HEARTBEAT
 MERGES_FROM = 4096
 """Near points of the quasi-static coupling from which one contact stands for several. Larger:
 broader contacts are felt point by point, and a period with them takes longer."""
+LARGE_FROM = 4096
+"""Points from which the quasi-static coupling tests spheres of runs before their points. The
+results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
 """Nanoseconds without an answer of the database after which hosted hands and contact proxies take
 all cells for unknown."""
@@ -64,7 +67,7 @@ class Station:
         self.row, self.cells, self.reader, self.session = row, cells, reader, session
         self.record = row[0, ...]
         self.servo, self.follower = self.record["servo"], self.record["follower"]
-        self.clusters, self.asleep = tool
+        self.clusters, self.budget = tool
         n_points = len(self.clusters.points)
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.field = np.zeros((FIELD_ROWS, n_points))
@@ -98,15 +101,14 @@ class Station:
         n_points = len(clusters.points)
         row["n_points"], row["run"] = n_points, clusters.run
         row["n_spheres"], row["n_groups"] = len(clusters.spheres), len(clusters.groups)
-        sleeping, (sleepers, budget, counts) = row["sleeping"], self.asleep
-        for name, array in sleepers._asdict().items():
-            sleeping[name] = array.ctypes.data
-        sleeping["counts"], sleeping["budget"] = counts.ctypes.data, budget
-        sleeping["n_blocks"], sleeping["n_chosen"] = len(sleepers.boxes), len(sleepers.indices)
+        budget, (most, *arrays) = row["budget"], self.budget
+        for name, array in zip(self.budget._fields[1:], arrays, strict=True):
+            budget[name] = array.ctypes.data
+        budget["most"] = most
+        budget["n_runs"], budget["n_chosen"] = len(self.budget.listed), len(self.budget.indices)
         self.follower["merges_from"] = MERGES_FROM
-        if len(sleepers.boxes):
-            self.follower["is_large"] = True
-            self.follower["most_looked"] = budget if budget < n_points else 0
+        self.follower["is_large"] = n_points >= LARGE_FROM or len(self.budget.listed) > 0
+        self.follower["most_looked"] = most if most < n_points else 0
 
     def set_spring(self, spring: DeviceSpring) -> None:
         """Replace the coupling; periods take the new one whole."""

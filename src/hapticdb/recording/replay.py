@@ -130,7 +130,7 @@ def resident(
     make_ready(frames_by(law))
     with CellTable.create(distances=is_smooth(law)) as table:
         residency = Residency(environment.store, table, exclude, where=where)
-        frames = ResidentFrames(residency, shell, law, sleeps=None, budget_points=budget_points)
+        frames = ResidentFrames(residency, shell, law, budget_points=budget_points)
         try:
             yield frames.wrenches
         finally:

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.cells import BUFFERS, UNKNOWN
+from hapticdb.kernels.resident.cells import BUFFERS
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Keys
 
@@ -76,8 +76,6 @@ class CellDirectory:
         version = self.version + 1
         self.wait_for_readers(version - BUFFERS + 1)
         table, which = self._table.cells, version % BUFFERS
-        both = np.union1d(change.leaving, change.cells)
-        changed = both[self.slots_of(both) != UNKNOWN]  # in the version that is published now
         changes = (*self._changes, change)
         if self._n_unknown_copies:
             self._n_unknown_copies -= 1
@@ -88,7 +86,7 @@ class CellDirectory:
             kernels.remove_cells(table.keys, table.slots, which, one.leaving)
             kernels.insert_cells(table.keys, table.slots, which, one.cells, one.slots)
         self._changes.append(change)
-        kernels.publish(table.control, version, revision, changed)
+        kernels.publish(table.control, version, revision)
 
     def oldest_version_read(self) -> int:
         """Oldest version that a frame is reading; a very large number if no frame runs."""

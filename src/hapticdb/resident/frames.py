@@ -7,11 +7,10 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.large.budget import feel_kernel
-from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.budget import LEFT_OUT, LOOKED_AT, feel_kernel
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
@@ -49,9 +48,8 @@ class FeltFrames(NamedTuple):
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
     int64: numbers of points that hit (in a voxel or, with distances, near a surface), that touch
     (below their tangent plane or the onset), in a cell that is not resident; deepest (M,): depth of
-    the deepest contact, metres; looked_at, left_out (M,) int64: with sleeping clusters, numbers of
-    points near something that the frame looked at, and that its budget left out; otherwise all and
-    none.
+    the deepest contact, metres; looked_at, left_out (M,) int64: with a budget, numbers of points
+    near something that the frame looked at, and that it left out; otherwise all and none.
     """
 
     wrenches: Floats
@@ -120,12 +118,9 @@ class ResidentFrames:
         Force law; the tangent plane with 1000 N/m unless given.
     run : int or None
         As for `held_tool`.
-    sleeps : bool or None
-        Whether clusters far from everything are not looked at while they stay there. The results
-        are the same, bit for bit; large shells are felt sooner. None: those of a large shell.
     budget_points : int or None
-        Most points near something that a frame looks at; then clusters sleep. A frame with more
-        looks at one in 2, 4, 8 ... of them. `FeltFrames.left_out` counts the others.
+        Most points near something that a frame looks at. A frame with more looks at one in 2, 4,
+        8 ... of them. `FeltFrames.left_out` counts the others.
 
     Raises
     ------
@@ -140,7 +135,6 @@ class ResidentFrames:
         law: ForceLaw | None = None,
         *,
         run: int | None = None,
-        sleeps: bool | None = False,
         budget_points: int | None = None,
     ) -> None:
         self.residency = residency
@@ -156,8 +150,8 @@ class ResidentFrames:
         if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
             self.cells = table.cells.without_distances()
         size = residency.grid.voxel_size
-        budget_points = checked_budget(budget_points)
-        self.clusters, self.asleep = held_tool(shell, size, budget_points, sleeps=sleeps, run=run)
+        most = checked_budget(budget_points)
+        self.clusters, self.budget = held_tool(shell, size, most, run=run)
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
@@ -178,7 +172,7 @@ class ResidentFrames:
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
         counts = counts_of(len(matrices))
-        if not len(self.asleep.sleepers.boxes):
+        if not len(self.budget.listed):
             counts[:, LOOKED_AT] = len(self.shell)
         done = 0
         while done < len(matrices):
@@ -247,8 +241,7 @@ class ResidentFrames:
     ) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
-        has_budget = self.asleep.budget < len(self.shell)
-        feel = self._feel_within_budget if has_budget else self._feel
+        feel = self._feel_within_budget if len(self.budget.listed) else self._feel
         done = feel(poses[part], out[part], counts[part])
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")
@@ -257,7 +250,7 @@ class ResidentFrames:
         return int(
             feel_kernel(
                 self.cells, self._row, self.clusters, poses, self.residency.place, self.law,
-                self.hits, self.missed, out, self.asleep._replace(counts=counts),
+                self.hits, self.missed, out, self.budget, counts,
             )
         )  # fmt: skip
 

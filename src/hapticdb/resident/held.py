@@ -1,14 +1,12 @@
-"""A tool as frames hold it: its points in runs, and what of it may sleep."""
+"""A tool as frames hold it: its points in runs, and its budget of points."""
 
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.large.budget import Asleep
-from hapticdb.kernels.large.sleeping import BLOCK, COUNTS, REST, Sleepers
-from hapticdb.kernels.large.waking import AWAKE, FOLLOWED, STATE
-from hapticdb.kernels.resident.cells import CHANGES_KEPT, GROUP, SCRATCH_ROWS, Clusters
+from hapticdb.kernels.resident.budget import COUNTS, Budget
+from hapticdb.kernels.resident.cells import BLOCK, GROUP, SCRATCH_ROWS, Clusters
 from hapticdb.kernels.resident.feeling import bounding_spheres
 from hapticdb.pointshell.shell import PointShell
 
@@ -16,50 +14,32 @@ RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
 """Points that are transformed at once without clusters: as many as a processor's L1 cache holds."""
-LARGE_FROM = 4096
-"""Points from which clusters of a session's tool sleep: one block of 64 runs of 64 points. A
-smaller tool has no block to skip at once. Results are the same: a larger value only costs time."""
+NO_RUNS = np.empty(0, dtype=np.int64)
 
 Floats = NDArray[np.float64]
 
 
 class PreparedTool(NamedTuple):
-    """clusters : the points and bounding spheres; asleep : what sleeps, and the budget."""
+    """clusters : the points and bounding spheres; budget : most points that a frame looks at."""
 
     clusters: Clusters
-    asleep: Asleep
+    budget: Budget
 
 
 def held_tool(
-    shell: PointShell,
-    voxel_size: float,
-    budget: int | None = None,
-    *,
-    sleeps: bool | None = None,
-    run: int | None = None,
+    shell: PointShell, voxel_size: float, most: int | None = None, *, run: int | None = None
 ) -> PreparedTool:
-    """Prepare a shell for frames; all of it is awake.
+    """Prepare a shell for frames.
 
     Parameters
     ----------
     shell, voxel_size, run
-        As for `clusters_of`.
-    budget : int or None
+        As for `clusters_of`; a budget needs clusters.
+    most : int or None
         Most points near something that a frame looks at, `checked_budget`; None for all.
-    sleeps : bool or None
-        Whether clusters sleep. A budget needs that they do. None: those of a large tool.
     """
-    sleeps = sleeps or budget is not None or (sleeps is None and len(shell) >= LARGE_FROM)
-    n_points = len(shell)
-    clusters = clusters_of(shell, voxel_size, run or RUN if sleeps else run)
-    spheres = clusters.spheres if sleeps else clusters.spheres[:0]
-    return PreparedTool(clusters, asleep_of(spheres, budget, n_points))
-
-
-def asleep_of(spheres: Floats, budget: int | None, n_points: int) -> Asleep:
-    """What sleeps of a tool with those spheres (C, 4) of runs: nothing without any."""
-    sleepers = _sleepers_of(spheres, budget, n_points)
-    return Asleep(sleepers, min(budget or n_points, n_points), counts_of(1))
+    clusters = clusters_of(shell, voxel_size, run if most is None else run or RUN)
+    return PreparedTool(clusters, budget_of(clusters.spheres, most, len(shell)))
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
@@ -86,49 +66,39 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
 
 
 def spheres_of(points: Floats, voxel_size: float, run: int) -> tuple[Floats, Floats]:
-    """Bounding spheres of runs of points (N, 6), and of groups of runs, as `Clusters` has them."""
+    """Bounding spheres of runs of points (N, 6), and of groups and blocks, as `Clusters` has."""
     spheres = np.empty((-(-len(points) // run) if run else 0, 4))
     groups = np.empty((-(-len(spheres) // GROUP), 4))
     if run:
         bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
         bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
-    return spheres, groups
+    return spheres, np.vstack([groups, _blocks_of(spheres)])
 
 
-def _boxes_of_blocks(spheres: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Boxes (B, 7) around the centres of the spheres (C, 4) of each `BLOCK` runs, tool frame.
+def _blocks_of(spheres: Floats) -> Floats:
+    """Spheres (B, 4) around those (C, 4) of each `BLOCK` runs, or (0, 4) for fewer runs.
 
-    A box is its centre, half its sides, and the radius of a sphere at its centre around the
-    spheres, metres; the radius has room for the stretch of a pose that `is_rigid` just accepts.
+    The radius has room for the stretch of a pose that `is_rigid` just accepts.
     """
-    starts = np.arange(0, len(spheres), BLOCK)
+    starts = np.arange(0, len(spheres), BLOCK) if len(spheres) >= BLOCK else NO_RUNS
+    if not len(starts):
+        return np.zeros((0, 4))
     low = np.minimum.reduceat(spheres[:, :3], starts, axis=0)
     high = np.maximum.reduceat(spheres[:, :3], starts, axis=0)
-    centers = 0.5 * (low + high)
-    ways = np.linalg.norm(
-        spheres[:, :3] - np.repeat(centers, BLOCK, axis=0)[: len(spheres)], axis=1
-    )
+    centers = np.repeat(0.5 * (low + high), BLOCK, axis=0)[: len(spheres)]
+    ways = np.linalg.norm(spheres[:, :3] - centers, axis=1)
     radii = np.maximum.reduceat(ways * (1.0 + 1e-5) + spheres[:, 3], starts)
-    return np.hstack([centers, 0.5 * (high - low), radii[:, None]])
+    return np.hstack([centers[starts], radii[:, None]])
 
 
-def _sleepers_of(spheres: Floats, budget: int | None, n_points: int) -> Sleepers:
-    n_runs = len(spheres)
-    n_chosen = min(budget or 0, n_points)
-    boxes = _boxes_of_blocks(spheres)
-    rests = np.zeros((n_runs, 4))
-    rests[:, 3] = AWAKE
-    state = np.zeros(STATE, dtype=np.int64)
-    state[FOLLOWED] = -1
-    return Sleepers(
-        boxes,
-        np.zeros((len(boxes), REST + 1)),
-        rests,
-        state,
-        np.zeros((CHANGES_KEPT, 3)),
+def budget_of(spheres: Floats, most: int | None, n_points: int) -> Budget:
+    """Budget of a tool with those spheres (C, 4) of runs; None: no bound, and nothing is listed."""
+    n_runs = 0 if most is None else len(spheres)
+    n_chosen = min(most or 0, n_points)
+    return Budget(
+        n_chosen,
         np.zeros(n_runs, dtype=np.int64),
         np.zeros((n_runs, 1)),
-        np.zeros((0, 4)),
         np.zeros((n_chosen, 6)),
         np.zeros((3, n_chosen)),
         np.zeros(n_chosen, dtype=np.int64),
@@ -136,5 +106,5 @@ def _sleepers_of(spheres: Floats, budget: int | None, n_points: int) -> Sleepers
 
 
 def counts_of(n_poses: int) -> NDArray[np.int64]:
-    """Room for the counts of frames: see `sleeping.LOOKED_AT`."""
+    """Room for the counts of frames: see `budget.LOOKED_AT`."""
     return np.zeros((n_poses, COUNTS), dtype=np.int64)

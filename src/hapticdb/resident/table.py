@@ -31,8 +31,6 @@ FIRST_VERSION = 1
 MOST_READERS = 80
 """Greatest number of readers of a table at the same time: the 64 sessions of a host, and others.
 Larger: 2.5 KiB of the table for each, and eviction looks at more of them."""
-CONTROL_WORDS = kernels.CHANGED + kernels.CHANGES_KEPT
-"""Number of int64 words in the control block."""
 HEARTBEAT, LOST, STOP = 8, 9, 10
 """Indices in the control block, after those of `kernels.cells`: time of the database's last answer
 (ns, CLOCK_MONOTONIC), whether it is lost, whether all processes must end."""
@@ -66,7 +64,7 @@ def _fields(n_slots: int, *, has_distances: bool) -> list[_Field]:
         _Field("near", np.uint32, (n_slots, kernels.CELL_WORDS)),
     ]
     return [
-        _Field("control", np.int64, (CONTROL_WORDS,)),
+        _Field("control", np.int64, (kernels.CONTROL_WORDS,)),
         _Field("readers", np.int64, (rows * kernels.READER_STRIDE,)),
         _Field("sessions", SESSION, (rows,)),
         _Field("pids", np.int64, (rows,)),

@@ -19,7 +19,6 @@ from hapticdb.kernels.field.spline import (
     second_derivatives,
     spline,
 )
-from hapticdb.kernels.large.sleeping import placed_center, room_around
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     LISTED,
@@ -27,7 +26,10 @@ from hapticdb.kernels.resident.cells import (
     brick_bit,
     cell_key,
     enter_cell,
+    seen_in,
 )
+from hapticdb.kernels.resident.clearance import room_around
+from hapticdb.kernels.resident.runs import placed_center
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5
@@ -227,7 +229,7 @@ def _look_at_run(
     cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
 ):
     """Look at points start .. end, of run number `run` -> OPEN, or what ended it; see `look`."""
-    keys, slots, masks, used = cells.keys, cells.slots, cells.masks, cells.used
+    seen = seen_in(cells, which, cells.words)
     payload, size, side = cells.payload, place.size, place.side
     cx, cy, cz = center[0], center[1], center[2]
     half = 1 - follower.side
@@ -251,9 +253,7 @@ def _look_at_run(
         key = cell_key(np.int64(x), np.int64(y), np.int64(z))
         if key != last_key:
             last_key = key
-            slot, mask, n_missed = enter_cell(
-                keys, slots, masks, used, which, key, missed, n_missed
-            )
+            slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
         if slot < 0:
             follower.n_unknown += 1
             field[DUE, n] = run_due = -NEVER
@@ -290,8 +290,8 @@ def _rest_of_sphere(cells, which, spheres, run, transform, place):
     """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
     x, y, z = placed_center(spheres, run, transform, place)
     return room_around(
-        cells.keys, cells.slots, cells.masks, cells.used, which, x, y, z,
-        spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side,
+        seen_in(cells, which, cells.words), x, y, z, spheres[run, 3] / place.size + FAR,
+        LONGEST_REST, place.side,
     )  # fmt: skip
 
 

@@ -19,14 +19,12 @@ from hapticdb.kernels.hand.handle import follow_reading
 from hapticdb.kernels.hand.holding import IS_HELD
 from hapticdb.kernels.hand.near_points import FELT_POINTS
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE, advance
-from hapticdb.kernels.large.budget import felt_asleep
-from hapticdb.kernels.large.sleeping import LEFT_OUT, LOOKED_AT
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
 from hapticdb.kernels.period.memory import (
     FELT,
     array_at,
-    asleep_of,
+    budget_of,
     cells_of,
     grid_of,
     memory_of,
@@ -45,6 +43,7 @@ from hapticdb.kernels.period.telling import (
     tell,
 )
 from hapticdb.kernels.records import FRAME, PACE, RESULTS, SEAT, SESSION, STATION
+from hapticdb.kernels.resident.budget import LEFT_OUT, LOOKED_AT, felt_within
 from hapticdb.kernels.resident.cells import (
     FELT_REVISION,
     READER_STRIDE,
@@ -79,13 +78,13 @@ def _place(body, pose):
 @leaf
 def _feel(law, station, cells, which, shell, place, memory, met):
     """Compute the law's frame at the pose, into memory.felt -> points that the budget left out."""
-    asleep = asleep_of(station)
-    asleep.counts[0, LOOKED_AT] = asleep.counts[0, LEFT_OUT] = 0
-    felt_asleep(
-        cells, which, shell, memory.pose, place, law, met, memory.missed, asleep, np.int64(0),
-        memory.felt,
+    counts = station.counts
+    counts[LOOKED_AT] = counts[LEFT_OUT] = 0
+    felt_within(
+        law, cells, which, shell, memory.pose, place, met, memory.missed, budget_of(station),
+        counts, memory.felt,
     )  # fmt: skip
-    return asleep.counts[0, LEFT_OUT]
+    return counts[LEFT_OUT]
 
 
 def _move_by_coupling(law, station, seat, shell, place, dt, memory):

@@ -17,14 +17,11 @@ from hapticdb.kernels._jit import leaf, maker
 from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
-from hapticdb.kernels.large.budget import Asleep
-from hapticdb.kernels.large.sleeping import COUNTS, RADIUS, REST, Sleepers
-from hapticdb.kernels.large.waking import STATE
 from hapticdb.kernels.records import MOST_MISSED, RESULTS
+from hapticdb.kernels.resident.budget import Budget
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     CELL_WORDS,
-    CHANGES_KEPT,
     READER_STRIDE,
     SCRATCH_ROWS,
     Cells,
@@ -117,23 +114,17 @@ def tool_of(station):
 
 
 @maker
-def asleep_of(station):
-    """What of a session's tool may sleep; a small one has no blocks."""
-    at, n_runs = station.sleeping, station.n_spheres
-    sleepers = Sleepers(
-        array_at(at.boxes, (at.n_blocks, RADIUS + 1), np.float64),
-        array_at(at.block_rests, (at.n_blocks, REST + 1), np.float64),
-        array_at(at.run_rests, (n_runs, 4), np.float64),
-        array_at(at.state, (STATE,), np.int64),
-        array_at(at.changed, (CHANGES_KEPT, 3), np.float64),
-        array_at(at.listed, (n_runs,), np.int64),
-        array_at(at.skips, (n_runs, 1), np.float64),
-        array_at(at.nothing, (0, 4), np.float64),
+def budget_of(station):
+    """Budget of a session's tool."""
+    at = station.budget
+    return Budget(
+        at.most,
+        array_at(at.listed, (at.n_runs,), np.int64),
+        array_at(at.skips, (at.n_runs, 1), np.float64),
         array_at(at.chosen, (at.n_chosen, 6), np.float64),
         array_at(at.columns, (3, at.n_chosen), np.float64),
         array_at(at.indices, (at.n_chosen,), np.int64),
     )
-    return Asleep(sleepers, at.budget, array_at(at.counts, (1, COUNTS), np.int64))
 
 
 class Memory(NamedTuple):

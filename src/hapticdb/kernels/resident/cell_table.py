@@ -29,10 +29,6 @@ from hapticdb.kernels.field.lattice import (
 from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
-    CHANGED,
-    CHANGES,
-    CHANGES_BEGUN,
-    CHANGES_KEPT,
     PLACE,
     READER_STRIDE,
     REVISION,
@@ -259,19 +255,9 @@ def slots_to_free(cell_of_slot, wanted_at, used, since, hand, wanted, out):
     return count, hand
 
 
-@entry(INTS, INT, INT, INTS)
-def publish(control, version, revision, changed):
-    """Publish a directory that is complete in its buffer: new frames read it from now on.
-
-    changed (n,): keys of the cells that the version before knew, and that are others now, or
-    unknown. What a frame may still read of the ring is announced before it is overwritten.
-    """
-    begun, count = control[CHANGES_BEGUN], changed.shape[0]
-    control[CHANGES_BEGUN] = begun + count
-    fence()
-    for n in range(max(count - CHANGES_KEPT, 0), count):
-        control[CHANGED + (begun + n) % CHANGES_KEPT] = changed[n]
-    control[CHANGES + version % BUFFERS] = begun + count
+@entry(INTS, INT, INT)
+def publish(control, version, revision):
+    """Publish a directory that is complete in its buffer: new frames read it from now on."""
     control[REVISION + version % BUFFERS] = revision
     fence()
     control[VERSION] = version

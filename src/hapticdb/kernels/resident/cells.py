@@ -53,24 +53,17 @@ VERSION = 0
 """Index into `Cells.control`: the number of the published version."""
 REVISION = 1
 """First index into `Cells.control` of the database's revisions, one for each buffer."""
-CHANGES = 4
-"""First index into `Cells.control` of the numbers of changed cells, one for each buffer: how many
-cells that were known have changed or left, up to the version in that buffer."""
-CHANGES_BEGUN = 7
-"""Index into `Cells.control`: the number of changed cells, with those that are being written."""
-CHANGED = 16
-"""First index into `Cells.control` of the keys of the changed cells, a ring."""
-CHANGES_KEPT = 2048
-"""Length of that ring. If more cells change from one frame to the next, all sleeping clusters wake
-(`waking`). Larger: seldomer, and 8 bytes more for each."""
+CONTROL_WORDS = 16
+"""Length of `Cells.control`: two cache lines."""
 READER_STRIDE = 8
 """Numbers from one reader to the next: a cache line, so readers do not slow one another down."""
 FELT_REVISION = 1
 """Index into a reader's numbers: the database's revision of the cells that its last frame read."""
 LISTED = 0
 """Index into a frame's list of unknown cells: their number. Their keys follow."""
-GROUP = 4
-"""Runs in a group. A group far from every voxel is skipped at once; a larger one is seldom far."""
+GROUP, BLOCK = 4, 64
+"""Runs in a group and in a block, which are skipped at once where they are far from every voxel.
+Larger ones are seldomer far."""
 WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
 """Indices into a frame's result (RESULTS,) float64."""
 
@@ -78,8 +71,8 @@ WRENCH, HITS, CONTACTS, UNKNOWNS, DEEPEST, RESULTS = 0, 6, 7, 8, 9, 10
 class Cells(NamedTuple):
     """A table of cells, as `hapticdb.resident.table.CellTable` lays it out in shared memory.
 
-    control (CHANGED + CHANGES_KEPT,) int64, whose last part is the ring of changed cells; readers
-    (R x 8,) int64, the version that each reader reads, 0 for none;
+    control (CONTROL_WORDS,) int64; readers (R x 8,) int64, the version that each reader reads, 0
+    for none;
     keys (3, capacity) int64 and slots (3, capacity) int32, the directories; words (slots, 1024)
     uint32; masks (slots,) uint64; used (slots,) uint8, set by a frame that reads the slot; payload
     (slots, 34^3) uint8: stored distances, all BEYOND in slot 0; near (slots, 1024) uint32: voxels
@@ -107,6 +100,20 @@ CELLS_WITH_DISTANCES = fields_of(
 )
 
 
+class Seen(NamedTuple):
+    """Voxels as one frame sees them: arrays of `Cells`, and which of the directories it reads.
+
+    words: those of the occupied voxels, or of the near ones (`near_voxels`).
+    """
+
+    keys: NDArray[np.int64]
+    slots: NDArray[np.int32]
+    words: NDArray[np.uint32]
+    masks: NDArray[np.uint64]
+    used: NDArray[np.uint8]
+    which: int
+
+
 class Place(NamedTuple):
     """A grid for kernels: origin x, y, z and voxel size in metres, voxels on each axis (side)."""
 
@@ -130,10 +137,10 @@ class Clusters(NamedTuple):
 
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
-    groups (G, 4): the same of each group of `GROUP` runs, or in a frame of sleeping clusters, which
-    has no spheres, (C, 1) runs to skip (`sleeping`); columns (3, N): the points again, one row for
-    each axis; scratch (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its own
-    scratch.
+    groups (G + B, 4): the same of each group of `GROUP` runs, and behind them of each block if
+    there are `BLOCK` runs or more; in a frame of a budget, which has no spheres, (C, 1) runs to
+    skip (`budget`); columns (3, N): the points again, one row for each axis; scratch (SCRATCH_ROWS,
+    run): memory for one placed run. Each thread needs its own scratch.
     """
 
     points: Floats
@@ -213,6 +220,12 @@ def slot_of(keys, slots, which, key):
     return np.int64(UNKNOWN)
 
 
+@inlined
+def seen_in(cells, which, words):
+    """Words of voxels as a frame sees them in directory `which`; for leaves, not for entries."""
+    return Seen(cells.keys, cells.slots, words, cells.masks, cells.used, which)
+
+
 @leaf
 def begin_frame(cells, reader):
     """Announce a frame of a reader; returns the directory that the frame reads to its end."""
@@ -247,16 +260,16 @@ def with_missed(missed, count, key):
 
 
 @inlined
-def enter_cell(keys, slots, masks, used, which, key, missed, n_missed):
+def enter_cell(seen, key, missed, n_missed):
     """Look a cell up -> its slot, its mask, and the number of unknown cells on the list `missed`.
 
     The mask of a cell that is empty or unknown is zero.
     """
-    slot = slot_of(keys, slots, which, key)
+    slot = slot_of(seen.keys, seen.slots, seen.which, key)
     mask = np.uint64(0)
     if slot > EMPTY_SLOT:
-        used[slot] = 1
-        mask = masks[slot]
+        seen.used[slot] = 1
+        mask = seen.masks[slot]
     elif slot < 0:
         n_missed = with_missed(missed, n_missed, key)
     return slot, mask, n_missed

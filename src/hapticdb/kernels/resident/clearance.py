@@ -156,6 +156,67 @@ def nearest_voxel(keys, slots, words, masks, used, which, x, y, z, square, voxel
     return square, voxel
 
 
+@leaf
+def room_around(seen, x, y, z, half, most, side):
+    """How far a cube may grow on each side before it meets an occupied brick or an unknown cell.
+
+    (x, y, z), half: the cube's centre and half its side, voxels. The result is at most `most`, and
+    not above zero if the cube meets one already.
+    """
+    reach, top = half + most, side - 1.0
+    least = reach
+    for ci in range(np.int64(max(x - reach, 0.0)) >> 5, (np.int64(min(x + reach, top)) >> 5) + 1):
+        di = gap(x, 32.0 * ci, 32.0 * ci + 32.0)
+        for cj in range(
+            np.int64(max(y - reach, 0.0)) >> 5, (np.int64(min(y + reach, top)) >> 5) + 1
+        ):
+            dj = max(di, gap(y, 32.0 * cj, 32.0 * cj + 32.0))
+            if dj >= least:
+                continue
+            for ck in range(
+                np.int64(max(z - reach, 0.0)) >> 5, (np.int64(min(z + reach, top)) >> 5) + 1
+            ):
+                dk = max(dj, gap(z, 32.0 * ck, 32.0 * ck + 32.0))
+                if dk >= least:
+                    continue
+                slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(ci, cj, ck))
+                if slot == EMPTY_SLOT:
+                    continue
+                if slot < 0:
+                    least = dk
+                else:
+                    seen.used[slot] = 1
+                    least = _nearest_brick(
+                        seen.masks[slot], 32.0 * ci, 32.0 * cj, 32.0 * ck, x, y, z, least
+                    )
+                if least <= half:
+                    return least - half
+    return least - half
+
+
+@leaf
+def _nearest_brick(mask, i, j, k, x, y, z, least):
+    """Distance on the axis where it is largest, from (x, y, z) to the nearest brick of a cell.
+
+    mask: of the cell, whose lowest corner is (i, j, k); all in voxels. `least` if none is nearer.
+    """
+    for bi in range(4):
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+            continue
+        di = gap(x, i + 8.0 * bi, i + 8.0 * bi + 8.0)
+        if di >= least:
+            continue
+        for bj in range(4):
+            four = (mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF)
+            dj = max(di, gap(y, j + 8.0 * bj, j + 8.0 * bj + 8.0))
+            if not four or dj >= least:
+                continue
+            for bk in range(4):
+                if (four >> np.uint64(bk)) & np.uint64(1):
+                    least = min(least, max(dj, gap(z, k + 8.0 * bk, k + 8.0 * bk + 8.0)))
+    return least
+
+
 @entry(FLOATS2, FLOATS3, PLACE, INT, INT, FLOAT, INTS, INT)
 def cells_near(points, poses, place, first, stride, reach, found, most):
     """Distinct cells within `reach` metres of points (N, 3+) at every stride-th of the poses.

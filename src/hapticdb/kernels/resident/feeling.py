@@ -40,6 +40,7 @@ from hapticdb.kernels.resident.cells import (
     cell_key,
     column_of,
     enter_cell,
+    seen_in,
 )
 from hapticdb.kernels.resident.runs import (
     BASE,
@@ -105,17 +106,17 @@ _felt_anyway = chosen_by_type(lambda law: _none if law in BY_WORDS else _all)
 
 @inlined
 def _near_of_run(
-    anyway, keys, slots, words, masks, used, felt, which, start, count, side, scratch, met, missed,
-    n_hits, n_missed, last_key, slot, mask, base,
-):  # fmt: skip
+    anyway, seen, words, start, count, side, scratch, met, missed, n_hits, n_missed, last
+):
     """Move the points of a placed run that may count to the front of `scratch`.
 
     Every point in a known brick is written there, and the next one over it if it does not count: a
-    mispredicted branch costs more. anyway: 1 if a point counts whatever its voxel. last_key, slot,
-    mask, base: the cell of the last point. Returns the numbers of such points, of hits and of
+    mispredicted branch costs more. anyway: 1 if a point counts whatever its voxel; last: key, slot,
+    mask and base of the cell of the last point. Returns the numbers of such points, of hits and of
     cells on the list `missed` so far, and of points in unknown cells, and then the cell of the last
     point.
     """
+    last_key, slot, mask, base = last
     n_near = n_unknown = np.int64(0)
     for at in range(count):
         x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
@@ -125,9 +126,7 @@ def _near_of_run(
         key = cell_key(i, j, k)
         if key != last_key:
             last_key = key
-            slot, mask, n_missed = enter_cell(
-                keys, slots, masks, used, which, key, missed, n_missed
-            )
+            slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
             first = cell_place(0, 0, 0) + slot * CELL_VALUES
             base = float(first - place_before(i & -32, j & -32, k & -32))
         # bricks first: most of space is free, and the mask is in a register
@@ -135,7 +134,7 @@ def _near_of_run(
             n_unknown += slot < 0
             continue
         column = column_of(i, j)
-        hit, bit = bit_in(words[slot, column], k), bit_in(felt[slot, column], k)
+        hit, bit = bit_in(words[slot, column], k), bit_in(seen.words[slot, column], k)
         met[n_hits] = start + at
         n_hits += np.int64(hit)
         scratch[0, n_near], scratch[3, n_near] = scratch[0, at], x
@@ -145,16 +144,16 @@ def _near_of_run(
         if anyway:
             scratch[WORD, n_near] = (slot << WORD_BITS) + column
         n_near += np.int64(bit) | anyway
-    return n_near, n_hits, n_missed, n_unknown, last_key, slot, mask, base
+    return n_near, n_hits, n_missed, n_unknown, (last_key, slot, mask, base)
 
 
 @inlined
-def _near_in_cells(words, felt, start, count, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits):
-    """`_near_of_run` for a run in the cells that `runs.cells_of_run` found: without a branch.
+def _near_in_cells(words, felt, start, count, box, scratch, met, n_hits):
+    """`_near_of_run` for a run in the cells of `runs.cells_of_run`: without a branch.
 
     Returns the numbers of points that may count and of hits. What a bit is set for is in a brick.
     """
-    words_of_run(count, n_cells, n_j, n_k, ci, cj, ck, start, scratch)
+    words_of_run(count, box, start, scratch)
     n_near = np.int64(0)
     for at in range(count):
         word, k = np.int64(scratch[WORD, at]), np.int64(scratch[BIT, at])
@@ -292,19 +291,16 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
     Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
     """
-    _, _, keys, slots, words, masks, used, _, near = cells
     points, _, spheres, groups, run, columns, scratch = shell
-    felt_here, margin, anyway = felt_words(law, words, near), felt_margin(law), _felt_anyway(law)
+    words, margin, anyway = cells.words, felt_margin(law), _felt_anyway(law)
+    seen = seen_in(cells, which, felt_words(law, words, cells.near))
     transform = transform_of(pose)
     mx, my, mz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     fx = fy = fz = tx = ty = tz = weight = deepest = 0.0
-    last_key, slot, mask, base = np.int64(-1), np.int64(UNKNOWN), np.uint64(0), 0.0
+    last = np.int64(-1), np.int64(UNKNOWN), np.uint64(0), 0.0
     n_hits = n_contacts = n_unknown = n_missed = cluster = start = np.int64(0)
     while start < points.shape[0]:
-        n_free = free_runs(
-            keys, slots, felt_here, masks, used, which, spheres, groups, cluster, transform, place,
-            margin,
-        )  # fmt: skip
+        n_free = free_runs(seen, spheres, groups, cluster, transform, place, margin)
         if n_free > 0:
             cluster += n_free
             start += n_free * run
@@ -312,17 +308,15 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
         n_run = min(run, points.shape[0] - start)
         place_run(columns, start, n_run, transform, place, scratch)
         n_near = np.int64(0)
-        n_cells, n_j, n_k, ci, cj, ck = cells_of_run(
-            keys, slots, masks, used, which, n_run, place.side, scratch
-        )
-        if n_cells > 0 and not anyway:
+        box = cells_of_run(seen, n_run, place.side, scratch)
+        if box[0] > 0 and not anyway:
             n_near, n_hits = _near_in_cells(
-                words, felt_here, start, n_run, n_cells, n_j, n_k, ci, cj, ck, scratch, met, n_hits
+                words, seen.words, start, n_run, box, scratch, met, n_hits
             )
-        elif n_cells != 0:
-            n_near, n_hits, n_missed, n_strange, last_key, slot, mask, base = _near_of_run(
-                anyway, keys, slots, words, masks, used, felt_here, which, start, n_run, place.side,
-                scratch, met, missed, n_hits, n_missed, last_key, slot, mask, base,
+        elif box[0] != 0:
+            n_near, n_hits, n_missed, n_strange, last = _near_of_run(
+                anyway, seen, words, start, n_run, place.side, scratch, met, missed, n_hits,
+                n_missed, last,
             )  # fmt: skip
             n_unknown += n_strange
         cluster += 1

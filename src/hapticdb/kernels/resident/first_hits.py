@@ -8,6 +8,7 @@ from hapticdb.kernels.resident.cells import (
     CLUSTERS,
     GROUP,
     PLACE,
+    Seen,
     begin_frame,
     bit_in,
     cell_key,
@@ -30,11 +31,12 @@ def find_first_hits(cells, reader, shell, poses, place, found):
     It is NOTHING or UNDECIDED where there is none. The search begins at the points that hit last,
     so neighbouring poses should follow one another. Hits are those of `feeling.felt`.
     """
-    _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, columns, scratch = shell
     side, total = place.side, points.shape[0]
     begin = np.int64(0)
     which = begin_frame(cells, reader)
+    # made here: references to what a leaf returns are not counted
+    seen = Seen(cells.keys, cells.slots, cells.words, cells.masks, cells.used, which)
     for n in range(poses.shape[0]):
         transform = transform_of(poses[n])
         hit = np.int64(NOTHING)
@@ -42,10 +44,7 @@ def find_first_hits(cells, reader, shell, poses, place, found):
             start, end = (begin, total) if turn == 0 else (np.int64(0), begin)
             cluster = start // run
             while start < end and hit < 0:
-                n_free = free_runs(
-                    keys, slots, words, masks, used, which, spheres, groups, cluster, transform,
-                    place, 0.0,
-                )  # fmt: skip
+                n_free = free_runs(seen, spheres, groups, cluster, transform, place, 0.0)
                 if n_free > 0:
                     cluster += n_free
                     start += n_free * run
@@ -57,10 +56,10 @@ def find_first_hits(cells, reader, shell, poses, place, found):
                     if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
                         continue
                     i, j, k = np.int64(x), np.int64(y), np.int64(z)
-                    slot = slot_of(keys, slots, which, cell_key(i, j, k))
+                    slot = slot_of(seen.keys, seen.slots, seen.which, cell_key(i, j, k))
                     if slot < 0:
                         hit = np.int64(UNDECIDED)
-                    elif bit_in(words[slot, column_of(i, j)], k):
+                    elif bit_in(seen.words[slot, column_of(i, j)], k):
                         hit = start + at
                         break
                 cluster += 1

@@ -6,6 +6,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import inlined
 from hapticdb.kernels.field.lattice import CELL_VALUES, cell_place, place_before
 from hapticdb.kernels.resident.cells import (
+    BLOCK,
     CELL_WORDS,
     EMPTY_SLOT,
     GROUP,
@@ -53,15 +54,13 @@ _COLUMNS = np.array(
 
 
 @inlined
-def _is_something_near(
-    keys, slots, words, masks, used, which, low_i, low_j, low_k, high_i, high_j, high_k
-):
-    """Whether a closed box in the grid holds a voxel of `words`, or may: unknown cells count, too.
+def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
+    """Whether a closed box in the grid holds a seen voxel, or may: unknown cells count, too.
 
-    words: those of the occupied voxels, or of the near ones (`near_voxels`). The masks of bricks
-    are read first, then, in a small box, the words. The loop over words has no
+    The masks of bricks are read first, then, in a small box, the words. The loop over words has no
     early end, since a mispredicted branch costs more than ten words.
     """
+    keys, slots, words, masks, used, which = seen
     is_near = False
     first_i, first_j, first_k = low_i >> 5, low_j >> 5, low_k >> 5
     last_i, last_j, last_k = high_i >> 5, high_j >> 5, high_k >> 5
@@ -96,52 +95,70 @@ def _is_something_near(
 
 
 @inlined
-def is_sphere_free(keys, slots, words, masks, used, which, spheres, n, transform, place, reached):
+def placed_center(spheres, n, transform, place):
+    """Centre of sphere n of a placed shell, voxels."""
+    x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
+    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
+
+
+@inlined
+def is_sphere_free(seen, spheres, n, transform, place, reached):
     """Whether no voxel is in the box around sphere n of a placed shell, wider by `reached` voxels.
 
     Unknown cells count as occupied; space outside the grid is free.
     """
     side = place.side
-    x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
+    x, y, z = placed_center(spheres, n, transform, place)
     radius = spheres[n, 3] / place.size + reached
-    x = (x - place.x) / place.size
-    y = (y - place.y) / place.size
-    z = (z - place.z) / place.size
     if x + radius < 0.0 or y + radius < 0.0 or z + radius < 0.0:
         return True
     if x - radius >= side or y - radius >= side or z - radius >= side:
         return True
     return not _is_something_near(
-        keys, slots, words, masks, used, which,
+        seen,
         np.int64(max(x - radius, 0.0)),
         np.int64(max(y - radius, 0.0)),
         np.int64(max(z - radius, 0.0)),
         np.int64(min(x + radius, side - 1.0)),
         np.int64(min(y + radius, side - 1.0)),
         np.int64(min(z + radius, side - 1.0)),
-    )  # fmt: skip
+    )
 
 
 @inlined
-def free_runs(
-    keys, slots, words, masks, used, which, spheres, groups, cluster, transform, place, reached
-):
-    """Number of runs, from run `cluster` on, that are far from all voxels: GROUP, 1 or 0.
+def is_block_free(seen, spheres, groups, cluster, transform, place, reached):
+    """Whether run `cluster` is the first of a block that is far from all voxels."""
+    n_runs = spheres.shape[0]
+    return (
+        n_runs >= BLOCK
+        and cluster % BLOCK == 0
+        and is_sphere_free(
+            seen,
+            groups,
+            (n_runs + GROUP - 1) // GROUP + cluster // BLOCK,
+            transform,
+            place,
+            reached,
+        )
+    )
+
+
+@inlined
+def free_runs(seen, spheres, groups, cluster, transform, place, reached):
+    """Number of runs, from run `cluster` on, that are far from all voxels: BLOCK, GROUP, 1 or 0.
 
     Far means farther away than `reached` voxels. A shell without spheres says in `groups` what to
-    skip (`sleeping.Sleepers.skips`), or has no groups: then it is 0.
+    skip (`budget.Budget.skips`), or has no groups: then it is 0.
     """
     if spheres.shape[0] == 0:
         return np.int64(groups[cluster, 0]) if groups.shape[0] > 0 else np.int64(0)
+    if is_block_free(seen, spheres, groups, cluster, transform, place, reached):
+        return BLOCK
     if cluster % GROUP == 0 and is_sphere_free(
-        keys, slots, words, masks, used, which, groups, cluster // GROUP, transform, place, reached
+        seen, groups, cluster // GROUP, transform, place, reached
     ):
         return GROUP
-    if is_sphere_free(
-        keys, slots, words, masks, used, which, spheres, cluster, transform, place, reached
-    ):
-        return 1
-    return 0
+    return 1 if is_sphere_free(seen, spheres, cluster, transform, place, reached) else 0
 
 
 @inlined
@@ -173,7 +190,7 @@ def _voxel_on_axis(x):
 
 
 @inlined
-def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
+def cells_of_run(seen, count, side, scratch):
     """Slots of the cells that a placed run meets, into the scratch -> cells, and where they begin.
 
     The cells are those of the box around the run's voxels, k fastest, then j; `BASE_OF` takes where
@@ -202,12 +219,12 @@ def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
     met = np.uint64(0)
     for n in range(n_cells):
         i, j, k = ci + n // (n_j * n_k), cj + n // n_k % n_j, ck + n % n_k
-        slot = slot_of(keys, slots, which, key_of_cell(i, j, k))
+        slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(i, j, k))
         if slot < 0:
             return np.int64(UNKNOWN), n_j, n_k, ci, cj, ck
         if slot > EMPTY_SLOT:
-            used[slot] = 1
-            met |= masks[slot]
+            seen.used[slot] = 1
+            met |= seen.masks[slot]
         scratch[SLOT_OF, n] = slot
         first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
         scratch[BASE_OF, n] = float(first - place_before(i << 5, j << 5, k << 5))
@@ -215,13 +232,14 @@ def cells_of_run(keys, slots, masks, used, which, count, side, scratch):
 
 
 @inlined
-def words_of_run(count, n_cells, n_j, n_k, ci, cj, ck, start, scratch):
+def words_of_run(count, box, start, scratch):
     """Enter `INDEX`, `BASE`, `WORD` and `BIT` of a run in the cells that `cells_of_run` found.
 
     All numbers are whole and below 2^53, so floats have them exactly, and the compiler vectorizes
     the loops: it cannot do so with integers of 64 bits. Runs in a single cell, more than half of
     them, look up no cell for each point.
     """
+    n_cells, n_j, n_k, ci, cj, ck = box
     for at in range(count):
         scratch[INDEX, at] = start + at
         scratch[BIT, at] = np.floor(scratch[5, at]) - 32.0 * np.floor(scratch[5, at] / 32.0)

@@ -1,4 +1,4 @@
-"""Clusters that sleep change nothing; a budget of points gives the same in each replay."""
+"""Clusters that are skipped change nothing; a budget of points gives the same in each replay."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from banded import move_points, write_points
 from hapticdb import Environment, PointShell
-from hapticdb.kernels.large.sleeping import BLOCK, REST
 from hapticdb.query.law import SMOOTH, ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
@@ -66,23 +65,23 @@ def in_parts(frames: ResidentFrames, poses: Poses, size: int) -> FeltFrames:
 
 @given(st.integers(0, 10_000))
 @settings(deadline=None, max_examples=4)
-def test_sleeping_clusters_change_nothing(
-    tmp_path_factory: pytest.TempPathFactory, seed: int
-) -> None:
+def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
     """Slow and fast hands that turn and jump, small and large runs, one pose or many at once."""
-    env = make(tmp_path_factory.mktemp("sleeping"))
+    env = make(tmp_path_factory.mktemp("clusters"))
     scatter(env, n_objects=2, n_voxels=600, seed=seed)
     rng = np.random.default_rng(seed)
-    shell = rod(int(rng.integers(1, 3000)), seed, float(rng.choice([0.01, 0.1, 0.25])))
+    shell = rod(int(rng.integers(1, 6000)), seed, float(rng.choice([0.01, 0.1, 0.25])))
     poses = walk(60, seed, float(rng.choice([1e-5, 1e-3, 1e-2])), 0.15)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
         flat = ResidentFrames(residency, shell, run=0).feel(poses)
         for run in (1, int(rng.integers(2, 64)), 64, None):
-            sleeping = ResidentFrames(residency, shell, run=run, sleeps=True)
-            assert same(in_parts(sleeping, poses, int(rng.integers(1, 20))), flat)
-            assert same(sleeping.feel(poses), flat)
-            sleeping.close()
+            clustered = ResidentFrames(residency, shell, run=run)
+            assert same(in_parts(clustered, poses, int(rng.integers(1, 20))), flat)
+            clustered.close()
+            listing = ResidentFrames(residency, shell, run=run, budget_points=len(shell))
+            assert same(listing.feel(poses), flat)
+            listing.close()
     env.close()
 
 
@@ -94,7 +93,8 @@ def test_a_tool_far_from_everything_looks_at_no_point(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (100, 1, 1))
     poses[:, 0, 3] = np.linspace(0.1, 0.05, 100)
     with CellTable.create(LEAST_BUDGET) as table:
-        felt = ResidentFrames(Residency(env.store, table), shell, sleeps=True).feel(poses)
+        frames = ResidentFrames(Residency(env.store, table), shell, budget_points=len(shell))
+        felt = frames.feel(poses)
     assert not felt.looked_at[:40].any()
     assert 0 < felt.looked_at[-1] < 2000
     assert felt.hits[-1] > 0
@@ -123,7 +123,7 @@ def scene(
 
 
 @pytest.mark.parametrize("which", ["plane", "distance"])
-def test_a_budget_is_kept_and_is_the_same_whatever_slept_before(tmp_path: Path, which: str) -> None:
+def test_a_budget_is_kept_and_is_the_same_in_any_order(tmp_path: Path, which: str) -> None:
     """Within it nothing changes. The order and number of poses asked at once do not matter."""
     shell = rod(5000, 3, 0.08)
     poses = walk(40, 4, 5e-4, 0.02)
@@ -132,7 +132,7 @@ def test_a_budget_is_kept_and_is_the_same_whatever_slept_before(tmp_path: Path, 
         CellTable.create(8 << 20, distances=law is not None) as table,
     ):
         residency = Residency(env.store, table)
-        full = ResidentFrames(residency, shell, law, sleeps=True).feel(poses)
+        full = ResidentFrames(residency, shell, law, budget_points=len(shell)).feel(poses)
         assert not full.left_out.any()
         budget = int(np.median(full.looked_at[full.looked_at > 0]))
         first = ResidentFrames(residency, shell, law, budget_points=budget)
@@ -173,7 +173,7 @@ def test_beyond_the_budget_each_row_of_a_sheet_keeps_its_share_of_hits(tmp_path:
     shares = []
     with CellTable.create(8 << 20) as table:
         residency = Residency(env.store, table)
-        whole = ResidentFrames(residency, sheet(pitch), sleeps=True)
+        whole = ResidentFrames(residency, sheet(pitch), budget_points=SIDE_OF_SHEET**2)
         part = ResidentFrames(residency, sheet(pitch), budget_points=128)
         for row in range(SIDE_OF_SHEET):
             pose = np.eye(4)
@@ -201,35 +201,3 @@ def test_beyond_the_budget_the_indices_of_hits_are_those_of_the_shell(tmp_path: 
         assert 0 < len(found) <= 200
         assert found == sorted(set(found))
         assert set(found) <= hit
-
-
-@given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=4)
-def test_no_sleeping_point_comes_near_a_voxel(
-    tmp_path_factory: pytest.TempPathFactory, seed: int
-) -> None:
-    """After any walk with turns, by the distance of every point to every voxel."""
-    env = make(tmp_path_factory.mktemp("rests"))
-    scatter(env, n_objects=1, n_voxels=300, seed=seed)
-    voxels = env.voxels(1)
-    rng = np.random.default_rng(seed)
-    shell = rod(2500, seed, 0.2)
-    run = int(rng.integers(4, 40))
-    with CellTable.create(LEAST_BUDGET) as table:
-        frames = ResidentFrames(Residency(env.store, table), shell, run=run, sleeps=True)
-        poses = walk(30, seed, float(rng.choice([1e-4, 2e-3])), 0.12)
-        frames.feel(poses)  # so that every cell is there
-        frames.feel(poses)
-        kept = frames.asleep.sleepers
-        placed = shell.points @ poses[-1, :3, :3].T + poses[-1, :3, 3]
-        places = (placed - env.grid.origin) / env.grid.voxel_size
-        inside = np.zeros(len(shell), dtype=bool)
-        for voxel in voxels:
-            inside |= ((voxel <= places) & (places < voxel + 1.0)).all(axis=1)
-        is_asleep = np.repeat(kept.run_rests[:, 3] >= 0.0, run)[: len(shell)]
-        for b in range(len(kept.boxes)):
-            if kept.block_rests[b, REST] > 0.0:
-                assert is_asleep[b * BLOCK * run : (b + 1) * BLOCK * run].all()
-        assert is_asleep.any()
-        assert not inside[is_asleep].any()
-    env.close()

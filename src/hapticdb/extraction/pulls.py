@@ -110,8 +110,8 @@ class Pulls:
         order = np.lexsort(
             (self._lengths[likely], np.round(self._opposed[likely], 2), ~self._is_axis[likely])
         )
-        for n in likely[order[:MOST_LIKELY]].tolist():
-            if self.done and time.monotonic() > until:
+        for tried, n in enumerate(likely[order[:MOST_LIKELY]].tolist()):
+            if tried and time.monotonic() > until:
                 return None
             direction, length = self._directions[n], float(self._lengths[n])
             now = time.monotonic()

@@ -22,7 +22,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import SettledCoupling
-from hapticdb.realtime.deadlines import SPIN, Timing, undisturbed
+from hapticdb.realtime.deadlines import SPIN, undisturbed
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
@@ -143,7 +143,7 @@ class Worker:
 
     def run(self) -> None:
         """Run periods until the host ends; the work of the loop's thread."""
-        with undisturbed(Timing(self._rate)):
+        with undisturbed():
             self._stations.run()
 
 

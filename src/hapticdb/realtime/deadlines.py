@@ -31,8 +31,6 @@ class Timing:
     ----------
     rate : float
         Frames a second.
-    is_fifo : bool
-        Ask for `SCHED_FIFO`, where the system allows it.
     processor : int or None
         Number of the processor that the loop is bound to.
 
@@ -43,7 +41,6 @@ class Timing:
     """
 
     rate: float = 1000.0
-    is_fifo: bool = False
     processor: int | None = None
 
     def __post_init__(self) -> None:
@@ -133,23 +130,21 @@ class Deadlines:
         )
 
 
-def empty_loop(timing: Timing, seconds: float) -> LoopFigures:
-    """Run a loop that does nothing at the rate of `timing`, to measure the machine's lateness."""
-    deadlines = Deadlines(round(1e9 / timing.rate), Times(), Times())
-    while deadlines.passed < seconds * timing.rate:
+def empty_loop(rate: float, seconds: float) -> LoopFigures:
+    """Run a loop that does nothing at that rate, to measure the machine's lateness."""
+    deadlines = Deadlines(round(1e9 / rate), Times(), Times())
+    while deadlines.passed < seconds * rate:
         deadlines.wait()
         deadlines.done()
     return deadlines.figures()
 
 
 @contextlib.contextmanager
-def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
-    """Disable garbage collection, shorten thread switches, sleep exactly, and apply `timing`.
+def undisturbed(processor: int | None = None) -> Iterator[None]:
+    """Disable garbage collection, shorten thread switches, sleep exactly, bind to a processor.
 
-    Yields a description of what the system granted; at the end all settings are restored.
-    SCHED_FIFO that is not granted is no error.
+    At the end all settings are restored.
     """
-    granted: dict[str, str] = {}
     switch, was_enabled = sys.getswitchinterval(), gc.isenabled()
     gc.collect()
     gc.freeze()
@@ -157,36 +152,18 @@ def undisturbed(timing: Timing) -> Iterator[dict[str, str]]:
     sys.setswitchinterval(SWITCH_INTERVAL)
     slack = _set_slack(1)
     processors = os.sched_getaffinity(0)
-    policy = None
     try:
-        if timing.processor is not None:
-            os.sched_setaffinity(0, {timing.processor})
-            granted["processor"] = f"bound to processor {timing.processor}"
-        if timing.is_fifo:
-            policy = _ask_for_fifo(granted)
-        yield granted
+        if processor is not None:
+            os.sched_setaffinity(0, {processor})
+        yield
     finally:
-        if policy is not None:
-            os.sched_setscheduler(0, *policy)
-        if timing.processor is not None:
+        if processor is not None:
             os.sched_setaffinity(0, processors)
         _set_slack(slack)
         sys.setswitchinterval(switch)
         gc.unfreeze()
         if was_enabled:
             gc.enable()
-
-
-def _ask_for_fifo(granted: dict[str, str]) -> tuple[int, os.sched_param] | None:
-    """Ask for SCHED_FIFO; returns the former policy if it was granted, else None."""
-    before = os.sched_getscheduler(0), os.sched_getparam(0)
-    try:
-        os.sched_setscheduler(0, os.SCHED_FIFO, os.sched_param(10))
-    except OSError as error:
-        granted["scheduling"] = f"SCHED_FIFO not granted: {error.strerror}"
-        return None
-    granted["scheduling"] = "SCHED_FIFO 10"
-    return before
 
 
 def _set_slack(nanoseconds: int) -> int:

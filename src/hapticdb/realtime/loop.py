@@ -240,17 +240,17 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
     loop = Loop(request)
     try:
         loop.warm_up()
-        with undisturbed(request.timing) as granted:
+        with undisturbed(request.timing.processor):
             empty = None
             if request.has_baseline:
-                empty = empty_loop(request.timing, min(EMPTY_SECONDS, request.seconds))
+                empty = empty_loop(request.timing.rate, min(EMPTY_SECONDS, request.seconds))
             warm_up = loop.prepare()
             compiled = n_compiled()
             sender.send("running")
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
-        answer = LoopAnswer(figures, empty, loop.bad_reading, granted, warm_up, loop.is_warm)
+        answer = LoopAnswer(figures, empty, loop.bad_reading, warm_up, loop.is_warm)
         sender.send("done", answer)
     finally:
         try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely

@@ -87,7 +87,6 @@ class LoopAnswer(NamedTuple):
     loop: LoopFigures
     empty: LoopFigures | None
     bad_reading: str | None
-    conditions: dict[str, str]
     warm_up: float
     is_warm: bool
 
@@ -103,8 +102,6 @@ class Report:
     loop, empty : LoopFigures
         Timing of the session's loop, and of an empty loop at the same rate on this machine just
         before. The empty loop shows the machine's own lateness; None if it was not run.
-    points : int
-        Points looked up in all frames.
     law : str
         The force law: "plane" or "smooth".
     coupling : SettledCoupling or DirectRendering
@@ -161,13 +158,12 @@ class Report:
     left_out_frames, most_left_out : int
         Frames in which the budget left out points, and the most points that one frame left out.
     conditions : dict
-        Conditions of the measurement: points, scheduling, processor.
+        Conditions of the measurement: points of the tool, processor.
     """
 
     rate: float
     loop: LoopFigures
     empty: LoopFigures | None
-    points: int
     law: str
     coupling: SettledCoupling | DirectRendering
     budget_points: int | None
@@ -210,11 +206,6 @@ class Report:
             f"{self.loop.missed:,} deadlines missed)"
         )
 
-    @property
-    def hit_rate(self) -> float:
-        """Share of the looked-up points whose cell was resident."""
-        return 1.0 - self.unknown_points / self.points if self.points else 1.0
-
     def figures(self) -> dict[str, object]:
         """All fields as plain numbers and strings, for JSON; times in seconds."""
         plain = asdict(self)
@@ -226,7 +217,6 @@ class Report:
             for times in ("lateness", "elapsed"):
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
-        plain["hit_rate"] = self.hit_rate
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
         plain["proportions"] = self.proportions.record()
         return plain

@@ -90,8 +90,8 @@ class Session:
         Greatest size of the recording, 4 GiB unless given; None: no limit of its own. 64 MiB of the
         disk always stay free. At the limit, or if the disk fails, the recording ends and stays
         whole, and the session continues: see `recording_ended`.
-    is_fifo, processor
-        As for `hapticdb.realtime.deadlines.Timing`.
+    processor : int or None
+        Number of the processor that the loop is bound to.
     has_baseline : bool
         Run an empty loop at the same rate before the first frame, for 2 s at most, to report the
         machine's own lateness; if False, `Report.empty` is None.
@@ -126,7 +126,6 @@ class Session:
         append_recording: bool = False,
         replace_recording: bool = False,
         record_limit_bytes: int | None = DEFAULT_LIMIT,
-        is_fifo: bool = False,
         processor: int | None = None,
         has_baseline: bool = True,
     ) -> None:
@@ -134,7 +133,7 @@ class Session:
         _check_choices(rate, seconds, staleness)
         self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
-        self.timing = Timing(rate, is_fifo, processor)
+        self.timing = Timing(rate, processor)
         self._owns_cells = isinstance(cells, str)
         needs_distances = None if law is None else is_smooth(law)
         if isinstance(cells, str):
@@ -379,8 +378,7 @@ class Session:
             loop=answer.loop,
             empty=answer.empty,
             bad_reading=answer.bad_reading,
-            conditions={"points": str(len(self.shell)), **answer.conditions},
-            points=answer.loop.frames * len(self.shell),
+            conditions=self._conditions(),
             warm_up=answer.warm_up,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
@@ -396,6 +394,13 @@ class Session:
             budget_points=self.budget_points,
             **counts_of(self._open_board.seats[0]),
         )
+
+    def _conditions(self) -> dict[str, str]:
+        """What a report says of the tool and the processor."""
+        points, processor = {"points": str(len(self.shell))}, self.timing.processor
+        if processor is None:
+            return points
+        return points | {"processor": f"bound to processor {processor}"}
 
     def close(self) -> None:
         """End the processes and close the recording, which stays.

@@ -27,7 +27,7 @@ from hapticdb.realtime.fetching import (
     FetchRequest,
 )
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.realtime.wishes import Motion, Wish
+from hapticdb.realtime.tracking import Motion, Wish
 from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
 from hapticdb.testing import write_voxels
 from realtime.troubled import refuse, refuse_strangely, troubled

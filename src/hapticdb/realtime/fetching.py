@@ -15,8 +15,7 @@ import numpy as np
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
-from hapticdb.realtime.tracking import ObjectAnswers, SessionTracker
-from hapticdb.realtime.wishes import Motion, Wish
+from hapticdb.realtime.tracking import Motion, ObjectAnswers, SessionTracker, Wish
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
     FIRST_VERSION,

@@ -8,6 +8,7 @@ StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgrou
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
 LawName = Literal["plane", "smooth"]
+FramesOn = Literal["cpu", "cuda"]
 UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 
 _TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")

@@ -185,6 +185,10 @@ FOLLOWER: Layout = _record(
         ("n_looked", "<i8"),  # points of the last look
         ("n_left_out", "<i8"),  # points of its runs that were left out
         ("most_left_out", "<i8"),  # of a look of this period
+        # where a GPU looks
+        ("looker", "<i8"),  # address of what is called for a look; 0: the period's kernel looks
+        ("way", "<f8"),  # voxels that the farthest point has moved since the last look
+        ("anew", "<i8"),  # what the next look forgets first, named in `near_points`
     ]
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""

@@ -9,6 +9,7 @@ import math
 import signal
 import time
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -38,6 +39,9 @@ from hapticdb.realtime.report import LoopAnswer, LoopFigures, Times
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import LOST, STOP, CellTable
+
+if TYPE_CHECKING:
+    from hapticdb.realtime.on_gpu import GpuLooks
 
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
@@ -69,6 +73,7 @@ class LoopRequest:
     has_baseline: bool = True
     is_recorded: bool = True
     budget_points: int | None = None
+    is_on_gpu: bool = False
 
 
 class Loop:
@@ -98,6 +103,11 @@ class Loop:
         self.station.set_spring(request.coupling.spring())
         self.station.row["source"], self.station.row["is_running"] = DEVICE, True
         self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
+        self.gpu: GpuLooks | None = None
+        if request.is_on_gpu:
+            from hapticdb.realtime import on_gpu  # noqa: PLC0415 - loads numba.cuda
+
+            self.gpu = on_gpu.GpuLooks(self.station, self.table)
         seats["is_recorded"] = request.is_recorded
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
@@ -187,6 +197,8 @@ class Loop:
         self._is_frame[()] = is_frame
         now = time.perf_counter_ns() if begun is None else begun
         self.stations.step(due, now, dt)
+        if self.gpu is not None:
+            self.gpu.check()
 
     def _is_stopped(self) -> bool:
         return bool(self.table.cells.control[STOP]) or bool(self._is_asked_to_end)
@@ -250,7 +262,8 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
-        answer = LoopAnswer(figures, empty, loop.bad_reading, warm_up, loop.is_warm)
+        card = None if loop.gpu is None else loop.gpu.card
+        answer = LoopAnswer(figures, empty, loop.bad_reading, warm_up, loop.is_warm, card)
         sender.send("done", answer)
     finally:
         try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely

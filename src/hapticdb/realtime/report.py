@@ -82,13 +82,17 @@ class LoopFigures:
 
 
 class LoopAnswer(NamedTuple):
-    """Last message of a loop's process; with the counts on the board a `Report` is made of it."""
+    """Last message of a loop's process; with the counts on the board a `Report` is made of it.
+
+    card: name of the GPU that looked, if one did.
+    """
 
     loop: LoopFigures
     empty: LoopFigures | None
     bad_reading: str | None
     warm_up: float
     is_warm: bool
+    card: str | None
 
 
 @dataclass(kw_only=True)

@@ -4,7 +4,7 @@ import os
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from typing import Self
+from typing import TYPE_CHECKING, Self
 
 import numpy as np
 
@@ -27,6 +27,9 @@ from hapticdb.realtime.stations import without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
 from hapticdb.recording.ring import SessionRecording
+
+if TYPE_CHECKING:
+    from hapticdb.batches.feeler import BatchDevice
 
 RING_SECONDS = 4.0
 """Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
@@ -81,6 +84,9 @@ class Session:
         one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has
         clusters that sleep far from everything, which changes no result (docs/realtime.md, Large
         tools).
+    frames_on : {"cpu", "cuda"}
+        What finds the tool's points near surfaces in each period: a processor, or a GPU of NVIDIA
+        for tools of millions of points (docs/realtime.md, Large tools).
     record : path or None
         A file for the recording; see `hapticdb.recording.file.Recorder`.
     append_recording, replace_recording : bool
@@ -122,6 +128,7 @@ class Session:
         handle: Handle | None = None,
         staleness: float = DEFAULT_STALENESS,
         budget_points: int | None = None,
+        frames_on: "BatchDevice" = "cpu",
         record: str | os.PathLike[str] | None = None,
         append_recording: bool = False,
         replace_recording: bool = False,
@@ -133,11 +140,11 @@ class Session:
         _check_choices(rate, seconds, staleness)
         self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
+        self.frames_on = _checked_frames(frames_on, law, budget_points)
         self.timing = Timing(rate, processor)
         self._owns_cells = isinstance(cells, str)
-        needs_distances = None if law is None else is_smooth(law)
         if isinstance(cells, str):
-            cells = ResidentCells(cells, distances=needs_distances)
+            cells = ResidentCells(cells, distances=None if law is None else is_smooth(law))
         elif cells.is_closed:
             raise UsageError("these cells are closed: make others")
         self.cells = cells
@@ -226,6 +233,7 @@ class Session:
             has_baseline=self._has_baseline,
             is_recorded=self._recording is not None,
             budget_points=self.budget_points,
+            is_on_gpu=self.frames_on == "cuda",
         )
         self._process = Process(
             "hapticdb.realtime.loop:work",
@@ -378,7 +386,7 @@ class Session:
             loop=answer.loop,
             empty=answer.empty,
             bad_reading=answer.bad_reading,
-            conditions=self._conditions(),
+            conditions=self._conditions() | ({"frames on": answer.card} if answer.card else {}),
             warm_up=answer.warm_up,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
@@ -439,3 +447,14 @@ def _check_choices(rate: float, seconds: float | None, staleness: float) -> None
         raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
     if not staleness > 0.0:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
+
+
+def _checked_frames(
+    frames_on: "BatchDevice", law: ForceLaw | LawName | None, budget_points: int | None
+) -> "BatchDevice":
+    """Refuse a session whose frames cannot be computed there."""
+    if frames_on != "cpu":
+        from hapticdb.realtime.on_gpu import check_frames  # noqa: PLC0415 - loads numba.cuda
+
+        check_frames(frames_on, as_law(law), budget_points)
+    return frames_on

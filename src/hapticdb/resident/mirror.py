@@ -28,7 +28,8 @@ class CellMirror:
     """The cells of a table on the GPU: slots that have changed are copied, the directory whole.
 
     It has as many slots as the table, so what the table evicts leaves the GPU, too, and what is
-    unknown in the table is unknown there. Only the process that writes the table may use it.
+    unknown in the table is unknown there. The process that writes the table may use it, and a
+    reader within a frame.
 
     Parameters
     ----------
@@ -36,8 +37,8 @@ class CellMirror:
         The table.
     law : NamedTuple
         Law of the frames that read it, in the kernels' form.
-    side : int
-        Voxels of the grid on each axis.
+    side : int or None
+        Voxels of the grid on each axis; None: the GPU has no list of all cells.
 
     Attributes
     ----------
@@ -52,7 +53,7 @@ class CellMirror:
         If the table is larger than the GPU's free memory.
     """
 
-    def __init__(self, table: CellTable, law: object, side: int) -> None:
+    def __init__(self, table: CellTable, law: object, side: int | None) -> None:
         self._table = table
         self._law = law
         self._version = 0
@@ -65,7 +66,7 @@ class CellMirror:
             raise UsageError(
                 f"a budget of {table.size_bytes} bytes for resident cells: the GPU has {free} free"
             )
-        across = -(-side // 32)
+        across = -(-(side or 0) // 32)
         self._across = across if across**3 <= MOST_LISTED else 0
         n_listed = self._across**3 or table.capacity
         values = table.cells.payload
@@ -82,12 +83,13 @@ class CellMirror:
             payload,
         )
 
-    def update(self) -> int:
+    def update(self, version: int | None = None) -> int:
         """Copy what the table has published since the last time; returns the slots copied.
 
-        No kernel may read the arrays meanwhile.
+        version: of the directory that a reader's frame has; None: the newest. No kernel may read
+        the arrays meanwhile.
         """
-        version = self._table.version
+        version = version or self._table.version
         if version == self._version:
             return 0
         cells, which = self._table.cells, version % BUFFERS

@@ -15,6 +15,7 @@ from hapticdb.cli.options import (
     BudgetOption,
     ConservativeOption,
     ExcludeOption,
+    FramesOn,
     JsonOption,
     LawName,
     LawOption,
@@ -100,6 +101,13 @@ BudgetPointsOption = Annotated[
         show_default="all",
     ),
 ]
+FramesOnOption = Annotated[
+    FramesOn,
+    typer.Option(
+        help="What finds the tool's points near surfaces: a processor, or a GPU of NVIDIA for "
+        "tools of millions of points.",
+    ),
+]
 DeviceStiffnessOption = Annotated[
     float | None,
     typer.Option(
@@ -168,6 +176,7 @@ def feel(
     record_limit: RecordLimitOption = None,
     budget: BudgetOption = 256.0,
     budget_points: BudgetPointsOption = None,
+    frames_on: FramesOnOption = "cpu",
     law: LawOption = None,
     conservative: ConservativeOption = False,
     stiffness: DeviceStiffnessOption = None,
@@ -185,7 +194,7 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
-    drive = _begin_loop(law, processor, budget_points)
+    drive = _begin_loop(law, processor, budget_points, frames_on)
     force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
@@ -197,14 +206,13 @@ def feel(
         chosen, coupling = force.law_and_coupling(cells)
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
-            coupling=coupling, budget_points=budget_points, processor=processor,
-            record=record, append_recording=append, replace_recording=replace,
+            coupling=coupling, budget_points=budget_points, frames_on=frames_on,
+            processor=processor, record=record, append_recording=append, replace_recording=replace,
             record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
         )  # fmt: skip
         force.tell_lowered(session)
         with session, ended_by_signals(session.ask_to_end) as signals:
-            fitting.tell(session.proportions, tool, "--scale")
-            report = _waited_for(session)
+            report = _waited_for(session, tool)
         session_page.show(report, cells, shell, record, speed, json=json)
     _exit_after(signals, report)
 
@@ -229,11 +237,18 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
     return limit_bytes
 
 
-def _begin_loop(law: LawName | None, processor: int | None, budget_points: int | None) -> str:
+def _begin_loop(
+    law: LawName | None, processor: int | None, budget_points: int | None, frames_on: FramesOn
+) -> str:
     """Have what forks the processes load kernels while the tool is sampled here.
 
     It also refuses what the loop cannot do. Returns the purpose of the kernels of the law.
     """
+    if frames_on != "cpu":
+        from hapticdb.query.law import as_law
+        from hapticdb.realtime.on_gpu import check_frames
+
+        check_frames(frames_on, as_law(law), budget_points)
     drive = "direct" if law == "plane" else "coupling"
     prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
 
@@ -264,8 +279,9 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
         raise typer.Exit(1)
 
 
-def _waited_for(session: "Session") -> "Report":
+def _waited_for(session: "Session", tool: str) -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
+    fitting.tell(session.proportions, tool, "--scale")
     report, notes = None, session_page.Notes()
     while report is None:
         report = session.wait(LOOK_EVERY)

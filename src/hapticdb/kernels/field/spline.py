@@ -38,7 +38,7 @@ def _spline_weights(t):
 @leaf
 def _from_center(x):
     """Way from the centre of the voxel that holds a coordinate to it, voxels, -1/2 to 1/2."""
-    return x - np.floor(x) - 0.5
+    return x - math.floor(x) - 0.5
 
 
 @inlined

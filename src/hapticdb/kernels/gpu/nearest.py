@@ -24,7 +24,7 @@ _nearest_voxel = on_gpu(clearance.nearest_voxel)
 
 
 @cuda.jit(device=True)
-def _agree(squares, points, t):
+def agree(squares, points, t):
     """Least of squares (threads,) and its point, the first one of several, to the first place."""
     cuda.syncthreads()
     half = squares.shape[0] // 2
@@ -70,7 +70,7 @@ def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are un
                         best[t], nearest[t] = -1.0, np.int64(UNDECIDED)
                     elif voxel >= 0:
                         best[t], nearest[t] = found, np.int64(at)
-                _agree(best, nearest, t)
+                agree(best, nearest, t)
                 square, point = best[0], nearest[0]
                 cuda.syncthreads()
             if t == 0:

@@ -19,6 +19,7 @@ from hapticdb.kernels.field.spline import (
     second_derivatives,
     spline,
 )
+from hapticdb.kernels.hand.calling import call
 from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     LISTED,
@@ -79,6 +80,8 @@ MOST_MERGED = 64
 LONGEST_REST = 16.0
 """Most voxels that a run of a large tool may go before its sphere is tested again. Larger: fewer
 tests in free space, each of which reads more cells."""
+RUNS_ANEW, POINTS_ANEW = 1, 2
+"""What a look by another forgets first: when runs are due, or when points are, too."""
 ROOMY = 4
 """A look takes twice as many points again when the last one took less than this part of the most.
 Larger: points that were left out come back later, and the number of points changes less often."""
@@ -212,7 +215,7 @@ def _goes_nearer(u, bound, last_u, last_bound):
 
 
 @inlined
-def _write_near(
+def write_near(
     payload, slot, mask, x, y, z, rx, ry, rz, u, gx, gy, gz, bound, is_bent, field, rows, m
 ):
     """Write near point m, at (x, y, z) voxels with lever r, into its rows."""
@@ -274,7 +277,7 @@ def _look_at_run(
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
         met[near, n_near] = n
-        _write_near(
+        write_near(
             payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
             follower.is_bent, field, base, n_near,
         )  # fmt: skip
@@ -286,13 +289,10 @@ def _look_at_run(
 
 
 @leaf
-def _rest_of_sphere(cells, which, spheres, run, transform, place):
+def rest_of_sphere(seen, spheres, run, transform, place):
     """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
     x, y, z = placed_center(spheres, run, transform, place)
-    return room_around(
-        seen_in(cells, which, cells.words), x, y, z, spheres[run, 3] / place.size + FAR,
-        LONGEST_REST, place.side,
-    )  # fmt: skip
+    return room_around(seen, x, y, z, spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side)
 
 
 @leaf
@@ -312,7 +312,9 @@ def _look_at_due_runs(
             continue
         is_new = field[RUN_DUE, at] == -NEVER or field[RUN_DUE, at] >= travelled - way
         if follower.is_large and is_new:
-            rest = _rest_of_sphere(cells, which, shell.spheres, at, transform, place)
+            rest = rest_of_sphere(
+                seen_in(cells, which, cells.words), shell.spheres, at, transform, place
+            )
             if rest > 0.0:
                 field[RUN_DUE, at] = travelled + rest
                 continue
@@ -335,14 +337,17 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     unfinished. Where there are more points to look at than `most_looked`, only every 2nd, 4th, 8th
     ... point of the shell is looked at, until `take_more_points`. Where `merges_from` points are
     near, one contact stands for 2, 4, 8 ... neighbours by index, up to `MOST_MERGED`. Of the others
-    only the bounds are computed, so that no point passes a surface.
+    only the bounds are computed, so that no point passes a surface. A GPU may look instead
+    (`kernels.gpu.looks`): then it is called.
     """
-    transform = transform_of(pose)
-    center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     follower.travelled += way
-    follower.is_walking = is_walking
+    follower.is_walking, follower.way = is_walking, way
     follower.n_looks += 1
     follower.stride, follower.merged = max(follower.stride, 1), max(follower.merged, 1)
+    if follower.looker != 0:
+        return call(follower.looker)
+    transform = transform_of(pose)
+    center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     while True:
         found = _look_at_due_runs(
             cells, which, shell, transform, place, center, way, follower, field, met, missed
@@ -393,8 +398,10 @@ def take_more_points(follower, field):
         follower.merged //= 2
     else:
         return False
-    for n in range(field.shape[1]):
-        field[RUN_DUE, n] = -NEVER
+    follower.anew = max(follower.anew, RUNS_ANEW)
+    if follower.looker == 0:
+        for n in range(field.shape[1]):
+            field[RUN_DUE, n] = -NEVER
     return True
 
 
@@ -402,6 +409,9 @@ def take_more_points(follower, field):
 def look_anew(follower, field):
     """Forget all ways, so that the next look looks at every point; near points stay as they are."""
     follower.travelled = follower.astray = 0.0
+    follower.anew = POINTS_ANEW
+    if follower.looker != 0:
+        return
     for n in range(field.shape[1]):
         field[DUE, n] = field[RUN_DUE, n] = -NEVER
 
@@ -428,9 +438,7 @@ def least_distance(follower, field):
 
 @leaf
 def fix_onsets(follower, field, met):
-    """Let each point's contact begin where it is now, at most at the full onset."""
+    """Let each near point's contact begin where it is now, at most at the full onset."""
     rows = NEAR + follower.side * NEAR_ROWS
-    for n in range(field.shape[1]):
-        field[ONSETS, n] = ONSET
     for m in range(follower.n_near):
         field[ONSETS, met[NEAR_POINTS + follower.side, m]] = min(field[rows + U, m], ONSET)

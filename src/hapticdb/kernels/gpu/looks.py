@@ -1,0 +1,205 @@
+"""Looks of the coupling on a graphics processor: `hand.near_points.look` at tools of any size.
+
+Two launches are a look. In the first a thread takes a run of points: is it due, and is its sphere
+free? In the second a block takes a run that is not: its threads look at the points that are due.
+Only near points leave the GPU, in any order; each point's number is beside it. When a point is due
+stays on the GPU, and a look that ends early puts back what it wrote beyond its last point, so that
+a tool goes the way that it goes on the processor.
+"""
+
+import functools
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import cuda, float64, int64
+
+from hapticdb.kernels import rigid
+from hapticdb.kernels.field.law import ONSET
+from hapticdb.kernels.gpu.nearest import agree
+from hapticdb.kernels.gpu.sources import on_gpu
+from hapticdb.kernels.hand import near_points
+from hapticdb.kernels.hand.near_points import FAR, LEAST_BOUND, MARGIN, NEVER
+from hapticdb.kernels.resident import cells
+from hapticdb.kernels.resident.cells import EMPTY_SLOT
+
+THREADS_OF_RUNS, THREADS = 128, 64
+"""Threads of a block of each launch; a block of the second one has a thread for each point."""
+MOST_BLOCKS = 1 << 13
+"""Most blocks of a launch; each takes several runs if there are more."""
+ROOM_FOR_MISSED = 128
+"""Unknown cells that a look can tell of, a power of two. Larger: fewer rounds of fetching."""
+DUE_RUNS, NEARS, UNKNOWNS, LEAST, FOUND = 0, 1, 2, 3, 4
+"""Of `Sight.found`: runs in the second launch; near points; points in unknown cells; the least way
+at which a run is due; their number."""
+
+_moved, _slot_of, _cell_key, _spread = map(
+    on_gpu, (rigid.moved, cells.slot_of, cells.cell_key, cells.spread_key)
+)
+_clamped_into, _bound_at, _distance_at, _write_near, _rest_of_sphere = map(
+    on_gpu,
+    (
+        near_points.clamped_into,
+        near_points.bound_at,
+        near_points.distance_at,
+        near_points.write_near,
+        near_points.rest_of_sphere,
+    ),
+)
+
+
+class Sight(NamedTuple):
+    """What the GPU keeps of a tool of N points in R runs, and what a look finds.
+
+    points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool. due (N,),
+    run_due (R,): rows DUE and RUN_DUE of `near_points`; due_before, run_due_before: the same
+    before the last look, of what it looked at; epochs (R,) int64: since when the points' numbers
+    are true; seen (R,) int64: number of the last look at the run; due_runs (R,) int64: runs of the
+    second launch. used (S,) uint8: slots that were read. missed (ROOM_FOR_MISSED,) int64: keys of
+    unknown cells, in no order, -1 for none. found (FOUND,). numbers (M,) int64 and rows (NEAR_ROWS,
+    M): the near points, if there are no more than M.
+    """
+
+    points: Any
+    spheres: Any
+    due: Any
+    run_due: Any
+    due_before: Any
+    run_due_before: Any
+    epochs: Any
+    seen: Any
+    due_runs: Any
+    used: Any
+    missed: Any
+    found: Any
+    numbers: Any
+    rows: Any
+
+
+class Look(NamedTuple):
+    """What is asked of a look: numbers of the coupling's record, as FOLLOWER has them.
+
+    epoch: numbers of points that are older are forgotten; run: points of a run.
+    """
+
+    number: int
+    epoch: int
+    run: int
+    is_large: bool
+    is_anew: bool
+    is_bent: bool
+    travelled: float
+    way: float
+    merged: int
+
+
+@cuda.jit
+def list_due_runs(place, transform, asked, seen, sight):
+    """First launch. seen: `resident.cells.Seen`."""
+    least = NEVER
+    for run in range(cuda.grid(1), sight.run_due.shape[0], cuda.gridsize(1)):
+        before = -NEVER if asked.is_anew else sight.run_due[run]
+        if asked.travelled < before:
+            least = min(least, before)
+            continue
+        sight.seen[run], sight.run_due_before[run] = asked.number, before
+        if asked.is_large and (before == -NEVER or before >= asked.travelled - asked.way):
+            rest = _rest_of_sphere(seen, sight.spheres, run, transform, place)
+            if rest > 0.0:
+                sight.run_due[run] = asked.travelled + rest
+                least = min(least, asked.travelled + rest)
+                continue
+        sight.due_runs[np.int64(cuda.atomic.add(sight.found, DUE_RUNS, 1.0))] = run
+    cuda.atomic.min(sight.found, LEAST, least)
+
+
+@cuda.jit(device=True)
+def _miss(missed, key):
+    """Enter an unknown cell, if absent and there is room."""
+    at = _spread(key, ROOM_FOR_MISSED)
+    for _ in range(ROOM_FOR_MISSED):
+        before = cuda.atomic.cas(missed, at, -1, key)
+        if before in (-1, key):
+            return
+        at = (at + 1) & (ROOM_FOR_MISSED - 1)
+
+
+@cuda.jit(device=True)
+def _look_at_point(n, place, transform, asked, seen, payload, sight):
+    """Look at point n, which is due -> when it is due again; see `near_points.look`."""
+    points, center = sight.points, sight.points.shape[1] - 1
+    px, py, pz = _moved(transform, points[0, n], points[1, n], points[2, n])
+    x, dx = _clamped_into((px - place.x) / place.size, place.side)
+    y, dy = _clamped_into((py - place.y) / place.size, place.side)
+    z, dz = _clamped_into((pz - place.z) / place.size, place.side)
+    key = _cell_key(np.int64(x), np.int64(y), np.int64(z))
+    slot, mask = _slot_of(seen.keys, seen.slots, seen.which, key), np.uint64(0)
+    if slot < 0:
+        cuda.atomic.add(sight.found, UNKNOWNS, 1.0)
+        _miss(sight.missed, key)
+        return -NEVER
+    if slot > EMPTY_SLOT:
+        seen.used[slot] = 1
+        mask = seen.masks[slot]
+    if n & (asked.merged - 1):  # another point's contact stands for this one
+        bound = _bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+        if bound >= LEAST_BOUND:
+            return asked.travelled + bound - FAR
+    u, gx, gy, gz, bound = _distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
+    if u < ONSET + MARGIN or bound < LEAST_BOUND:
+        at = np.int64(cuda.atomic.add(sight.found, NEARS, 1.0))
+        if at < sight.numbers.shape[0]:
+            cx, cy, cz = _moved(transform, points[0, center], points[1, center], points[2, center])
+            sight.numbers[at] = n
+            _write_near(
+                payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
+                asked.is_bent, sight.rows, 0, at,
+            )  # fmt: skip
+    return asked.travelled + bound - FAR
+
+
+@functools.cache
+def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
+    """Kernel of the second launch, for blocks of so many threads (a power of two).
+
+    Its arguments: those of `list_due_runs`, and payload (S, 34^3).
+    """
+
+    @cuda.jit
+    def look(place, transform, asked, seen, payload, sight):
+        best = cuda.shared.array(threads, float64)
+        nobody = cuda.shared.array(threads, int64)
+        t, n_points = cuda.threadIdx.x, sight.due.shape[0]
+        for at in range(cuda.blockIdx.x, np.int64(sight.found[DUE_RUNS]), cuda.gridDim.x):
+            run, least = sight.due_runs[at], NEVER
+            is_known, start = sight.epochs[run] == asked.epoch, run * asked.run
+            for n in range(start + t, min(start + asked.run, n_points), threads):
+                due = sight.due[n] if is_known else -NEVER
+                sight.due_before[n] = due
+                if asked.travelled >= due:
+                    due = _look_at_point(n, place, transform, asked, seen, payload, sight)
+                    sight.due[n] = due
+                least = min(least, due)
+            best[t], nobody[t] = least, 0
+            agree(best, nobody, t)
+            if t == 0:
+                sight.epochs[run], sight.run_due[run] = asked.epoch, best[0]
+                cuda.atomic.min(sight.found, LEAST, best[0])
+            cuda.syncthreads()
+
+    return look
+
+
+@cuda.jit
+def put_back(last, n_due, asked, sight):
+    """Put back what the look wrote beyond point `last`, whose run is not done either.
+
+    n_due: runs of the look's second launch.
+    """
+    first, step = cuda.grid(1), cuda.gridsize(1)
+    for run in range(max(last, 0) // asked.run + first, sight.seen.shape[0], step):
+        if sight.seen[run] == asked.number:
+            sight.run_due[run] = sight.run_due_before[run]
+    for at in range(first, n_due, step):
+        start = sight.due_runs[at] * asked.run
+        for n in range(max(start, last + 1), min(start + asked.run, sight.due.shape[0])):
+            sight.due[n] = sight.due_before[n]

@@ -6,6 +6,7 @@
 It checks first that both feel the same: equal counts, sums within 1e-12, and each answer repeated
 bit for bit. Then it times frames, pose in and wrench out, of 300 to 10^7 points, and poses a second
 of 300 points that are far from everything, within a few voxels, or touching. Cells are resident.
+Last come sessions of `feel`: a hand that comes to what it touches, its looks on either side.
 """
 
 import argparse
@@ -23,13 +24,16 @@ from numpy.typing import NDArray
 import hapticdb
 import records
 from batches import EXTENT, MODEL, poses_by_situation
-from hapticdb import Environment, GridOptions, ImportOptions, PointShell
+from hapticdb import Environment, GridOptions, ImportOptions, PointShell, Session
 from hapticdb.batches.feeler import Feeler
 from hapticdb.batches.on_gpu import GpuFrames
+from hapticdb.devices.scripted import Player
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.poses import read_poses
+from hapticdb.recording.file import Recording
+from hapticdb.recording.replay import replay
 from hapticdb.resident.held import counts_of
 from hapticdb.sample import write_sample
 from slide_paths import write_along
@@ -153,6 +157,31 @@ def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
     return found | {"one_processor": percentiles(cpu)}
 
 
+def hands_of(folder: Path, shell: PointShell, ends: Floats, *, quick: bool) -> Any:  # noqa: ANN401
+    """Periods of a hand that goes from one pose to another, looks on the GPU and on a processor.
+
+    The session on the GPU is recorded: are its frames those of the processor?
+    """
+    seconds, rate = (1.0, 10.0) if quick else (3.0, 1000.0)
+    found: dict[str, Any] = {"points": len(shell)}
+    for name, frames_on in (("gpu", "cuda"), ("processor", "cpu")):
+        recording = folder / f"{name}.hdbrec"
+        with Session(
+            str(folder / "scene.db"), shell, Player([0.0, 0.5 * seconds], ends), rate=rate,
+            seconds=seconds, frames_on=frames_on, has_baseline=False,  # type: ignore[arg-type]
+            record=recording, replace_recording=True,
+        ) as session:  # fmt: skip
+            report = session.wait(60.0 + 20.0 * seconds)
+        assert report is not None
+        spread = report.loop.elapsed._asdict()
+        found[name] = {f"{key}_ms": 1e3 * value for key, value in spread.items()}
+        found[name] |= {"reached_hz": report.loop.rate, "contact_frames": report.contact_frames}
+        if frames_on == "cuda" and len(shell) <= BASE:
+            with hapticdb.open(folder / "scene.db", read_only=True) as env:
+                found["frames_equal"] = replay(Recording(recording), env).is_equal
+    return found
+
+
 def batches_of(
     on_gpu: Feeler, on_cpu: Feeler, poses: Floats, size: int, situation: str
 ) -> dict[str, Any]:
@@ -219,14 +248,18 @@ def by_triangles(
     return found
 
 
-def measure(folder: Path, sizes: tuple[int, ...], batch: int, repeats: int) -> dict[str, Any]:
+def measure(
+    folder: Path, sizes: tuple[int, ...], batch: int, repeats: int, *, quick: bool = False
+) -> dict[str, Any]:
     """Measure all; results as records for JSON."""
     began = time.perf_counter()
-    compile_missing([*entries_for("replay"), "resident.nearest.find_nearest", *SEARCHES])
+    compile_missing(
+        [*entries_for("frames", "frames by distance"), "resident.nearest.find_nearest", *SEARCHES]
+    )
     print(f"compiled after {time.perf_counter() - began:.0f} s", flush=True)
     few, many = PointShell.load(folder / "few.npz"), PointShell.load(folder / "many.npz")
     situations = dict(np.load(folder / "poses.npz"))
-    frames, batches = [], []
+    frames, batches, hands = [], [], []
     name = getattr(cuda.current_context().device, "name", "none: simulated")
     with hapticdb.open(folder / "scene.db", read_only=True) as env:
         with (
@@ -239,13 +272,15 @@ def measure(folder: Path, sizes: tuple[int, ...], batch: int, repeats: int) -> d
                 print(batches[-1], flush=True)
         triangles = by_triangles(env, few, situations, min(batch, 200_000))
         print(triangles, flush=True)
-        spread = 0.3 * env.grid.voxel_size
+        voxel = env.grid.voxel_size
         for n_points in sizes:
-            shell = few if n_points == len(few) else larger(many, n_points, spread)
+            shell = few if n_points == len(few) else larger(many, n_points, 0.3 * voxel)
             with env.feeler(shell, budget_bytes=TABLE, device="cuda") as feeler:
                 touching = np.ascontiguousarray(situations["touching"][:64])
                 frames.append(frames_of(feeler, touching, repeats))
-            print(frames[-1], flush=True)
+            ends = np.stack([situations["free"][0], touching[0]])
+            hands.append(hands_of(folder, shell, ends, quick=quick))
+            print(frames[-1], hands[-1], flush=True)
     about = {
         "card": name.decode() if isinstance(name, bytes) else str(name),
         "machine": records.machine(),
@@ -256,7 +291,7 @@ def measure(folder: Path, sizes: tuple[int, ...], batch: int, repeats: int) -> d
         },
         "memory_for_cells": TABLE,
     }
-    return about | {"frames": frames, "batches": batches, "warp": triangles}
+    return about | {"frames": frames, "hands": hands, "batches": batches, "warp": triangles}
 
 
 def main() -> None:
@@ -272,7 +307,8 @@ def main() -> None:
         prepare(given.prepare, 7 if given.quick else BITS, 50 if given.quick else MOST_POSES)
     if given.scene is not None:
         sizes, batch = (SIZES[:1], 20) if given.quick else (SIZES, BATCH)
-        found = measure(given.scene, sizes, batch, 3 if given.quick else REPEATS)
+        repeats = 3 if given.quick else REPEATS
+        found = measure(given.scene, sizes, batch, repeats, quick=given.quick)
         records.write(given.out, {"gpu": found})
 
 

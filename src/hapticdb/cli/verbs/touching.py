@@ -171,6 +171,10 @@ def _path_of(
 
     if on != "cpu" and out is None:
         raise UsageError(f"--on {on}: give --out, too")
+    if on == "cuda":
+        from hapticdb.batches.on_gpu import check_gpu
+
+        check_gpu()  # before kernels are compiled
     if not poses.lower().endswith(".npy"):
         return read_poses(poses, unit=unit or "m")
     if out is None or unit not in {None, "m"}:

@@ -36,9 +36,9 @@ class Order(NamedTuple):
     """What a process shall do, and in which surroundings.
 
     work : function, as ``package.module:function``; purposes : of the kernels that are loaded
-    before the fork (`kernels.compiling.PURPOSES`), with the function's module; with none, neither
-    is; numbers : of the descriptors that it gets, or None where no process is wanted yet;
-    path, environment, most_files : as the process that gives the order has them.
+    before the fork (`kernels.compiling.PURPOSES`), with the function's module; with none, `prepare`
+    alone loads the module; numbers : of the descriptors that it gets, or None where no process is
+    wanted yet; path, environment, most_files : as the process that gives the order has them.
     """
 
     work: str
@@ -213,7 +213,7 @@ def _serve(channel: Channel, owning: int) -> None:
                 wanted, descriptors = channel.receive()
             except (EOFError, OSError):
                 return
-            if wanted.purposes:
+            if wanted.purposes or wanted.numbers is None:
                 _load(wanted.work, wanted.purposes, compiles=wanted.numbers is not None)
             if wanted.numbers is None:
                 continue

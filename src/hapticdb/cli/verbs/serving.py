@@ -171,6 +171,9 @@ def _serving(
     recordings: str | None,
 ) -> "Serving":
     """What to serve; refuses an environment, a tool or a folder that is not there."""
+    from hapticdb.realtime.fork_server import prepare
+
+    prepare("hapticdb.page.process:work", [])  # loads while the server does here
     import hapticdb
     from hapticdb.server.access import Role
     from hapticdb.server.running import Serving

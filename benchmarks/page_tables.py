@@ -125,6 +125,17 @@ def gpu_frames(results: Results) -> str:
     return table(["points", "p50, ms", "p99, ms", "one processor, p50, ms"], rows)
 
 
+def gpu_hands(results: Results) -> str:
+    """Sessions whose looks are on a GPU, beside those whose looks are on a processor."""
+    rows = []
+    for one in results["gpu"]["hands"]:
+        gpu, processor = one["gpu"], one["processor"]
+        times = [us_text(gpu[share]) for share in ("p50_ms", "p99_ms")]
+        reached = [us_text(side["reached_hz"]) for side in (gpu, processor)]
+        rows.append([f"{one['points']:,}", *times, *reached])
+    return table(["points", "p50, ms", "p99, ms", "Hz", "Hz on a processor"], rows)
+
+
 def gpu_batches(results: Results) -> str:
     """Millions of poses a second on a GPU, beside all processors, and Warp's mesh queries."""
     columns = ("touch", "processors", "clearance_gpu", "clearance_processors")
@@ -211,6 +222,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "frames": frames,
         "edits": edits,
         "gpu-frames": gpu_frames,
+        "gpu-hands": gpu_hands,
         "gpu-batches": gpu_batches,
         "ways-out": ways_out,
         "fits": fits,

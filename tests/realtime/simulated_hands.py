@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 SIZE = 0.005
 RUN = 8
 kernels.THREADS_OF_RUNS, kernels.THREADS, kernels.MOST_BLOCKS = 2, 2, 3
-on_gpu.ROOM = 4
+on_gpu.ROOM = 4, 1 << 30
 sys.setswitchinterval(1e-4)  # the simulator watches its threads without a pause
 
 

@@ -1,9 +1,11 @@
 """Looks of a session's coupling on a graphics processor, which the kernel of its periods calls."""
 
 import ctypes
+from collections.abc import Callable
+from typing import Any
 
 import numpy as np
-from numba import cuda
+from numba import config, cuda
 from numpy.typing import NDArray
 
 from hapticdb.batches.on_gpu import check_gpu
@@ -35,8 +37,13 @@ from hapticdb.realtime.stations import Station
 from hapticdb.resident.mirror import CellMirror
 from hapticdb.resident.table import CellTable
 
-ROOM = 1 << 14
-"""Near points for which the GPU has room at first; it doubles where there are more."""
+ROOM = 1 << 17, 8
+"""Near points for which there is room at first: so many, or all of a smaller tool's, or this part
+of a larger tool's, at 0.2 kB each. More make new room, in a frame that is late."""
+NOBODY = 1 << 62
+"""In the place of a point's number: none."""
+NUMBER, RUN, LAST, N_DUE = map(kernels.Look._fields.index, ("number", "run", "last", "n_due"))
+"""Of `Look`."""
 USED_EVERY = 16
 """Looks after which the table learns which cells were read. Larger: less copying; a cell may be
 evicted sooner after it was read."""
@@ -51,6 +58,41 @@ def check_frames(frames_on: str, law: ForceLaw | None, budget_points: int | None
     if budget_points is not None:
         raise UsageError("a budget of points is for frames on 'cpu': a GPU looks at all points")
     check_gpu()
+
+
+class _Repeated:
+    """Launches and copies of a stream, repeated with the arguments that they have now.
+
+    A launch by numba reads its arguments in Python, a third of a millisecond for twenty arrays; a
+    CUDA graph has read them. numba's simulator has no graphs.
+    """
+
+    def __init__(self, stream: Any, work: Callable[[], None]) -> None:  # noqa: ANN401 - numba's
+        self._stream, self._work = stream, work
+        self._graph: Any = None
+        if config.ENABLE_CUDASIM:
+            return
+        from cuda.bindings import driver  # noqa: PLC0415 - of the extra, on a machine with a GPU
+
+        self._driver = driver
+        mode = driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED
+        self._checked(driver.cuStreamBeginCapture(int(stream), mode))
+        work()
+        graph = self._checked(driver.cuStreamEndCapture(int(stream)))
+        self._graph = self._checked(driver.cuGraphInstantiate(graph, 0))
+
+    def __call__(self) -> None:
+        """Begin them once more."""
+        if self._graph is None:
+            self._work()
+        else:
+            self._checked(self._driver.cuGraphLaunch(self._graph, int(self._stream)))
+
+    @staticmethod
+    def _checked(answer: tuple[Any, ...]) -> Any:  # noqa: ANN401 - the driver's
+        if int(answer[0]):
+            raise HapticDBError(f"the driver says {answer[0]}")
+        return answer[-1]
 
 
 class GpuLooks:
@@ -81,14 +123,20 @@ class GpuLooks:
         self._n_looks, self._epoch = 0, 0
         self._error: BaseException | None = None
         self._stream = cuda.stream()
-        self._nothing = np.array([0.0, 0.0, 0.0, NEVER])
+        self._nothing = cuda.to_device(np.array([0.0, 0.0, 0.0, NEVER]))
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
+        self._asked: NDArray[np.float64] = cuda.pinned_array(kernels.ASKED, np.float64)
         self._sight = self._sight_of(station)
         n_runs = self._sight.run_due.size
         self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
         self._of_points = min(n_runs, kernels.MOST_BLOCKS)
         self._kernel = kernels.look_at_runs(kernels.THREADS)
-        self._put_back(-1, 0, self._asked())  # compiles it
+        self._asked[:] = 0.0
+        self._asked[NUMBER], self._asked[RUN] = -1, 1
+        self._launch_look()  # compiles them; no run is due yet
+        self._launch_put_back()
+        self._stream.synchronize()
+        self._repeat()
         self._called = FUNCTION(self._answer)  # kept as long as its address is used
         station.follower["looker"] = ctypes.cast(self._called, ctypes.c_void_p).value
 
@@ -97,23 +145,25 @@ class GpuLooks:
         clusters, table = station.clusters, self._table
         n_points = len(clusters.points)
         n_runs = -(-n_points // clusters.run)
+        room = min(n_points, max(ROOM[0], n_points // ROOM[1]))
         points = np.empty((3, n_points + 1))
         points[:, :-1], points[:, -1] = clusters.columns, clusters.center
         return kernels.Sight(
             points=cuda.to_device(points),
             spheres=cuda.to_device(clusters.spheres if len(clusters.spheres) else np.zeros((1, 4))),
             due=cuda.device_array(n_points, np.float64),
-            run_due=cuda.device_array(n_runs, np.float64),
+            run_due=cuda.to_device(np.full(n_runs, NEVER)),
             due_before=cuda.device_array(n_points, np.float64),
             run_due_before=cuda.device_array(n_runs, np.float64),
             epochs=cuda.to_device(np.full(n_runs, -1)),
             seen=cuda.to_device(np.zeros(n_runs, np.int64)),
             due_runs=cuda.device_array(n_runs, np.int64),
+            asked=cuda.device_array(kernels.ASKED, np.float64),
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
-            found=cuda.to_device(self._nothing),
-            numbers=cuda.mapped_array(ROOM, np.int64),
-            rows=cuda.mapped_array((NEAR_ROWS, ROOM), np.float64),
+            found=cuda.to_device(np.array([0.0, 0.0, 0.0, NEVER])),
+            numbers=cuda.mapped_array(room, np.int64),
+            rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
         )
 
     def check(self) -> None:
@@ -135,93 +185,101 @@ class GpuLooks:
         """Look at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
         follower, station = self._follower, self._station
         self._mirror.update(int(station.cells.readers[station.reader * READER_STRIDE]))
+        self._mirror.directory()  # in the arrays that the launches read
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
         self._epoch += int(follower.anew) == POINTS_ANEW
         most, half, field = int(follower.merges_from), 1 - int(follower.side), station.field
         while True:
-            asked = self._asked()
-            n_due, n_near, n_unknown, least = self._launch(asked).tolist()
-            n = int(n_near)
-            if n > self._sight.numbers.size:
-                self._put_back(-1, int(n_due), asked)
+            n_due, n_near, n_unknown, least = self._look_once().tolist()
+            n, numbers = int(n_near), self._sight.numbers
+            if n > numbers.size:
+                self._put_back(-1, n_due)
                 self._make_room(n)
                 continue
-            numbers = np.array(self._sight.numbers[:n])
-            order = np.argsort(numbers)
-            numbers, rows = numbers[order], np.array(self._sight.rows[:, :n])[:, order]
-            shut = self._first_shut(numbers, rows)
-            if not (0 < most < min(n, shut) and follower.merged < MOST_MERGED):
+            numbers = np.array(numbers[:n])
+            shut = self._first_shut(numbers)
+            if not (0 < most < n and follower.merged < MOST_MERGED):
                 break
-            self._put_back(int(numbers[most]), int(n_due), asked)
+            last = int(np.partition(numbers, most)[most])
+            if shut < last:
+                break
+            self._put_back(last, n_due)
             follower.merged[()] *= 2
-        if shut < n:
-            self._put_back(int(numbers[shut]), int(n_due), asked)
+        if shut < NOBODY:
+            self._put_back(shut, n_due)
             return SHUT
-        field[NEAR + half * NEAR_ROWS : NEAR + (half + 1) * NEAR_ROWS, :n] = rows
-        station.met[NEAR_POINTS + half, :n] = numbers
+        order = np.argsort(numbers)
+        rows = field[NEAR + half * NEAR_ROWS : NEAR + (half + 1) * NEAR_ROWS, :n]
+        np.take(self._sight.rows[:, :n], order, axis=1, out=rows)
+        station.met[NEAR_POINTS + half, :n] = numbers[order]
         follower.n_tried[()], follower.n_unknown[()] = n, n_unknown
-        follower.tried_clearance[()] = least - asked.travelled + FAR
+        follower.tried_clearance[()] = least - float(follower.travelled) + FAR
         self._tell_missed(int(n_unknown))
         return NOT_KNOWN if n_unknown else OPEN
 
-    def _first_shut(self, numbers: NDArray[np.int64], rows: NDArray[np.float64]) -> int:
-        """First of the near points that may not be there; their number if all may."""
+    def _first_shut(self, numbers: NDArray[np.int64]) -> int:
+        """First of the near points that may not be there; NOBODY if all may."""
         if not self._follower.is_walking:
-            return len(numbers)
-        field, u, bound = self._station.field, rows[U], rows[BOUND]
+            return NOBODY
+        field = self._station.field
+        u, bound = np.array(self._sight.rows[U : BOUND + 1, : len(numbers)])
         is_shut = (u < FLOOR) & (u <= field[LAST_U, numbers])
         is_shut |= (bound < LEAST_BOUND) & (bound <= field[LAST_BOUND, numbers])
-        return int(is_shut.argmax()) if is_shut.any() else len(numbers)
+        return int(numbers[is_shut].min(initial=NOBODY))
 
-    def _asked(self) -> kernels.Look:
-        """Numbers of one look; what it forgets is forgotten then."""
+    def _look_once(self) -> NDArray[np.float64]:
+        """Look at the tried pose once -> what was found (FOUND,). It forgets what it is to."""
         follower = self._follower
-        is_anew, self._n_looks = int(follower.anew) > 0, self._n_looks + 1
+        self._n_looks += 1
+        asked = kernels.Look(
+            self._n_looks, self._epoch, self._station.clusters.run, follower.is_large,
+            follower.anew > 0, follower.is_bent, follower.merged, -1, 0, follower.travelled,
+            follower.way, tuple(self._tried[:3].ravel().tolist()),
+        )  # fmt: skip
+        self._asked[: -len(asked.pose)], self._asked[-len(asked.pose) :] = asked[:-1], asked.pose
         follower.anew[()] = 0
-        return kernels.Look(
-            number=self._n_looks,
-            epoch=self._epoch,
-            run=int(self._station.clusters.run),
-            is_large=bool(follower.is_large),
-            is_anew=is_anew,
-            is_bent=bool(follower.is_bent),
-            travelled=float(follower.travelled),
-            way=float(follower.way),
-            merged=int(follower.merged),
-        )
+        self._begin_look()
+        self._stream.synchronize()
+        return self._found
 
-    def _launch(self, asked: kernels.Look) -> NDArray[np.float64]:
-        """Both launches of a look -> what they found (FOUND,)."""
+    def _put_back(self, last: int, n_due: float) -> None:
+        """Put back what a look wrote beyond a point; a later launch waits for it."""
+        self._asked[LAST], self._asked[N_DUE] = last, n_due
+        self._begin_put_back()
+        self._stream.synchronize()
+
+    def _launch_look(self) -> None:
+        """Launches and copies of a look."""
         keys, slots, masks, _ = self._mirror.directory()
-        transform = tuple(self._tried[:3].ravel().tolist())
         place, stream, sight = self._place, self._stream, self._sight
         seen = Seen(keys, slots, self._mirror.arrays[2], masks, sight.used, 0)
-        kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](
-            place, transform, asked, seen, sight
-        )
+        sight.asked.copy_to_device(self._asked, stream=stream)
+        kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, sight)
         self._kernel[self._of_points, kernels.THREADS, stream](
-            place, transform, asked, seen, self._mirror.arrays[-1], sight
+            place, seen, self._mirror.arrays[-1], sight
         )
         sight.found.copy_to_host(self._found, stream=stream)
         sight.found.copy_to_device(self._nothing, stream=stream)
-        stream.synchronize()
-        return self._found
 
-    def _put_back(self, last: int, n_due: int, asked: kernels.Look) -> None:
-        """Put back what a look wrote beyond a point; a later launch waits for it."""
-        kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](
-            last, n_due, asked, self._sight
-        )
+    def _launch_put_back(self) -> None:
+        """Launch and copy of what puts back."""
+        self._sight.asked.copy_to_device(self._asked, stream=self._stream)
+        kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._sight)
+
+    def _repeat(self) -> None:
+        """Take both with the arrays that they have now."""
+        self._begin_look = _Repeated(self._stream, self._launch_look)
+        self._begin_put_back = _Repeated(self._stream, self._launch_put_back)
 
     def _make_room(self, n: int) -> None:
         """Make room for n near points."""
-        self._stream.synchronize()
         room = 1 << (n - 1).bit_length()
         self._sight = self._sight._replace(
             numbers=cuda.mapped_array(room, np.int64),
             rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
         )
+        self._repeat()
 
     def _tell_missed(self, n_unknown: int) -> None:
         """List the unknown cells that the look met, for the fetching process."""

@@ -38,7 +38,8 @@ class CellMirror:
     law : NamedTuple
         Law of the frames that read it, in the kernels' form.
     side : int or None
-        Voxels of the grid on each axis; None: the GPU has no list of all cells.
+        Voxels of the grid on each axis; None: for looks of a hand, which need the directory, the
+        masks and the payload alone.
 
     Attributes
     ----------
@@ -57,7 +58,8 @@ class CellMirror:
         self._table = table
         self._law = law
         self._version = 0
-        self._directory: tuple[int, tuple[Any, ...]] = 0, ()
+        self._directory: tuple[int, tuple[Any, ...]] = -1, ()
+        self._has_words = side is not None
         self.n_copied = 0
         self._has_distances = reads_distances(law)
         n_slots = table.n_slots
@@ -70,10 +72,11 @@ class CellMirror:
         self._across = across if across**3 <= MOST_LISTED else 0
         n_listed = self._across**3 or table.capacity
         values = table.cells.payload
-        words = cuda.to_device(np.zeros((n_slots, CELL_WORDS), np.uint32))
+        n_words = n_slots if self._has_words else 1
+        words = cuda.to_device(np.zeros((n_words, CELL_WORDS), np.uint32))
         gate, payload = words, cuda.to_device(np.full((1, 1), BEYOND, np.uint8))
         if self._has_distances and values is not None:
-            gate = cuda.to_device(np.zeros((n_slots, CELL_WORDS), np.uint32))
+            gate = cuda.to_device(np.zeros((n_words, CELL_WORDS), np.uint32))
             payload = cuda.device_array(values.shape, np.uint8)
         self.arrays = (
             cuda.device_array((1, 1 if self._across else n_listed), np.int64),
@@ -103,22 +106,35 @@ class CellMirror:
         is_new[EMPTY_SLOT] = False
         runs = _runs_of(np.flatnonzero(is_new))
         for first, end in runs:
-            words[first:end].copy_to_device(cells.words[first:end])
             if self._has_distances and cells.payload is not None:
                 payload[first:end].copy_to_device(cells.payload[first:end])
-                gate[first:end].copy_to_device(self._gate_of(cells, slice(first, end)))
+            if self._has_words:
+                words[first:end].copy_to_device(cells.words[first:end])
+                if self._has_distances and cells.payload is not None:
+                    gate[first:end].copy_to_device(self._gate_of(cells, slice(first, end)))
         self._version = version
         n_slots = sum(end - first for first, end in runs)
         self.n_copied += n_slots
         return n_slots
 
     def directory(self) -> tuple[Any, ...]:
-        """keys, slots, masks and used of the cells that are there, as searches take them."""
+        """keys, slots, masks and used of the cells that are there, as searches take them.
+
+        The arrays are the same each time; `used` has what its kernels write.
+        """
         version, arrays = self._directory
         if version != self._version:
             cells, which = self._table.cells, slice(self._version % BUFFERS, None)
-            parts = cells.keys[which][:1], cells.slots[which][:1], cells.masks, cells.used
-            arrays = tuple(cuda.to_device(np.ascontiguousarray(one)) for one in parts)
+            found = [cells.masks]
+            if self._across:
+                found += [cells.keys[which][:1], cells.slots[which][:1]]
+            parts = [np.ascontiguousarray(one) for one in found]
+            if not arrays:
+                made = [cuda.device_array(one.shape, one.dtype) for one in parts]
+                keys, slots = made[1:] or self.arrays[:2]
+                arrays = keys, slots, made[0], cuda.device_array(self._table.n_slots, np.uint8)
+            for array, part in zip((arrays[2], *arrays[:2]), parts, strict=False):
+                array.copy_to_device(part)
             self._directory = self._version, arrays
         return arrays
 

@@ -1,10 +1,11 @@
 """Looks of the coupling on a graphics processor: `hand.near_points.look` at tools of any size.
 
-Two launches are a look. In the first a thread takes a run of points: is it due, and is its sphere
-free? In the second a block takes a run that is not: its threads look at the points that are due.
-Only near points leave the GPU, in any order; each point's number is beside it. When a point is due
-stays on the GPU, and a look that ends early puts back what it wrote beyond its last point, so that
-a tool goes the way that it goes on the processor.
+Two launches are a look. A CUDA graph repeats them with the arguments that they had at first, so
+what changes from look to look is read from memory (`Sight.asked`). In the first a thread takes a
+run of points: is it due, and is its sphere free? In the second a block takes a run that is not: its
+threads look at the points that are due. Only near points leave the GPU, in any order; each point's
+number is beside it. When a point is due stays on the GPU, and a look that ends early puts back what
+it wrote beyond its last point, so that a tool goes the way that it goes on the processor.
 """
 
 import functools
@@ -54,9 +55,9 @@ class Sight(NamedTuple):
     run_due (R,): rows DUE and RUN_DUE of `near_points`; due_before, run_due_before: the same
     before the last look, of what it looked at; epochs (R,) int64: since when the points' numbers
     are true; seen (R,) int64: number of the last look at the run; due_runs (R,) int64: runs of the
-    second launch. used (S,) uint8: slots that were read. missed (ROOM_FOR_MISSED,) int64: keys of
-    unknown cells, in no order, -1 for none. found (FOUND,). numbers (M,) int64 and rows (NEAR_ROWS,
-    M): the near points, if there are no more than M.
+    second launch. asked (ASKED,): a look's `Look`. used (S,) uint8: slots that were read. missed
+    (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. found (FOUND,).
+    numbers (M,) int64 and rows (NEAR_ROWS, M): the near points, if there are no more than M.
     """
 
     points: Any
@@ -68,6 +69,7 @@ class Sight(NamedTuple):
     epochs: Any
     seen: Any
     due_runs: Any
+    asked: Any
     used: Any
     missed: Any
     found: Any
@@ -78,24 +80,46 @@ class Sight(NamedTuple):
 class Look(NamedTuple):
     """What is asked of a look: numbers of the coupling's record, as FOLLOWER has them.
 
-    epoch: numbers of points that are older are forgotten; run: points of a run.
+    epoch: numbers of points that are older are forgotten; run: points of a run; pose: the rows of
+    the pose that is tried. For `put_back` alone: last, the point up to which what the look wrote
+    stays, and n_due, the runs of its second launch.
     """
 
     number: int
     epoch: int
     run: int
-    is_large: bool
-    is_anew: bool
-    is_bent: bool
+    is_large: int
+    is_anew: int
+    is_bent: int
+    merged: int
+    last: int
+    n_due: int
     travelled: float
     way: float
-    merged: int
+    pose: tuple[float, ...]
+
+
+ASKED = 23
+"""Numbers of a `Look`."""
+
+
+@cuda.jit(device=True)
+def _look_of(asked):
+    """The `Look` that is in asked (ASKED,)."""
+    return Look(
+        int64(asked[0]), int64(asked[1]), int64(asked[2]), int64(asked[3]), int64(asked[4]),
+        int64(asked[5]), int64(asked[6]), int64(asked[7]), int64(asked[8]), asked[9], asked[10],
+        (
+            asked[11], asked[12], asked[13], asked[14], asked[15], asked[16], asked[17], asked[18],
+            asked[19], asked[20], asked[21], asked[22],
+        ),
+    )  # fmt: skip
 
 
 @cuda.jit
-def list_due_runs(place, transform, asked, seen, sight):
+def list_due_runs(place, seen, sight):
     """First launch. seen: `resident.cells.Seen`."""
-    least = NEVER
+    least, asked = NEVER, _look_of(sight.asked)
     for run in range(cuda.grid(1), sight.run_due.shape[0], cuda.gridsize(1)):
         before = -NEVER if asked.is_anew else sight.run_due[run]
         if asked.travelled < before:
@@ -103,7 +127,7 @@ def list_due_runs(place, transform, asked, seen, sight):
             continue
         sight.seen[run], sight.run_due_before[run] = asked.number, before
         if asked.is_large and (before == -NEVER or before >= asked.travelled - asked.way):
-            rest = _rest_of_sphere(seen, sight.spheres, run, transform, place)
+            rest = _rest_of_sphere(seen, sight.spheres, run, asked.pose, place)
             if rest > 0.0:
                 sight.run_due[run] = asked.travelled + rest
                 least = min(least, asked.travelled + rest)
@@ -124,9 +148,9 @@ def _miss(missed, key):
 
 
 @cuda.jit(device=True)
-def _look_at_point(n, place, transform, asked, seen, payload, sight):
+def _look_at_point(n, place, asked, seen, payload, sight):
     """Look at point n, which is due -> when it is due again; see `near_points.look`."""
-    points, center = sight.points, sight.points.shape[1] - 1
+    points, center, transform = sight.points, sight.points.shape[1] - 1, asked.pose
     px, py, pz = _moved(transform, points[0, n], points[1, n], points[2, n])
     x, dx = _clamped_into((px - place.x) / place.size, place.side)
     y, dy = _clamped_into((py - place.y) / place.size, place.side)
@@ -165,10 +189,10 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
     """
 
     @cuda.jit
-    def look(place, transform, asked, seen, payload, sight):
+    def look(place, seen, payload, sight):
         best = cuda.shared.array(threads, float64)
         nobody = cuda.shared.array(threads, int64)
-        t, n_points = cuda.threadIdx.x, sight.due.shape[0]
+        t, n_points, asked = cuda.threadIdx.x, sight.due.shape[0], _look_of(sight.asked)
         for at in range(cuda.blockIdx.x, np.int64(sight.found[DUE_RUNS]), cuda.gridDim.x):
             run, least = sight.due_runs[at], NEVER
             is_known, start = sight.epochs[run] == asked.epoch, run * asked.run
@@ -176,7 +200,7 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
                 due = sight.due[n] if is_known else -NEVER
                 sight.due_before[n] = due
                 if asked.travelled >= due:
-                    due = _look_at_point(n, place, transform, asked, seen, payload, sight)
+                    due = _look_at_point(n, place, asked, seen, payload, sight)
                     sight.due[n] = due
                 least = min(least, due)
             best[t], nobody[t] = least, 0
@@ -190,16 +214,14 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
 
 
 @cuda.jit
-def put_back(last, n_due, asked, sight):
-    """Put back what the look wrote beyond point `last`, whose run is not done either.
-
-    n_due: runs of the look's second launch.
-    """
-    first, step = cuda.grid(1), cuda.gridsize(1)
+def put_back(sight):
+    """Put back what the look wrote beyond its point `last`, whose run is not done either."""
+    first, step, asked = cuda.grid(1), cuda.gridsize(1), _look_of(sight.asked)
+    last = asked.last
     for run in range(max(last, 0) // asked.run + first, sight.seen.shape[0], step):
         if sight.seen[run] == asked.number:
             sight.run_due[run] = sight.run_due_before[run]
-    for at in range(first, n_due, step):
+    for at in range(first, asked.n_due, step):
         start = sight.due_runs[at] * asked.run
         for n in range(max(start, last + 1), min(start + asked.run, sight.due.shape[0])):
             sight.due[n] = sight.due_before[n]

@@ -179,7 +179,7 @@ def _check(store: Store, report: CheckReport, progress: CheckCallback | None) ->
         for finding in _surface_findings(store, objects, report):
             report.add(finding)
         try:
-            store.pairs()
+            list(store.pairs())
         except DamagedError as error:
             report.add(_cause(error))
 
@@ -222,12 +222,28 @@ def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
 class _Sums:
     """Voxels and checksum of each object, from the rows read so far."""
 
-    def __init__(self) -> None:
+    def __init__(self, store: Store) -> None:
+        self._store = store
         self.voxels: dict[int, int] = {}
         self.checksums: dict[int, Checksum] = {}
+        self.disorder: str | None = None
 
-    def add(self, rows: Rows) -> None:
-        """Add a batch to the counts and the checksums of its objects."""
+    def batches(self, at_once: int, *, distances: bool = False) -> Iterator[Rows]:
+        """All rows, added to the sums; ends where they are in `disorder`."""
+        key, object_id = -1, 0
+        while len(rows := self._store.rows_after(key, object_id, at_once, distances=distances)):
+            if not _is_ascending(rows, key, object_id):
+                self.disorder = f"after key {key} are not in order"
+                return
+            key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+            self._add(rows)
+            yield rows
+
+    def value(self, obj: Object) -> int:
+        """Checksum of an object's rows."""
+        return self.checksums.get(obj.id, Checksum()).value()
+
+    def _add(self, rows: Rows) -> None:
         if rows.occupancy.size:
             counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
         else:
@@ -247,20 +263,15 @@ def _row_findings(
     report: CheckReport,
     progress: CheckCallback | None,
 ) -> Iterator[str]:
-    sums = _Sums()
-    places = _Places(store, objects)
-    total = store.size().rows
-    key, object_id = -1, 0
-    while len(rows := store.rows_after(key, object_id, ROWS_AT_ONCE)):
-        if not _is_ascending(rows, key, object_id):
-            yield f"rows after key {key} are not in order"
-            return
-        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+    sums, places, total = _Sums(store), _Places(store, objects), store.size().rows
+    for rows in sums.batches(ROWS_AT_ONCE):
         report.rows += len(rows)
-        sums.add(rows)
         yield from places.findings(rows)
         if progress is not None:
             progress(_CheckProgress(min(report.rows, total), total))
+    if sums.disorder:
+        yield f"rows {sums.disorder}"
+        return
     report.voxels = sum(sums.voxels.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"
@@ -269,8 +280,7 @@ def _row_findings(
         yield f"rows of object {missing}, which is not there"
     for obj in objects.values():
         found = sums.voxels.get(obj.id, 0)
-        checksum = sums.checksums.get(obj.id, Checksum()).value()
-        is_other = obj.rows_crc is not None and checksum != obj.rows_crc
+        is_other = obj.rows_crc is not None and sums.value(obj) != obj.rows_crc
         if found != obj.voxels:
             yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
         if is_other:
@@ -284,22 +294,20 @@ def _row_findings(
 
 def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport) -> Iterator[str]:
     """Distances that are damaged, missing, or of no object."""
-    sums = _Sums()
-    key, object_id = -1, 0
+    sums = _Sums(store)
     key_end = 1 << max(3 * store.grid.bits - row_shift(store.layout), 0)
-    while len(rows := store.rows_after(key, object_id, BAND_ROWS_AT_ONCE, distances=True)):
-        if not _is_ascending(rows, key, object_id):
-            yield f"distances after key {key} are not in order"
-            return
-        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
-        if int(rows.keys[0]) < 0 or key >= key_end:
+    for rows in sums.batches(BAND_ROWS_AT_ONCE, distances=True):
+        first, last = int(rows.keys[0]), int(rows.keys[-1])
+        if first < 0 or last >= key_end:
             yield "distances of bricks outside the grid"
         assert rows.distances is not None  # noqa: S101 - read with distances
         try:
             packing.unpack(*rows.distances)
         except ValueError as error:
-            yield f"distances between keys {int(rows.keys[0])} and {key}: {error}"
-        sums.add(rows)
+            yield f"distances between keys {first} and {last}: {error}"
+    if sums.disorder:
+        yield f"distances {sums.disorder}"
+        return
     for found in sorted(sums.checksums):
         if found not in objects:
             report.strays = sorted({*report.strays, found})
@@ -310,7 +318,7 @@ def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport
         if not obj.has_distances:
             continue
         lacks = sums.voxels.get(obj.id, 0) != obj.voxels
-        is_other = sums.checksums.get(obj.id, Checksum()).value() != obj.distances_crc
+        is_other = sums.value(obj) != obj.distances_crc
         if lacks:
             yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
         if is_other:

@@ -12,10 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.clashes.judge import judge
 from hapticdb.clashes.result import GRAVITY
-from hapticdb.clashes.run import BUDGET, CONTACT
-from hapticdb.clashes.shapes import BuiltShape, Shapes
+from hapticdb.clashes.run import CONTACT
+from hapticdb.clashes.shapes import BuiltShape
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.poses import rotation_of
@@ -23,6 +24,7 @@ from hapticdb.ready import make_ready
 from hapticdb.store.finding import Words
 from hapticdb.store.pairs import Kind
 from hapticdb.sweeps.gap import Pair, box_gaps
+from hapticdb.sweeps.run import center_of
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -87,23 +89,14 @@ def find_meetings(
         raise UsageError(f"contact {contact} m: give a length above 0")
     make_ready("sweep", "clashes")
     with env.store.snapshot():
-        shell = env.shell(*of, inset=0.0)
-        tool = MovingSurface(shell)
-        box = np.stack([tool.corners.min(axis=0), tool.corners.max(axis=0)])
-        center = box.mean(axis=0) if about is None else np.asarray(about, dtype=np.float64)
-        way = Way.of(poses, tool.corners, center)
-        own = {obj.id for obj in env.find(*of)}
-        objects = [obj for obj in env.felt(against, ()) if obj.id not in own]
+        tool = MovingSurface(env.shell(*of, inset=0.0))
+        way = Way.of(poses, tool.corners, center_of(tool, about))
+        objects = env.felt(against, of)
         gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
-        shapes, moved = Shapes(env.store, BUDGET), BuiltShape(tool.tree.corners, is_cloud=False)
-        found = []
-        for n, obj in enumerate(near):
-            placed = shapes.placed(obj)
-            if placed is None:
-                continue
-            turn, at = placed[1][:3, :3], placed[1][:3, 3]
-            still = BuiltShape(placed[0].tree.corners @ turn.T + at, is_cloud=placed[0].is_cloud)
+        moved, found = BuiltShape(tool.tree.corners, is_cloud=False), []
+        for n, (obj, part) in enumerate(parts_of(env.store, near)):
+            still = BuiltShape(part.surface(), is_cloud=part.is_cloud)
             for ways in _intervals(Pair(still.tree, tool, way), contact):
                 kind, depth, place = _gravest(
                     still, moved, way.at(np.linspace(*ways, POSES)), contact

@@ -1,4 +1,4 @@
-"""Objects that the words of an option choose: ids, names, patterns, attributes."""
+"""An environment opened, and objects that the words of an option choose."""
 
 from collections.abc import Iterable
 from contextlib import suppress
@@ -19,6 +19,17 @@ class Felt(NamedTuple):
     where: list[str]
     exclude: list[int | str]
     left_out: list[int]
+
+
+def opened_to_keep(url: str) -> "Environment":
+    """Open to write, so that what is found is kept; to read where this user may do no more."""
+    import hapticdb
+    from hapticdb.errors import ReadOnlyError
+
+    try:
+        return hapticdb.open(url)
+    except ReadOnlyError:
+        return hapticdb.open(url, read_only=True)
 
 
 def chosen(env: "Environment", words: Iterable[str], option: str) -> "list[Object]":

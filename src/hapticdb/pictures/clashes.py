@@ -11,9 +11,8 @@ from matplotlib.image import imsave
 from numpy.typing import NDArray
 
 from hapticdb.clashes.result import GRAVITY, Clash, Clashes
-from hapticdb.clashes.run import BUDGET
-from hapticdb.clashes.shapes import Shapes
 from hapticdb.environment import Environment
+from hapticdb.ingest.geometry import found_parts
 from hapticdb.pictures.demo import TOWARDS, shortened
 from hapticdb.pictures.splat import (
     DEPTH_STEPS,
@@ -156,14 +155,14 @@ def _cell(deep: int, near: int) -> str:
 
 
 def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]) -> Iterator[str]:
-    shapes = Shapes(env.store, BUDGET)
     up, drawn = up_axis(objects.values()), 0
     for one in sorted(told, key=lambda one: not one.is_open):
         pair = [objects.get(i) for i in (one.a, one.b)]
         a, b = pair
         if one.kind not in GRAVITY[:4] or one.place is None or a is None or b is None:
             continue
-        surfaces = [_placed(shapes, obj) for obj in (a, b)]
+        parts = [part for _, part in found_parts(env.store, [a, b])]
+        surfaces = [part.surface() for part in parts if part is not None]
         picture = io.BytesIO()
         imsave(picture, _drawn(one, (a, b), surfaces, up), format="png")
         data = base64.b64encode(picture.getvalue()).decode()
@@ -175,15 +174,6 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
         drawn += 1
         if drawn == PICTURES:
             return
-
-
-def _placed(shapes: Shapes, obj: Object) -> Floats:
-    """Triangles (T, 3, 3) of an object, world frame."""
-    placed = shapes.placed(obj)
-    if placed is None:
-        return np.empty((0, 3, 3))
-    shape, pose = placed
-    return np.asarray(shape.tree.corners @ pose[:3, :3].T + pose[:3, 3])
 
 
 def _drawn(one: Clash, pair: tuple[Object, Object], surfaces: Sequence[Floats], up: int) -> Image:

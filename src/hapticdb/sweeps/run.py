@@ -97,7 +97,7 @@ def sweep(
     asked = _asked(contact, limit, seconds, profile=profile, until_hit=until_hit, progress=progress)
     make_ready("sweep")
     tool = MovingSurface(shell)
-    way = Way.of(poses, tool.corners, _center_of(tool, about))
+    way = Way.of(poses, tool.corners, center_of(tool, about))
     with suppress(ConnectionLostError):
         return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
     return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
@@ -133,7 +133,7 @@ def _asked(
     return _Asked(contact, most, until, profile, until_hit, progress)
 
 
-def _center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
+def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
     """Centre (3,) of turns: as it is asked for, or the middle of the tool's box."""
     if about is None:
         return np.asarray(0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0)))

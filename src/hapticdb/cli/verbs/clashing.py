@@ -1,23 +1,26 @@
 """The verb clashes."""
 
 from contextlib import nullcontext
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Annotated
 
 import typer
 
 from hapticdb.cli import render
+from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
 from hapticdb.cli.options import ClusterOption, CsvOption, JsonOption, UrlArgument
 from hapticdb.cli.values import numbers_of
 from hapticdb.cli.verbs.sweeping import MM
-from hapticdb.errors import ReadOnlyError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
+    from collections.abc import Callable
+
     from hapticdb.clashes.moving import Meeting
     from hapticdb.clashes.result import Clash, Clashes
-    from hapticdb.environment import Environment
     from hapticdb.store.pairs import Kind
 
 MOST_ROWS = 20
@@ -158,15 +161,15 @@ def clashes(
     if poses is not None or turn is not None:
         if html or seconds or on or not of:
             raise UsageError("--poses and --turn take --of, and no --html, --seconds, --on")
-        motion = _Motion(of, poses, turn, about, from_, to)
-        raise typer.Exit(_moved(url, motion, against, contact, kinds, csv, json=json))
-    render.compile_kernels("clashes")
+        motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
+        raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
+    render.compile_kernels(*(["clashes"] if on is None else []))
     from hapticdb.clashes.run import find_clashes
 
     with (
         open_csv(csv, "--csv", COLUMNS) as table,
         nullcontext() if html is None else new_file(Path(html), "--html") as page,
-        _opened(url) as env,
+        opened_to_keep(url) as env,
         render.bar("measuring", "pairs", lambda *now: now) as progress,
     ):
         found = find_clashes(
@@ -181,7 +184,7 @@ def clashes(
 
             page.write_text(clashes_page(env, found, told), encoding="utf-8")
     for one in told if json else ():
-        render.say_json(one.record())
+        render.say_json(one._asdict())
     if not json and csv != STDOUT:
         _show(found, told)
     if not found.is_kept:
@@ -189,25 +192,13 @@ def clashes(
     raise typer.Exit(_exit_code(found, kinds))
 
 
-class _Motion(NamedTuple):
-    """How the parts of --of move, as the options say."""
-
-    of: list[str]
-    poses: str | None
-    turn: str | None
-    about: str | None
-    begin: float
-    end: float
-
-
 def _moved(
-    url: str, motion: _Motion, against: list[str] | None, contact: float,
-    kinds: "tuple[Kind, ...]", csv: str | None, *, json: bool,
+    motion: "Callable[[], list[Meeting]]", turn: str | None, kinds: "tuple[Kind, ...]",
+    csv: str | None, *, json: bool,
 ) -> int:  # fmt: skip
     """Print when parts that move meet others; returns the exit code."""
     with open_csv(csv, "--csv", MEETING_COLUMNS) as table:
-        met = _meetings(url, motion, against, contact)
-        told = [one for one in met if not kinds or one.kind in kinds]
+        told = [one for one in motion() if not kinds or one.kind in kinds]
         if table:
             table.write([one.id, text_cell(one.name), *one[2:6], *one.place] for one in told)
     if json:
@@ -216,7 +207,7 @@ def _moved(
     elif csv != STDOUT:
         rows = [(str(one.id), one.name, f"{one.begin:.4g}", f"{one.end:.4g}", one.kind,
                  length_text(one.at_least) if one.at_least else "-") for one in told]  # fmt: skip
-        unit = "pose" if motion.turn is None else "degrees"
+        unit = "pose" if turn is None else "degrees"
         if rows:
             render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
         render.say(f"{render.counted(len(told), 'meeting')} on the way")
@@ -224,41 +215,41 @@ def _moved(
 
 
 def _meetings(
-    url: str, motion: _Motion, against: list[str] | None, contact: float
-) -> "list[Meeting]":
+    url: str, of: list[str], poses: str | None, turn: str | None, about: str | None,
+    begin: float, end: float, against: list[str] | None, contact: float,
+) -> "list[Meeting]":  # fmt: skip
     """When parts that move meet others: numbers of poses, or degrees."""
-    import numpy as np
-
     import hapticdb
     from hapticdb.clashes.moving import find_meetings, hinge
     from hapticdb.poses import read_poses
+    from hapticdb.store.base import scene_bounds
 
-    if (motion.poses is None) == (motion.turn is None) or motion.turn not in {None, *AXES}:
+    if (poses is None) == (turn is None) or turn not in {None, *AXES}:
         raise UsageError("give either --poses CSV, or --turn x, y or z")
     center = None
-    if motion.about is not None:
-        center = [MM * x for x in numbers_of(motion.about, 3, "--about", "X,Y,Z in millimetres")]
+    if about is not None:
+        center = [MM * x for x in numbers_of(about, 3, "--about", "X,Y,Z in millimetres")]
     render.compile_kernels("sweep", "clashes")
     with (
         hapticdb.open(url, read_only=True) as env,
         render.bar("moving", "objects", lambda *now: now) as progress,
     ):
-        if motion.poses is not None:
-            poses = read_poses(motion.poses)
+        if poses is not None:
+            placed = read_poses(poses)
         else:
-            boxes = np.array([obj.bounds for obj in env.find(*motion.of)])
-            middle = 0.5 * (boxes[:, 0].min(axis=0) + boxes[:, 1].max(axis=0))
-            center = middle.tolist() if center is None else center
-            poses = hinge(AXES.index(motion.turn or "x"), center, motion.begin, motion.end)
+            bounds = scene_bounds(env.find(*of))
+            assert bounds is not None  # noqa: S101 - words choose something
+            center = bounds.mean(axis=0).tolist() if center is None else center
+            placed = hinge(AXES.index(turn or "x"), center, begin, end)
         found = find_meetings(
-                env, motion.of, poses, about=center, against=against or (), contact=MM * contact,
+                env, of, placed, about=center, against=against or (), contact=MM * contact,
                 progress=progress,
             )  # fmt: skip
-    if motion.turn is None:
+    if turn is None:
         return found
-    start, step = motion.begin, (motion.end - motion.begin) / (len(poses) - 1)
+    step = (end - begin) / (len(placed) - 1)
     return [
-        one._replace(begin=start + step * one.begin, end=start + step * one.end) for one in found
+        one._replace(begin=begin + step * one.begin, end=begin + step * one.end) for one in found
     ]
 
 
@@ -276,16 +267,6 @@ def _checked(names: list[str] | None) -> "tuple[Kind, ...]":
         if name not in GRAVITY:
             raise UsageError(f"--kind {name!r}: give one of {', '.join(sorted(GRAVITY))}")
     return tuple(kind for kind in GRAVITY if kind in (names or ()))
-
-
-def _opened(url: str) -> "Environment":
-    """Open to write, so that what is found is kept; to read where this user may do no more."""
-    import hapticdb
-
-    try:
-        return hapticdb.open(url)
-    except ReadOnlyError:
-        return hapticdb.open(url, read_only=True)
 
 
 def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> int:

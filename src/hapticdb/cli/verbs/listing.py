@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
+from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.units import length_text
 
@@ -238,16 +239,10 @@ def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
     """Costs as measured now, and whether they are kept; renews the statistics, too, if it may."""
     from contextlib import suppress
 
-    import hapticdb
-    from hapticdb.errors import AccessError, ReadOnlyError
+    from hapticdb.errors import AccessError
 
-    try:
-        env = hapticdb.open(url)
-        is_kept = True
-    except ReadOnlyError:
-        env = hapticdb.open(url, read_only=True)
-        is_kept = False
-    with env:
+    with opened_to_keep(url) as env:
+        is_kept = not env.store.is_read_only
         render.compile_kernels("calibrate")
         if is_kept:
             with suppress(AccessError):  # a role may keep costs only

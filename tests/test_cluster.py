@@ -156,7 +156,7 @@ def test_workers_read_a_server(
     copy_environment(path, url)
     with hapticdb.open(url) as env, hapticdb.open(path) as alone:
         assert find_clashes(env, on=scheduler).pairs == find_clashes(alone).pairs
-        assert len(env.store.pairs()) == 4
+        assert len(env.store.pairs().rows) == 4
 
 
 @pytest.mark.long

@@ -8,11 +8,11 @@ engines have.
 # ruff: noqa: ARG002 - a store takes what the protocol gives, needed or not
 
 import contextlib
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterator, Mapping, Sequence
 from dataclasses import replace
 from functools import cached_property
 from threading import Lock
-from typing import Literal
+from typing import Literal, cast
 
 import numpy as np
 
@@ -38,7 +38,7 @@ from hapticdb.store.base import (
     joined,
     touched_ranges,
 )
-from hapticdb.store.pairs import PairRow
+from hapticdb.store.pairs import MARK, KeptPairs, Mark, Outlines, PairRow
 from hapticdb.store.parsing import distances_crc, rows_crc
 from hapticdb.store.refusals import (
     check_distances,
@@ -198,9 +198,21 @@ class MemoryStore:
 
     # -- objects -----------------------------------------------------------------------------
 
-    def objects(self) -> list[Object]:
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
         objects = self._state().objects
-        return [objects[object_id][0] for object_id in sorted(objects)]
+        chosen = objects.keys() if ids is None else objects.keys() & set(ids)
+        return [objects[object_id][0] for object_id in sorted(chosen)]
+
+    def outlines(self) -> Outlines:
+        objects = self.objects()
+        ids = np.array([(obj.id, obj.revision) for obj in objects], dtype=np.int64).reshape(-1, 2)
+        return Outlines(
+            [obj.name for obj in objects],
+            [obj.digest for obj in objects],
+            ids[:, 0],
+            ids[:, 1],
+            np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3),
+        )
 
     def object(self, object_id: int) -> Object:
         objects = self._state().objects
@@ -321,17 +333,28 @@ class MemoryStore:
 
     # -- pairs -------------------------------------------------------------------------------
 
-    def pairs(self) -> list[PairRow]:
-        return sorted(self._state().pairs.values())
+    def pairs(self) -> KeptPairs:
+        rows = sorted(self._state().pairs.values())
+        return KeptPairs(rows, lambda row: cast("PairRow", row))
 
-    def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
+    def put_pairs(
+        self,
+        rows: Sequence[PairRow],
+        gone: Sequence[tuple[int, int]] = (),
+        was: Mark | None = None,
+        now: Mark | None = None,
+    ) -> Mark | None:
         with self._contents.write_lock:
             held = dict(self._newest().pairs)
-            for row in rows:
+            found = [(row.setting, row.revision) for row in [held.pop(MARK, None)] if row]
+            mark, marked = Mark.after(found, was, now)
+            held = {key: row for key, row in held.items() if key not in gone}
+            for row in (*rows, marked):
                 old = held.get(row[:2], row)
                 if row.revision >= old.revision:
                     held[row[:2]] = row._replace(because=old.because, shapes=old.shapes)
-            self._keep({key: row for key, row in held.items() if key not in gone})
+            self._keep(held)
+            return mark
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
         with self._contents.write_lock:

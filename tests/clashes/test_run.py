@@ -7,7 +7,7 @@ import sqlite3
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from contextlib import closing
 from pathlib import Path
 from urllib.parse import urlencode
@@ -25,6 +25,7 @@ from hapticdb import Environment, accept_clash, find_clashes
 from hapticdb.clashes.result import Clashes
 from hapticdb.errors import UsageError
 from hapticdb.store.connect import grant
+from hapticdb.store.pairs import PairRow
 from hapticdb.store.postgres.address import parse
 from hapticdb.transfer import copy_environment
 from servers import Place
@@ -118,7 +119,7 @@ def test_a_reader_finds_the_same_and_keeps_nothing(path: Path) -> None:
     with hapticdb.open(path) as env, hapticdb.open(path, read_only=True) as reader:
         found = find_clashes(reader)
         assert not found.is_kept
-        assert env.store.pairs() == []
+        assert list(env.store.pairs()) == []
         find_clashes(env)
         assert find_clashes(reader).kept == 3
 
@@ -202,11 +203,49 @@ def test_the_kept_table_is_bit_for_bit_that_of_a_full_run(
                 continue
             find_clashes(env)
         kept = findings(env)
-        env.store.put_pairs([], [(row.a, row.b) for row in env.store.pairs()])
-        find_clashes(env)
-        assert [row[:6] for row in findings(env)] == [row[:6] for row in kept]
+        assert full_findings(env) == [row[:6] for row in kept]
         assert len(kept) > 10
         assert len({row[2] for row in kept}) >= 3
+
+
+def full_findings(env: Environment) -> Found:
+    """What the table says after everything was measured anew, without statuses."""
+    env.store.put_pairs([], [(row.a, row.b) for row in env.store.pairs()])
+    find_clashes(env)
+    return [row[:6] for row in findings(env)]
+
+
+def test_only_what_is_near_a_change_is_read(path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    with hapticdb.open(path) as env:
+        first = find_clashes(env)
+        read: list[set[int]] = []
+        objects = env.store.objects
+
+        def noted(ids: Collection[int] | None = None) -> list[hapticdb.Object]:
+            found = objects(ids)
+            read.append({obj.id for obj in found})
+            return found
+
+        shifted(env, 4, 0.01 * MM)
+        monkeypatch.setattr(env.store, "objects", noted)
+        found = find_clashes(env)
+        assert set.union(*read) == {3, 4}
+        assert (found.measured, found.kept) == (1, 2)
+        assert found.counts() == first.counts()
+        assert [one[:4] for one in found.pairs] == [one[:4] for one in first.pairs]
+
+
+def test_what_another_writes_meanwhile_is_looked_at(path: Path) -> None:
+    with hapticdb.open(path) as env, hapticdb.open(path) as other:
+        late = PairRow(1, 4, "touching", 0.0, 0.0, (0.0,) * 6, "same", 1, "of an older scene")
+        find_clashes(env, progress=lambda *_: other.store.put_pairs([late]) and None)
+        assert told(find_clashes(env)) == {
+            (1, 2, "touching", "same"), (2, 3, "touching", "same"), (3, 4, "touching", "same"),
+            (1, 4, "apart", "gone"),
+        }  # fmt: skip
+        kept = [row[:6] for row in findings(env)]
+        assert len(kept) == 3
+        assert full_findings(env) == kept
 
 
 def on_server(place: Place, path: Path) -> str:

@@ -1,32 +1,41 @@
 """Pairs of objects whose boxes are near one another: never too few."""
 
-from collections.abc import Sequence
-
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.curves import Z_ORDER, encode
-from hapticdb.store.base import Object
 
 Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+Bools = NDArray[np.bool_]
 AT_ONCE = 1 << 20
 """Pairs of boxes that are compared together. Larger: more memory."""
 BITS = 10
 """Bits an axis of the curve along which pairs are ordered."""
+FEW = 1000
+"""Boxes that are compared with each other one. More: that takes longer than to sort all boxes."""
 
 
-def near_pairs(
-    objects: Sequence[Object],
-    within: float,
-    is_of: NDArray[np.bool_],
-    is_against: NDArray[np.bool_],
-) -> Ints:
-    """Pairs (P, 2) of indices, lesser first, whose boxes are `within` metres, along a curve.
+def near_pairs(boxes: Floats, within: float, is_of: Bools, is_against: Bools) -> Ints:
+    """Pairs (P, 2) of boxes (O, 2, 3), lesser first, `within` metres, along a curve.
 
     is_of, is_against (O,) : one object of each pair is of the first, the other of the second.
     """
-    boxes = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
     reach = within * (1.0 + 1e-9)
+    some = np.arange(len(boxes))
+    if is_of.sum() <= FEW:
+        is_near, high = np.zeros_like(is_of), boxes[:, 1] + reach
+        for n in np.flatnonzero(is_of):
+            is_near |= _are_near(boxes[:, 0], high, boxes[n, 0], high[n])
+        some = np.flatnonzero(is_near)
+    pairs = some[_near_pairs(boxes[some], reach)]
+    a, b = pairs[:, 0], pairs[:, 1]
+    pairs = pairs[(is_of[a] & is_against[b]) | (is_of[b] & is_against[a])]
+    return pairs[_along_curve(boxes, pairs)]
+
+
+def _near_pairs(boxes: Floats, reach: float) -> Ints:
+    """Pairs (P, 2), lesser first, of boxes (O, 2, 3) that are `reach` metres from one another."""
     sweeps = [_sweep(boxes[:, :, axis], reach) for axis in range(3)]
     order, counts = min(sweeps, key=lambda sweep: int(sweep[1].sum()))
     low, high = boxes[order, 0], boxes[order, 1] + reach
@@ -41,23 +50,25 @@ def near_pairs(
             ends[start:stop] - counts[start:stop] - before, counts[start:stop]
         )
         second = first + 1 + after
-        is_near = ((low[second] <= high[first]) & (low[first] <= high[second])).all(axis=1)
+        is_near = _are_near(low[first], high[first], low[second], high[second])
         found.append(np.stack([order[first[is_near]], order[second[is_near]]], axis=1))
         start = stop
-    pairs = np.sort(np.concatenate(found), axis=1)
-    a, b = pairs[:, 0], pairs[:, 1]
-    pairs = pairs[(is_of[a] & is_against[b]) | (is_of[b] & is_against[a])]
-    return pairs[_along_curve(boxes, pairs)]
+    return np.sort(np.concatenate(found), axis=1)
 
 
-def _sweep(edges: NDArray[np.float64], reach: float) -> tuple[Ints, Ints]:
+def _are_near(low: Floats, high: Floats, other_low: Floats, other_high: Floats) -> Bools:
+    """Whether boxes (N, 3) meet others, or one other (3,)."""
+    return np.asarray(((other_low <= high) & (low <= other_high)).all(axis=1))
+
+
+def _sweep(edges: Floats, reach: float) -> tuple[Ints, Ints]:
     """Order of boxes by their lower ends (O, 2), and how many after each begin before it ends."""
     order = np.argsort(edges[:, 0], kind="stable")
     low, high = edges[order, 0], edges[order, 1] + reach
     return order, np.searchsorted(low, high, side="right") - np.arange(1, len(order) + 1)
 
 
-def _along_curve(boxes: NDArray[np.float64], pairs: Ints) -> Ints:
+def _along_curve(boxes: Floats, pairs: Ints) -> Ints:
     """Order of pairs by the places of their first objects, then of their second ones."""
     if not len(pairs):
         return np.empty(0, dtype=np.int64)

@@ -1,10 +1,12 @@
 """Results of a search for clashes: metres, world frame."""
 
 from collections import Counter
+from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple
+from functools import cached_property
+from typing import Literal, NamedTuple
 
-from hapticdb.store.pairs import KINDS, Kind, Status
+from hapticdb.store.pairs import KINDS, KeptPairs, Kind, PairRow, Status
 from hapticdb.units import length_text
 
 Shown = Literal[Status, "accepted", "not looked at"]
@@ -55,22 +57,46 @@ class Clash(NamedTuple):
             return f"{at_least} or more"
         return f"{at_least} to {length_text(self.at_most)}"
 
-    def record(self) -> dict[str, Any]:
-        """Everything by name, as `hapticdb clashes --json` prints it."""
-        return self._asdict()
+
+Known = Mapping[int, tuple[str, str]]
+"""Name and digest of each object, by its id."""
+
+
+def shapes_of(known: Known, a: int, b: int) -> str | None:
+    """Both shapes, as an acceptance notes them; None if an object is gone."""
+    return f"{known[a][1]} {known[b][1]}" if a in known and b in known else None
+
+
+def accepted(row: PairRow, known: Known) -> str | None:
+    """Why a pair is accepted; None where it is not, or a shape has changed since."""
+    return row.because if row.shapes == shapes_of(known, row.a, row.b) else None
+
+
+def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
+    """A kept pair as it is told."""
+    because = accepted(row, known)
+    a_name, b_name = (known[i][0] if i in known else None for i in (row.a, row.b))
+    return Clash(
+        row.a, row.b, a_name, b_name, "apart" if status == "gone" else row.kind, row.at_least,
+        row.at_most, row.place,
+        "accepted" if because is not None and status != "gone" else status, because,
+    )  # fmt: skip
 
 
 @dataclass(frozen=True)
 class Clashes:
     """Result of a search.
 
-    pairs : the gravest first, and the deepest or nearest of each kind; measured, kept : numbers of
-    pairs of near boxes that were measured now, or were known; left : not looked at, since the time
-    was over or an object was written meanwhile; within, contact : metres; revision : of the
-    database that was read; elapsed : seconds; is_kept : whether the database keeps what was found.
+    told : pairs of objects that were looked at; rest : rows of all other pairs, which are as the
+    last call has told them; known : all objects; measured, kept : numbers of pairs of near boxes
+    that were measured now, or were known; left : not looked at, since the time was over or an
+    object was written meanwhile; within, contact : metres; revision : of the database that was
+    read; elapsed : seconds; is_kept : whether the database keeps what was found.
     """
 
-    pairs: tuple[Clash, ...]
+    told: tuple[Clash, ...]
+    rest: KeptPairs
+    known: Known
     measured: int
     kept: int
     left: int
@@ -80,6 +106,13 @@ class Clashes:
     elapsed: float
     is_kept: bool
 
+    @cached_property
+    def pairs(self) -> tuple[Clash, ...]:
+        """All pairs, the gravest first, and the deepest or nearest of each kind."""
+        # when they are asked for: that takes as long as a search after one change (make clashes)
+        rest = (clash_of(row, "same", self.known) for row in self.rest if row.kind != "far")
+        return tuple(sorted((*self.told, *rest), key=gravity))
+
     def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
         """Pairs of some kinds, and what was not looked at; without accepted and gone ones."""
         return tuple(
@@ -88,7 +121,8 @@ class Clashes:
 
     def counts(self) -> dict[str, int]:
         """How many pairs are of each kind, those that are gone left out."""
-        found = Counter(one.kind for one in self.pairs if one.status != "gone")
+        found = Counter[str](row[2] for row in self.rest.rows)
+        found.update(one.kind for one in self.told if one.status != "gone")
         return {kind: found[kind] for kind in GRAVITY}
 
     def statuses(self) -> dict[str, int]:

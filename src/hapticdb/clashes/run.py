@@ -8,7 +8,7 @@ measured, so a call that was stopped goes on where it was.
 
 import time
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import closing, contextmanager
+from contextlib import closing
 from functools import partial
 from typing import NamedTuple
 
@@ -16,8 +16,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.clashes.judge import Judged, PlacedPair, judge_placed
-from hapticdb.clashes.near import near_pairs
-from hapticdb.clashes.result import Clash, Clashes, gravity
+from hapticdb.clashes.near import FEW, near_pairs
+from hapticdb.clashes.result import Clash, Clashes, Known, accepted, clash_of, shapes_of
 from hapticdb.clashes.shapes import Shapes
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
@@ -26,7 +26,7 @@ from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words, find_objects
-from hapticdb.store.pairs import PairRow, Status
+from hapticdb.store.pairs import Mark, Outlines, PairRow, Status
 
 Floats = NDArray[np.float64]
 ClashCallback = Callable[[int, int], object]
@@ -99,11 +99,12 @@ def find_clashes(
         )
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"a search of {seconds} seconds: give more than 0")
-    make_ready("clashes")
     began = time.monotonic()
     until = np.inf if seconds is None else began + seconds
     asked = _Asked(within, contact, tuple(of), tuple(against), until, budget, progress)
     with connected(on) as workers:
+        if workers is None:
+            make_ready("clashes")
         return _Search(env, asked, workers).found(began)
 
 
@@ -120,7 +121,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     if because is not None and not because.strip():
         raise UsageError("an empty reason: say why the pair is accepted")
     ones, others = ({obj.id: obj for obj in find_objects(env.store, words)} for words in (a, b))
-    known = ones | others
+    known = {obj.id: (obj.name, obj.digest) for obj in (ones | others).values()}
     rows = [
         row
         for row in env.store.pairs()
@@ -130,7 +131,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     if not rows:
         raise UsageError("no pair between these objects is known: run 'hapticdb clashes' first")
     for row in rows:
-        shapes = None if because is None else _shapes(known[row.a], known[row.b])
+        shapes = None if because is None else shapes_of(known, row.a, row.b)
         env.store.accept_pair(row.a, row.b, because, shapes)
     return rows
 
@@ -164,47 +165,67 @@ class _Search:
         self._wrote = time.monotonic()
         self._shapes = Shapes(store, asked.budget)
         self._setting = asked.setting
+        self._mark: Mark | None = None  # as this search has read or left it; None if it is another
+        self._known: Known = {}
 
     def found(self, began: float) -> Clashes:
         """Search."""
-        with self._store.snapshot():
-            revision = self._store.revision()
-            objects = self._store.objects()
-            rows = {(row.a, row.b): row for row in self._store.pairs()}
-            chosen = [
-                {obj.id for obj in find_objects(self._store, words)} if words else None
-                for words in (self._asked.of, self._asked.against)
-            ]
-        masks = [
-            np.array([ids is None or obj.id in ids for obj in objects], dtype=np.bool_)
-            for ids in chosen
-        ]
-        near = near_pairs(objects, self._asked.within, masks[0], masks[1])
-        known = np.array([(obj.id, obj.revision) for obj in objects], dtype=np.int64)
-        ids, written = known.reshape(-1, 2).T
-        keys: list[tuple[int, int]] = list(map(tuple, ids[near].tolist()))
-        newest = written[near].max(axis=1, initial=0).tolist()
-        looked = {
-            key
-            for key, later in zip(keys, newest, strict=True)
-            if self._is_fresh(rows.get(key), later)
-        }
-        n_kept = len(looked)
-        by_id = {obj.id: obj for obj in objects}
-        stale = [(by_id[a], by_id[b]) for a, b in keys if (a, b) not in looked]
-        shown = {key: row for key, row in rows.items() if _is_asked(*key, *chosen)}
-        with self._keeping():
+        store, asked = self._store, self._asked
+        with store.snapshot():
+            revision, kept, outlines = store.revision(), store.pairs(), store.outlines()
+            of, against = (
+                {obj.id for obj in find_objects(store, words)} if words else None
+                for words in (asked.of, asked.against)
+            )
+            self._mark, is_whole = kept.mark, of is None and against is None
+            if is_whole and (of := self._changed(revision)) is not None:
+                kept, rest = kept.parted(of)
+            else:
+                rest, kept = kept.parted(())
+            rows = {(row.a, row.b): row for row in kept}
+            near = self._near(outlines, of, against)
+            looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
+            keys = [key for key in near if key not in looked]
+            by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}
+        n_kept = len(looked) + len(rest.rows)
+        known = zip(outlines.names, outlines.digests, strict=True)
+        self._known = dict(zip(outlines.ids.tolist(), known, strict=True))
+        stale = [(by_id[a], by_id[b]) for a, b in keys]
+        shown = {key: row for key, row in rows.items() if _is_asked(*key, of, against)}
+        try:
             for row in self._measured(stale, rows, revision):
                 shown[row.a, row.b] = row
                 looked.add((row.a, row.b))
-        left = [pair for pair in stale if _key(*pair) not in looked]
-        told = self._told(by_id, shown, looked, left)
-        self._settle(shown, looked, left, by_id)
+        finally:  # of an error or an interrupt, too
+            self._write()
+        left = [key for key in keys if key not in looked]
+        told = tuple(self._told(shown, looked, left))
+        if not left:
+            self._settle(shown, looked, Mark(self._setting, revision) if is_whole else None)
         return Clashes(
-            tuple(sorted(told, key=gravity)), len(stale) - len(left), n_kept, len(left),
-            self._asked.within, self._asked.contact, revision,
-            time.monotonic() - began, self._is_kept,
+            told, rest, self._known, len(keys) - len(left), n_kept, len(left), asked.within,
+            asked.contact, revision, time.monotonic() - began, self._is_kept,
         )  # fmt: skip
+
+    def _changed(self, revision: int) -> set[int] | None:
+        """Objects written since the table had all pairs; None where anything may be missing."""
+        setting, since = self._mark or Mark()
+        if setting != self._setting or not 0 <= revision - since <= FEW:
+            return None
+        return {change.id for change in self._store.changes(since)}
+
+    def _near(
+        self, outlines: Outlines, of: set[int] | None, against: set[int] | None
+    ) -> dict[tuple[int, int], int]:
+        """Keys of pairs of near boxes that are asked for, and the later revision of both."""
+        ids, written = outlines.ids, outlines.revisions
+        is_of, is_against = (
+            np.ones(len(ids), dtype=np.bool_) if some is None else np.isin(ids, list(some))
+            for some in (of, against)
+        )
+        near = near_pairs(outlines.bounds, self._asked.within, is_of, is_against)
+        newest = written[near].max(axis=1, initial=0).tolist()
+        return dict(zip(map(tuple, ids[near].tolist()), newest, strict=True))
 
     def _is_fresh(self, row: PairRow | None, newest: int) -> bool:
         return row is not None and row.revision >= newest and row.setting == self._setting
@@ -218,9 +239,8 @@ class _Search:
         """Measure pairs, and keep each; leaves out what was written meanwhile."""
         alike: dict[object, list[tuple[Object, Object]]] = {}
         placed = []
-        for one, other in stale:
-            (a, world_from_a), (b, world_from_b) = map(self._shapes.placement, (one, other))
-            pose = _rounded(_inverse(world_from_a) @ world_from_b)
+        for (one, other), pose in zip(stale, self._poses(stale), strict=True):
+            a, b = (self._shapes.placement(obj)[0] for obj in (one, other))
             group = alike.setdefault((a, b, pose.tobytes()), [])
             if not group:
                 placed.append(PlacedPair(one, other, pose))
@@ -239,6 +259,21 @@ class _Search:
                         self._write()
                 if self._asked.progress is not None:
                     self._asked.progress(n_done, len(stale))
+
+    def _poses(self, pairs: Sequence[tuple[Object, Object]]) -> Floats:
+        """Poses (P, 4, 4) of second shapes in the frames of the first, rounded to `ROUNDING`.
+
+        So equal shapes that are placed alike are the same pair everywhere.
+        """
+        world_from_a, world_from_b = (
+            np.array([self._shapes.placement(pair[n])[1] for pair in pairs]).reshape(-1, 4, 4)
+            for n in (0, 1)
+        )
+        back = np.zeros_like(world_from_a)
+        back[:, 3, 3] = 1.0
+        back[:, :3, :3] = world_from_a[:, :3, :3].transpose(0, 2, 1)
+        back[:, :3, 3:] = -back[:, :3, :3] @ world_from_a[:, :3, 3:]
+        return np.asarray(np.round(back @ world_from_b / ROUNDING) * ROUNDING + 0.0)
 
     def _row(self, one: Object, other: Object, judged: Judged, revision: int) -> PairRow:
         """What the table keeps of a pair."""
@@ -274,19 +309,12 @@ class _Search:
                 if time.monotonic() > asked.until:
                     return
 
-    @contextmanager
-    def _keeping(self) -> Iterator[None]:
-        """Write what was measured, also when the block ends by an error or an interrupt."""
-        try:
-            yield
-        finally:
-            self._write()
-
-    def _write(self, gone: Sequence[tuple[int, int]] = ()) -> None:
-        """Write the rows that wait, if this user may."""
-        if self._is_kept and (self._waiting or gone):
+    def _write(self, gone: Sequence[tuple[int, int]] = (), mark: Mark | None = None) -> None:
+        """Write the rows that wait, and the mark of a table with all pairs, if this user may."""
+        is_new = mark is not None and self._mark not in {mark, None}
+        if self._is_kept and (self._waiting or gone or is_new):
             try:
-                self._store.put_pairs(self._waiting, gone)
+                self._mark = self._store.put_pairs(self._waiting, gone, self._mark, mark)
             except ReadOnlyError:
                 self._is_kept = False
         self._waiting = []
@@ -294,14 +322,12 @@ class _Search:
 
     def _told(
         self,
-        by_id: dict[int, Object],
         shown: dict[tuple[int, int], PairRow],
         looked: set[tuple[int, int]],
-        left: Sequence[tuple[Object, Object]],
+        left: Sequence[tuple[int, int]],
     ) -> Iterator[Clash]:
         """Pairs as they are told: looked at, gone since the last call, and not looked at."""
-        names = {i: obj.name for i, obj in by_id.items()}
-        waiting = {_key(*pair) for pair in left}
+        waiting = set(left)
         for key, row in shown.items():
             status: Status = row.status
             if key not in looked:
@@ -310,28 +336,18 @@ class _Search:
                 status = "gone"
             elif row.kind == "far" and status != "gone":
                 continue
-            because = _accepted(row, by_id)
-            yield Clash(
-                *key, names.get(row.a), names.get(row.b),
-                "apart" if status == "gone" else row.kind, row.at_least, row.at_most, row.place,
-                "accepted" if because is not None and status != "gone" else status, because,
-            )  # fmt: skip
-        for one, other in left:
-            yield Clash(
-                one.id, other.id, one.name, other.name, "not known", 0.0, None, None,
-                "not looked at",
-            )  # fmt: skip
+            yield clash_of(row, status, self._known)
+        for a, b in left:
+            names = self._known[a][0], self._known[b][0]
+            yield Clash(a, b, *names, "not known", 0.0, None, None, "not looked at")
 
     def _settle(
         self,
         shown: dict[tuple[int, int], PairRow],
         looked: set[tuple[int, int]],
-        left: Sequence[tuple[Object, Object]],
-        by_id: dict[int, Object],
+        mark: Mark | None,
     ) -> None:
         """Note that statuses were told: what is new now is the same next time."""
-        if left:
-            return
         self._waiting = [
             shown[key]._replace(status="same") for key in looked if shown[key].status != "same"
         ]
@@ -339,11 +355,11 @@ class _Search:
         for key, row in shown.items():
             if key in looked:
                 continue
-            if _accepted(row, by_id) is not None:
+            if accepted(row, self._known) is not None:
                 self._waiting.append(row._replace(kind="far", status="same"))
             else:
                 gone.append(key)
-        self._write(gone)
+        self._write(gone, mark)
 
 
 def _piece(
@@ -359,31 +375,12 @@ def _piece(
         return [work(shapes, one) for one in placed]
 
 
-def _key(one: Object, other: Object) -> tuple[int, int]:
-    return one.id, other.id
-
-
 def _is_asked(a: int, b: int, of: set[int] | None, against: set[int] | None) -> bool:
     """Whether one object is of the first, and the other of the second; None is of all."""
     return any(
         (of is None or one in of) and (against is None or other in against)
         for one, other in ((a, b), (b, a))
     )
-
-
-def _shapes(one: Object, other: Object) -> str:
-    """Both shapes, as an acceptance notes them."""
-    return f"{one.digest} {other.digest}"
-
-
-def _accepted(row: PairRow, by_id: dict[int, Object]) -> str | None:
-    """Why a pair is accepted; None where it is not, or a shape has changed since."""
-    if row.because is None:
-        return None
-    one, other = by_id.get(row.a), by_id.get(row.b)
-    if one is None or other is None or row.shapes != _shapes(one, other):
-        return None
-    return row.because
 
 
 def _compared(row: PairRow, old: PairRow | None) -> PairRow:
@@ -405,20 +402,5 @@ def _compared(row: PairRow, old: PairRow | None) -> PairRow:
 def _is_same(row: PairRow, old: PairRow) -> bool:
     if row.kind != old.kind or (row.at_most is None) != (old.at_most is None):
         return False
-    now, before = (
-        np.array([one.at_least, one.at_most or 0.0], dtype=np.float64) for one in (row, old)
-    )
-    return bool((np.abs(now - before) <= SAME).all())
-
-
-def _rounded(pose: Floats) -> Floats:
-    """A pose to `ROUNDING`, so that equal shapes placed alike are the same pair everywhere."""
-    return np.asarray(np.round(pose / ROUNDING) * ROUNDING + 0.0)
-
-
-def _inverse(pose: Floats) -> Floats:
-    """Inverse of a rigid pose (4, 4)."""
-    back = np.eye(4)
-    back[:3, :3] = pose[:3, :3].T
-    back[:3, 3] = -back[:3, :3] @ pose[:3, 3]
-    return back
+    moved = row.at_least - old.at_least, (row.at_most or 0.0) - (old.at_most or 0.0)
+    return all(abs(length) <= SAME for length in moved)

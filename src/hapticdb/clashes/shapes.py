@@ -108,7 +108,7 @@ class Shapes:
     def _read(self, obj: Object, linear: Floats) -> BuiltShape | None:
         packed = self._store.surfaces([obj.digest]).get(obj.digest)
         if packed is None:
-            if all(now.digest != obj.digest for now in self._store.objects() if now.id == obj.id):
+            if all(now.digest != obj.digest for now in self._store.objects([obj.id])):
                 return None
             raise no_surface(self._store.url, obj)
         part = unpacked_part(self._store.url, obj, packed)

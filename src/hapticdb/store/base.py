@@ -1,6 +1,6 @@
 """What an engine does for an opened environment: the protocol `Store`, and what crosses it."""
 
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from dataclasses import dataclass, field
 from typing import Literal, NamedTuple, Protocol, get_args, runtime_checkable
@@ -294,8 +294,8 @@ class _ReadsObjects(Protocol):
     def version(self) -> int:
         """Give a number that differs when the last read may have seen another revision."""
 
-    def objects(self) -> list[Object]:
-        """All objects, ordered by id."""
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
+        """All objects, or those of some ids that are there, ordered by id."""
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""

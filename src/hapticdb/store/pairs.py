@@ -1,7 +1,11 @@
 """Pairs of objects as the table `pair` keeps them, and what a store does with them."""
 
-from collections.abc import Sequence
-from typing import Literal, NamedTuple, Protocol, get_args
+import os
+from collections.abc import Callable, Container, Iterator, Sequence
+from typing import Any, Literal, NamedTuple, Protocol, get_args
+
+import numpy as np
+from numpy.typing import NDArray
 
 Kind = Literal["apart", "touching", "overlapping", "inside", "not known", "far"]
 Status = Literal["new", "gone", "changed", "same"]
@@ -10,14 +14,18 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 
 COLUMNS = "a, b, kind, at_least, at_most, a_x, a_y, a_z, b_x, b_y, b_z, status, revision, setting"
 """Columns of the table `pair` that a measurement writes."""
-UNLESS_LATER = """
+ALL = f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b"
+PUT = f"""
+INSERT INTO pair ({COLUMNS}) {{values}}
     ON CONFLICT (a, b) DO UPDATE
    SET kind = excluded.kind, at_least = excluded.at_least, at_most = excluded.at_most,
        a_x = excluded.a_x, a_y = excluded.a_y, a_z = excluded.a_z, b_x = excluded.b_x,
        b_y = excluded.b_y, b_z = excluded.b_z, status = excluded.status,
        revision = excluded.revision, setting = excluded.setting
  WHERE excluded.revision >= pair.revision"""
-"""End of the statement, in each engine's dialect, that writes rows."""
+"""Writes rows, given as each engine gives values."""
+MARK = (0, 1)
+"""Key of the row that is no pair but the mark. No object has the id 0."""
 
 
 class PairRow(NamedTuple):
@@ -49,16 +57,84 @@ class PairRow(NamedTuple):
         return (*self[:5], *self.place, *self[6:9])
 
 
+class Mark(NamedTuple):
+    """What the table is, so that a search need not look at pairs of unchanged objects again.
+
+    After a search of everything, alone from its reading to its end: the setting and the revision
+    of which the table has all pairs of near boxes. Otherwise a setting that nobody has given.
+    """
+
+    setting: str = ""
+    revision: int = 0
+
+    @classmethod
+    def after(
+        cls, found: Sequence[tuple[str, int]], was: "MaybeMark", now: "MaybeMark"
+    ) -> tuple["MaybeMark", PairRow]:
+        """What `put_pairs` returns, and the row that it writes; found : the mark's row, or none."""
+        held = cls(*found[0]) if found else cls()
+        mark = now if now is not None and held == was else cls(f"written {os.urandom(8).hex()}")
+        row = PairRow(*MARK, "far", 0.0, None, (0.0,) * 6, "same", mark.revision, mark.setting)
+        return (mark if held == was else None), row
+
+
+MaybeMark = Mark | None
+Ids = Sequence[tuple[int, int]]
+"""Ids of pairs, the lesser one first."""
+
+
+class KeptPairs:
+    """Rows of the table, read together, and each checked when it is asked for.
+
+    rows : as the engine gave them, ordered by a and b: `COLUMNS`, because and shapes; checked :
+    makes a `PairRow` of one, or raises `DamagedError`.
+    """
+
+    def __init__(
+        self, rows: Sequence[Sequence[Any]], checked: Callable[[Sequence[Any]], PairRow]
+    ) -> None:
+        has_mark = bool(rows) and rows[0][0] == MARK[0]
+        row = checked(rows[0]) if has_mark else None
+        self.mark = Mark() if row is None else Mark(row.setting, row.revision)
+        self.rows, self._checked = rows[has_mark:], checked
+
+    def __iter__(self) -> Iterator[PairRow]:
+        return map(self._checked, self.rows)
+
+    def parted(self, ids: Container[int]) -> tuple["KeptPairs", "KeptPairs"]:
+        """Rows of pairs that one of these objects is in, and the other rows."""
+        some = [row for row in self.rows if row[0] in ids or row[1] in ids]
+        others = [row for row in self.rows if row[0] not in ids and row[1] not in ids]
+        return KeptPairs(some, self._checked), KeptPairs(others, self._checked)
+
+
+class Outlines(NamedTuple):
+    """What is short of O objects: names, digests, ids and revisions (O,), bounds (O, 2, 3)."""
+
+    names: Sequence[str]
+    digests: Sequence[str]
+    ids: NDArray[np.int64]
+    revisions: NDArray[np.int64]
+    bounds: NDArray[np.float64]
+
+
 class KeepsPairs(Protocol):
     """Keeps what was found about pairs of objects. It changes no revision."""
 
-    def pairs(self) -> list[PairRow]:
-        """All rows, ordered by a and b."""
+    def outlines(self) -> Outlines:
+        """What is short of all objects, ordered by id, a twentieth of the time of `objects`."""
 
-    def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
-        """Write rows and delete others, in one transaction.
+    def pairs(self) -> KeptPairs:
+        """All rows, and the mark, in one statement."""
+
+    def put_pairs(
+        self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
+    ) -> MaybeMark:
+        """Delete rows and write others, in one transaction.
 
         Rows of a later revision than a given one stay, and so does what `accept_pair` has written.
+        The mark becomes `now` if it is `was`, and else, or without `now`, one that is new. Returns
+        what it became if it was `was`: then nobody else has written since that was read.
         """
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:

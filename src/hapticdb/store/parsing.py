@@ -28,7 +28,7 @@ from hapticdb.store.base import (
     Object,
     Rows,
 )
-from hapticdb.store.pairs import KINDS, STATUSES, PairRow
+from hapticdb.store.pairs import KINDS, STATUSES, Outlines, PairRow
 
 KEY_END = 1 << 63
 """One above the largest count or key that an int64 holds."""
@@ -194,6 +194,25 @@ def object_of(url: str, row: Sequence[Any]) -> Object:
         rows_crc=_crc_of(known.get(ROWS_CRC)),
         distances_crc=_crc_of(known.get(DISTANCES_CRC)),
     )
+
+
+def outlines_of(url: str, rows: Sequence[Sequence[Any]]) -> Outlines:
+    """Read what is short of objects: name, digest, id, revision, bounds as bytes or as a list."""
+    names, digests, ids, revisions, bounds = zip(*rows, strict=True) if rows else ((),) * 5
+    try:
+        if set(map(type, (*ids, *revisions))) - {int} or set(map(type, (*names, *digests))) - {str}:
+            raise TypeError  # noqa: TRY301 - told below
+        numbers = np.array((ids, revisions), dtype=np.int64)
+        if set(map(type, bounds)) == {bytes} and set(map(len, bounds)) == {48}:
+            boxes = np.frombuffer(b"".join(bounds), dtype="<f8")
+        else:
+            boxes = np.array(bounds, dtype=np.float64)
+        boxes = boxes.reshape(-1, 2, 3)
+        if not (boxes[:, 0] <= boxes[:, 1]).all() or not np.isfinite(boxes).all():
+            raise ValueError  # noqa: TRY301 - told below
+    except (TypeError, ValueError, OverflowError):
+        raise damaged(url, "names, digests, ids, revisions or bounds of its objects") from None
+    return Outlines(names, digests, numbers[0], numbers[1], boxes)
 
 
 def change_of(url: str, row: Sequence[Any]) -> Change:

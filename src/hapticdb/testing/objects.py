@@ -44,6 +44,20 @@ class ObjectsContract(StoreCase):
             first.bounds, voxel_object(store.grid, blob(1, (20, 20, 20))).bounds
         )
 
+    def test_some_objects_and_outlines_are_those_of_all(self, store: Store) -> None:
+        """Ids that no object has are passed over; an empty environment has empty outlines."""
+        objects = store.objects()
+        assert [obj.name for obj in store.objects([7, 2])] == ["two"]
+        assert store.objects([]) == []
+        found = store.outlines()
+        assert list(found.names) == [obj.name for obj in objects]
+        assert list(found.digests) == [obj.digest for obj in objects]
+        assert found.ids.tolist() == [obj.id for obj in objects]
+        assert found.revisions.tolist() == [obj.revision for obj in objects]
+        np.testing.assert_array_equal(found.bounds, [obj.bounds for obj in objects])
+        none = self.make(store.grid, store.layout, "fresh").outlines()
+        assert (len(none.names), none.ids.shape, none.bounds.shape) == (0, (0,), (0, 2, 3))
+
     def test_the_same_part_is_not_written_twice(self, store: Store) -> None:
         """Link and name are a part's identity; the failed write leaves nothing."""
         before = store.size().rows

@@ -195,8 +195,8 @@ class ClashPanel:
             self._browser.tell("Done", said, is_good=True)
             if self._found is not None:
                 now = one._replace(status="accepted" if reason else "same", because=reason)
-                pairs = tuple(now if old is one else old for old in self._found.pairs)
-                self._found = replace(self._found, pairs=pairs)
+                told = tuple(now if old is one else old for old in self._found.pairs)
+                self._found = replace(self._found, told=told, rest=self._found.rest.parted(())[0])
                 self._fill()
                 self._choose(now)
 

@@ -57,6 +57,7 @@ class PostgresStore:
         self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.version, self.revision = reader.version, reader.revision
         self.objects, self.object = reader.objects, reader.object
+        self.outlines = reader.outlines
         self.removed, self.changes = reader.removed, reader.changes
         self.surfaces, self.surface_digests = reader.surfaces, reader.surface_digests
         watch = Watch(connection, self.identity)

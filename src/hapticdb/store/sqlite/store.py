@@ -42,6 +42,7 @@ class SQLiteStore:
         self.rows_after = reader.rows_after
         self.statement, self.statement_hits = reader.statement, reader.statement_hits
         self.objects, self.object = reader.objects, reader.object
+        self.outlines = reader.outlines
         self.removed, self.changes = reader.removed, reader.changes
         self.surfaces, self.surface_digests = reader.surfaces, reader.surface_digests
         writer = SQLiteWriter(connection, self.grid, self.layout, reader)

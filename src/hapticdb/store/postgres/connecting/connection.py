@@ -117,9 +117,16 @@ class ServerConnection(Link):
 
         return self.again(read)
 
-    def rows(self, text: str, parameters: Sequence[Any] = ()) -> list[tuple[Any, ...]]:
-        """All rows of a statement as Python values: for statements outside frames."""
-        return self.again(lambda: self.execute(text, parameters).fetchall())
+    def rows(
+        self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
+    ) -> list[tuple[Any, ...]]:
+        """All rows of a statement as Python values: for statements outside frames.
+
+        binary : whether they come as the server holds them, which is faster for bytes and doubles.
+        """
+        return self.again(
+            lambda: self.driver.execute(text, parameters or None, binary=binary).fetchall()
+        )
 
     def execute(
         self, text: str | sql.Composed, parameters: Sequence[Any] = ()

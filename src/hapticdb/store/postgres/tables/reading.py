@@ -1,6 +1,6 @@
 """Reads on a server: rows by key and by range, the paper's Figure 3, objects, changes."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ from hapticdb.store.base import (
     no_rows,
     row_shift,
 )
+from hapticdb.store.pairs import Outlines
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
@@ -165,20 +166,28 @@ class PostgresReader:
 
     # -- objects --------------------------------------------------------------------------------
 
-    def objects(self) -> list[Object]:
-        """All objects, ordered by id."""
-        self.revision()  # first: a write between the two statements is noticed by the next read
-        return [
-            parsing.object_of(self._url, row)
-            for row in self._connection.rows(f"{OBJECTS} ORDER BY id")
-        ]
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
+        """All objects, or those of some ids that are there, ordered by id."""
+        if ids is None:
+            self.revision()  # first: the next read notices a write between the two statements
+            found = self._connection.rows(f"{OBJECTS} ORDER BY id")
+        else:
+            found = self._connection.rows(f"{OBJECTS} WHERE id = ANY (%s) ORDER BY id", [list(ids)])
+        return [parsing.object_of(self._url, row) for row in found]
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
-        rows = self._connection.rows(f"{OBJECTS} WHERE id = %s", (object_id,))
-        if not rows:
+        found = self.objects([object_id])
+        if not found:
             raise no_object(object_id, self._url)
-        return parsing.object_of(self._url, rows[0])
+        return found[0]
+
+    def outlines(self) -> Outlines:
+        """What is short of all objects, ordered by id."""
+        found = self._connection.rows(
+            "SELECT name, digest, id, revision, bounds FROM object ORDER BY id", binary=True
+        )
+        return parsing.outlines_of(self._url, found)
 
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
@@ -199,11 +208,8 @@ class PostgresReader:
         if not self.has_table(parsing.SURFACE):
             return {}
         text = "SELECT digest, geometry FROM surface WHERE digest = ANY (%s)"
-
-        def read() -> list[tuple[object, ...]]:
-            return self._connection.driver.execute(text, (list(digests),), binary=True).fetchall()
-
-        return parsing.surfaces_of(self._url, self._connection.again(read))
+        found = self._connection.rows(text, (list(digests),), binary=True)
+        return parsing.surfaces_of(self._url, found)
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""

@@ -1,15 +1,16 @@
 """The table `pair` in a file."""
 
 from collections.abc import Sequence
+from functools import partial
 
 from hapticdb.store import parsing
-from hapticdb.store.pairs import COLUMNS, UNLESS_LATER, PairRow
+from hapticdb.store.pairs import ALL, MARK, PUT, Ids, KeptPairs, Mark, MaybeMark, PairRow
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 
-PUT = f"""
-INSERT INTO pair ({COLUMNS}) VALUES (?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?, ?)
-{UNLESS_LATER}"""
+PUT_EACH = PUT.format(values=f"VALUES ({', '.join('?' * 14)})")
+HELD = "SELECT setting, revision FROM pair WHERE (a, b) = (?, ?)"
+DELETE = "DELETE FROM pair WHERE (a, b) = (?, ?)"
 
 
 class SQLitePairs:
@@ -18,18 +19,23 @@ class SQLitePairs:
     def __init__(self, connection: FileConnection, reader: SQLiteReader) -> None:
         self._connection, self._reader = connection, reader
 
-    def pairs(self) -> list[PairRow]:
-        """All rows, ordered by a and b."""
-        if not self._reader.has_table(parsing.PAIR):
-            return []
-        found = self._connection.fetch(f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b")
-        return [parsing.pair_of(self._connection.url, row) for row in found]
+    def pairs(self) -> KeptPairs:
+        """All rows, and the mark, in one statement."""
+        found = []
+        if self._reader.has_table(parsing.PAIR):
+            found = self._connection.fetch(ALL)
+        return KeptPairs(found, partial(parsing.pair_of, self._connection.url))
 
-    def put_pairs(self, rows: Sequence[PairRow], gone: Sequence[tuple[int, int]] = ()) -> None:
-        """Write rows, unless a later revision's are there, and delete others."""
+    def put_pairs(
+        self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
+    ) -> MaybeMark:
+        """Delete rows, write others unless a later revision's are there, and set the mark."""
         with self._connection.writing():
-            self._connection.driver.executemany(PUT, [row.columns for row in rows])
-            self._connection.driver.executemany("DELETE FROM pair WHERE (a, b) = (?, ?)", gone)
+            held = self._connection.fetch(HELD, MARK)
+            mark, row = Mark.after(held, was, now)
+            self._connection.driver.executemany(DELETE, [*gone, MARK])
+            self._connection.driver.executemany(PUT_EACH, [one.columns for one in (*rows, row)])
+        return mark
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
         """Note why a pair is accepted, and the shapes of both."""

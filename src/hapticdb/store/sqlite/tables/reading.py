@@ -7,7 +7,7 @@ Python's own.
 """
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from typing import Any
 
 import apsw
@@ -27,12 +27,16 @@ from hapticdb.store.base import (
     no_rows,
     row_shift,
 )
+from hapticdb.store.pairs import Outlines
 from hapticdb.store.refusals import no_object
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.sqlite.tables.ranges import COLUMNS, TABLES, RangeStatements
 
+OBJECTS = (
+    "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision FROM object"
+)
 HAS_TABLE = "SELECT count(*) FROM sqlite_master WHERE name = ? AND type = 'table'"
 LOOKUP: dict[Table, str] = {
     table: f"""
@@ -175,27 +179,28 @@ class SQLiteReader:
 
     # -- objects --------------------------------------------------------------------------------
 
-    def objects(self) -> list[Object]:
-        """All objects, ordered by id."""
-        return self._objects("TRUE")
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
+        """All objects, or those of some ids that are there, ordered by id."""
+        self._connection.file.check()
+        some = "" if ids is None else "WHERE id IN (SELECT value FROM json_each(?))"
+        bindings = [] if ids is None else [json.dumps(list(ids))]
+        found = self._connection.fetch(f"{OBJECTS} {some} ORDER BY id", bindings)
+        return [parsing.object_of(self._connection.url, row) for row in found]
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
-        found = self._objects("id = ?", object_id)
+        found = self.objects([object_id])
         if not found:
             raise no_object(object_id, self._connection.url)
         return found[0]
 
-    def _objects(self, condition: str, *bindings: int) -> list[Object]:
+    def outlines(self) -> Outlines:
+        """What is short of all objects, ordered by id."""
         self._connection.file.check()
-        return [
-            parsing.object_of(self._connection.url, row)
-            for row in self._connection.fetch(
-                "SELECT id, name, link, digest, transform, voxels, bounds, attributes, revision "
-                f"FROM object WHERE {condition} ORDER BY id",
-                bindings,
-            )
-        ]
+        found = self._connection.fetch(
+            "SELECT name, digest, id, revision, bounds FROM object ORDER BY id"
+        )
+        return parsing.outlines_of(self._connection.url, found)
 
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""

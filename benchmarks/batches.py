@@ -41,7 +41,6 @@ MODEL = "assembly_vw_t1/vw_t1.glb"
 BITS, EXTENT = 11, 1.6
 """Grid: bits an axis, and its edge as a multiple of the model's longest side."""
 POINTS = (300, 10_000, 100_000)
-SITUATIONS = ("free", "near", "touching")
 NEAR = 8.0
 """Voxels: a tool is near if it is no farther away and does not touch."""
 REACH = 32.0

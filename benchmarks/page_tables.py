@@ -180,17 +180,6 @@ def fits(results: Results) -> str:
     return table([*head, "on the axis, N", "beside it, N"], rows)
 
 
-def partitions(results: Results) -> str:
-    """Milliseconds of each job, and how many times as long as on one server."""
-    cells = results["partitions"]["cells"]
-    jobs = list(cells[0]["ms"])
-    rows = [
-        [one["rows"], *(f"{us_text(one['ms'][job])} ({one['ratio'][job]:.1f})" for job in jobs)]
-        for one in cells
-    ]
-    return table(["rows on", *(f"{job}, ms" for job in jobs)], rows)
-
-
 # --- pages ----------------------------------------------------------------------------------------
 
 
@@ -227,7 +216,6 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "ways-out": ways_out,
         "fits": fits,
         "scale-ahead": scale_ahead,
-        "partitions": partitions,
         "feel": lambda results: table_of(results["feel"]["cells"]),
         "walls": lambda results: walls_of(results["feel"]["cells"]),
         "feel-conditions": lambda results: facts(results["feel"]),

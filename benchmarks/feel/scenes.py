@@ -85,13 +85,3 @@ def convex_edge(axes: Floats) -> Scene:
         quad([[0.0, -h, -h], [0.0, h, -h], [0.0, h, 0.0], [0.0, -h, 0.0]]),
     ]
     return _scene("convex edge", found, axes, h)
-
-
-def concave_corner(axes: Floats) -> Scene:
-    """A corner of 90 degrees along y: free where x > 0 and z > 0."""
-    h = HALF
-    found = [
-        quad([[0.0, -h, 0.0], [h, -h, 0.0], [h, h, 0.0], [0.0, h, 0.0]]),
-        quad([[0.0, -h, 0.0], [0.0, h, 0.0], [0.0, h, h], [0.0, -h, h]]),
-    ]
-    return _scene("concave corner", found, axes, h)

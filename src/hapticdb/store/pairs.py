@@ -24,6 +24,7 @@ INSERT INTO pair ({COLUMNS}) {{values}}
        revision = excluded.revision, setting = excluded.setting
  WHERE excluded.revision >= pair.revision"""
 """Writes rows, given as each engine gives values."""
+HELD = "SELECT setting, revision FROM pair WHERE (a, b) = (%s, %s)"
 MARK = (0, 1)
 """Key of the row that is no pair but the mark. No object has the id 0."""
 

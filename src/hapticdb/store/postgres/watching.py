@@ -18,7 +18,6 @@ import time
 import psycopg
 from psycopg import sql
 
-from hapticdb.errors import ConnectionLostError
 from hapticdb.store.postgres.address import LONGEST_NAME
 from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -107,9 +106,7 @@ class Watch:
         before, self._is_hinted = self._revision, False
         found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:
-            raise ConnectionLostError(
-                f"{self._connection.shown} is another environment than before: open it again"
-            )
+            raise failures.remade(self._connection.shown)
         self._revision = wire.read_int8(found or b"")
         self._asked = time.monotonic()
         self._due = self._asked + (DEAF_S if self._is_deaf else HEARING_S)

@@ -194,6 +194,11 @@ def standby(shown: str) -> ReadOnlyError:
     )
 
 
+def remade(shown: str) -> ConnectionLostError:
+    """Build the error for an environment that was dropped and made anew."""
+    return ConnectionLostError(f"{shown} is another environment than before: open it again")
+
+
 def no_editor(shown: str) -> ReadOnlyError:
     """Build the error for a user who may write to the environment, but not to its objects."""
     return ReadOnlyError(

@@ -1,6 +1,6 @@
-"""Reads on a server: rows by key and by range, the paper's Figure 3, objects, changes."""
+"""Reads on a server: rows by key and by range, the paper's Figure 3, surfaces."""
 
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,62 +9,35 @@ from hapticdb.store import parsing
 from hapticdb.store.base import (
     NO_KEYS,
     NO_OCCUPANCY,
-    Change,
     Keys,
-    Layout,
     LocatedShell,
-    Object,
     Rows,
     Table,
     joined,
     no_rows,
     row_shift,
 )
-from hapticdb.store.pairs import Outlines
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.refusals import no_object
+from hapticdb.store.postgres.tables.asking import ServerTables
 
 MOST_BITS = 1 << 20
 """Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
 larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
-OBJECTS = (
-    "SELECT id, name, link, digest, transform, voxels, bounds, attributes::text, revision"
-    " FROM object"
-)
-HAS_TABLE = "SELECT to_regclass(%s) IS NOT NULL"
 
 
-class PostgresReader:
-    """Reads of one environment. The reader remembers the revision that its last read has seen."""
+class PostgresReader(ServerTables):
+    """Reads of one environment."""
 
-    def __init__(
-        self, connection: ServerConnection, layout: Layout, *, is_spread: bool = False
-    ) -> None:
-        self._connection = connection
-        self._sql = statements.SPREAD if is_spread else statements.ONE_SERVER
-        self._url = connection.shown
-        self._layout = layout
-        self._shift = row_shift(layout)
-        self._seen = -1
-        self._found: set[str] = set()
+    def __init__(self, connection: ServerConnection) -> None:
+        super().__init__(connection)
+        self._sql = statements.SPREAD if self._is_spread else statements.ONE_SERVER
+        self._shift = row_shift(self.layout)
         self._excluded = NO_KEYS
         self._excluded_parameters: list[wire.Parameter] = []
 
-    def version(self) -> int:
-        """The revision that the last read has seen."""
-        return self._seen
-
-    def revision(self) -> int:
-        """Number of the last committed write; 0 for an empty environment."""
-        rows = self._connection.rows("SELECT revision FROM environment WHERE id = 1")
-        self._seen = int(rows[0][0])
-        return self._seen
-
-    # -- rows -----------------------------------------------------------------------------------
-
-    def unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
+    def _unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
         """Rows from a statement's one packed row; its last value is the revision that was read."""
         seen = found[-1]
         self._seen = wire.read_int8(seen) if seen is not None else -1
@@ -75,14 +48,8 @@ class PostgresReader:
         rows = Rows(keys, ids, occupancy)
         if distances:
             lengths = wire.read_int8s(found[4])
-            rows = rows.having(parsing.band_of(self._url, found[3] or b"", lengths))
+            rows = rows.having(parsing.band_of(self.url, found[3] or b"", lengths))
         return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
-
-    def has_table(self, name: str) -> bool:
-        """Whether a table of a later format is there; another may make it at any time."""
-        if name not in self._found and self._connection.rows(HAS_TABLE, (name,)) == [(True,)]:
-            self._found.add(name)
-        return name in self._found
 
     def _read(
         self,
@@ -94,8 +61,8 @@ class PostgresReader:
         """Rows by the statement of the table that answers; none if that table is not there."""
         if is_nothing or (distances and not self.has_table(parsing.BAND)):
             return no_rows(distances=distances)
-        text = texts["band" if distances else self._layout]
-        return self.unpacked(self._connection.fetch(text, *parameters), distances=distances)
+        text = texts["band" if distances else self.layout]
+        return self._unpacked(self._connection.fetch(text, *parameters), distances=distances)
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
@@ -129,13 +96,13 @@ class PostgresReader:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
-        text = self._sql.counts[self._layout]
+        text = self._sql.counts[self.layout]
         (found,) = self._connection.fetch(text, wire.int8s(lows), wire.int8s(highs))
         return wire.read_int8(found or b"")
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
-        text = self._sql.wrench[self._layout]
+        text = self._sql.wrench[self.layout]
         parameters = wire.shell(frame)
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         (found,) = self._connection.fetch(text, *parameters)
@@ -143,7 +110,7 @@ class PostgresReader:
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
-        text = self._sql.hits[self._layout]
+        text = self._sql.hits[self.layout]
         parameters = [wire.int8s(frame.addresses)]
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
         ordinals, ids, seen = self._connection.fetch(text, *parameters)
@@ -161,62 +128,21 @@ class PostgresReader:
         leave_out = statements.without_excluded
         if len(self._excluded_parameters) == 1:
             leave_out = statements.without_few
-        text = leave_out(text, self._layout, len(parameters) + 1)
+        text = leave_out(text, self.layout, len(parameters) + 1)
         return text, [*parameters, *self._excluded_parameters]
-
-    # -- objects --------------------------------------------------------------------------------
-
-    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
-        """All objects, or those of some ids that are there, ordered by id."""
-        if ids is None:
-            self.revision()  # first: the next read notices a write between the two statements
-            found = self._connection.rows(f"{OBJECTS} ORDER BY id")
-        else:
-            found = self._connection.rows(f"{OBJECTS} WHERE id = ANY (%s) ORDER BY id", [list(ids)])
-        return [parsing.object_of(self._url, row) for row in found]
-
-    def object(self, object_id: int) -> Object:
-        """One object; raises ObjectNotFoundError when there is none of that id."""
-        found = self.objects([object_id])
-        if not found:
-            raise no_object(object_id, self._url)
-        return found[0]
-
-    def outlines(self) -> Outlines:
-        """What is short of all objects, ordered by id."""
-        found = self._connection.rows(
-            "SELECT name, digest, id, revision, bounds FROM object ORDER BY id", binary=True
-        )
-        return parsing.outlines_of(self._url, found)
 
     def removed(self, link: str) -> set[str]:
         """Names of a file's parts that were removed and are not there again."""
-        if self._connection.rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
+        if self._rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
             return set()  # the format is 2 or older, and only the owner can bring it up to date
-        return {row[0] for row in self._connection.rows("SELECT removed_parts(%s)", (link,))}
-
-    def changes(self, since: int = 0) -> Iterator[Change]:
-        """Committed writes after that revision, oldest first."""
-        for row in self._connection.rows(
-            "SELECT revision, action, id, ranges FROM change WHERE revision > %s ORDER BY revision",
-            (since,),
-        ):
-            yield parsing.change_of(self._url, row)
+        return {row[0] for row in self._rows("SELECT removed_parts(%s)", (link,))}
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
         """Packed surfaces of the digests that have one, in one statement."""
         if not self.has_table(parsing.SURFACE):
             return {}
         text = "SELECT digest, geometry FROM surface WHERE digest = ANY (%s)"
-        found = self._connection.rows(text, (list(digests),), binary=True)
-        return parsing.surfaces_of(self._url, found)
-
-    def surface_digests(self) -> set[str]:
-        """Digests of all surfaces."""
-        if not self.has_table(parsing.SURFACE):
-            return set()
-        found = self._connection.rows("SELECT digest FROM surface")
-        return parsing.digests_of(self._url, found)
+        return parsing.surfaces_of(self.url, self._rows(text, (list(digests),), binary=True))
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:

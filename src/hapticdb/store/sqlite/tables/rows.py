@@ -14,7 +14,6 @@ from hapticdb.store.base import (
     NO_OCCUPANCY,
     NO_ROWS,
     Band,
-    Object,
     Rows,
 )
 
@@ -83,14 +82,3 @@ def pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
     except (TypeError, ValueError, OverflowError) as error:
         raise parsing.damaged(url, f"a row of another kind: {error}") from error
-
-
-def contents(record: Object, rows: Rows) -> tuple[Any, ...]:
-    """Bindings of an object's columns from digest to attributes."""
-    return (
-        record.digest,
-        np.ascontiguousarray(record.transform, dtype="<f8").tobytes(),
-        int(record.voxels),
-        np.ascontiguousarray(record.bounds, dtype="<f8").tobytes(),
-        parsing.attributes_text(record, rows),
-    )

@@ -1,0 +1,409 @@
+"""An environment in tables of SQL: what all engines that keep one in this way have in common.
+
+Each of them understands the statements here. Their parameters are written ``%s``.
+"""
+
+import json
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager
+from functools import partial
+from typing import Any, ClassVar, Protocol, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.store import parsing
+from hapticdb.store.base import (
+    NO_KEYS,
+    Change,
+    Covering,
+    Freshness,
+    Histogram,
+    Keys,
+    Layout,
+    Object,
+    Rows,
+    touched_ranges,
+)
+from hapticdb.store.pairs import (
+    ALL,
+    HELD,
+    MARK,
+    Ids,
+    KeptPairs,
+    Mark,
+    MaybeMark,
+    Outlines,
+    PairRow,
+)
+from hapticdb.store.refusals import (
+    check_distances,
+    check_unwritten,
+    no_object,
+    older_format,
+    present_already,
+)
+
+Result = TypeVar("Result")
+
+INSERT_OBJECT = """
+INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
+VALUES (%s, %s, %s, %s, %s, %s, %s, %s, %s) RETURNING id"""
+UPDATE_OBJECT = """
+UPDATE object SET digest = %s, transform = %s, voxels = %s, bounds = %s, attributes = %s,
+       revision = %s
+ WHERE id = %s"""
+# asked before the bytes are sent
+LACKS_SURFACE = """
+SELECT EXISTS (SELECT 1 FROM object WHERE digest = %s)
+       AND NOT EXISTS (SELECT 1 FROM surface WHERE digest = %s)"""
+DROP_SURFACE = """
+DELETE FROM surface
+ WHERE digest = %s AND NOT EXISTS (SELECT 1 FROM object WHERE digest = %s)"""
+LAST_REVISION = "(SELECT coalesce(max(revision), 0) FROM change)"
+KEEP_HISTOGRAM = """
+INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
+   SET revision = excluded.revision, n_rows = excluded.n_rows, bounds = excluded.bounds
+ WHERE quantile.revision <= excluded.revision"""
+KEEP_COSTS = """
+INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = excluded.figures"""
+
+
+class _Connection(Protocol):
+    """What the connection of any engine does."""
+
+    is_closed: bool
+    is_read_only: bool
+
+    def close(self) -> None: ...
+    def give_to(self, thread: int) -> None: ...
+    def snapshot(self) -> AbstractContextManager[None]: ...
+
+
+class Tables(ABC):
+    """The tables of one environment: objects, changes, surfaces, pairs, kept statistics, writes.
+
+    A subclass says how its engine runs statements, and reads and writes the tables of rows. The
+    attributes are those of `hapticdb.store.base.Store`.
+    """
+
+    HAS_TABLE: ClassVar[str]
+    """Statement that finds a row if there is a table of that name."""
+    AMONG: ClassVar[str]
+    """Condition that an id is in a JSON list."""
+    AS_TEXT: ClassVar[str]
+    """What makes text of a column of JSON."""
+    TAKEN: ClassVar[type[Exception]]
+    """The driver's error where an object has this link and name already."""
+
+    url: str
+    grid: Grid
+    layout: Layout
+    wants_distances: bool
+
+    def __init__(self, connection: _Connection) -> None:
+        self._connection = connection
+        self.is_read_only = connection.is_read_only
+        self._found: set[str] = set()
+
+    # -- what an engine adds ---------------------------------------------------------------------
+
+    @abstractmethod
+    def _rows(
+        self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
+    ) -> list[Any]:
+        """Rows of a statement that reads; binary : whether as the engine holds them, if faster."""
+
+    @abstractmethod
+    def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:
+        """One statement of a write; its rows, where it returns some."""
+
+    @abstractmethod
+    def _save(self, text: str, parameters: Sequence[Any] = ()) -> None:
+        """Write by one statement in a transaction of its own."""
+
+    @abstractmethod
+    def _alone(self, work: Callable[[], Result]) -> Result:
+        """Do what makes no revision, in one transaction that holds the write lock."""
+
+    @abstractmethod
+    def _commit(self, work: Callable[[], Result]) -> Result:
+        """Do a write in one transaction; `work` begins with `_next_revision`."""
+
+    @abstractmethod
+    def _next_revision(self) -> int:
+        """Number of the revision that this write makes."""
+
+    @abstractmethod
+    def _new_id(self, revision: int) -> int | None:
+        """Id of a new object; None where the table itself gives it."""
+
+    @abstractmethod
+    def _packed(self, values: NDArray[Any]) -> object:
+        """Numbers of any shape as the engine's columns hold them."""
+
+    @abstractmethod
+    def _put(self, rows: Rows, object_id: int) -> None:
+        """Write the rows of an object that has none."""
+
+    @abstractmethod
+    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
+        """Delete the rows of an object as it is now, from all tables; returns their keys.
+
+        keys : of its new rows.
+        """
+
+    @abstractmethod
+    def _note(self, change: tuple[Any, ...]) -> None:
+        """Write the row of `change`: revision, action, id, ranges."""
+
+    @abstractmethod
+    def _exchange_pairs(self, gone: Ids, rows: Sequence[PairRow]) -> None:
+        """Delete rows of the table `pair`, and write others unless a later revision's are there."""
+
+    @abstractmethod
+    def _exact(self, resolution: int) -> tuple[Keys, int]:
+        """Bounds of the quantile vector over all rows, and their number."""
+
+    @abstractmethod
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+
+    # -- the connection --------------------------------------------------------------------------
+
+    @property
+    def is_closed(self) -> bool:
+        """Whether `close` was called."""
+        return self._connection.is_closed
+
+    def close(self) -> None:
+        """Close the connection."""
+        self._connection.close()
+
+    def give_to(self, thread: int) -> None:
+        """Give the store to another thread, or to `NOBODY`; only while nobody uses it."""
+        self._connection.give_to(thread)
+
+    def snapshot(self) -> AbstractContextManager[None]:
+        """All reads inside see one committed revision. May be nested."""
+        return self._connection.snapshot()
+
+    # -- reads -----------------------------------------------------------------------------------
+
+    def has_table(self, name: str) -> bool:
+        """Whether a table of a later format is there; another may make it at any time."""
+        if name not in self._found and self._rows(self.HAS_TABLE, (name,)):
+            self._found.add(name)
+        return name in self._found
+
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
+        """All objects, or those of some ids that are there, ordered by id."""
+        if ids is not None:
+            return self._objects(self.AMONG, json.dumps(list(ids)))
+        self.revision()  # first: a write between the two statements is noticed by the next read
+        return self._objects("TRUE")
+
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+        for found in self._objects("id = %s", object_id):
+            return found
+        raise no_object(object_id, self.url)
+
+    def outlines(self) -> Outlines:
+        """What is short of all objects, ordered by id."""
+        text = "SELECT name, digest, id, revision, bounds FROM object ORDER BY id"
+        return parsing.outlines_of(self.url, self._rows(text, binary=True))
+
+    def _objects(self, condition: str, *parameters: int | str) -> list[Object]:
+        found = self._rows(
+            "SELECT id, name, link, digest, transform, voxels, bounds,"
+            f" attributes{self.AS_TEXT}, revision FROM object WHERE {condition} ORDER BY id",
+            parameters,
+        )
+        return [parsing.object_of(self.url, row) for row in found]
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+        text = "SELECT revision, action, id, ranges FROM change WHERE revision > %s"
+        for row in self._rows(f"{text} ORDER BY revision", (since,)):
+            yield parsing.change_of(self.url, row)
+
+    def surface_digests(self) -> set[str]:
+        """Digests of all surfaces."""
+        if not self.has_table(parsing.SURFACE):
+            return set()
+        return parsing.digests_of(self.url, self._rows("SELECT digest FROM surface"))
+
+    def pairs(self) -> KeptPairs:
+        """All rows of the table `pair`, and the mark, in one statement."""
+        found = self._rows(ALL, binary=True) if self.has_table(parsing.PAIR) else []
+        return KeptPairs(found, partial(parsing.pair_of, self.url))
+
+    # -- writes ----------------------------------------------------------------------------------
+
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
+        """Write an object, its rows and its surface in one transaction; returns its id."""
+
+        def work() -> int:
+            revision = self._next_revision()
+            own: int | None = record.id
+            if record.id <= 0 or self._do("SELECT 1 FROM object WHERE id = %s", (own,)):
+                own = self._new_id(revision)
+            named = (own, record.name, record.link)
+            contents = self._contents(record, rows)
+            try:
+                ((object_id,),) = self._do(INSERT_OBJECT, (*named, *contents, revision))
+            except self.TAKEN as error:
+                raise present_already(record, self.url) from error
+            self._put(rows, object_id)
+            self._put_surface(record.digest, surface)
+            self._log(revision, "add", object_id, rows.keys)
+            return int(object_id)
+
+        return self._commit(work)
+
+    def replace(
+        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+    ) -> None:
+        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            known = self.object(record.id)
+            check_unwritten(record, known, self.url)
+            gone = self._take(known, covering, rows.keys)
+            self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
+            self._put(rows, record.id)
+            self._drop_surface(known.digest)
+            self._put_surface(record.digest, surface)
+            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+
+        self._commit(work)
+
+    def remove(self, object_id: int, covering: Covering) -> None:
+        """Remove an object and its rows in one transaction; `covering` says where they are."""
+
+        def work() -> None:
+            revision = self._next_revision()
+            known = self.object(object_id)
+            gone = self._take(known, covering)
+            self._do("DELETE FROM object WHERE id = %s", (object_id,))
+            self._drop_surface(known.digest)
+            self._log(revision, "remove", object_id, gone)
+
+        self._commit(work)
+
+    def add_surface(self, digest: str, surface: bytes) -> None:
+        """Write the surface of objects that lack it; nothing if no object has the digest."""
+        if not self.has_table(parsing.SURFACE):
+            raise older_format(self.url)
+        self._alone(lambda: self._put_surface(digest, surface))
+
+    def want_distances(self) -> None:
+        """Note that parts get distances when they are imported."""
+        check_distances(self.layout, distances=True)
+        self._save("UPDATE environment SET wants_distances = true")
+        self.wants_distances = True
+
+    def put_pairs(
+        self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
+    ) -> MaybeMark:
+        """Delete rows, write others unless a later revision's are there, and set the mark."""
+
+        def work() -> MaybeMark:
+            mark, row = Mark.after(self._do(HELD, MARK), was, now)
+            self._exchange_pairs([*gone, MARK], [*rows, row])
+            return mark
+
+        if not self.has_table(parsing.PAIR):
+            raise older_format(self.url)
+        return self._alone(work)
+
+    def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
+        """Note why a pair is accepted, and the shapes of both."""
+        if not self.has_table(parsing.PAIR):
+            raise older_format(self.url)
+        text = "UPDATE pair SET because = %s, shapes = %s WHERE (a, b) = (%s, %s)"
+        self._save(text, (because, shapes, a, b))
+
+    def _contents(self, record: Object, rows: Rows) -> tuple[Any, ...]:
+        """Values of an object's columns from digest to attributes."""
+        return (
+            record.digest,
+            self._packed(np.asarray(record.transform, np.float64)),
+            int(record.voxels),
+            self._packed(np.asarray(record.bounds, np.float64)),
+            parsing.attributes_text(record, rows),
+        )
+
+    def _put_surface(self, digest: str, surface: bytes | None) -> None:
+        """Write a surface; an editor of an older environment, whose owner makes the table, none."""
+        if surface is None or not self.has_table(parsing.SURFACE):
+            return
+        if self._do(LACKS_SURFACE, (digest, digest))[0][0]:
+            self._do("INSERT INTO surface VALUES (%s, %s)", (digest, surface))
+
+    def _drop_surface(self, digest: str) -> None:
+        """Delete a surface that no object has any more."""
+        if self.has_table(parsing.SURFACE):
+            self._do(DROP_SURFACE, (digest, digest))
+
+    def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
+        """Record which keys a write touched."""
+        ranges = touched_ranges(self.grid, self.layout, row_keys)
+        self._note((revision, action, object_id, self._packed(ranges)))
+
+    # -- statistics ------------------------------------------------------------------------------
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets.
+
+        The kept one while no object was written since, else by a scan of the whole index.
+        """
+        kept = self._rows(
+            "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL"
+            f" AND revision = {LAST_REVISION}",
+            (resolution,),
+        )
+        if kept:
+            return parsing.histogram_of(self.url, *kept[0])
+        return Histogram(*self._exact(resolution), "computed")
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the histogram of that resolution is, by the revision stored with it."""
+        text = f"SELECT {LAST_REVISION}, (SELECT revision FROM quantile WHERE resolution = %s)"
+        ((revision, made),) = self._rows(text, (resolution,))
+        return Freshness(made, int(revision) - int(made or 0))
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Compute and keep a histogram, unless a fresh one is kept."""
+        freshness = self.freshness(resolution)
+        if anew or freshness.revision is None or freshness.changes:
+            revision, n_rows, bounds = self._measured(resolution)
+            told = None if bounds is None else self._packed(bounds)
+            self._save(KEEP_HISTOGRAM, (resolution, revision, n_rows, told))
+
+    def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
+        """Revision, rows and bounds of a new histogram; None for statistics kept elsewhere."""
+        with self.snapshot():
+            revision = self.revision()
+            bounds, n_rows = self._exact(resolution)
+        return revision, n_rows, bounds
+
+    def findings(self) -> Iterator[str]:
+        """What is wrong with kept statistics, a line each."""
+        kept = self._rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
+        costs = self._rows(f"SELECT figures{self.AS_TEXT} FROM cost")
+        yield from parsing.findings_of_kept(self.url, kept, costs)
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+        text = f"SELECT figures{self.AS_TEXT} FROM cost WHERE machine = %s"
+        kept = self._rows(text, (machine,))
+        return parsing.figures_of(self.url, kept[0][0]) if kept else None
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+        self._save(KEEP_COSTS, (machine, json.dumps(dict(figures))))

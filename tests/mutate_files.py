@@ -5,29 +5,27 @@ times the memory of the file and its result, and with sound geometry. A table co
 the exit code is 1 if a file broke one of these rules. File number n of a seed is the same on every
 run: ``--only n`` makes it again and tells its result.
 
-Meshes are read by `hapticdb.mesh.read_file`, with one difference: its child is forked from this
-process, which has loaded the reader, instead of started anew, so a file takes milliseconds. Each
-format has a process of its own, because a fork copies everything that is loaded.
+Each file is read in a fork of a process that has loaded the reader, under the limit of memory of an
+import's child, so that a file takes milliseconds. Each format has a process of its own, because a
+fork copies everything that is loaded.
 """
 
 # ruff: noqa: T201 - a script that prints
 import argparse
-import io
 import json
 import os
 import resource
 import signal
-import subprocess
 import sys
 import tempfile
 import time
 import traceback
 import warnings
 from collections import Counter
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from random import Random
-from typing import IO, Any
+from typing import Any
 
 import numpy as np
 
@@ -35,7 +33,7 @@ from children import finished
 from file_mutations import mutated
 from file_seeds import OTHERS, seeds
 from hapticdb.errors import FileError, UsageError
-from hapticdb.mesh import SUFFIXES, MeshFile, child, read_file, reader
+from hapticdb.mesh import SUFFIXES, MeshFile, child, parse_in_process
 from hapticdb.mesh.parse import reader_of
 
 FORMATS = (*SUFFIXES, *OTHERS)
@@ -45,91 +43,11 @@ SLOWEST = 30.0
 BASE_BYTES = 64 << 20
 """Bytes that a file may take beyond ten times its size and the size of its result."""
 SOUND = ("read", "refused", "library crashed, in one line")
-peak = 0
-"""Bytes that the last forked child took beyond what it shared with this process."""
-
-
-class Forked:
-    """Stands in for `subprocess.Popen` in `reader`: the child is a copy of this process."""
-
-    def __init__(
-        self, _command: Sequence[str], *, stderr: IO[bytes], env: dict[str, str], **_: object
-    ) -> None:
-        self.returncode: int | None = None
-        request, answer = os.pipe(), os.pipe()
-        self._before = _resident()
-        self.pid = os.fork()
-        if self.pid == 0:
-            os.dup2(request[0], 0)
-            os.dup2(answer[1], 1)
-            os.dup2(stderr.fileno(), 2)
-            for end in (*request, *answer):  # others stay: PROJ would close its own a second time
-                os.close(end)
-            os.environ.update(env)
-            _run_child()
-        os.close(request[0])
-        os.close(answer[1])
-        self.stdin, self.stdout = os.fdopen(request[1], "wb"), os.fdopen(answer[0], "rb")
-
-    def kill(self) -> None:
-        """End it, unless it has ended."""
-        if self.returncode is None:
-            os.kill(self.pid, signal.SIGKILL)
-
-    def wait(self) -> None:
-        """Take its exit code; `kill` and the reader's clock see to its end."""
-        global peak  # noqa: PLW0603 - one file at a time
-        if self.returncode is None:
-            _, status, usage = os.wait4(self.pid, 0)
-            self.returncode = os.waitstatus_to_exitcode(status)
-            peak = max(0, (usage.ru_maxrss << 10) - self._before)
 
 
 def _resident() -> int:
     pages = int(Path("/proc/self/statm").read_text().split()[1])
     return pages * resource.getpagesize()
-
-
-def _run_child() -> None:
-    """Run `child.py` as its own interpreter would. Never returns."""
-    code = 1
-    try:
-        sys.stdin, sys.stderr = io.TextIOWrapper(io.FileIO(0)), io.TextIOWrapper(io.FileIO(2, "w"))
-        child.main()
-        code = 0
-    except BaseException:  # noqa: BLE001 - told as the interpreter would
-        traceback.print_exc(file=sys.stderr)
-        sys.stderr.flush()
-    finally:
-        os._exit(code)
-
-
-def in_fork(call: Callable[[], None], seconds: float) -> str:
-    """Call a function in a forked child and return what happened."""
-    global peak  # noqa: PLW0603
-    before, ends = _resident(), os.pipe()
-    pid = os.fork()
-    if pid == 0:
-        try:
-            signal.setitimer(signal.ITIMER_REAL, seconds)
-            try:
-                call()
-                word = "read"
-            except (FileError, UsageError) as error:
-                word = "refused" if "\n" not in str(error) else "several lines"
-            except BaseException:  # noqa: BLE001 - what is looked for
-                word = "traceback: " + traceback.format_exc(limit=-2)
-            os.write(ends[1], word.encode()[:4000])
-        finally:
-            os._exit(0)
-    os.close(ends[1])
-    with os.fdopen(ends[0], "rb") as stream:
-        word = stream.read().decode()
-    _, status, usage = os.wait4(pid, 0)
-    peak = max(0, (usage.ru_maxrss << 10) - before)
-    if status:
-        return "hang" if os.WTERMSIG(status) == signal.SIGALRM else f"killed by {status}"
-    return word
 
 
 def _read_ours(path: Path) -> None:
@@ -168,26 +86,47 @@ def _unsound(file: MeshFile) -> str | None:
     return None
 
 
+def _read(path: Path) -> list[Any]:
+    """Result of reading a file, a line that describes it, and the bytes of what was read."""
+    try:
+        if path.suffix in OTHERS:
+            _read_ours(path)
+            return ["read", "", 0]
+        child._limit_memory(child.allowance(path), None)
+        file = parse_in_process(path)
+        return [_unsound(file) or "read", "", _size_of(file)]
+    except (FileError, UsageError) as error:
+        return ["refused" if "\n" not in str(error) else "several lines", str(error), 0]
+    except MemoryError:
+        return ["refused" if path.suffix in SUFFIXES else "memory", "too much memory", 0]
+    except BaseException:  # noqa: BLE001 - what is looked for
+        return ["traceback", traceback.format_exc(limit=-2), 0]
+
+
 def verdict(path: Path) -> tuple[str, str]:
-    """The result of reading a file, and a line that describes it."""
-    started, n_result, line = time.monotonic(), 0, ""
-    if path.suffix in OTHERS:
-        line = in_fork(lambda: _read_ours(path), SLOWEST)
-        found = line.split(":")[0]
-    else:
+    """The result of reading a file in a fork, and a line that describes it."""
+    before, ends = _resident(), os.pipe()
+    pid = os.fork()
+    if pid == 0:
         try:
-            file = read_file(path)
-            n_result = _size_of(file)
-            found = _unsound(file) or "read"
-        except FileError as error:
-            line = str(error)
-            found = "library crashed, in one line" if " crashed on it " in line else "refused"
-            if "ended with status" in line or "\n" in line:
-                found = "traceback"
-        except Exception:  # noqa: BLE001 - what is looked for
-            found, line = "traceback", traceback.format_exc()
-    if time.monotonic() - started > SLOWEST:
-        found = "hang"
+            signal.setitimer(signal.ITIMER_REAL, SLOWEST)
+            for stream in (1, 2):  # libraries write there
+                os.dup2(os.open(os.devnull, os.O_WRONLY), stream)
+            os.write(ends[1], json.dumps(_read(path)).encode()[:4000])
+        finally:
+            os._exit(0)
+    os.close(ends[1])
+    with os.fdopen(ends[0], "rb") as stream:
+        said = stream.read()
+    _, status, usage = os.wait4(pid, 0)
+    if os.WIFSIGNALED(status):
+        if os.WTERMSIG(status) == signal.SIGALRM:
+            return "hang", ""
+        # an import's child ends like this, too, and its reader says so in one line
+        is_told = path.suffix in SUFFIXES
+        return "library crashed, in one line" if is_told else "crash", f"killed by {status}"
+    found, line, n_result = json.loads(said)
+    peak = (usage.ru_maxrss << 10) - before
     if found in SOUND and peak > BASE_BYTES + 10 * (path.stat().st_size + n_result):
         found, line = "memory", f"{peak >> 20} MiB; {line}"
     return found, line
@@ -210,18 +149,14 @@ def run(suffix: str, numbers: Sequence[int], seed: int, folder: Path) -> Counter
         _read_ours(path)
     else:
         reader_of(path)
-    popen, counts = subprocess.Popen, Counter[str]()
-    reader.subprocess.Popen = Forked  # type: ignore[attr-defined]
-    try:
-        for n in numbers:
-            path.write_bytes(make(n, seed, known))
-            found, line = verdict(path)
-            counts[found] += 1
-            if found not in SOUND or len(numbers) == 1:
-                size = path.stat().st_size
-                print(f"file {n} ({suffix}, {size} bytes): {found}: {line[-1500:]}", flush=True)
-    finally:
-        reader.subprocess.Popen = popen  # type: ignore[attr-defined]
+    counts = Counter[str]()
+    for n in numbers:
+        path.write_bytes(make(n, seed, known))
+        found, line = verdict(path)
+        counts[found] += 1
+        if found not in SOUND or len(numbers) == 1:
+            size = path.stat().st_size
+            print(f"file {n} ({suffix}, {size} bytes): {found}: {line[-1500:]}", flush=True)
     return counts
 
 

@@ -116,8 +116,8 @@ def verdict(path: Path) -> tuple[str, str]:
         finally:
             os._exit(0)
     os.close(ends[1])
-    with os.fdopen(ends[0], "rb") as stream:
-        said = stream.read()
+    with os.fdopen(ends[0], "rb") as answer:
+        said = answer.read()
     _, status, usage = os.wait4(pid, 0)
     if os.WIFSIGNALED(status):
         if os.WTERMSIG(status) == signal.SIGALRM:

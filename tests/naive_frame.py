@@ -7,6 +7,12 @@ The hits come from a plain set.
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb import Grid, PointShell
 
 Triple = tuple[float, float, float]
 Voxel = tuple[int, int, int]
@@ -100,6 +106,29 @@ def touch(
         total.add(p, nrm, cm, stiffness, depth)
     found.force, found.torque = total.averaged(float(len(found.hits)))
     return found
+
+
+def touch_of_shell(
+    ids: Mapping[Voxel, Collection[int]],
+    grid: Grid,
+    shell: PointShell,
+    pose: NDArray[np.float64],
+    exclude: Collection[int] = (),
+    **more: Any,  # noqa: ANN401 - handed on
+) -> NaiveTouch:
+    """What `touch` says of a shell at a pose (4, 4); more: other arguments of `touch`."""
+    return touch(
+        ids,
+        [(x, y, z) for x, y, z in shell.points.tolist()],
+        [(x, y, z) for x, y, z in shell.normals.tolist()],
+        (shell.center[0], shell.center[1], shell.center[2]),
+        pose.tolist(),
+        grid.origin,
+        grid.voxel_size,
+        grid.side,
+        exclude=exclude,
+        **more,
+    )
 
 
 class Total:

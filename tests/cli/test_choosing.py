@@ -71,15 +71,6 @@ def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
     assert ids_in(scene) == [1]
 
 
-@pytest.mark.parametrize("word", ["1,9", "BOX1"])
-def test_what_chooses_nothing_is_one_line(run: Run, scene: Path, word: str) -> None:
-    refused(run("touch", scene, *TOUCH, "--exclude", word), "--exclude: no object")
-    refused(run("sweep", scene, "--part", word, "--path", "path.csv"), "--part: no object")
-    refused(run("move", scene, word, "--translate", "0,0,0"), "WORDS: no object")
-    refused(run("remove", scene, word), "WORDS: no object")
-    assert ids_in(scene) == [1, 2, 3]
-
-
 def test_a_number_is_an_id_or_else_a_name_and_a_verb_says_which(run: Run, tmp_path: Path) -> None:
     corners = "".join(f"v {x} 0 {y}\n" for x, y in ((0, 0), (1, 0), (0, 1)))
     faces = "".join(f"o {name}\nf 1 2 3\n" for name in ("2", "4711", "body", "9"))

@@ -8,7 +8,6 @@ import os
 import re
 import sys
 from pathlib import Path
-from typing import get_args
 
 import pytest
 
@@ -25,12 +24,7 @@ from command_line import (  # noqa: F401 - fixtures among them
     scene,
 )
 from hapticdb import cli
-from hapticdb.cli import options
-from hapticdb.grid import CURVE_NAMES
-from hapticdb.query.frame import STRATEGIES
 from hapticdb.store import connect
-from hapticdb.store.base import LAYOUTS
-from hapticdb.units import UNITS
 
 VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS if verb not in cli.HIDDEN]
 HIDDEN = ("sample", "warm")
@@ -58,13 +52,6 @@ def test_every_verb_has_help_with_an_example(run: Run, verb: str) -> None:
 
 def test_version(run: Run) -> None:
     assert run("--version") == (0, f"hapticdb {hapticdb.__version__}\n", "")
-
-
-def test_choices_are_those_of_the_library() -> None:
-    assert get_args(options.StrategyName) == STRATEGIES
-    assert set(get_args(options.CurveName)) == set(CURVE_NAMES)
-    assert set(get_args(options.LayoutName)) == set(LAYOUTS)
-    assert set(get_args(options.UnitName)) == set(UNITS)
 
 
 def test_every_verb_with_a_result_has_json() -> None:
@@ -117,14 +104,6 @@ def modules_after(program: str, *names: str) -> list[str]:
     code = f"{program}\nimport sys\nprint(*sorted(sys.modules))"
     done = finished([sys.executable, "-c", code], check=True)
     return sorted({*names} & {*done.stdout.splitlines()[-1].split()})
-
-
-def test_the_library_does_without_typer_and_rich() -> None:
-    program = (
-        "import hapticdb, hapticdb.demo, hapticdb.pictures.demo\n"
-        "for name in hapticdb.__all__: getattr(hapticdb, name)"
-    )
-    assert modules_after(program, "typer", "rich", "numba") == ["numba"]
 
 
 SLOW_TO_LOAD = ("numba", "scipy", "matplotlib", "trimesh", "collada", "cascadio", "psycopg")

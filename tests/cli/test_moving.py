@@ -3,7 +3,6 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -23,10 +22,9 @@ from command_line import (  # noqa: F401 - fixtures among them
 )
 from hapticdb import Grid
 from hapticdb.cli.verbs import moving
-from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.sqlite.tables.writing import SQLiteWriter
-from hapticdb.testing import voxel_object, write_voxels
+from hapticdb.testing import write_voxels
 
 # -- copy -----------------------------------------------------------------------------------------
 
@@ -46,31 +44,6 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
     )
 
 
-def test_a_copy_goes_on_with_what_is_missing(run: Run, scene: Path) -> None:
-    assert run("copy", scene, "b.db")[0] == 0
-    done = "b.db: complete already (3 objects), nothing to do\n"
-    assert run("copy", scene, "b.db") == (0, done, "")
-    assert rows_of(Path("b.db")) == rows_of(scene)
-    assert run("remove", "b.db", 2)[0] == 0
-    assert "1 object copied" in (out := run("copy", scene, "b.db")[1])
-    assert out.endswith("; 2 were there already\n")
-
-
-def test_other_ids_are_told(run: Run, scene: Path) -> None:
-    assert run("copy", scene, "b.db")[0] == 0
-    assert run("remove", "b.db", 1, 2, 3)[0] == 0
-    ijk = np.array([[1, 2, 3]])
-    with hapticdb.open("b.db") as env:
-        record = replace(voxel_object(env.grid, ijk, "x"), id=2)
-        assert env.store.add(record, rows_of_voxels(ijk, env.grid, env.layout)) == 2
-    out = run("copy", scene, "b.db")[1]
-    assert "3 objects copied" in out
-    assert out.endswith("; 1 under another id, since their own was taken\n")
-    code, out, _ = run("diff", scene, "b.db")
-    assert code == 1
-    assert out.splitlines()[2].split() == ["2", "x", "only", "in", "B", "1", "made"]
-
-
 def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
     code, out, err = run("copy", scene, "b.db", "--json")
     assert (code, err) == (0, "")
@@ -84,27 +57,6 @@ def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
         "present": 0,
         "renumbered": 0,
     }
-
-
-@pytest.mark.parametrize(
-    ("args", "word"),
-    [
-        (["scene.db", "scene.db"], "are one"),
-        (["none.db", "b.db"], "no environment at none.db"),
-        (["scene.db", "none/b.db"], "folder none"),
-        (["scene.db", "tool.stl"], "tool.stl"),
-        (["scene.db", "b.db", "--curve", "lexicographic"], "hierarchical"),
-        (["scene.db", "b.db", "--curve", "peano"], "peano"),
-        (["scene.db"], "missing argument"),
-    ],
-)
-def test_a_copy_that_cannot_be_leaves_nothing(
-    run: Run, scene: Path, args: list[str], word: str
-) -> None:
-    before = rows_of(scene)
-    refused(run("copy", *args), word)
-    assert not Path("b.db").exists()
-    assert rows_of(scene) == before
 
 
 # -- diff -----------------------------------------------------------------------------------------

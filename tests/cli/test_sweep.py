@@ -85,10 +85,6 @@ def test_a_path_may_turn_about_another_centre(run: Run, scene: Path) -> None:
     refused(run(*sweep, "--about", "0,-100"), "--about", "millimetres")
 
 
-def test_a_saved_shell_has_no_surface(run: Run, scene: Path) -> None:
-    refused(run("sweep", scene, "--tool", "tool.npz", "--path", "path.csv"), "surface")
-
-
 @pytest.mark.usefixtures("through")
 def test_a_sweep_is_written_as_csv(run: Run, scene: Path) -> None:
     sweep = ("sweep", scene, *TOOL, "--path", "through.csv")

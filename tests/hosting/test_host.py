@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from banded import write_points
 from children import child, until
 from hapticdb import Environment, PointShell
-from hapticdb.errors import HapticDBError, ObjectNotFoundError, UsageError
+from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting import host as hosting
 from hapticdb.hosting.attached import AttachedHost
 from hapticdb.hosting.host import SessionHost
@@ -159,17 +159,6 @@ def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
     finally:
         session.end()
         env.remove(added)
-
-
-def test_where_chooses_what_is_felt(env: Environment, sphere: PointShell) -> None:
-    write_points(env.store, np.array([[50.5, 50.5, 50.5]]), "post")
-    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20) as host:
-        session = host.begin(sphere, ABOVE, where=["post"])
-        (floor,) = env.find("floor")
-        assert host.cells[0].left_out == (floor.id,)
-        with pytest.raises(ObjectNotFoundError):
-            host.begin(sphere, ABOVE, where=["nothing so called"])
-        assert [one.id for one in host.sessions()] == [session.id]
 
 
 def test_a_new_coupling_is_felt(session: HostedSession) -> None:

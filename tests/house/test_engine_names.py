@@ -4,8 +4,6 @@ import ast
 import re
 from collections.abc import Iterator
 
-import pytest
-
 from house.test_house import imported
 from sources import PACKAGE, modules
 
@@ -40,17 +38,3 @@ def branches_on_engines(source: str) -> Iterator[str]:
         parts = [part for one in asked for part in ast.walk(one) if isinstance(part, ast.Constant)]
         if any(isinstance(part.value, str) and engine.search(part.value) for part in parts):
             yield ast.unparse(node)
-
-
-@pytest.mark.parametrize(
-    ("line", "is_branch"),
-    [
-        ('if engine == "sqlite": pass', True),
-        ('url.startswith("postgresql://")', True),
-        ('kind in {"sqlite", "toy"}', True),
-        ('"match" if isinstance(store, SupportsCaches) else None', False),
-        ('message = "PostgreSQL, 15 or newer"', False),
-    ],
-)
-def test_a_branch_on_an_engine_is_seen(line: str, is_branch: bool) -> None:
-    assert bool(list(branches_on_engines(line))) == is_branch

@@ -12,7 +12,7 @@ from hapticdb import Environment, PointShell
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout
-from naive_frame import touch as naive_touch
+from naive_frame import touch_of_shell
 
 ASSEMBLIES = {
     "demo_vintage_car/vintage_car.glb": 200,
@@ -98,19 +98,9 @@ def test_strategies_layouts_and_the_plain_set_agree_along_a_path(
     env = environments["brick"]
     plain = all_voxels(env)
     shell, poses = scaled_tool(env, tmp_path)
-    x, y, z = shell.center.tolist()
     n_hits = 0
     for pose in poses:
-        wanted = naive_touch(
-            plain,
-            [(a, b, c) for a, b, c in shell.points.tolist()],
-            [(a, b, c) for a, b, c in shell.normals.tolist()],
-            (x, y, z),
-            pose.tolist(),
-            env.grid.origin,
-            env.grid.voxel_size,
-            env.grid.side,
-        )
+        wanted = touch_of_shell(plain, env.grid, shell, pose)
         n_hits += len(wanted.hits)
         for each in environments.values():
             for strategy in STRATEGIES:

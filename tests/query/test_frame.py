@@ -21,8 +21,8 @@ from hapticdb.store.postgres.private_server import Binaries
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import KINDS, blob, write_voxels
-from naive_frame import NaiveTouch
-from naive_frame import touch as naive_touch
+from naive_frame import NaiveTouch, touch_of_shell
+from realtime.worlds import turned
 from servers import FOUND, base_url, named
 
 ORIGIN = (-0.31, 0.17, -0.05)
@@ -92,12 +92,7 @@ def random_shell(seed: int, n_points: int) -> PointShell:
 
 def random_pose(seed: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    if np.linalg.det(q) < 0:
-        q[:, 0] *= -1
-    pose = np.eye(4)
-    pose[:3, :3] = q
+    pose = turned(rng, np.zeros(3))
     center = np.array(BLOBS[rng.integers(len(BLOBS))][0]) + rng.normal(size=3) * 4
     pose[:3, 3] = np.array(ORIGIN) + SIZE * center
     return pose
@@ -109,18 +104,7 @@ def expected(
     pose: NDArray[np.float64],
     exclude: list[int],
 ) -> NaiveTouch:
-    x, y, z = shell.center.tolist()
-    return naive_touch(
-        plain,
-        [(a, b, c) for a, b, c in shell.points.tolist()],
-        [(a, b, c) for a, b, c in shell.normals.tolist()],
-        (x, y, z),
-        pose.tolist(),
-        ORIGIN,
-        SIZE,
-        1 << BITS,
-        exclude=exclude,
-    )
+    return touch_of_shell(plain, Grid(SIZE, ORIGIN, BITS), shell, pose, exclude)
 
 
 def assert_same(touch: hapticdb.Touch, wanted: NaiveTouch) -> None:

@@ -314,42 +314,4 @@ def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int) -> None:
         np.testing.assert_allclose(moved.torque, turn @ plain.torque, atol=ROUNDING)
 
 
-@pytest.mark.parametrize("shift", [(0, 0, 13), (-7, 3, 11)])
-def test_a_scene_shifted_by_whole_voxels_keeps_the_wrench(
-    tmp_path: Path, shift: tuple[int, int, int]
-) -> None:
-    before = scene_of(tmp_path / "a.db", BLOB)
-    after = scene_of(tmp_path / "b.db", BLOB + np.array(shift), layout="voxel")
-    shell, pose = random_shell(4, 200, 8 * SIZE), tilted(4)
-    assert off_borders(shell.points @ pose[:3, :3].T + pose[:3, 3])
-    plain = before.touch(shell, pose, "points")
-    moved = after.touch(shell, at(*(SIZE * s for s in shift)) @ pose, "points")
-    assert moved.hits.tolist() == plain.hits.tolist()
-    assert np.abs(plain.force).max() > 1e-3
-    np.testing.assert_allclose(moved.force, plain.force, atol=ROUNDING)
-    np.testing.assert_allclose(moved.torque, plain.torque, atol=ROUNDING)
-
-
 # --- cases 11 and 12 ----------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("layout", ["brick", "voxel"])
-def test_two_objects_in_one_voxel_push_once_and_are_both_named(
-    tmp_path: Path, layout: Layout
-) -> None:
-    floor = floor_voxels(grid_of(SIZE))
-    alone = scene_of(tmp_path / "a.db", floor, layout=layout)
-    half = floor[floor[:, 0] >= MIDDLE]
-    shared = scene_of(tmp_path / "b.db", floor, half, floor, layout=layout)
-    shell = shell_of(punch(9))
-    one = alone.touch(shell, at(z=-0.004), "points")
-    ids = [(1, 2, 3) if x >= 0 else (1, 3) for x in shell.points[:, 0]]
-    for strategy in STRATEGIES:
-        all_three = shared.touch(shell, at(z=-0.004), strategy)
-        assert all_three.force.tobytes() == one.force.tobytes()
-        assert all_three.torque.tobytes() == one.torque.tobytes()
-        assert all_three.hits.tolist() == one.hits.tolist()
-        assert [obj.id for obj in all_three.objects] == [1, 2, 3]
-        assert [tuple(p) for p in all_three.pairs] == [
-            (n, i) for n, found in enumerate(ids) for i in found
-        ]

@@ -18,8 +18,7 @@ from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.testing import blob, write_voxels
-from naive_frame import NaiveTouch
-from naive_frame import touch as naive_touch
+from naive_frame import NaiveTouch, touch_of_shell
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -77,12 +76,9 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
     for seed, center in ((1, (20, 20, 20)), (2, (26, 22, 20))):
         for i, j, k in blob(seed, center).tolist():
             plain.setdefault((i, j, k), set()).add(seed)
-    x, y, z = shell.center.tolist()
-    points = [(a, b, c) for a, b, c in shell.points.tolist()]
-    normals = [(a, b, c) for a, b, c in shell.normals.tolist()]
-    return naive_touch(
-        plain, points, normals, (x, y, z), pose.tolist(), ORIGIN, SIZE, 1 << BITS, STIFFNESS,
-        depth_of=lambda _p, _n, _c, size: 0.5 * size,
+    return touch_of_shell(
+        plain, Grid(SIZE, ORIGIN, BITS), shell, pose,
+        stiffness=STIFFNESS, depth_of=lambda _p, _n, _c, size: 0.5 * size,
     )  # fmt: skip
 
 

@@ -26,8 +26,9 @@ from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.file import remove_file
 from hapticdb.testing import write_voxels
+from naive_frame import touch_of_shell
 from realtime.test_fetching import Side, until
-from realtime.worlds import SIZE, block, expected, ids_by_voxel, make
+from realtime.worlds import SIZE, block, ids_by_voxel, make
 from servers import Place
 
 
@@ -71,7 +72,7 @@ def test_a_file_that_is_taken_away_is_away_and_felt_again_when_it_is_put_back(
 ) -> None:
     pose = np.eye(4)
     side = served(cells, sphere, pose)
-    naive = expected(ids_by_voxel(env), env.grid, sphere, pose)
+    naive = touch_of_shell(ids_by_voxel(env), env.grid, sphere, pose)
     Path(env.url).rename(tmp_path / "elsewhere")
     until(lambda: cells.is_lost)
     (tmp_path / "elsewhere").rename(env.url)
@@ -91,7 +92,7 @@ def test_another_file_is_felt_instead_that_came_while_nobody_fetched(
     assert cells._process.wait(PATIENCE)
     other = replace(env, tmp_path / "other")
     assert other.store.revision() == revision
-    naive = expected(ids_by_voxel(other), other.grid, sphere, pose)
+    naive = touch_of_shell(ids_by_voxel(other), other.grid, sphere, pose)
     assert naive.hits != before
     until(lambda: side.reader.feel(pose)[0] == naive.hits, cells.supervise)
     assert cells.restarts == 1
@@ -114,7 +115,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         assert fetching.store.revision() == 1  # SQLite still reads the deleted file
         other = make(tmp_path)
         write_voxels(other.store, block((62, 56, 56), (68, 72, 72)))
-        naive = expected(ids_by_voxel(other), grid, sphere, pose)
+        naive = touch_of_shell(ids_by_voxel(other), grid, sphere, pose)
         assert naive.hits != before
         fetching.reopen()
         side.be_at(pose)
@@ -139,7 +140,7 @@ def test_an_environment_of_a_server_made_anew_is_felt_instead(
             drop(store.connection)
         with hapticdb.create(url, grid) as env:  # has the same revision
             write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
-            naive = expected(ids_by_voxel(env), grid, sphere, pose)
+            naive = touch_of_shell(ids_by_voxel(env), grid, sphere, pose)
         assert naive.hits != before
         until(lambda: side.reader.feel(pose)[0] == naive.hits)
 

@@ -1,4 +1,4 @@
-"""Environments for the tests of resident cells, and the frames that the oracle expects."""
+"""Environments, shells and poses for the tests of resident cells."""
 
 import dataclasses
 from collections.abc import Iterable
@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 import hapticdb
-import naive_frame
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
@@ -116,27 +115,6 @@ def poses_in(grid: Grid, count: int, seed: int = 0, beyond: float = 0.1) -> NDAr
     low, high = grid.bounds
     spare = beyond * grid.edge
     return np.stack([turned(rng, rng.uniform(low - spare, high + spare)) for _ in range(count)])
-
-
-def expected(
-    ids: dict[Voxel, list[int]],
-    grid: Grid,
-    shell: PointShell,
-    pose: NDArray[np.float64],
-    exclude: Iterable[int] = (),
-) -> naive_frame.NaiveTouch:
-    """The frame as the oracle computes it."""
-    return naive_frame.touch(
-        ids,
-        [(x, y, z) for x, y, z in shell.points.tolist()],
-        [(x, y, z) for x, y, z in shell.normals.tolist()],
-        (shell.center[0], shell.center[1], shell.center[2]),
-        pose.tolist(),
-        grid.origin,
-        grid.voxel_size,
-        grid.side,
-        exclude=tuple(exclude),
-    )
 
 
 class Reader:

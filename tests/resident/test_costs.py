@@ -16,7 +16,6 @@ from realtime.troubled import troubled
 from realtime.worlds import make, scatter
 
 MEASURED = CostModel(*range(1, 6))
-EQUAL = CostModel.of_equal_parts()
 ELSEWHERE = "a machine without kept figures"
 
 

@@ -4,8 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from hapticdb import PointShell
 from hapticdb.errors import UsageError
@@ -16,7 +14,8 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
 from hapticdb.testing import write_voxels
-from realtime.worlds import HIERARCHICAL, cloud, expected, ids_by_voxel, make, poses_in, scatter
+from naive_frame import touch_of_shell
+from realtime.worlds import HIERARCHICAL, cloud, ids_by_voxel, make, poses_in, scatter
 
 
 @pytest.mark.parametrize("bits", [3, 6])
@@ -40,7 +39,7 @@ def test_frames_are_the_oracles_bit_for_bit(
         assert felt.hits.any()
         assert not felt.unknown.any()
         for n, pose in enumerate(poses):
-            naive = expected(ids, env.grid, shell, pose, exclude)
+            naive = touch_of_shell(ids, env.grid, shell, pose, exclude)
             wrench = np.array([*naive.force, *naive.torque])
             assert (felt.wrenches[n] + 0.0).tobytes() == (wrench + 0.0).tobytes()
             assert felt.hits[n] == len(naive.hits)
@@ -50,27 +49,6 @@ def test_frames_are_the_oracles_bit_for_bit(
             assert (wrench + 0.0).tobytes() == (
                 np.concatenate([touch.force, touch.torque]) + 0.0
             ).tobytes()
-
-
-@given(st.integers(0, 10_000))
-@settings(deadline=None, max_examples=8)
-def test_clusters_change_nothing(tmp_path_factory: pytest.TempPathFactory, seed: int) -> None:
-    """For clusters of any size, and points in any order."""
-    env = make(tmp_path_factory.mktemp("clusters"))
-    scatter(env, n_objects=2, n_voxels=600, seed=seed)
-    rng = np.random.default_rng(seed)
-    shell = cloud(int(rng.integers(1, 400)), seed, float(rng.choice([0.002, 0.01, 0.04])))
-    poses = poses_in(env.grid, 12, seed)
-    with CellTable.create(LEAST_BUDGET) as table:
-        residency = Residency(env.store, table)
-        plain = ResidentFrames(residency, shell, run=0).feel(poses)
-        for run in (1, int(rng.integers(2, 64)), len(shell)):
-            clustered = ResidentFrames(residency, shell, run=run)
-            found = clustered.feel(poses)
-            clustered.close()
-            for a, b in zip(plain, found, strict=True):
-                assert (a + 0.0).tobytes() == (b + 0.0).tobytes()
-    env.close()
 
 
 def test_a_path_longer_than_the_table_is_felt_in_parts_and_a_larger_tool_is_refused(

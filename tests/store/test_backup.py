@@ -3,9 +3,7 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
-import os
 import shutil
-import signal
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -16,31 +14,17 @@ import apsw
 import pytest
 
 import hapticdb
-from children import child, exit_code
+from children import child
 from command_line import Run, refused, run  # noqa: F401 - a fixture
-from hapticdb import Grid, backup_environment, restore_environment
+from files_in_use import killed, make, write
+from hapticdb import backup_environment, restore_environment
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, floor_voxels, write_voxels
-
-GRID = Grid(0.005, (0, 0, 0), 6)
-
-
-def write(store: SQLiteStore, *numbers: int) -> None:
-    for n in numbers:
-        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
 
 
 def names(path: Path) -> list[str]:
     with hapticdb.open(path) as env:
         assert env.store.revision() == len(env.objects())
         return [obj.name for obj in env.objects()]
-
-
-def make(path: Path, *numbers: int) -> Path:
-    with closing(SQLiteStore.create(path, GRID)) as store:
-        write_voxels(store, floor_voxels(GRID), "floor")
-        write(store, *numbers)
-    return path
 
 
 def files(folder: Path) -> dict[str, bytes]:
@@ -138,18 +122,6 @@ def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
 
 
 # --- restoring ------------------------------------------------------------------------------------
-
-
-def killed(path: Path, *numbers: int) -> None:
-    """Write in a process that is killed right after, so that its log remains."""
-    pid = os.fork()
-    if pid == 0:  # fork is safe: all modules are imported, and no thread runs
-        try:
-            store = SQLiteStore.open(path)  # kept in a variable: a dropped store closes itself
-            write(store, *numbers)
-        finally:
-            os.kill(os.getpid(), signal.SIGKILL)
-    assert exit_code(pid) == -signal.SIGKILL
 
 
 def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) -> None:

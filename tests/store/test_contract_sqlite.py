@@ -18,6 +18,7 @@ import pytest
 import hapticdb
 from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import child, exit_code, finished
+from files_in_use import GRID, make
 from hapticdb import Grid
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import backup_environment
@@ -30,12 +31,10 @@ from hapticdb.testing import (
     EngineContract,
     StoreContract,
     blob,
-    floor_voxels,
     with_distances,
     write_voxels,
 )
 
-GRID = Grid(0.005, (0, 0, 0), 6)
 ALL_KEYS = np.array([0]), np.array([1 << 9])
 
 
@@ -67,10 +66,7 @@ class TestSQLiteEngine(EngineContract):
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """Path of a small environment that no store has open."""
-    store = SQLiteStore.create(tmp_path / "e.db", GRID)
-    write_voxels(store, floor_voxels(GRID))
-    store.close()
-    return tmp_path / "e.db"
+    return make(tmp_path / "e.db")
 
 
 def make_old(path: Path) -> None:

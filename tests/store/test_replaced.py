@@ -12,29 +12,16 @@ import pytest
 
 import hapticdb
 from children import finished
-from hapticdb import Grid
+from files_in_use import make, names, write
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, floor_voxels, write_voxels
 
-GRID = Grid(0.005, (0, 0, 0), 6)
 EVERYWHERE = [(0, 2**62)]
-
-
-def write(store: SQLiteStore, n: int) -> None:
-    write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-
-
-def names(path: Path) -> list[str]:
-    with hapticdb.open(path, read_only=True) as env:
-        return [obj.name for obj in env.objects()]
 
 
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """Path of a small environment that no store has open; a copy of it is beside it."""
-    store = SQLiteStore.create(tmp_path / "q.db", GRID)
-    write_voxels(store, floor_voxels(GRID), "floor")
-    store.close()
+    make(tmp_path / "q.db")
     shutil.copy(tmp_path / "q.db", tmp_path / "copy")
     return tmp_path / "q.db"
 

@@ -1,9 +1,6 @@
 """A log belongs to one file: with another file it is refused, with its own it is accepted."""
 
-import os
 import shutil
-import signal
-from collections.abc import Callable
 from contextlib import closing
 from pathlib import Path
 from typing import Any
@@ -13,35 +10,9 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import exit_code
-from hapticdb import Grid
+from files_in_use import killed, make, names, write
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, floor_voxels, write_voxels
-
-GRID = Grid(0.005, (0, 0, 0), 6)
-
-
-def write(store: SQLiteStore, *numbers: int) -> None:
-    for n in numbers:
-        write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
-
-
-def killed(path: Path, work: Callable[[SQLiteStore], None]) -> None:
-    """Change a database in a process that is killed right after."""
-    pid = os.fork()
-    if pid == 0:  # fork is safe: all modules are imported, and no thread runs
-        try:
-            store = SQLiteStore.open(path)  # kept in a variable: a dropped store closes itself
-            work(store)
-        finally:
-            os.kill(os.getpid(), signal.SIGKILL)
-    assert exit_code(pid) == -signal.SIGKILL
-
-
-def names(path: Path, *, read_only: bool = True) -> list[str]:
-    with hapticdb.open(path, read_only=read_only) as env:
-        return [obj.name for obj in env.objects()]
 
 
 def folder_bytes(folder: Path) -> dict[str, bytes]:
@@ -51,10 +22,7 @@ def folder_bytes(folder: Path) -> dict[str, bytes]:
 @pytest.fixture
 def path(tmp_path: Path) -> Path:
     """Path of a small environment that no store has open."""
-    store = SQLiteStore.create(tmp_path / "q.db", GRID)
-    write_voxels(store, floor_voxels(GRID), "floor")
-    store.close()
-    return tmp_path / "q.db"
+    return make(tmp_path / "q.db")
 
 
 @pytest.fixture
@@ -63,7 +31,7 @@ def stale(path: Path, tmp_path: Path) -> Path:
     shutil.copy(path, tmp_path / "backup")
     with closing(SQLiteStore.open(path)) as store:
         write(store, 1, 2)
-    killed(path, lambda store: write(store, 3, 4))
+    killed(path, 3, 4)
     shutil.copy(path, tmp_path / "former")
     shutil.copy(tmp_path / "backup", path)
     return path
@@ -100,9 +68,6 @@ def test_a_file_copied_over_one_that_is_being_written_is_noticed_by_the_next_wri
     assert path.read_bytes() == (tmp_path / "backup").read_bytes()
     with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
         hapticdb.open(path)
-
-
-# --- a file with its own log ----------------------------------------------------------------------
 
 
 # --- crashes at every moment ----------------------------------------------------------------------
@@ -146,9 +111,7 @@ def taped(tmp_path_factory: pytest.TempPathFactory) -> tuple[dict[str, bytes], T
     The changes use several connections, several generations of the log, and checkpoints within one.
     """
     path = tmp_path_factory.mktemp("taped") / "q.db"
-    store = SQLiteStore.create(path, GRID)
-    write_voxels(store, floor_voxels(GRID), "floor")
-    store.close()
+    make(path)
     start = {"q.db": path.read_bytes(), "q.db-wal": b""}
     tape = Tape()
     try:

@@ -2,6 +2,7 @@
 
 import os
 from collections.abc import Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -21,9 +22,10 @@ from hapticdb.store.postgres.private_server import Binaries
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import KINDS, blob, write_voxels
+from hapticdb.testing.scenes import EVERYWHERE, covering
 from naive_frame import NaiveTouch, touch_of_shell
 from realtime.worlds import turned
-from servers import FOUND, base_url, named
+from servers import FOUND, Place, base_url, named
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -207,6 +209,39 @@ def test_a_touch_reads_one_revision_though_objects_come_and_go(tmp_path: Path) -
     new = write_voxels(other.store, scene_voxels()[touched - 1], "again")
     assert new in [o.id for o in env.touch(shell, pose).objects]
     assert [o.name for o in env.touch(shell, pose).objects if o.id == new] == ["again"]
+
+
+@pytest.mark.parametrize("is_file", [True, False])
+def test_a_frame_after_edits_reads_the_objects_that_they_wrote_and_no_others(
+    tmp_path: Path, place: Place, is_file: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    env = make_scene(tmp_path / "e.db" if is_file else place(), "brick", "z")
+    shell, pose = random_shell(5, 300), random_pose(5)
+    env.touch(shell, pose)
+    known, listing = env._touching.known, env.store.objects
+    monkeypatch.setattr(env.store, "objects", None)
+    with hapticdb.open(env.url) as other:
+        rows = other.store.rows_of(2, *EVERYWHERE)
+        old = other.remove(2)
+        write_voxels(other.store, scene_voxels()[1], "new")
+        env.touch(shell, pose)
+        assert known.by_id[6].name == "new"
+        other.store.replace(
+            replace(other.object(1), attributes={"a": 1}, revision=0),
+            other.store.rows_of(1, *EVERYWHERE), covering(other.store),
+        )  # fmt: skip
+        other.store.add(old, rows)
+        env.touch(shell, pose)
+        assert [(o.id, o.name, o.revision) for o in known.by_id.values()] == [
+            (o.id, o.name, o.revision) for o in listing()
+        ]
+        assert known.by_id[1].attributes == {"a": 1}
+        monkeypatch.undo()
+        monkeypatch.setattr(known, "_last", replace(list(env.store.changes())[-1], id=5))
+        other.remove(4)
+        env.touch(shell, pose)  # the log is another one: all are listed
+        assert list(known.by_id) == [1, 2, 3, 5, 6]
+    env.close()
 
 
 def test_an_empty_environment_is_free(tmp_path: Path) -> None:

@@ -1,13 +1,20 @@
 """The objects, by id, of the revision that the last frame read."""
 
+import contextlib
 from collections.abc import Iterable
 
-from hapticdb.errors import UsageError
+import numpy as np
+
+from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
-from hapticdb.store.base import Keys, Object, Store
+from hapticdb.store.base import Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
 from hapticdb.store.parsing import damaged
+
+MOST_READ = 16
+"""Writes since the last listing after which all objects are listed. A larger value reads more of
+them one by one, each in a round trip."""
 
 
 class KnownObjects:
@@ -33,6 +40,7 @@ class KnownObjects:
         self.own_law: ForceLaw = PLANE
         self.version: int | None = None
         self._unfelt: dict[Filter, Unfelt] = {}
+        self._last: Change | None = None
 
     def learn(self) -> bool:
         """List the objects if the snapshot's revision is new; returns whether it is new."""
@@ -43,11 +51,31 @@ class KnownObjects:
         return True
 
     def _list(self) -> None:
-        objects = self._store.objects()
-        self.by_id = {obj.id: obj for obj in objects}
+        """Read the objects that were written since the last time; all if that is not known."""
+        log = self._writes_since()
+        if log is None:
+            self.by_id = {obj.id: obj for obj in self._store.objects()}
+        elif log:
+            found = self.by_id.copy()
+            for object_id in {change.id for change in log}:
+                found.pop(object_id, None)
+                with contextlib.suppress(ObjectNotFoundError):
+                    found[object_id] = self._store.object(object_id)
+            self.by_id = dict(sorted(found.items()))
         self._unfelt = {}
+        objects = self.by_id.values()
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
         self.own_law = SMOOTH if self.have_distances else PLANE
+
+    def _writes_since(self) -> list[Change] | None:
+        """Writes since the last listing; None for too many, or if the log is another one by now."""
+        revision, known = self._store.revision(), self._last
+        is_near = known is not None and 0 <= revision - known.revision <= MOST_READ
+        first = known.revision if known is not None and is_near else revision
+        log = list(self._store.changes(first - 1))
+        self._last = log[-1] if log else None
+        is_same = known is not None and bool(log) and _are_equal(log[0], known)
+        return log[1:] if is_same else None
 
     def forget(self) -> None:
         """Make the next frame list the objects again."""
@@ -115,3 +143,9 @@ class KnownObjects:
                 f"{len(lacking)} of {len(self.by_id)} objects of {url} have no distances to their "
                 f"surfaces ({lacking[0]}): run 'hapticdb upgrade {url}', or give the law 'plane'"
             )
+
+
+def _are_equal(one: Change, other: Change) -> bool:
+    """Whether two rows of the log are one: a server that lost its last commits wrote others."""
+    same = (one.revision, one.action, one.id) == (other.revision, other.action, other.id)
+    return same and np.array_equal(one.ranges, other.ranges)

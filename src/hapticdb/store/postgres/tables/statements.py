@@ -24,48 +24,30 @@ PACKED: dict[Table, str] = {
 }
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
+
+def _by_table(source: str) -> dict[Table, str]:
+    """Packed rows of each table, and the revision."""
+    return {
+        table: f"\nSELECT {PACKED[table]}, {SEEN}\n{source.replace('TABLE', table)}"
+        for table in TABLES
+    }
+
+
 # PostgreSQL 17 and later read each leaf page once for all of the sorted keys on it
-LOOKUP: dict[Table, str] = {
-    table: f"""
-SELECT {PACKED[table]}, {SEEN}
-  FROM {table}
- WHERE z_val = ANY ($1)"""
-    for table in TABLES
-}
-LOOKUP_ONE: dict[Table, str] = {
-    table: f"""
-SELECT {PACKED[table]}, {SEEN}
-  FROM {table}
- WHERE z_val = $1"""
-    for table in TABLES
-}
-SCAN: dict[Table, str] = {
-    table: f"""
-SELECT {PACKED[table]}, {SEEN}
-  FROM unnest($1, $2) AS range(low, high) JOIN {table}
-    ON z_val BETWEEN range.low AND range.high"""
-    for table in TABLES
-}
-AFTER: dict[Table, str] = {
-    table: f"""
-SELECT {PACKED[table]}, {SEEN}
-  FROM (SELECT * FROM {table}
+LOOKUP = _by_table("  FROM TABLE\n WHERE z_val = ANY ($1)")
+LOOKUP_ONE = _by_table("  FROM TABLE\n WHERE z_val = $1")
+SCAN = _by_table("""  FROM unnest($1, $2) AS range(low, high) JOIN TABLE
+    ON z_val BETWEEN range.low AND range.high""")
+AFTER = _by_table("""  FROM (SELECT * FROM TABLE
          WHERE z_val >= $1 AND (z_val, id) > ($1, $2)
-         ORDER BY z_val, id LIMIT $3) AS {table}"""
-    for table in TABLES
-}
+         ORDER BY z_val, id LIMIT $3) AS TABLE""")
 # LATERAL and OFFSET 0 force a scan of each range: the planner expects wide ranges, and would read
 # the whole index to find the id
-ROWS_OF: dict[Table, str] = {
-    table: f"""
-SELECT {PACKED[table]}, {SEEN}
-  FROM unnest($1, $2) AS range(low, high),
+ROWS_OF = _by_table("""  FROM unnest($1, $2) AS range(low, high),
        LATERAL (SELECT *
-                  FROM {table}
+                  FROM TABLE
                  WHERE z_val BETWEEN range.low AND range.high AND id = $3
-                 ORDER BY z_val OFFSET 0) AS {table}"""
-    for table in TABLES
-}
+                 ORDER BY z_val OFFSET 0) AS TABLE""")
 DELETE_ROWS: dict[Table, str] = {
     table: f"""
 WITH gone AS (
@@ -89,39 +71,30 @@ SELECT count(*)
     for layout in LAYOUTS
 }
 
-# The paper's Figure 3. Only hits fetch their point, by its ordinal: unnesting all seven arrays of
-# the shell takes half as long again.
-WRENCH: dict[Layout, str] = {
-    "voxel": """
-SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
-                 $8, $9, $10, $11, shell.key)::hit ORDER BY n)
-  FROM unnest($1) WITH ORDINALITY AS shell(key, n)
- WHERE EXISTS (SELECT 1 FROM voxel
-                WHERE z_val = shell.key)""",
-    "brick": """
-SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
-                 $8, $9, $10, $11, shell.key)::hit ORDER BY n)
-  FROM unnest($1) WITH ORDINALITY AS shell(key, n)
- WHERE EXISTS (SELECT 1 FROM brick
-                WHERE z_val = shell.key >> 9
-                  AND get_bit(occupancy, shell.key & 511) = 1)""",
-}
-HITS: dict[Layout, str] = {
-    "voxel": f"""
-SELECT array_agg(n), array_agg(id), {SEEN}
-  FROM unnest($1) WITH ORDINALITY AS shell(key, n) JOIN voxel
-    ON z_val = shell.key""",
-    "brick": f"""
-SELECT array_agg(n), array_agg(id), {SEEN}
-  FROM unnest($1) WITH ORDINALITY AS shell(key, n) JOIN brick
-    ON z_val = shell.key >> 9
-   AND get_bit(occupancy, shell.key & 511) = 1""",
-}
+# The conditions of the paper's Figure 3 on a row: its key, and on bricks the voxel's bit
+KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = shell.key >> 9"}
 BIT_TEST: dict[Layout, str] = {
     "voxel": "",
     "brick": " AND get_bit(occupancy, shell.key & 511) = 1",
 }
-KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = shell.key >> 9"}
+# Only hits fetch their point, by its ordinal: unnesting all seven arrays of the shell takes half as
+# long again.
+WRENCH: dict[Layout, str] = {
+    layout: f"""
+SELECT force(ROW(($2)[n], ($3)[n], ($4)[n], ($5)[n], ($6)[n], ($7)[n],
+                 $8, $9, $10, $11, shell.key)::hit ORDER BY n)
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n)
+ WHERE EXISTS (SELECT 1 FROM {layout}
+                WHERE {KEY_TEST[layout]}{BIT_TEST[layout]})"""
+    for layout in LAYOUTS
+}
+HITS: dict[Layout, str] = {
+    layout: f"""
+SELECT array_agg(n), array_agg(id), {SEEN}
+  FROM unnest($1) WITH ORDINALITY AS shell(key, n) JOIN {layout}
+    ON {KEY_TEST[layout]}{BIT_TEST[layout]}"""
+    for layout in LAYOUTS
+}
 
 
 def without_excluded(sql: str, layout: Layout, number: int) -> str:

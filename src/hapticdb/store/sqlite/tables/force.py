@@ -17,32 +17,25 @@ from hapticdb.kernels.query import refining
 from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, Keys, Layout, LocatedShell, row_shift
 
-WRENCH = {
-    "voxel": """
+TEST: dict[Layout, str] = {
+    "voxel": "z_val = shell.value",
+    "brick": "z_val = shell.value >> 9 AND get_bit(occupancy, shell.value & 511)",
+}
+"""The condition of the statements on a row."""
+WRENCH: dict[Layout, str] = {
+    layout: f"""
 SELECT force(?1, shell.rowid, shell.value)
   FROM carray(?2) AS shell
- WHERE EXISTS (SELECT 1 FROM voxel
-                WHERE z_val = shell.value)""",
-    "brick": """
-SELECT force(?1, shell.rowid, shell.value)
-  FROM carray(?2) AS shell
- WHERE EXISTS (SELECT 1 FROM brick
-                WHERE z_val = shell.value >> 9
-                  AND get_bit(occupancy, shell.value & 511))""",
+ WHERE EXISTS (SELECT 1 FROM {layout} WHERE {test})"""
+    for layout, test in TEST.items()
 }
-HITS = {
-    "voxel": """
+HITS: dict[Layout, str] = {
+    layout: f"""
 SELECT shell.rowid, id
-  FROM carray(?1) AS shell CROSS JOIN voxel
- WHERE z_val = shell.value""",
-    "brick": """
-SELECT shell.rowid, id
-  FROM carray(?1) AS shell CROSS JOIN brick
- WHERE z_val = shell.value >> 9
-   AND get_bit(occupancy, shell.value & 511)""",
+  FROM carray(?1) AS shell CROSS JOIN {layout}
+ WHERE {test}"""
+    for layout, test in TEST.items()
 }
-LAST_TEST = {"voxel": "z_val = shell.value", "brick": "get_bit(occupancy, shell.value & 511)"}
-"""The last condition of the statements on a row."""
 
 
 def wrench_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
@@ -120,9 +113,9 @@ def _without_excluded(
     """
     if not frame.exclude.size:
         return sql, bindings
-    test = LAST_TEST[layout]
-    condition = f"{test} AND is_felt(?{len(bindings) + 1}, id)"
-    return sql.replace(test, condition), (*bindings, apsw.pyobject(frame.exclude))
+    test = TEST[layout]
+    felt = f"{test} AND is_felt(?{len(bindings) + 1}, id)"
+    return sql.replace(test, felt), (*bindings, apsw.pyobject(frame.exclude))
 
 
 class _LastExcluded:

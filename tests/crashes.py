@@ -20,6 +20,7 @@ from hapticdb.query.frame import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+from servers import kill
 from validity import Contents, contents, valid_contents
 
 N_PARTS = 30
@@ -73,7 +74,7 @@ def running(
     try:
         yield made
     finally:
-        made.kill()
+        kill(made)
         shutil.rmtree(place)
 
 
@@ -127,7 +128,7 @@ class Killer:
 
 def crash(server: PrivateServer) -> None:
     """Kill the server and start it again, so that clients that wait for it can go on."""
-    server.kill()
+    kill(server)
     server.start()
 
 

@@ -9,8 +9,10 @@ create schemas; HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be th
 ``15,18``. Without any server the run fails; tests are never skipped for lack of one.
 """
 
+import contextlib
 import itertools
 import os
+import signal
 from collections.abc import Callable, Iterator
 from functools import cache
 
@@ -19,6 +21,7 @@ import pytest
 from psycopg import sql
 
 import children
+from hapticdb.resident.table import is_alive
 from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
 
@@ -64,6 +67,19 @@ def base_url(found: Binaries | str) -> str:
     server, name = private_server(found), f"tests_{os.getpid()}"
     server.create_database(name)
     return server.conninfo(name)
+
+
+def kill(server: PrivateServer) -> None:
+    """End a server and its children as a crash does; nothing if it does not run."""
+    pid = server._postmaster()
+    if pid is None:
+        return
+    os.kill(pid, signal.SIGSTOP)  # so that it starts no more children
+    family = [*children.descendants(pid), pid]
+    for member in family:
+        with contextlib.suppress(ProcessLookupError):
+            os.kill(member, signal.SIGKILL)
+    children.until(lambda: not any(map(is_alive, family)))
 
 
 Place = Callable[[], str]

@@ -8,6 +8,7 @@ import signal
 import subprocess
 import sys
 import threading
+from collections.abc import Collection
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +17,7 @@ import pytest
 
 from children import finished
 from command_line import command
+from hapticdb import ready
 from hapticdb.kernels import compiling
 from hapticdb.kernels.compiling import NAMES, PURPOSES, entries_for, jobs_of
 
@@ -239,3 +241,22 @@ def test_nobody_waits_for_kernels_to_hear_that_a_file_is_missing(
     assert "compiling" not in done.stderr
     assert "none.stl" in done.stderr
     assert not list((tmp_path / "cache").rglob("*.nbi"))
+
+
+def test_compiling_is_told_in_one_line_and_happens_once(
+    monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    compiled: list[str] = []
+
+    def compile_missing(names: Collection[str]) -> int:
+        compiled.extend(names)
+        return len(names)
+
+    monkeypatch.setattr(ready, "_READY", set())
+    monkeypatch.setattr(ready, "missing", lambda names: [n for n in names if n not in compiled])
+    monkeypatch.setattr(ready, "compile_missing", compile_missing)
+    for _ in range(2):
+        ready.make_ready("shell")
+    assert capsys.readouterr().err.count("\n") == 1
+    assert "curves.encode_kernel" in compiled
+    assert len(compiled) == len(set(compiled))

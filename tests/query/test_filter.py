@@ -118,7 +118,7 @@ def env(
     made = make_scene(with_environment(base_url(server), f"filter_{os.getpid()}"), *kind)
     yield made
     assert isinstance(made.store, PostgresStore)
-    drop(made.store.connection)
+    drop(made.store._connection)
     made.close()
 
 

@@ -72,7 +72,7 @@ def env(
     env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
     yield env
     assert isinstance(env.store, PostgresStore)
-    drop(env.store.connection)
+    drop(env.store._connection)
     env.close()
 
 

@@ -137,7 +137,7 @@ def test_an_environment_of_a_server_made_anew_is_felt_instead(
         side = served(cells, sphere, pose)
         before = side.reader.feel(pose)[0]
         with contextlib.closing(PostgresStore.open(url)) as store:
-            drop(store.connection)
+            drop(store._connection)
         with hapticdb.create(url, grid) as env:  # has the same revision
             write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
             naive = touch_of_shell(ids_by_voxel(env), grid, sphere, pose)

@@ -17,7 +17,7 @@ import pytest
 
 import hapticdb
 from assemblies import placement
-from children import PATIENCE, child, joined, until
+from children import PATIENCE, child, descendants, joined, until
 from command_line import command, tool
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
@@ -38,7 +38,7 @@ from hapticdb.errors import StuckError
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.postgres.connecting import answering
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.private_server import PrivateServer, _children_of
+from hapticdb.store.postgres.private_server import PrivateServer
 from servers import Place
 from validity import Contents, assert_valid, contents
 
@@ -145,7 +145,7 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
         reconnect = ServerConnection._reconnect
 
         def late(here: ServerConnection) -> None:
-            if here is env.store.connection:  # type: ignore[attr-defined]
+            if here is env.store._connection:  # type: ignore[attr-defined]
                 other.move(7, PLACE)
             reconnect(here)
 
@@ -168,7 +168,7 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
     with small(url, file) as env:
         pid = server._postmaster()
         assert pid is not None
-        family = [pid, *_children_of(pid)]
+        family = [pid, *descendants(pid)]
         try:
             for member in family:
                 os.kill(member, signal.SIGSTOP)
@@ -191,7 +191,7 @@ def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
     """End the server process of an environment's connection, and wait until it is gone."""
 
     def end(env: Environment) -> None:
-        pid = env.store.connection.driver.info.backend_pid  # type: ignore[attr-defined]
+        pid = env.store._connection.driver.info.backend_pid  # type: ignore[attr-defined]
         admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
 
     return end

@@ -329,4 +329,4 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
 
 
 def backend_of(env: Environment) -> int:
-    return int(env.store.connection.driver.info.backend_pid)  # type: ignore[attr-defined]
+    return int(env.store._connection.driver.info.backend_pid)  # type: ignore[attr-defined]

@@ -48,7 +48,7 @@ from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.writing import PostgresWriter
 from hapticdb.store.urls import redact, with_partitions
 from hapticdb.testing import StoreContract
-from servers import SETTINGS
+from servers import SETTINGS, kill
 from validity import Contents, contents, valid_contents
 
 pytestmark = pytest.mark.long
@@ -133,7 +133,7 @@ def test_frames_are_those_of_one_server(
 def plan(url: str, text: str, *parameters: wire.Parameter) -> str:
     with hapticdb.open(url, read_only=True) as env:
         assert isinstance(env.store, PostgresStore)
-        connection = env.store.connection
+        connection = env.store._connection
         found = connection.run(f"EXPLAIN (ANALYZE, VERBOSE, COSTS OFF) {text}", parameters)
         lines = [found.get_value(row, 0) or b"" for row in range(found.ntuples)]
         return b"\n".join(lines).decode()
@@ -200,7 +200,7 @@ def test_a_partition_that_dies_in_a_write_leaves_the_environment_as_it_was(
     with hapticdb.open(made) as env:
         before = contents(env)
         with monkeypatch.context() as patch:
-            After(patch, PostgresWriter, step, dying.kill)
+            After(patch, PostgresWriter, step, lambda: kill(dying))
             with pytest.raises(
                 ConnectionLostError, match="one of its partitions cannot be reached"
             ):

@@ -15,11 +15,12 @@ from subprocess import STDOUT
 import psycopg
 import pytest
 
-from children import PATIENCE, child, finished, until
+from children import PATIENCE, child, descendants, finished, until
 from hapticdb.errors import DatabaseError
 from hapticdb.resident.table import is_alive
 from hapticdb.store.postgres import private_server, server_binaries
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+from servers import kill
 
 FOUND = find_binaries()
 assert FOUND, "no PostgreSQL found: install the extra postgres"
@@ -54,7 +55,7 @@ def place() -> Iterator[Path]:
     folder.chmod(0o755)
     yield folder
     for pid_file in folder.rglob("postmaster.pid"):
-        PrivateServer.at(pid_file.parent.parent).kill()
+        kill(PrivateServer.at(pid_file.parent.parent))
     for socket in folder.rglob("socket"):
         shutil.rmtree(socket.resolve())
     shutil.rmtree(folder)
@@ -184,12 +185,12 @@ def test_stopping_ends_the_server_and_may_be_repeated(server: PrivateServer) -> 
 def test_what_was_written_outlives_a_kill(server: PrivateServer) -> None:
     server.start()
     write(server)
-    family = [pid_of(server), *private_server._children_of(pid_of(server))]
+    family = [pid_of(server), *descendants(pid_of(server))]
     assert len(family) > 4
-    server.kill()
+    kill(server)
     assert not server.is_running
     assert [private_server._parent_of(pid) for pid in family] == [None] * len(family)
-    server.kill()
+    kill(server)
     server.start()
     assert holds(server)
 
@@ -221,7 +222,7 @@ def test_a_stale_pid_file_does_not_hinder_a_start(server: PrivateServer, kind: s
     write(server)
     pid_file = server.folder / "data" / "postmaster.pid"
     lines = pid_file.read_text().splitlines()
-    server.kill()
+    kill(server)
     with child(["true"]) as ended:
         until(lambda: not is_alive(ended.pid))
         if kind == "nobody":

@@ -43,6 +43,7 @@ from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.tables.writing import PostgresWriter
+from servers import kill
 from validity import Contents, assert_valid, contents, valid_contents
 
 # --- imports ------------------------------------------------------------------------------------
@@ -59,7 +60,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
     layout: Layout,
 ) -> None:
     for n_parts, delay in moments(1):
-        killer = Killer(n_parts, delay, server.kill)
+        killer = Killer(n_parts, delay, lambda: kill(server))
         with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
             hapticdb.import_files(url, [file], options(layout), killer)
         assert "\n" not in str(told.value)
@@ -106,7 +107,7 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
         for (name, edit), after in zip(EDITS, edited, strict=True):
             for step in steps_of(name):
                 with pytest.MonkeyPatch.context() as patch:
-                    After(patch, PostgresWriter, step, server.kill)
+                    After(patch, PostgresWriter, step, lambda: kill(server))
                     with pytest.raises(
                         hapticdb.errors.ConnectionLostError, match="cannot be reached"
                     ):
@@ -178,7 +179,7 @@ def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afte
     small(url, file).close()
     with hapticdb.open(url, read_only=True) as env:
         expected = felt(env, sphere, np.eye(4))
-        server.kill()
+        kill(server)
         for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.size):
             with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
                 ask()

@@ -25,7 +25,7 @@ from hapticdb.store.engines import MayLag
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import is_noticed, write_voxels
-from servers import FOUND, SETTINGS, named
+from servers import FOUND, SETTINGS, kill, named
 
 
 class Pair(NamedTuple):
@@ -43,11 +43,11 @@ def pair(request: pytest.FixtureRequest, made: Path) -> Iterator[Pair]:
         folder = Path(tempfile.mkdtemp(prefix="standby-")).resolve()
         ends.callback(shutil.rmtree, folder, ignore_errors=True)
         primary = PrivateServer.at(folder / "primary", request.param, SETTINGS)
-        ends.callback(primary.kill)
+        ends.callback(kill, primary)
         primary.start()
         hapticdb.copy_environment(made / "scene.db", primary.conninfo())
         standby = standby_of(primary, folder / "standby", request.param)
-        ends.callback(standby.kill)
+        ends.callback(kill, standby)
         standby.start()
         urls = primary.conninfo(), standby.conninfo()
         hosts = ",".join(parse_qs(urlsplit(url).query)["host"][0] for url in urls)
@@ -89,7 +89,7 @@ def test_a_standby_gives_the_primarys_answers(pair: Pair, sphere: PointShell) ->
         hapticdb.open(pair.primary, read_only=True) as there,
     ):
         assert isinstance(here.store, PostgresStore)
-        assert here.store.connection.rows("SELECT pg_is_in_recovery()") == [(True,)]
+        assert here.store._connection.rows("SELECT pg_is_in_recovery()") == [(True,)]
         assert [obj.name for obj in here.objects()] == [obj.name for obj in there.objects()]
         for strategy in STRATEGIES:
             found, expected = (

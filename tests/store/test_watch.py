@@ -110,7 +110,7 @@ def test_a_reader_that_lost_its_connection_listens_again(
     monkeypatch.setattr(watching, "HEARING_S", 1e9)
     for is_used_meanwhile in (False, True):
         reader.watch()
-        pid = reader.connection.driver.info.backend_pid
+        pid = reader._connection.driver.info.backend_pid
         admin.execute("SELECT pg_terminate_backend(%s, 5000)", (pid,))
         write(url)
         if is_used_meanwhile:
@@ -160,7 +160,7 @@ def test_an_environment_made_anew_is_told_from_the_one_before(
     write(url)
     assert is_noticed(reader)
     with contextlib.closing(PostgresStore.open(url)) as store:
-        drop(store.connection)
+        drop(store._connection)
     create_store(url, GRID).close()
     write(url)  # the same revision as before
     for _ in range(2):

@@ -153,18 +153,6 @@ class PrivateServer:
             if self.is_running and not self._is_used():
                 self._stop()
 
-    def kill(self) -> None:
-        """End the server and its children as a crash does; nothing if it does not run."""
-        pid = self._postmaster()
-        if pid is None:
-            return
-        os.kill(pid, signal.SIGSTOP)  # so that it starts no more children
-        family = [*_children_of(pid), pid]
-        for member in family:
-            with contextlib.suppress(ProcessLookupError):
-                os.kill(member, signal.SIGKILL)
-        self._await_end(family)
-
     @property
     def is_running(self) -> bool:
         """Whether the server's process is there."""
@@ -372,11 +360,8 @@ class PrivateServer:
         pid = self._postmaster()
         if pid is not None:
             os.kill(pid, signal.SIGINT)
-            self._await_end([pid])
-
-    def _await_end(self, processes: list[int]) -> None:
         deadline = time.monotonic() + STOP_S
-        while any(_parent_of(pid) is not None for pid in processes):
+        while pid is not None and _parent_of(pid) is not None:
             if time.monotonic() > deadline:
                 raise DatabaseError(f"the server in {self.folder} does not end: see its log there")
             time.sleep(POLL_S)
@@ -419,12 +404,6 @@ def _parent_of(pid: int) -> int | None:
         return None
     state, parent = line.rpartition(")")[2].split()[:2]  # a name in parentheses holds anything
     return None if state in {"Z", "X"} else int(parent)
-
-
-def _children_of(pid: int) -> list[int]:
-    """Living children of a process."""
-    numbers = [int(path.name) for path in Path("/proc").glob("[0-9]*")]
-    return [number for number in numbers if _parent_of(number) == pid]
 
 
 def _complaint(log: str) -> str:

@@ -57,11 +57,6 @@ class PostgresStore(PostgresReader, PostgresWriter, PostgresStatistics):
         schema_of.created(url, grid, layout, distances=distances)
         return cls.open(url)
 
-    @property
-    def connection(self) -> ServerConnection:
-        """The connection, for features that only this engine has."""
-        return self._connection
-
     def discard(self) -> None:
         """Close and delete an environment without any write, unless another writes to it."""
         self._loading.drop_unused()

@@ -12,7 +12,7 @@ from hapticdb.realtime.processes import MessageSender, parent_is_gone
 def work(request: PageRequest, sender: MessageSender) -> None:
     """Serve the page until the server ends."""
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    connection = PageConnection(request.server)
+    connection = PageConnection(request.server, request.secret)
     connection.guard(server)
     slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
     said = server.gui.add_markdown("nothing yet")
@@ -29,7 +29,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
 
     @server.on_client_connect
     def _(client: viser.ClientHandle) -> None:
-        who = connection.announced(client.client_id)
+        who = connection.visitor(client.client_id)
         client.gui.add_markdown(f"{who.name} is a {who.role}")
 
     sender.send("ready", server.get_port())

@@ -1,4 +1,4 @@
-"""The page lets in the browsers that the server announced, and nobody else."""
+"""The page lets in the connections of its server, and nobody else."""
 
 import json
 import socket
@@ -8,6 +8,7 @@ from typing import NamedTuple
 
 import pytest
 import viser
+from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.client import connect
 from websockets.sync.connection import Connection
@@ -18,9 +19,12 @@ from hapticdb.page.connection import (
     LATE,
     LONGEST_WORDS,
     MOST_FAILED,
+    NAME,
+    ROLE,
+    SECRET,
     PageConnection,
     Visitor,
-    announcement,
+    line,
 )
 from serving import CAMERA, PROTOCOL, close_code, sent
 
@@ -42,7 +46,7 @@ def page() -> Iterator[Page]:
     ours, theirs = socket.socketpair()
     ours.settimeout(20.0)
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
-    link = PageConnection(theirs.detach())
+    link = PageConnection(theirs.detach(), "the secret")
     link.guard(server)
     yield Page(ours, link, server)
     server.stop()
@@ -51,17 +55,10 @@ def page() -> Iterator[Page]:
 
 @contextmanager
 def entered(page: Page, role: str) -> Iterator[Connection]:
-    """A browser that was announced and is connected."""
-    sock = socket.socket()
-    sock.bind(("127.0.0.1", 0))
-    port = sock.getsockname()[1]
-    page.ours.sendall(announcement(port, "Guest 1", role))
-    assert said(page.ours) == {"word": "expected", "port": port}
-    sock.connect(("127.0.0.1", page.server.get_port()))
-    with connect(page.address, sock=sock, subprotocols=PROTOCOL) as browser:
-        assert said(page.ours) == {"word": "connected", "port": port}
+    """A browser that is connected as the server connects it."""
+    headers = {SECRET: "the secret", NAME: "Guest 1", ROLE: role}
+    with connect(page.address, additional_headers=headers, subprotocols=PROTOCOL) as browser:
         yield browser
-    assert said(page.ours)["word"] == "closed"
 
 
 def said(ours: socket.socket) -> dict[str, object]:
@@ -72,42 +69,49 @@ def said(ours: socket.socket) -> dict[str, object]:
     return found
 
 
-def test_an_announced_browser_is_let_in_under_its_name(page: Page) -> None:
+def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> None:
     with entered(page, "toucher") as browser:
         assert browser.recv(timeout=20.0)
-        assert page.link.announced(0) == Visitor("Guest 1", "toucher")
+        assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
     until(lambda: _is_gone(page.link))
 
 
 def _is_gone(link: PageConnection) -> bool:
     try:
-        link.announced(0)
+        link.visitor(0)
     except KeyError:
         return True
     return False
 
 
-def test_whoever_was_not_announced_is_sent_away_with_nothing(page: Page) -> None:
+@pytest.mark.parametrize(
+    "shown",
+    [
+        {},
+        {SECRET: ""},
+        {SECRET: "a guess"},
+        {SECRET: "the secre"},
+        [(SECRET, "the secret"), (SECRET, "the secret")],
+    ],
+)
+def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
+    page: Page, shown: dict[str, str]
+) -> None:
     page.server.scene.add_label("/secret", "secret")
-    page.ours.sendall(announcement(1, "Guest 1", "editor"))
-    assert said(page.ours)["word"] == "expected"
-    for _ in range(3):
-        with connect(page.address, subprotocols=PROTOCOL) as browser:
-            with pytest.raises(ConnectionClosed) as closed:
-                browser.recv(timeout=20.0)
-            assert closed.value.rcvd is not None
-            assert closed.value.rcvd.code == LATE
-        assert said(page.ours)["word"] == "refused"
+    named = Headers(shown)
+    named.update({NAME: "Guest 1", ROLE: "editor"})
+    with connect(page.address, additional_headers=named, subprotocols=PROTOCOL) as browser:
+        with pytest.raises(ConnectionClosed) as closed:
+            browser.recv(timeout=20.0)
+        assert closed.value.rcvd is not None
+        assert closed.value.rcvd.code == LATE
+    assert said(page.ours)["word"] == "refused"
     assert page.server.get_clients() == {}
 
 
-def test_a_port_is_good_for_one_connection(page: Page) -> None:
-    with entered(page, "viewer") as first:
-        assert first.recv(timeout=20.0)
-        second = connect(page.address, subprotocols=PROTOCOL)
-        with second, pytest.raises(ConnectionClosed):
-            second.recv(timeout=20.0)
-        assert said(page.ours)["word"] == "refused"
+def test_the_page_answers_a_ping(page: Page) -> None:
+    page.ours.sendall(line("ping"))
+    assert said(page.ours)["word"] == "pong"
 
 
 def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(

@@ -71,13 +71,13 @@ def page_of(
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     ours, theirs = socket.socketpair()
-    ours.sendall(line({"word": "prepared"}))
+    ours.sendall(line("prepared"))
     request = PageRequest(
-        dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0,
+        dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0, "",
         None if recordings is None else str(recordings),
     )  # fmt: skip
     try:
-        site = Site(server, NoHost(), request, PageConnection(theirs.detach()))  # type: ignore[arg-type]
+        site = Site(server, NoHost(), request, PageConnection(theirs.detach(), ""))  # type: ignore[arg-type]
         try:
             open_page(site, lambda _: Visitor("Ada", "editor"))
             address = f"ws://127.0.0.1:{server.get_port()}"

@@ -1,9 +1,8 @@
 """What the server and its page process say to one another.
 
 The page answers on a port of the loopback interface, which every user of this machine can reach. So
-the server announces each browser before it connects: it binds the connection's own port first,
-tells the page that port with the browser's name and role, waits for the answer, and connects from
-that port. The page closes every connection from another port.
+the server makes a secret for each page process, and shows it in a header of each connection, beside
+the browser's name and role. The page closes every connection without it.
 
 The page also asks the server for what a hand calls (``prepare``), and is told how far that is.
 
@@ -11,6 +10,7 @@ The messages are lines of JSON on a socket pair that the page process inherits.
 """
 
 import contextlib
+import hmac
 import json
 import logging
 import socket
@@ -23,19 +23,19 @@ from hapticdb.errors import HapticDBError
 if TYPE_CHECKING:
     import viser
     from viser.infra import Message, WebsockClientConnection
+    from websockets.asyncio.server import ServerConnection
 
 LOG = logging.getLogger("hapticdb.page")
+SECRET, NAME, ROLE = "hapticdb-secret", "hapticdb-name", "hapticdb-role"
+"""Headers of the server's connections to the page."""
 ROLES = ("viewer", "toucher", "editor")
 """Roles, each with the rights of those before it: sees, feels, moves parts."""
 LONGEST_LINE = 4096
 """Most bytes of one message. A longer line means that something else writes there."""
-FORGOTTEN_AFTER = 256
-"""Announcements that are kept without a connection. Larger: more memory for browsers that went away
-before they were connected."""
 LONGEST_WORDS = 200
 """Letters of an error of viser in the log. Larger: more of what a client sent stands there."""
 LATE = 1013
-"""WebSocket close code "try again later", for a connection that was not announced."""
+"""WebSocket close code "try again later", for a connection without the secret."""
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
 PREPARED_EVERY = 0.2
@@ -50,13 +50,15 @@ class PageRequest(NamedTuple):
 
     urls : the environment's address for each role: the database decides what each may do; tools :
     files, the first is chosen at the start; server, host : descriptors of the sockets to the server
-    (this module) and to the `SessionHost`; recordings : folder for recordings, or None.
+    (this module) and to the `SessionHost`; secret : of the server's connections; recordings : a
+    folder, or None.
     """
 
     urls: Mapping[str, str]
     tools: tuple[str, ...]
     server: int
     host: int
+    secret: str
     recordings: str | None = None
     title: str = ""
 
@@ -73,51 +75,56 @@ class Visitor(NamedTuple):
 
 
 class PageConnection:
-    """The page's end, on an inherited socket: learns who comes next, and lets nobody else in."""
+    """The page's end, on an inherited socket: lets in the server's connections, and nobody else."""
 
-    def __init__(self, descriptor: int) -> None:
+    def __init__(self, descriptor: int, secret: str) -> None:
         self._socket = socket.socket(fileno=descriptor)
-        self._lock = threading.Lock()
-        self._expected: dict[int, Visitor] = {}
-        self._inside: dict[int, Visitor] = {}
+        self._secret = secret.encode()
+        self._live: Mapping[int, ServerConnection] = {}
         self._asking = threading.Lock()
         self._is_asked = False
         self._is_prepared = threading.Event()
         self.preparing = ""
         """How far the server is with what a hand calls, in words; empty while it does nothing."""
-        self._thread = threading.Thread(target=self._listen, name="announcements", daemon=True)
+        self._thread = threading.Thread(target=self._listen, name="server", daemon=True)
         self._thread.start()
 
     def guard(self, server: "viser.ViserServer") -> None:
-        """Close each connection to a viser server that was not announced, or sends nonsense.
+        """Close each connection to a viser server that is not our server's, or sends nonsense.
 
         A message that viser fails at is one line of the log, whatever viser raises.
         """
         inner = server._websock_server  # noqa: SLF001 - viser shows connections nowhere else
-        live_connections = inner._live_connections  # noqa: SLF001 - likewise
-        nonsense = _Nonsense(live_connections)
+        live = self._live = inner._live_connections  # noqa: SLF001 - likewise
+        nonsense = _Nonsense(live)
 
         async def check(connection: "WebsockClientConnection") -> None:
             client = int(connection.client_id)
-            live = live_connections[connection.client_id]
-            port = int(live.remote_address[1])
-            if not self._let_in(client, port):
-                self.tell("refused", port)
-                await live.close(LATE, "connect through the server")
+            try:
+                self.visitor(client)
+            except KeyError:
+                self.tell("refused")
+                await live[client].close(LATE, "connect through the server")
             nonsense.contain(connection)
 
         def leave(connection: "WebsockClientConnection") -> None:
             nonsense.forget(int(connection.client_id))
-            self._let_out(connection)
 
         nonsense.contain(inner)
         inner.on_client_connect(check)
         inner.on_client_disconnect(leave)
 
-    def announced(self, client_id: int) -> Visitor:
-        """Return who a client of the guarded server is; KeyError if it is not connected."""
-        with self._lock:
-            return self._inside[client_id]
+    def visitor(self, client_id: int) -> Visitor:
+        """Return who a client of the guarded server is.
+
+        KeyError if it is not connected, or not by our server.
+        """
+        request = self._live[client_id].request
+        assert request is not None  # noqa: S101 - the handshake is over
+        shown = "".join(request.headers.get_all(SECRET)).encode(errors="replace")
+        if not hmac.compare_digest(shown, self._secret):
+            raise KeyError(client_id)
+        return Visitor(request.headers[NAME], request.headers[ROLE])
 
     def prepare(self, is_ending: Callable[[], bool]) -> None:
         """Wait until the server has compiled what a hand calls; the first call asks for it.
@@ -132,42 +139,22 @@ class PageConnection:
             if is_ending():
                 raise HapticDBError("the page ends")
 
-    def tell(self, word: str, port: int = 0) -> None:
+    def tell(self, word: str) -> None:
         """Send a message to the server; does nothing if it has ended."""
         with contextlib.suppress(OSError):
-            self._socket.sendall(line({"word": word, "port": port}))
-
-    def _let_in(self, client: int, port: int) -> bool:
-        with self._lock:
-            announced = self._expected.pop(port, None)
-            if announced is None:
-                return False
-            self._inside[client] = announced
-        self.tell("connected", port)
-        return True
-
-    def _let_out(self, connection: "WebsockClientConnection") -> None:
-        with self._lock:
-            known = self._inside.pop(int(connection.client_id), None)
-        if known is not None:
-            self.tell("closed")
+            self._socket.sendall(line(word))
 
     def _listen(self) -> None:
         with contextlib.suppress(ConnectionError), self._socket.makefile("rb") as stream:
             while received := stream.readline(LONGEST_LINE):
                 message = json.loads(received)
-                if message["word"] == "preparing":
-                    self.preparing = message["text"]
-                    continue
-                if message["word"] == "prepared":
-                    self._is_prepared.set()
-                    continue
-                announced = Visitor(message["name"], message["role"])
-                with self._lock:
-                    self._expected[message["port"]] = announced
-                    while len(self._expected) > FORGOTTEN_AFTER:
-                        self._expected.pop(next(iter(self._expected)))
-                self.tell("expected", message["port"])
+                match message["word"]:
+                    case "preparing":
+                        self.preparing = message["text"]
+                    case "prepared":
+                        self._is_prepared.set()
+                    case "ping":
+                        self.tell("pong")
 
 
 class _Nonsense:
@@ -205,11 +192,6 @@ class _Nonsense:
             await live.close(BREAKS_RULES, "too many messages that mean nothing here")
 
 
-def line(message: Mapping[str, object]) -> bytes:
+def line(word: str, text: str = "") -> bytes:
     """Bytes of a message."""
-    return json.dumps(message).encode() + b"\n"
-
-
-def announcement(port: int, name: str, role: str) -> bytes:
-    """Bytes that announce a browser which will connect from that port."""
-    return line({"word": "expect", "port": port, "name": name, "role": role})
+    return json.dumps({"word": word, "text": text}).encode() + b"\n"

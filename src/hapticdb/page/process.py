@@ -30,12 +30,12 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     Sends the message ``ready`` with viser's port once browsers can connect.
     """
     server = new_server()
-    connection = PageConnection(request.server)
+    connection = PageConnection(request.server, request.secret)
     connection.guard(server)
     try:
         with AttachedHost(socket.socket(fileno=request.host)) as host:
             site = Site(server, host, request, connection)
-            open_page(site, connection.announced)
+            open_page(site, connection.visitor)
             sender.send("ready", server.get_port())
             try:
                 while not parent_is_gone():

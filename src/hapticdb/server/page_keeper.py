@@ -1,32 +1,28 @@
-"""The page process seen from the server: started, told who comes, and started again if it dies."""
+"""The page process seen from the server: started, and started again if it dies."""
 
 import asyncio
 import contextlib
 import json
 import logging
+import secrets
 import socket
 from collections.abc import Awaitable, Callable
 
 from hapticdb.errors import HapticDBError
-from hapticdb.page.connection import LONGEST_LINE, announcement, line
+from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, line
 from hapticdb.realtime.processes import Process
 
 LOG = logging.getLogger("hapticdb.server")
 START_PATIENCE = 120.0
 """Seconds that a page process has to become ready; it reads and prepares the whole scene."""
 ANSWER_PATIENCE = 2.0
-"""Seconds that the page has to answer an announcement. Larger: browsers wait longer for a page that
-hangs."""
+"""Seconds that the page has to answer a ping. Larger: that it hangs is noticed later."""
 FIRST_PAUSE = 0.5
 """Seconds before a page that died is started again; doubled each time that it dies again."""
 LONGEST_PAUSE = 30.0
 """Greatest such pause. Larger: a page that cannot start costs less, and comes back later."""
 LASTING = 60.0
 """Seconds that a page must live so that its pause begins small again."""
-
-
-class PageAwayError(HapticDBError):
-    """The page process does not answer now; it may be starting again."""
 
 
 class PageKeeper:
@@ -38,7 +34,7 @@ class PageKeeper:
         Function of the process, as `Process` takes it; it sends ``ready`` with its port.
     request : callable
         Makes the request of each process, of the descriptors of its sockets to the server and to
-        the host.
+        the host, and of the secret that the server's connections show.
     serve_host : callable
         Takes the socket at whose other end the page begins its sessions.
     prepare : callable
@@ -48,7 +44,7 @@ class PageKeeper:
     def __init__(
         self,
         work: str,
-        request: Callable[[int, int], object],
+        request: Callable[[int, int, str], object],
         serve_host: Callable[[socket.socket], None],
         prepare: Callable[[], Awaitable[None]],
     ) -> None:
@@ -58,7 +54,8 @@ class PageKeeper:
         self._process: Process | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reader: asyncio.StreamReader | None = None
-        self._expected: dict[int, asyncio.Future[None]] = {}
+        self._secret = ""
+        self._has_answered = asyncio.Event()
         self._is_stopping = False
         self.port = 0
         self.n_starts = 0
@@ -106,7 +103,8 @@ class PageKeeper:
                     own, other = socket.socketpair()
                     pairs.append((ours.enter_context(own), theirs.enter_context(other)))
                 server, host = (other.fileno() for _, other in pairs)
-                request = self._request(server, host)
+                self._secret = secrets.token_urlsafe()
+                request = self._request(server, host, self._secret)
                 process = await asyncio.to_thread(Process, self._work, request, (server, host))
             ours.pop_all()  # nothing failed, so they stay open
         return process, pairs[0][0], pairs[1][0]
@@ -131,28 +129,14 @@ class PageKeeper:
             except (HapticDBError, OSError) as error:
                 LOG.error("the page cannot start: %s", error)  # noqa: TRY400 - its message says all
 
-    async def announce(self, port: int, name: str, role: str) -> int:
-        """Announce a browser that will connect from a port; returns the page's port.
-
-        PageAwayError if the page does not answer.
-        """
-        if not self.is_ready or self._writer is None:
-            raise PageAwayError("the page is starting; try again in a few seconds")
-        answer: asyncio.Future[None] = asyncio.get_running_loop().create_future()
-        self._expected[port] = answer
-        try:
-            self._writer.write(announcement(port, name, role))
-            await asyncio.wait_for(answer, ANSWER_PATIENCE)
-        except (TimeoutError, OSError):
-            raise PageAwayError("the page does not answer; try again in a few seconds") from None
-        finally:
-            self._expected.pop(port, None)
-        return self.port
+    def headers(self, name: str, role: str) -> dict[str, str]:
+        """Headers by which the page lets in the connection of a browser of that name and role."""
+        return {SECRET: self._secret, NAME: name, ROLE: role}
 
     def tell(self, word: str, text: str = "") -> None:
         """Send the page a message of words; does nothing without a page."""
         if self._writer is not None:
-            self._writer.write(line({"word": word, "text": text}))
+            self._writer.write(line(word, text))
 
     def prepare(self) -> None:
         """Compile what hands call, and tell the page when they may begin."""
@@ -168,11 +152,13 @@ class PageKeeper:
 
     async def answers(self) -> bool:
         """Whether the page answers now."""
+        self._has_answered.clear()
+        self.tell("ping")
         try:
-            await self.announce(0, "", "viewer")
-        except PageAwayError:
+            await asyncio.wait_for(self._has_answered.wait(), ANSWER_PATIENCE)
+        except TimeoutError:
             return False
-        return True
+        return self.is_ready
 
     async def stop(self) -> None:
         """End the page process, which ends its sessions first."""
@@ -186,20 +172,16 @@ class PageKeeper:
             return
         with contextlib.suppress(OSError, ValueError):
             while received := await reader.readline():
-                message = json.loads(received)
-                answer = self._expected.get(message["port"])
-                if message["word"] == "expected" and answer is not None and not answer.done():
-                    answer.set_result(None)
-                elif message["word"] == "prepare":
-                    self.prepare()
-                elif message["word"] == "refused":
-                    LOG.warning("a connection to the page went round the server: closed")
+                match json.loads(received)["word"]:
+                    case "pong":
+                        self._has_answered.set()
+                    case "prepare":
+                        self.prepare()
+                    case "refused":
+                        LOG.warning("a connection to the page went round the server: closed")
 
     async def _end(self) -> None:
         self.port = 0
-        for answer in self._expected.values():
-            if not answer.done():
-                answer.set_exception(PageAwayError("the page ended; try again in a few seconds"))
         process, writer = self._process, self._writer
         self._process = self._reader = self._writer = None
         if process is not None:

@@ -8,7 +8,6 @@ import asyncio
 import contextlib
 import logging
 import re
-import socket
 from collections.abc import Coroutine, Iterator
 
 from starlette.websockets import WebSocket, WebSocketDisconnect, WebSocketState
@@ -20,7 +19,7 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits, TokenBucket
 from hapticdb.server.messages import judged
-from hapticdb.server.page_keeper import PageAwayError, PageKeeper
+from hapticdb.server.page_keeper import PageKeeper
 
 LOG = logging.getLogger("hapticdb.server")
 VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
@@ -37,7 +36,7 @@ RENEW_EVERY = 60.0
 """Seconds between two looks at a browser's cookie. Larger: a cookie that became invalid works
 longer."""
 
-GOING_AWAY, POLICY, TOO_LARGE, TRY_LATER, SIGNED_OUT = 1001, 1008, 1009, 1013, 4401
+GOING_AWAY, POLICY, TRY_LATER, SIGNED_OUT = 1001, 1008, 1013, 4401
 """WebSocket close codes; the last one is ours."""
 
 
@@ -117,16 +116,13 @@ class Relay:
             self._numbers.discard(number)
 
     async def _connected(self, name: str, role: Role, version: Subprotocol) -> ClientConnection:
-        """Connect to the page from a port that was announced before."""
-        sock = socket.socket()
+        """Connect to the page."""
         try:
-            sock.setblocking(False)  # noqa: FBT003 - its only argument
-            sock.bind(("127.0.0.1", 0))
-            port = await self._keeper.announce(sock.getsockname()[1], name, role.word)
-            await asyncio.get_running_loop().sock_connect(sock, ("127.0.0.1", port))
+            if not self._keeper.is_ready:
+                raise ConnectionError("it is starting")
             return await connect(
-                f"ws://127.0.0.1:{port}/",
-                sock=sock,
+                f"ws://127.0.0.1:{self._keeper.port}/",
+                additional_headers=self._keeper.headers(name, role.word),
                 subprotocols=[version],
                 compression=None,  # it costs more time than the loopback interface needs
                 max_size=None,
@@ -135,8 +131,7 @@ class Relay:
                 open_timeout=CONNECT_PATIENCE,
                 proxy=None,
             )
-        except (PageAwayError, OSError, InvalidHandshake, TimeoutError) as error:
-            sock.close()
+        except (OSError, InvalidHandshake, TimeoutError) as error:
             LOG.warning("the page cannot be reached: %s", error)
             raise Closing(TRY_LATER, "the page is starting; try again", "page away") from None
 

@@ -215,9 +215,9 @@ async def run(
     LOG.info("stopped")
 
 
-def _page_request(serving: Serving, server: int, host: int) -> PageRequest:
+def _page_request(serving: Serving, server: int, host: int, secret: str) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
-    return PageRequest(urls, serving.tools, server, host, serving.recordings, serving.title)
+    return PageRequest(urls, serving.tools, server, host, secret, serving.recordings, serving.title)
 
 
 async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:

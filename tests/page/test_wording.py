@@ -2,7 +2,7 @@
 
 import pytest
 
-from hapticdb.page.scene.names import found_ids, tree_of
+from hapticdb.page.scene.names import assemblies_of, found_ids
 from hapticdb.page.wording import (
     escaped,
     note_html,
@@ -49,13 +49,9 @@ NAMES = {
 }
 
 
-def test_the_tree_has_each_object_once_with_counts() -> None:
-    tree = tree_of(NAMES)
-    assert tree.count == 5
-    assert [(b.name, b.count) for b in tree.branches] == [("body", 3), ("engine", 1)]
-    door = tree.branches[0].branches[0]
-    assert (door.path, door.ids, tree.ids) == ("body/door", [7, 4], [1])
-    assert sorted(tree.all_ids()) == sorted(NAMES)
+def test_each_sub_assembly_has_the_objects_below_it_and_stands_before_what_it_holds() -> None:
+    found = assemblies_of(NAMES)
+    assert list(found.items()) == [("body", [7, 4, 2]), ("body/door", [7, 4]), ("engine", [9])]
 
 
 def test_a_search_holds_each_word_in_any_case_and_ranks_last_elements_first() -> None:

@@ -1,6 +1,6 @@
 """The tab Parts: a list with search, what a part is, what is shown, distances, moving a part."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -11,7 +11,7 @@ from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.panels.moving import MovingControls
-from hapticdb.page.scene.names import Branch
+from hapticdb.page.scene.names import assemblies_of, found_ids
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html, plain_name, rows_html, short_name, size_text
 from hapticdb.pointshell.shell import PointShell
@@ -82,19 +82,18 @@ class PartsPanel:
         self._say_chosen()
 
     def _list(self) -> None:
-        site = self._browser.site
+        objects = self._browser.site.objects
         search, hidden = self._search.value.strip(), self._browser.scene.hidden
-        found: list[tuple[str, tuple[int, ...]]] = []
+        names = {i: obj.name for i, obj in objects.items()}
+        found: list[tuple[str, tuple[int, ...]]]
         if search:
-            ids = site.view.search(search[:LONGEST_SEARCH])
-            found += [(site.objects[i].name, (i,)) for i in ids if i in site.objects]
+            found = [(names[i], (i,)) for i in found_ids(names, search[:LONGEST_SEARCH])]
         else:
-            found += [
-                (f"▸ {branch.path} ({branch.count:,} parts)", tuple(branch.all_ids()))
-                for branch in _below(site.view.tree())
+            found = [
+                (f"▸ {path} ({len(ids):,} parts)", tuple(ids))
+                for path, ids in assemblies_of(names).items()
             ]
-            by_name = sorted(site.objects.values(), key=lambda obj: (obj.name, obj.id))
-            found += [(obj.name, (obj.id,)) for obj in by_name]
+            found += [(name, (i,)) for i, name in sorted(names.items(), key=lambda one: one[::-1])]
         self._lines = {}
         for name, ids_of in found[:MOST_LISTED]:
             label = plain_name(name)
@@ -102,8 +101,8 @@ class PartsPanel:
                 label = f"{label} [{ids_of[0]}]"
             self._lines[label + (" (hidden)" if hidden.issuperset(ids_of) else "")] = ids_of
         more = f", {MOST_LISTED:,} listed" if len(found) > MOST_LISTED else ""
-        n_found = len(found) if search else len(site.objects)
-        self._where.content = note_html(f"{n_found:,} of {len(site.objects):,} parts{more}")
+        n_found = len(found) if search else len(objects)
+        self._where.content = note_html(f"{n_found:,} of {len(objects):,} parts{more}")
         self._list_of.options = (NOTHING, *self._lines)
         put(self._list_of, NOTHING)
 
@@ -267,10 +266,3 @@ class PartsPanel:
         distance = length_text(self._browser.scene.measure(start, end))
         along = " / ".join(length_text(float(x)) for x in np.abs(end - start))
         self._distance.content = rows_html((("Distance", distance), ("Along x / y / z", along)))
-
-
-def _below(branch: Branch) -> Iterator[Branch]:
-    """Sub-assemblies below a branch, each before what it holds."""
-    for below in branch.branches:
-        yield below
-        yield from _below(below)

@@ -15,7 +15,6 @@ from hapticdb.page.scene.contents import Contents, is_same_shape
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
 from hapticdb.page.scene.following import Followed, Follower
-from hapticdb.page.scene.names import Branch, found_ids, tree_of
 from hapticdb.page.scene.reading import MOST_BLOCKS, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
 from hapticdb.page.scene.surroundings import add_shadow, add_surroundings
@@ -47,7 +46,6 @@ class SceneView:
         self.on_edit: Callable[[], None] | None = None
         """Called from a thread after each commit, the view's own or another's, is shown."""
         self._is_closed = Event()
-        self._tree: Branch | None = None
         self._is_surrounded = False
         self.up = 2
         """Number of the axis that points up: 0 for x, 1 for y, 2 for z."""
@@ -87,20 +85,6 @@ class SceneView:
         with self.contents.lock:
             return dict(self.contents.records)
 
-    def tree(self) -> Branch:
-        """All objects as sub-assemblies, by the elements of their names, with counts.
-
-        The same object, which nobody may change, until objects come, go or get other names.
-        """
-        with self.contents.lock:
-            if self._tree is None:
-                self._tree = tree_of({i: obj.name for i, obj in self.contents.records.items()})
-            return self._tree
-
-    def search(self, text: str) -> list[int]:
-        """Ids of the objects whose name holds each word of a text, in any case; best first."""
-        return found_ids({i: obj.name for i, obj in self.objects.items()}, text)
-
     # -- edits -------------------------------------------------------------------------------
 
     def move(self, object_id: int, transform: ArrayLike) -> bool:
@@ -124,8 +108,6 @@ class SceneView:
     def _follow(self, followed: Followed) -> None:
         """Show what was committed: the first time, all objects."""
         with self.contents.lock, self._server.atomic():
-            if self._has_other_names(followed):
-                self._tree = None
             self.contents.remove(followed.removed)
             anew = []
             for obj in followed.written:
@@ -141,13 +123,6 @@ class SceneView:
             self._reader.read(anew)
         if self.on_edit is not None:
             self.on_edit()
-
-    def _has_other_names(self, followed: Followed) -> bool:
-        """Whether the names of the objects are others after a commit; a move leaves them."""
-        known = self.contents.records
-        return bool(followed.removed) or any(
-            obj.id not in known or known[obj.id].name != obj.name for obj in followed.written
-        )
 
     def _add_surroundings(self) -> None:
         objects, box = self.contents.records.values(), self.contents.box()

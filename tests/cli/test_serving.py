@@ -12,6 +12,7 @@ import hapticdb
 from children import PATIENCE, child
 from hapticdb.cli import main
 from hapticdb.cli.root import TERMINATED
+from hapticdb.realtime import fork_server
 
 
 @pytest.fixture
@@ -34,9 +35,16 @@ def scene(tmp_path: Path) -> Path:
     ],
 )
 def test_a_mistake_is_one_line_and_starts_nothing(
-    scene: Path, capsys: pytest.CaptureFixture[str], args: list[str], words: str
+    scene: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
+    args: list[str],
+    words: str,
 ) -> None:
+    started: list[str] = []
+    monkeypatch.setattr(fork_server, "prepare", lambda work, _: started.append(work))
     assert main(["serve", str(scene), *args]) == 2
+    assert not started or args[0] in {"--host", "--prefix", "--tls-cert", "--seconds"}
     told = capsys.readouterr()
     assert told.out == ""
     assert words in told.err

@@ -95,19 +95,23 @@ def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list
         if path.suffix.lower() == ".npz":
             found.append(from_shell(path.stem, PointShell.load(path)))
             continue
-        parts = [part for part in mesh.read_file(path).parts if not part.is_cloud]
+        file = mesh.read_file(path)
+        parts = [part for part in file.parts if not part.is_cloud]
         if not parts:
             raise FileError(f"{path}: no triangles; a tool needs a surface")
         vertices = np.concatenate([part.triangles() for part in parts]).reshape(-1, 3)
         middle = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
         faces = np.arange(len(vertices)).reshape(-1, 3)
-        sample = partial(_centred_shell, path, inset)
+        sample = partial(_centred_shell, vertices, faces, inset, file.link)
         found.append(HeldTool(path.stem, sample, vertices - middle, faces))
     return found
 
 
-def _centred_shell(path: Path, inset: float) -> PointShell:
-    return from_shell(path.stem, PointShell.from_file(path, inset=inset)).shell
+def _centred_shell(
+    vertices: Floats, faces: NDArray[np.int64], inset: float, link: str
+) -> PointShell:
+    shell = PointShell.from_mesh(vertices, faces, inset=inset)
+    return from_shell("", replace(shell, link=link)).shell
 
 
 def from_shell(name: str, shell: PointShell) -> HeldTool:

@@ -171,25 +171,27 @@ def _serving(
     recordings: str | None,
 ) -> "Serving":
     """What to serve; refuses an environment, a tool or a folder that is not there."""
-    from hapticdb.realtime.fork_server import prepare
+    from contextlib import closing
 
-    prepare("hapticdb.page.process:work", [])  # loads while the server does here
-    import hapticdb
+    from hapticdb.realtime.fork_server import prepare
     from hapticdb.server.access import Role
-    from hapticdb.server.running import Serving
+    from hapticdb.store.connect import open_store
 
     urls = dict.fromkeys(Role, url)
     for text in role_urls or ():
         role, other = _pair(text, "--role-url")
         urls[role] = other
     for other in dict.fromkeys(urls.values()):
-        with hapticdb.open(other, read_only=True):
+        with closing(open_store(other, read_only=True)):
             pass
     for tool in tools or ():
         if not Path(tool).is_file():
             raise UsageError(f"--tool {tool}: no such file")
     if recordings is not None and not Path(recordings).is_dir():
         raise UsageError(f"--recordings {recordings}: no such folder")
+    prepare("hapticdb.page.process:work", [])  # loads while the server does here
+    from hapticdb.server.running import Serving
+
     return Serving(
         urls=urls, tools=tuple(tools or ()), tokens=tokens,
         open_role=None if tokens else Role.EDITOR,

@@ -31,7 +31,7 @@ FLOORS: list[set[str]] = [
     {"demo", "pictures"},
     {"pool", "warm"},
     {"client", "hosting"},
-    {"clashes", "edits", "extraction", "realtime", "sweeps"},
+    {"clashes", "extraction", "realtime", "sweeps"},
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},

@@ -1,72 +1,176 @@
 """Edits that people make on the page: one thread, one writable connection, undo for each person."""
 
-from collections.abc import Callable
-from typing import Any, TypeVar
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.clashes.run import accept_clash
-from hapticdb.edits.editor import Editor
 from hapticdb.environment import Environment
-from hapticdb.errors import AccessError, ConflictError, HapticDBError, UsageError
+from hapticdb.errors import (
+    AccessError,
+    ConflictError,
+    EnvironmentExistsError,
+    HapticDBError,
+    ObjectNotFoundError,
+    UsageError,
+)
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.wording import error_text, short_name
 from hapticdb.store.base import Object
 
 Answer = TypeVar("Answer")
+Floats = NDArray[np.float64]
+
+
+MOST_STEPS = 1000
+"""Steps of a person that can be undone. Larger: more records in memory."""
+
+
+@dataclass(frozen=True, eq=False)
+class _Step:
+    """One edit of one object, which was one transaction.
+
+    before : the object before it; for "put back", as it was when it was taken out;
+    place (4, 4) : world_from_part after it, metres; for "take out", where the object was.
+    """
+
+    kind: Literal["move", "take out", "put back"]
+    before: Object
+    place: Floats
+
+    def describe(self) -> str:
+        """One line for people: what was done, to which object."""
+        whom = f"{self.before.id} ({self.before.name})"
+        if self.kind != "move":
+            return f"{'took out' if self.kind == 'take out' else self.kind} {whom}"
+        way = self.place[:3, 3] - self.before.transform[:3, 3]
+        turned = self.place[:3, :3] @ np.linalg.inv(self.before.transform[:3, :3])
+        angle = np.degrees(np.arccos(np.clip((np.trace(turned) - 1.0) / 2.0, -1.0, 1.0)))
+        told = f"moved {whom} by {1000 * float(np.linalg.norm(way)):.4g} mm"
+        return f"{told}, turned it by {angle:.3g} degrees" if angle > 0.01 else told
 
 
 class PersonsEdits:
-    """Edits of one person in an environment, each one transaction, and their undo."""
+    """Edits of one person in an environment, each one transaction, and their undo.
+
+    A step is based on an object as the person saw it, and an undo on the person's last write of it.
+    If somebody else has written the object since, nothing is written, and ConflictError says so.
+    Steps from before another's write cannot be undone: they would take that back, too.
+    """
 
     def __init__(self, env: Environment) -> None:
         self._env = env
-        self._editor = Editor(env)
+        self._done: list[_Step] = []
+        self._revisions: dict[int, int] = {}
+        """Of the person's last write of each object, by its id."""
+        self._out: dict[int, Object] = {}
 
-    def move(self, obj: Object, way: NDArray[np.float64]) -> Object:
+    def move(self, obj: Object, way: Floats) -> Object:
         """Displace an object, as the person saw it, by (4, 4); returns it as it is now.
 
         ConflictError if somebody has written the object since.
         """
-        self._check(obj)
-        return self._editor.move(obj.id, way @ obj.transform)
+        place = way @ obj.transform
+        moved = self._move(obj, place, obj.revision)
+        self._note(_Step("move", obj, place))
+        return moved
 
     def take_out(self, obj: Object) -> str:
         """Take an object, as the person saw it, out of the scene; errors as for `move`."""
-        self._check(obj)
-        return f"{short_name(self._editor.take_out(obj.id).name)} is out"
+        before = self._take_out(obj, obj.revision)
+        self._note(_Step("take out", before, before.transform))
+        return f"{short_name(obj.name)} is out"
 
     def put_back(self) -> str:
-        """Put back the object that this person took out last."""
-        out = self._editor.taken_out
-        if not out:
+        """Put back the object that this person took out last.
+
+        UsageError if there is none, ConflictError if somebody has imported it again.
+        """
+        if not self._out:
             raise UsageError("you have taken no part out")
-        return f"{short_name(self._editor.put_back(out[-1].id).name)} is back"
+        before = [*self._out.values()][-1]
+        self._put_back(before)
+        self._note(_Step("put back", before, before.transform))
+        return f"{short_name(before.name)} is back"
 
     def undo(self) -> str:
         """Undo the person's last step; ConflictError if somebody has written its object since."""
-        return self._editor.undo()
+        if not self._done:
+            raise UsageError("there is nothing to undo")
+        step = self._done[-1]
+        before = step.before
+        try:
+            if step.kind == "take out":
+                self._put_back(before)
+            elif step.kind == "put back":
+                self._take_out(before, self._revisions[before.id])
+            else:
+                self._move(before, before.transform, self._revisions[before.id])
+        except ConflictError as error:
+            self._drop(before.id)
+            raise ConflictError(f"cannot undo ({step.describe()}): {error}") from error
+        self._done.pop()
+        return f"undid: {step.describe()}"
 
     def accept(self, a: int, b: int, because: str | None) -> str:
         """Accept a pair of objects that are near, or no longer without a reason."""
         accept_clash(self._env, [a], [b], because)
         return "the pair is no longer accepted" if because is None else "the pair is accepted"
 
-    def _check(self, obj: Object) -> None:
-        """Base the next step on an object as the person saw it, if nobody has written it since.
+    # -- transactions ------------------------------------------------------------------------
 
-        The editor looks at the object only then. After a look at what another has written, an undo
-        would be based on that, too.
+    def _move(self, obj: Object, place: Floats, revision: int) -> Object:
+        with _conflicts_named(obj):
+            moved = self._env.move(obj.id, place, revision=revision)
+        self._wrote(moved, place, revision)
+        return moved
+
+    def _take_out(self, obj: Object, revision: int) -> Object:
+        with _conflicts_named(obj):
+            removed = self._env.remove(obj.id, revision=revision)
+        self._out[removed.id] = removed
+        self._wrote(removed, removed.transform, revision)
+        return removed
+
+    def _put_back(self, removed: Object) -> None:
+        try:
+            now = self._env.restore(removed)
+        except EnvironmentExistsError as error:
+            self._out.pop(removed.id, None)
+            raise ConflictError(f"another has put it back meanwhile: {error}") from None
+        self._out.pop(removed.id, None)
+        self._wrote(now, removed.transform, self._revisions[removed.id])
+
+    def _wrote(self, obj: Object, place: Floats, base: int) -> None:
+        """Note a write, which was based on a revision: of another, it ends what can be undone.
+
+        `obj` was read after the write. It may be as another has written it since.
         """
-        now = self._env.object(obj.id)
-        if now.revision == obj.revision:
-            now = self._editor.look(obj.id)[0]
-        if now.revision != obj.revision:
-            raise ConflictError(
-                f"{short_name(obj.name)}: somebody has moved it since you saw it; it is shown "
-                "where it is now"
-            )
+        if base != self._revisions.get(obj.id, base):
+            self._drop(obj.id)
+        self._revisions[obj.id] = obj.revision if np.array_equal(obj.transform, place) else base
+
+    def _drop(self, object_id: int) -> None:
+        self._done = [step for step in self._done if step.before.id != object_id]
+
+    def _note(self, step: _Step) -> None:
+        self._done = [*self._done, step][-MOST_STEPS:]
+
+
+@contextmanager
+def _conflicts_named(obj: Object) -> Iterator[None]:
+    """Say in a person's words that somebody else has written an object meanwhile."""
+    try:
+        yield
+    except (ConflictError, ObjectNotFoundError) as error:
+        what = "moved it since you saw it; it is shown where it is now"
+        if isinstance(error, ObjectNotFoundError):
+            what = "taken it out since you saw it"
+        raise ConflictError(f"{short_name(obj.name)}: somebody has {what}") from None
 
 
 class Edits:

@@ -1,1 +1,0 @@
-"""Moves of objects by several people: each one transaction, with undo."""

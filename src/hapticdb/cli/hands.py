@@ -18,8 +18,6 @@ VENDORS = {
 """Module and class of each device that can be bought, by its word."""
 RANDOM_SPEED = 0.3
 """Greatest speed of a random hand unless --speed is given, m/s."""
-PATH_SPEED = 0.1
-"""Speed along a path without times unless --speed is given, m/s."""
 
 
 @dataclass(frozen=True)
@@ -38,22 +36,14 @@ class HandOptions:
     is_simulated: bool
     profile: "DeviceProfile | None" = None
 
-    def _path_speed(self) -> float | None:
-        """Speed, m/s, that is assumed for a path without times; None where none is assumed."""
-        from hapticdb.poses import read_timed_poses
-
-        if self.speed is not None or not self._ends_with(".csv"):
-            return None
-        return PATH_SPEED if read_timed_poses(self.word)[0] is None else None
-
     def open(self) -> "tuple[Device, float | None]":
         """Open the device, or read the motion; also the speed assumed for a path without times."""
         self._check()
         if self.word in VENDORS:
             return self._vendor_device(), None
-        path_speed = self._path_speed()
-        hand = self._scripted(path_speed)
-        return self._simulated(hand) if self.is_simulated else hand, path_speed
+        hand = self._scripted()
+        assumed = getattr(hand, "assumed_speed", None)
+        return self._simulated(hand) if self.is_simulated else hand, assumed
 
     def _ends_with(self, suffix: str) -> bool:
         return self.word.lower().endswith(suffix)
@@ -97,20 +87,19 @@ class HandOptions:
             return SimulatedDevice(hand, max_force=self.profile.cap)
         return SimulatedDevice(hand, max_force=self.profile.cap, mass=self.profile.mass)
 
-    def _scripted(self, path_speed: float | None) -> "Device":
+    def _scripted(self) -> "Device":
         """The hand that a motion moves."""
         from hapticdb.devices import scripted
         from hapticdb.recording.file import Recording
 
-        speed = self.speed if path_speed is None else path_speed
         if self.word == "random":
-            greatest = RANDOM_SPEED if speed is None else speed
+            greatest = RANDOM_SPEED if self.speed is None else self.speed
             return scripted.RandomHand(self._position(), self.seed, greatest)
         if self._ends_with(".hdbrec"):
             times, poses = Recording(self.word).poses()
             return scripted.Player(times, poses, loops=self.loops)
         if self._ends_with(".csv"):
-            return scripted.Path(self.word, speed=speed, loops=self.loops)
+            return scripted.Path(self.word, speed=self.speed, loops=self.loops)
         raise UsageError(
             f"--device {self.word!r}: give poses in a .csv, a .hdbrec, random, {', '.join(VENDORS)}"
         )

@@ -25,6 +25,9 @@ LEVER = 0.1
 """Metres. Along a path with a speed, a turn counts as the distance that a point this far from the
 origin moves. Larger: turns take longer."""
 
+PATH_SPEED = 0.1
+"""Metres a second along a path without times, unless another speed is given."""
+
 CYCLE = 20.0
 """Seconds after which `RandomHand` repeats itself; its frequencies are multiples of 1 / CYCLE."""
 
@@ -175,8 +178,10 @@ class Path(Player):
         clock: Clock = time.perf_counter,
     ) -> None:
         times, poses = read_timed_poses(path)
+        self.assumed_speed = PATH_SPEED if times is None and speed is None else None
+        """Metres a second that were assumed because neither file nor `speed` told it."""
         if times is None or speed is not None:
-            times, poses = _times_at(poses, _positive("speed", 0.1 if speed is None else speed))
+            times, poses = _times_at(poses, _positive("speed", self.assumed_speed or speed or 0.0))
         super().__init__(times, poses, loops=loops, clock=clock)
 
 

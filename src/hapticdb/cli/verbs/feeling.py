@@ -9,7 +9,7 @@ import typer
 import hapticdb
 from hapticdb.cli import fitting, render, session_page
 from hapticdb.cli.choosing import Felt, felt_objects
-from hapticdb.cli.forces import ForceOptions
+from hapticdb.cli.forces import law_and_coupling
 from hapticdb.cli.hands import HandOptions
 from hapticdb.cli.options import (
     BudgetOption,
@@ -28,12 +28,14 @@ from hapticdb.cli.options import (
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import compile_for, shell_of
 from hapticdb.cli.values import budget_bytes, size_bytes
+from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
 from hapticdb.realtime.fork_server import prepare
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.report import Report
+    from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
 LOOK_EVERY = 0.25
@@ -195,24 +197,23 @@ def feel(
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     drive = _begin_loop(law, processor, budget_points, frames_on)
-    force = ForceOptions(law, stiffness, device_profile, cap, delay, conservative)
+    profile = None if device_profile is None else profile_named(device_profile)
+    chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
-    hands = HandOptions(device, speed, at, seed or 0, loop, simulate, force.profile())
+    hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, "feel", drive)
-    felt, voxel_size = _looked_at(url, where, exclude)
-    shell = _shell(tool, tool_unit, points, seed, device, force.inset(voxel_size))
-    with force.cells(url, budget_bytes(budget), felt) as cells:
-        chosen, coupling = force.law_and_coupling(cells)
+    felt, inset = _looked_at(url, where, exclude, law or "smooth")
+    shell = _shell(tool, tool_unit, points, seed, device, 0.0 if conservative else inset)
+    with _cells(url, budget_bytes(budget), felt, law) as cells:
         session = hapticdb.Session(
             cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
             coupling=coupling, budget_points=budget_points, frames_on=frames_on,
             processor=processor, record=record, append_recording=append, replace_recording=replace,
             record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
         )  # fmt: skip
-        force.tell_lowered(session)
         with session, ended_by_signals(session.ask_to_end) as signals:
-            report = _waited_for(session, tool)
+            report = _waited_for(session, tool, stiffness)
         session_page.show(report, cells, shell, record, speed, json=json)
     _exit_after(signals, report)
 
@@ -261,11 +262,21 @@ def _begin_loop(
 
 
 def _looked_at(
-    url: str, where: Sequence[str] | None, exclude: Sequence[str] | None
+    url: str, where: Sequence[str] | None, exclude: Sequence[str] | None, law: LawName
 ) -> tuple[Felt, float]:
-    """Words of the options, checked before a process is started, and the edge of a voxel, m."""
+    """Words of the options, checked before a process is started; where contact begins, metres."""
+    from hapticdb.query.law import inset_of
+
     with hapticdb.open(url, read_only=True) as env:
-        return felt_objects(env, where, exclude), env.grid.voxel_size
+        return felt_objects(env, where, exclude), inset_of(env.grid.voxel_size, law)
+
+
+def _cells(url: str, budget_bytes: int, felt: Felt, law: LawName | None) -> "ResidentCells":
+    """Resident cells for a session; they have distances where the law reads them."""
+    distances = None if law is None else law == "smooth"
+    return hapticdb.ResidentCells(
+        url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude, distances=distances
+    )
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
@@ -279,8 +290,11 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
         raise typer.Exit(1)
 
 
-def _waited_for(session: "Session", tool: str) -> "Report":
+def _waited_for(session: "Session", tool: str, stiffness: float | None) -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
+    lowered = getattr(session.coupling, "lowered", None)
+    if stiffness is not None and lowered is not None:
+        render.note(lowered)
     fitting.tell(session.proportions, tool, "--scale")
     report, notes = None, session_page.Notes()
     while report is None:

@@ -7,8 +7,7 @@ strategies take turns at going first.
 
 import os
 import time
-from collections import Counter
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -22,7 +21,7 @@ from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
-from hapticdb.query.frame import Strategy
+from hapticdb.query.frame import Query, Strategy
 from hapticdb.query.touches import Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
@@ -62,42 +61,16 @@ class DemoScene:
     grid_text: str
 
 
-@dataclass
-class _StrategyFigures:
-    """Times and counts of one strategy, frame by frame."""
-
-    elapsed_us: list[float] = field(default_factory=list)
-    statements: list[int] = field(default_factory=list)
-    ranges: list[int] = field(default_factory=list)
-    rows: list[int] = field(default_factory=list)
-    used: Counter[str] = field(default_factory=Counter)
-
-    def add(self, touched: Touch) -> None:
-        """Add the figures of one frame."""
-        query = touched.query
-        self.elapsed_us.append(query.elapsed_us)
-        self.statements.append(query.statements)
-        self.ranges.append(query.ranges)
-        self.rows.append(query.rows)
-        self.used[query.strategy] += 1
-
-    @property
-    def median_us(self) -> float:
-        """Median time of a frame, microseconds."""
-        return float(np.median(self.elapsed_us))
-
-    @property
-    def p99_us(self) -> float:
-        """Time that 99 frames of 100 keep, microseconds."""
-        return float(np.percentile(self.elapsed_us, 99))
-
-
 @dataclass(frozen=True)
 class LayoutFigures:
-    """All strategies on one layout."""
+    """All strategies on one layout: how each asked the database, pose by pose."""
 
     imported: Imported
-    felt: dict[Strategy, _StrategyFigures]
+    felt: dict[Strategy, list[Query]]
+
+    def median_us(self, strategy: Strategy) -> float:
+        """Median time of a strategy's frames, microseconds."""
+        return float(np.median([query.elapsed_us for query in self.felt[strategy]]))
 
 
 @dataclass
@@ -132,8 +105,8 @@ class Comparison:
 
     def against_paper(self) -> str:
         """One line: `auto` on bricks beside the paper's point queries on its layout of voxels."""
-        felt = {measured.imported.layout: measured.felt for measured in self.layouts}
-        ours, theirs = felt["brick"]["auto"].median_us, felt["voxel"][YARDSTICK].median_us
+        known = {measured.imported.layout: measured for measured in self.layouts}
+        ours, theirs = known["brick"].median_us("auto"), known["voxel"].median_us(YARDSTICK)
         return (
             f"auto on bricks against the paper's point queries on voxels: "
             f"{ours:.0f} µs to {theirs:.0f} µs, {theirs / ours:.1f} times as fast"
@@ -217,21 +190,21 @@ def compare(scene: DemoScene) -> Comparison:
 
 def _race(
     env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
-) -> dict[Strategy, _StrategyFigures]:
-    """Figures of every strategy. Each pose's answer is compared with `reference`.
+) -> dict[Strategy, list[Query]]:
+    """How every strategy asked. Each pose's answer is compared with `reference`.
 
     The first layout's first strategy fills `reference`; differences are added to `disagreed`.
     """
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy, law="plane")
-    felt: dict[Strategy, _StrategyFigures] = {strategy: _StrategyFigures() for strategy in COMPARED}
+    felt: dict[Strategy, list[Query]] = {strategy: [] for strategy in COMPARED}
     for index, pose in enumerate(scene.poses):
         # the first strategy at a pose brings its pages into the cache: they take turns at it
         turn = index % len(COMPARED)
         for strategy in COMPARED[turn:] + COMPARED[:turn]:
             touched = env.touch(scene.shell, pose, strategy, law="plane")
-            felt[strategy].add(touched)
+            felt[strategy].append(touched.query)
             found = _found(touched)
             if len(reference) == index:
                 reference.append(found)

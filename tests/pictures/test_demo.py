@@ -35,8 +35,7 @@ def test_every_strategy_agrees_on_both_layouts(comparison: demo.Comparison) -> N
     assert layouts == ["brick", "voxel"]
     for measured in comparison.layouts:
         assert tuple(measured.felt) == demo.COMPARED
-        assert all(len(felt.elapsed_us) == 60 for felt in measured.felt.values())
-        assert measured.felt["auto"].used.total() == 60
+        assert all(len(queries) == 60 for queries in measured.felt.values())
     assert len({measured.imported.voxels for measured in comparison.layouts}) == 1
 
 

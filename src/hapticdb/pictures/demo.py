@@ -207,7 +207,7 @@ def _draw_tool(
 
 
 def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") -> None:
-    one, felt = comparison.layouts[0].imported, comparison.layouts[0].felt["auto"]
+    one, median_us = comparison.layouts[0].imported, comparison.layouts[0].median_us("auto")
     figure.text(0.022, 0.955, "hapticdb", color="white", fontsize=25, weight="bold", va="center")
     lines = (
         (
@@ -216,7 +216,7 @@ def _draw_words(figure: Figure, scene: "DemoScene", comparison: "Comparison") ->
         ),
         (
             f"{len(scene.shell)} points of a spanner looked up {len(scene.poses):,} times, "
-            f"{felt.median_us / 1000:.2f} ms each time"
+            f"{median_us / 1000:.2f} ms each time"
         ),
     )
     for number, line in enumerate(lines):

@@ -1,5 +1,6 @@
 """The verbs that need no data of the user's: sample, demo."""
 
+from collections import Counter
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -125,20 +126,14 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
 
     from hapticdb.demo import YARDSTICK
 
-    base = measured.felt[YARDSTICK].median_us
-    rows = [
-        (
-            name,
-            f"{felt.median_us:.0f}",
-            f"{felt.p99_us:.0f}",
-            f"{np.mean(felt.statements):.0f}",
-            f"{np.mean(felt.ranges):.0f}",
-            f"{np.mean(felt.rows):.0f}",
-            f"{base / felt.median_us:.1f}",
-        )
-        for name, felt in measured.felt.items()
-    ]
-    keys = np.median(measured.felt[YARDSTICK].ranges)
+    base = measured.median_us(YARDSTICK)
+    rows = []
+    for name, queries in measured.felt.items():
+        _, statements, ranges, n_rows, elapsed = zip(*queries, strict=True)
+        median, p99 = np.percentile(elapsed, [50, 99])
+        counts = (f"{np.mean(asked):.0f}" for asked in (statements, ranges, n_rows))
+        rows.append((name, f"{median:.0f}", f"{p99:.0f}", *counts, f"{base / median:.1f}"))
+    keys = np.median([query.ranges for query in measured.felt[YARDSTICK]])
     one = measured.imported
     render.say(
         f"\n{one.engine}, {one.layout} layout, {render.counted(one.rows, 'row')}; "
@@ -147,4 +142,5 @@ def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> 
     )
     columns = ("strategy", "median µs>", "p99 µs>", "statements>", "ranges>", "rows>", "x faster>")
     render.table(columns, rows)
-    render.say(f"auto chose {render.shares(measured.felt['auto'].used)}")
+    used = Counter(query.strategy for query in measured.felt["auto"])
+    render.say(f"auto chose {render.shares(used)}")

@@ -8,6 +8,7 @@ import io
 import tempfile
 import time
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -187,7 +188,10 @@ def main() -> None:
         server.scene.world_axes.visible = False
         page = browser.new_page(viewport={"width": SIZE[0], "height": SIZE[1]})
         page.set_default_timeout(1000.0 * PATIENCE)
-        with SceneView(server, str(url)) as view, hapticdb.open(url, read_only=True) as env:
+        with (
+            closing(SceneView(server, str(url))) as view,
+            hapticdb.open(url, read_only=True) as env,
+        ):
             page.goto(f"http://127.0.0.1:{server.get_port()}/?fixedDpr=1&hideViserLogo")
             end = time.monotonic() + PATIENCE
             while (view.contents.waiting() or not server.get_clients()) and time.monotonic() < end:

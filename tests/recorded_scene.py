@@ -23,6 +23,11 @@ class RecordedNode:
         self.visible = True
         self.__dict__.update(props)
 
+    def __setattr__(self, name: str, value: Any) -> None:
+        if isinstance(value, np.ndarray):
+            self._nodes.bytes_sent += value.nbytes
+        super().__setattr__(name, value)
+
     def remove(self) -> None:
         del self._nodes.nodes[self._name]
 
@@ -32,12 +37,14 @@ class RecordedScene:
 
     def __init__(self) -> None:
         self.nodes: dict[str, RecordedNode] = {}
+        self.bytes_sent = 0
 
     def add_batched_meshes_simple(  # as viser's
         self, name: str, vertices: Any, faces: Any, wxyzs: Any, positions: Any, **props: Any
     ) -> RecordedNode:
         props |= {"batched_wxyzs": np.asarray(wxyzs, np.float32), "vertices": vertices}
         props |= {"batched_positions": np.asarray(positions, np.float32), "faces": faces}
+        self.bytes_sent += vertices.nbytes + faces.nbytes
         self.nodes[name] = RecordedNode(self, name, **props)
         return self.nodes[name]
 

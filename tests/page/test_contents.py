@@ -168,10 +168,10 @@ def test_moves_are_drawn_in_place_and_send_few_bytes(shown: Shown) -> None:
             assert contents.move(obj.id, to)
             contents.refresh()
             expected[obj.id] = moved(shown.triangles[obj.id], obj, to)
-        before = contents.bytes_sent
+        before = shown.scene.bytes_sent
         contents.move(obj.id, placed(obj, 77))
         contents.refresh()
-        assert contents.bytes_sent - before < 28 * 35
+        assert shown.scene.bytes_sent - before < 28 * 35
         contents.move(obj.id, to)
         contents.refresh()
     seen, files = drawn(shown.scene), np.concatenate(list(expected.values()))

@@ -3,6 +3,7 @@
 import re
 import shutil
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -126,7 +127,7 @@ def aim(car: Path) -> Iterator[Aim]:
     viser_server = new_server()
     try:
         with (
-            SceneView(viser_server, str(car)) as view,
+            closing(SceneView(viser_server, str(car))) as view,
             hapticdb.open(car, read_only=True) as env,
         ):
             patiently(lambda: view.contents.waiting() == 0)

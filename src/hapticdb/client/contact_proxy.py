@@ -46,14 +46,12 @@ class _LinkFigures(NamedTuple):
     """Figures of a connection so far.
 
     proxies, late : proxies that arrived, and those of them that were too old to use; bytes : of all
-    proxies; round_trip : seconds, median of the last ones, without the time that the server kept a
-    hand; losses : how often the connection was lost.
+    proxies; losses : how often the connection was lost.
     """
 
     proxies: int
     late: int
     bytes: int
-    round_trip: float
     losses: int
 
 
@@ -126,7 +124,6 @@ class ContactProxy:
         """Why the server is not reached now; None while it is."""
         self._arrived = time.monotonic()
         self._counts = [0, 0, 0, 0]  # proxies, late, bytes, losses
-        self._trips: list[float] = []
         self._seen = 0
         self._threads = [
             threading.Thread(target=target, daemon=True, name=name)
@@ -191,18 +188,9 @@ class ContactProxy:
         """What the last wrench was computed from."""
         return self._force.told
 
-    @property
-    def is_connected(self) -> bool:
-        """Whether the server is connected now."""
-        return self._connection is not None
-
     def figures(self) -> _LinkFigures:
         """Figures of the connection so far."""
-        proxies, late, n_bytes, losses = self._counts
-        trips = self._trips[-1000:]
-        return _LinkFigures(
-            proxies, late, n_bytes, float(np.median(trips)) if trips else 0.0, losses
-        )
+        return _LinkFigures(*self._counts)
 
     # -- the network's threads -----------------------------------------------------------------
 
@@ -224,8 +212,6 @@ class ContactProxy:
             counts[0] += 1
             counts[1] += not self._force.take(proxy, now)
             counts[2] += size
-            if proxy.echo:
-                self._trips = [*self._trips[-999:], now - proxy.echo_clock - proxy.kept]
 
     def _lose(self, connection: ContactConnection, error: HapticDBError) -> None:
         if self._is_closed.is_set():

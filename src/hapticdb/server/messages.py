@@ -58,18 +58,6 @@ class ScenePointerMessage(_Message, tag=True):
     modifier: Modifier = None
 
 
-class SceneNodeClickMessage(_Message, tag=True):
-    """A click on a part."""
-
-    name: Name
-    instance_index: Whole | None
-    ray_origin: Three
-    ray_direction: Three
-    screen_pos: tuple[Real, Real]
-    modifier: Modifier = None
-    owner: Name = ""
-
-
 class TransformControlsUpdateMessage(_Message, tag=True):
     """A gizmo moves."""
 
@@ -103,12 +91,6 @@ class GuiUpdateMessage(_Message, tag=True):
     updates: _ValueUpdate
 
 
-class CommandTriggerMessage(_Message, tag=True):
-    """A command was chosen, or its key pressed."""
-
-    uuid: Name
-
-
 class _Tag(msgspec.Struct):
     """The type of any message."""
 
@@ -118,12 +100,10 @@ class _Tag(msgspec.Struct):
 Known = (
     ViewerCameraMessage
     | ScenePointerMessage
-    | SceneNodeClickMessage
     | TransformControlsUpdateMessage
     | TransformControlsDragStartMessage
     | TransformControlsDragEndMessage
     | GuiUpdateMessage
-    | CommandTriggerMessage
 )
 FOR_HANDS = (
     TransformControlsUpdateMessage,

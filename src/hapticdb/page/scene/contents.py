@@ -44,17 +44,6 @@ class Contents:
         self._loose: set[int] = set()
         self._preview: dict[int, NDArray[np.float64]] = {}
 
-    @property
-    def n_nodes(self) -> int:
-        """Nodes that all browsers are sent."""
-        with self.lock:
-            return len(self._audiences[ALL][0].names)
-
-    @property
-    def bytes_sent(self) -> int:
-        """Bytes of all arrays that were sent to all browsers, each browser counted once."""
-        return self._audiences[ALL][0].bytes_sent
-
     # -- objects -----------------------------------------------------------------------------
 
     def add(self, objects: Sequence[Object]) -> None:

@@ -110,8 +110,6 @@ class Audience:
         self._scene = scene
         self._meshes: dict[str, tuple[Hashable, BatchedMeshHandle | PointCloudHandle]] = {}
         self._blanks: dict[str, SceneNodeHandle] = {}
-        self.bytes_sent = 0
-        """Bytes of all arrays of nodes, before compression."""
 
     @property
     def names(self) -> set[str]:
@@ -142,7 +140,6 @@ class Audience:
         ):
             if not np.array_equal(getattr(mesh, prop), value):
                 setattr(mesh, prop, value)
-                self.bytes_sent += value.nbytes
 
     def _added(
         self, name: str, drawing: Drawing | Sprinkle
@@ -150,7 +147,6 @@ class Audience:
         if isinstance(drawing, Sprinkle):
             return self._sprinkled(name, drawing)
         vertices, faces = drawing.geometry.make()
-        self.bytes_sent += vertices.nbytes + faces.nbytes + 31 * len(drawing.positions)
         return self._scene.add_batched_meshes_simple(
             name,
             vertices,
@@ -168,7 +164,6 @@ class Audience:
 
     def _sprinkled(self, name: str, drawing: Sprinkle) -> "PointCloudHandle":
         points, colours, size = drawing.dots
-        self.bytes_sent += points.nbytes + colours.nbytes
         return self._scene.add_point_cloud(
             name,
             points,

@@ -3,7 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from threading import Event
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -33,7 +33,7 @@ class SceneView:
 
     Boxes are shown at once, then the objects' surfaces and points as they are read, then, as
     blocks, the voxels of objects without a surface in the database. All methods may be called from
-    any thread. It is a context manager, which closes it.
+    any thread.
 
     The server's scene below ``/parts``, its ground, light, background and first view are this
     view's. HapticDBError if the environment cannot be opened or read.
@@ -58,12 +58,6 @@ class SceneView:
         except BaseException:
             self._reader.close()
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the view's threads and its connection. The browsers keep what they show."""

@@ -19,6 +19,7 @@ Errors are in `hapticdb.errors`.
 """
 
 from importlib import import_module
+from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb import errors as errors
@@ -61,6 +62,7 @@ if TYPE_CHECKING:
     from hapticdb.query.law import TangentPlane as TangentPlane
     from hapticdb.query.quantiles import QuantileVector as QuantileVector
     from hapticdb.query.touches import Touch as Touch
+    from hapticdb.ready import warm_up as warm_up
     from hapticdb.realtime.coupling import Coupling as Coupling
     from hapticdb.realtime.handle import Handle as Handle
     from hapticdb.realtime.report import Report as Report
@@ -76,52 +78,14 @@ if TYPE_CHECKING:
     from hapticdb.sweeps.run import sweep as sweep
     from hapticdb.transfer import CopyReport as CopyReport
     from hapticdb.transfer import copy_environment as copy_environment
-    from hapticdb.warm import warm_up as warm_up
 
 __version__ = "0.1.0"
 
-_HOMES = {
-    "batches.feeler": "Feeler",
-    "batches.result": "ClearanceBatch TouchBatch",
-    "check": "CheckReport check_environment",
-    "clashes.result": "Clashes",
-    "clashes.run": "accept_clash find_clashes",
-    "difference": "Difference diff_environments",
-    "environment": "Environment create open",
-    "extraction.disassembly.result": "Disassembly",
-    "extraction.disassembly.run": "disassemble",
-    "extraction.result": "Extraction",
-    "extraction.run": "extract",
-    "query.law": "DistanceField TangentPlane",
-    "grid": "Grid GridOptions",
-    "ingest.files": "FileReport ImportOptions import_files",
-    "ingest.upgrading": "UpgradeReport upgrade_environment",
-    "pictures.plots": "plot",
-    "pointshell.shell": "PointShell",
-    "pool": "Pool",
-    "poses": "read_poses write_poses",
-    "proportions": "Proportions compare_proportions",
-    "query.frame": "Query",
-    "realtime.coupling": "Coupling",
-    "realtime.handle": "Handle",
-    "recording.file": "Recording",
-    "recording.replay": "Replayed replay",
-    "realtime.report": "Report",
-    "realtime.resident_cells": "ResidentCells",
-    "realtime.session": "Session",
-    "sweeps.run": "sweep",
-    "sweeps.result": "Swept",
-    "query.cost_model": "CostModel",
-    "query.quantiles": "QuantileVector",
-    "store.base": "Object",
-    "store.connect": "backup_environment restore_environment",
-    "query.touches": "Touch",
-    "transfer": "CopyReport copy_environment",
-    "warm": "warm_up",
-}
-"""Modules of the public names, which are imported when the name is first used: a program pays for
-what it uses, and ``hapticdb --help`` for nothing."""
-_HOME_OF = {name: module for module, names in _HOMES.items() for name in names.split()}
+_LINES = Path(__file__).read_text("utf-8").splitlines()
+_WORDS = [line.split() for line in _LINES if line.startswith("    from hapticdb.")]
+_HOME_OF = {words[3]: words[1] for words in _WORDS}
+"""Modules of the public names, read from the lines above, which type checkers read. A module is
+imported when its name is first used: a program pays for what it uses."""
 __all__ = [*sorted(_HOME_OF)]  # noqa: PLE0604 - they are strings
 
 
@@ -129,7 +93,7 @@ def __getattr__(name: str) -> object:
     """Import a public name from its module."""
     if name not in _HOME_OF:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    value: object = getattr(import_module(f"hapticdb.{_HOME_OF[name]}"), name)
+    value: object = getattr(import_module(_HOME_OF[name]), name)
     globals()[name] = value
     return value
 

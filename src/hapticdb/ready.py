@@ -2,10 +2,17 @@
 
 import os
 import sys
-from collections.abc import Collection
+from collections.abc import Callable, Collection
 from threading import Lock
 
-from hapticdb.kernels.compiling import compile_missing, entries_for, missing
+from hapticdb.kernels.compiling import (
+    NAMES,
+    Compiled,
+    compile_missing,
+    entries_for,
+    load,
+    missing,
+)
 
 SECONDS = {"period.loop.run": 25.0, "period.direct.run_directly": 12.0}
 """Seconds that the longest kernels compile, of one processor; the others take `SHORT` each."""
@@ -40,3 +47,15 @@ def make_ready(*purposes: str) -> None:
             sys.stderr.flush()
             compile_missing(names)
         _READY.update(purposes)
+
+
+def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:
+    """Compile every kernel that this machine has not compiled yet, and load all of them.
+
+    Half a minute on two processors where nothing is compiled yet, a process for each; about a
+    second later. Afterwards no import, touch, session or sweep of this process compiles anything.
+    `progress` is called with the numbers of kernels that are compiled and that were missing, at the
+    start and after each few; not at all when none was missing.
+    """
+    compile_missing(NAMES, progress)
+    load(NAMES)

@@ -29,7 +29,7 @@ FLOORS: list[set[str]] = [
     {"server"},
     {"page"},
     {"demo", "pictures"},
-    {"pool", "warm"},
+    {"pool"},
     {"client", "hosting"},
     {"clashes", "extraction", "realtime", "sweeps"},
     {"recording", "devices"},

@@ -19,7 +19,7 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.page.database import DatabaseThread
-from hapticdb.page.wording import error_text, short_name
+from hapticdb.page.wording import short_name
 from hapticdb.store.base import Object
 
 Answer = TypeVar("Answer")
@@ -177,7 +177,6 @@ class Edits:
     """Edits of all people of a page, at the environment's address for one who may write."""
 
     def __init__(self, url: str) -> None:
-        self._url = url
         self._database = DatabaseThread(url, read_only=False)
         self._of: dict[int, PersonsEdits] = {}
 
@@ -190,12 +189,13 @@ class Edits:
     ) -> None:
         """Do an edit of a person later; then call `then` or `failed`. Waits for no database.
 
-        person : a number that nobody else ever gets. The error names neither the environment's
-        address nor its user.
+        person : a number that nobody else ever gets.
         """
 
         def refused(error: HapticDBError) -> None:
-            failed(self._without_address(error))
+            if isinstance(error, AccessError):
+                error = AccessError("the server may only read its database: nothing was changed")
+            failed(error)
 
         def work(env: Environment) -> Answer:
             own = self._of.get(person)
@@ -204,13 +204,6 @@ class Edits:
             return job(own)
 
         self._database.ask(work, then, refused)
-
-    def _without_address(self, error: HapticDBError) -> HapticDBError:
-        """Return an error as people elsewhere may read it."""
-        if isinstance(error, AccessError):
-            return AccessError("the server may only read its database: nothing was changed")
-        text = error_text(error, (self._url,))
-        return error if text == str(error) else HapticDBError(text)
 
     def forget(self, person: int) -> None:
         """Forget a person's moves."""

@@ -9,7 +9,7 @@ import pytest
 import trimesh
 
 from command_line import Run, on_terminal, refused, run  # noqa: F401 - fixtures
-from hapticdb.cli import columns, main
+from hapticdb.cli import main, render
 from hapticdb.cli.verbs.listing import PAGE
 
 N_BOLTS = 60
@@ -71,9 +71,10 @@ def test_a_terminal_has_as_many_as_it_shows(bolts: Path) -> None:
 # -- columns --------------------------------------------------------------------------------------
 
 
-def test_columns_stand_below_their_headings() -> None:
+def test_columns_stand_below_their_headings(capsys: pytest.CaptureFixture[str]) -> None:
     rows = [("1", "short", "10"), ("12", "a somewhat longer text", "9,000"), ("3", "部品", "")]
-    assert columns.table(("id>", "name", "n>"), rows) == [
+    render.table(("id>", "name", "n>"), rows)
+    assert capsys.readouterr().out.splitlines() == [
         " id   name                         n",
         "─" * 37,
         "  1   short                       10",

@@ -11,8 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ParamSpec
-
-from hapticdb.cli import columns
+from unicodedata import category, east_asian_width
 
 if TYPE_CHECKING:
     import numpy as np
@@ -25,6 +24,8 @@ _UNPRINTABLE = re.compile(
 )
 """Controls of a terminal, and of the direction of writing; a line's end is neither."""
 NEW_LINE = "\n"
+GAP, FACTS_GAP = 3, 2
+"""Blanks between two columns of a table, and between a name and its value."""
 Progressed = ParamSpec("Progressed")
 """What a callback of the library is called with."""
 
@@ -62,11 +63,6 @@ def say(text: str = "") -> None:
     print(printable(text))
 
 
-def _cell(text: str) -> str:
-    """Text of one cell of a table, in one line."""
-    return printable(text).replace(NEW_LINE, "\\n")
-
-
 def say_json(record: Mapping[str, Any]) -> None:
     """Print one JSON object on a line; numbers round-trip and are finite."""
     print(json.dumps(record, allow_nan=False))
@@ -74,13 +70,41 @@ def say_json(record: Mapping[str, Any]) -> None:
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under headings; a heading that ends in ``>`` is of a column of numbers."""
-    laid = columns.table(headings, [[_cell(text) for text in row] for row in rows])
-    print("\n".join(laid))
+    numbers = [heading.endswith(">") for heading in headings]
+    lines = _laid([[heading.rstrip(">") for heading in headings], *rows], numbers, GAP)
+    rule = "─" * (max(map(_width_of, lines)) + 2)
+    print("\n".join([f" {lines[0]}", rule, *(f" {line}" for line in lines[1:])]))
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> None:
     """Print names and values, a pair a line."""
-    print("\n".join(columns.facts((_cell(name), _cell(value)) for name, value in rows)))
+    print("\n".join(_laid([*rows], [False, False], FACTS_GAP)))
+
+
+def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool], gap: int) -> list[str]:
+    """Lines of rows whose columns are as wide as they need.
+
+    Of 4,000 objects a general table library laid out the columns in 9.8 of 11 s, under a profiler.
+    """
+    cells = [[printable(text).replace(NEW_LINE, "\\n") for text in row] for row in rows]
+    widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
+    lines = []
+    for row in cells:
+        blanks = [" " * (width - _width_of(text)) for text, width in zip(row, widths, strict=True)]
+        padded = (
+            blank + text if is_number else text + blank
+            for text, blank, is_number in zip(row, blanks, numbers, strict=True)
+        )
+        lines.append((" " * gap).join(padded).rstrip())
+    return lines
+
+
+def _width_of(text: str) -> int:
+    """Columns that a text takes on a terminal."""
+    if text.isascii():
+        return len(text)
+    kinds = [character for character in text if category(character) not in {"Mn", "Me", "Cf"}]
+    return sum(2 if east_asian_width(character) in "WF" else 1 for character in kinds)
 
 
 def counted(n: float, noun: str = "") -> str:

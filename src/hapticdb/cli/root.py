@@ -16,6 +16,15 @@ class Interrupted(Exception):  # noqa: N818 - no error: the user pressed Ctrl-C
     """Ctrl-C, with what the user should know about the state that is left."""
 
 
+@contextmanager
+def left_at(state: str) -> Iterator[None]:
+    """Say what is left when Ctrl-C ends the block."""
+    try:
+        yield
+    except KeyboardInterrupt:
+        raise Interrupted(f"interrupted; {state}") from None
+
+
 class PipeClosedError(Exception):
     """The reader of standard output has closed it, as ``| head`` does."""
 

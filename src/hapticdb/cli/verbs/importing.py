@@ -15,7 +15,7 @@ from hapticdb.cli.options import (
     UnitName,
     UrlArgument,
 )
-from hapticdb.cli.root import Interrupted
+from hapticdb.cli.root import left_at
 from hapticdb.cli.values import numbers_of
 
 if TYPE_CHECKING:
@@ -179,15 +179,11 @@ def _imported(
     """Import files: a report of each, and seconds."""
     from hapticdb.ingest.files import import_files
 
-    try:
+    with left_at("what went in is whole, and the same command goes on from there"):
         render.compile_kernels("import", files=files)
         started = time.perf_counter()
         with render.import_bar() as progress:
             reports = import_files(url, files, options, progress)
-    except KeyboardInterrupt:
-        raise Interrupted(
-            "interrupted; what went in is whole, and the same command goes on from there"
-        ) from None
     return reports, time.perf_counter() - started
 
 

@@ -6,15 +6,16 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, UrlArgument
-from hapticdb.cli.root import Interrupted
+from hapticdb.cli.root import left_at
 from hapticdb.cli.verbs.importing import JobsOption
 
 if TYPE_CHECKING:
     from collections.abc import Callable
+    from contextlib import AbstractContextManager
 
     from hapticdb.check import CheckReport
     from hapticdb.ingest.upgrading import UpgradeReport
-    from hapticdb.store.engines import BackupReport
+    from hapticdb.store.engines import BackupCallback, BackupReport
 
 CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
@@ -114,13 +115,8 @@ def backup(
     """
     from hapticdb.store.connect import backup_environment
 
-    try:
-        with render.bar(
-            "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
-        ) as progress:
-            report = backup_environment(url, file, replace=replace, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; there is no new {file}") from None
+    with left_at(f"there is no new {file}"), _bar() as progress:
+        report = backup_environment(url, file, replace=replace, progress=progress)
     _say_copied(report, json=json)
 
 
@@ -135,14 +131,15 @@ def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -
     """
     from hapticdb.store.connect import restore_environment
 
-    try:
-        with render.bar(
-            "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
-        ) as progress:
-            report = restore_environment(file, url, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(f"interrupted; {url} is as it was") from None
+    with left_at(f"{url} is as it was"), _bar() as progress:
+        report = restore_environment(file, url, progress=progress)
     _say_copied(report, json=json)
+
+
+def _bar() -> "AbstractContextManager[BackupCallback | None]":
+    return render.bar(
+        "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
+    )
 
 
 def _say_copied(report: "BackupReport", *, json: bool) -> None:
@@ -169,14 +166,10 @@ def upgrade(url: UrlArgument, *, jobs: JobsOption = None, json: JsonOption = Fal
     """
     from hapticdb.ingest.upgrading import upgrade_environment
 
-    try:
+    with left_at("what is upgraded is whole, and the same command goes on from there"):
         render.compile_kernels("move")
         with render.import_bar() as progress:
             report = upgrade_environment(url, jobs=jobs, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(
-            "interrupted; what is upgraded is whole, and the same command goes on from there"
-        ) from None
     for left in report.left_out:
         render.note(str(left.error))
     if json:

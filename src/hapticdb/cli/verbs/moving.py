@@ -7,7 +7,7 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, SameCurveOption, SameLayoutOption
-from hapticdb.cli.root import Interrupted
+from hapticdb.cli.root import left_at
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
@@ -45,14 +45,10 @@ def copy(
     """
     from hapticdb.transfer import copy_environment
 
-    try:
+    with left_at("what went over is whole, and the same command goes on from there"):
         render.compile_kernels("copy")
         with _bar("copying") as progress:
             report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
-    except KeyboardInterrupt:
-        raise Interrupted(
-            "interrupted; what went over is whole, and the same command goes on from there"
-        ) from None
     if json:
         render.say_json(vars(report))
     else:

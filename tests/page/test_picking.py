@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticdb.page.scene.facets import Facets
+from hapticdb.page.scene.nodes import Member
 from hapticdb.page.scene.picking import Targets
 from hapticdb.page.scene.shapes import PartShape
 
@@ -45,7 +46,8 @@ def nearest(
 @given(st.integers(0, 2**32), st.sampled_from([1e-3, 1.0, 1e3]))
 def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size: float) -> None:
     rng = np.random.default_rng(seed)
-    targets, triangles = Targets(), {}
+    members: dict[int, Member] = {}
+    targets, triangles = Targets(members), {}
     for number in range(12):
         shape = PartShape(
             Facets(SHAPES[number % 3].facets.vertices * size, SHAPES[number % 3].facets.faces)
@@ -53,7 +55,7 @@ def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size
         pose = np.eye(4)
         pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         pose[:3, 3] = rng.uniform(-1, 1, 3) * size
-        targets.put(number, shape, pose, shape.bounds(pose))
+        members[number] = Member(number, pose, shape.bounds(pose), (0, 0, 0), shape)
         triangles[number] = shape.facets.triangles @ pose[:3, :3].T + pose[:3, 3]
     hidden = set(rng.integers(0, 12, 3).tolist())
     for _ in range(10):
@@ -72,23 +74,26 @@ def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size
 
 
 def test_a_box_is_met_until_its_shape_is_there() -> None:
-    targets = Targets()
-    targets.put(3, None, np.eye(4), np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]]))
+    box = np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+    members = {3: Member(3, np.eye(4), box, (0, 0, 0))}
+    targets = Targets(members)
     found = targets.first([0.2, 0.1, 5.0], [0, 0, -2.0], lambda _: True)
     assert found is not None
     assert found.id == 3
     assert found.distance == pytest.approx(4.0)
-    targets.remove(3)
+    del members[3]
+    targets.changed()
     assert targets.first([0.2, 0.1, 5.0], [0, 0, -2.0], lambda _: True) is None
 
 
 def test_thousands_of_shapes_can_be_hit() -> None:
-    targets = Targets()
+    members: dict[int, Member] = {}
+    targets = Targets(members)
     for number in range(3000):  # Embree crashes when each has a device of its own
         shape = PartShape(SHAPES[1].facets)
         pose = np.eye(4)
         pose[2, 3] = -float(number)
-        targets.put(number, shape, pose, shape.bounds(pose))
+        members[number] = Member(number, pose, shape.bounds(pose), (0, 0, 0), shape)
         assert shape.first_hit(np.array([0.01, 0.02, 5.0]), np.array([0.0, 0, -1])) is not None
     found = targets.first([0.01, 0.02, 5.0], [0, 0, -1], lambda i: i > 2000)
     assert found is not None

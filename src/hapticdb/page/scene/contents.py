@@ -34,7 +34,7 @@ class Contents:
         """Objects by id, as the database had them when they were read last."""
         self._members: dict[int, Member] = {}
         self._home: dict[int, Node] = {}
-        self._targets = Targets()
+        self._targets = Targets(self._members)
         self._audiences: dict[Hashable, tuple[Audience, Sight]] = {
             ALL: (audience, lambda member: member.colour)
         }
@@ -66,7 +66,7 @@ class Contents:
                 if self.records.pop(object_id, None) is not None:
                     self._leave(object_id)
                     del self._members[object_id]
-                    self._targets.remove(object_id)
+                    self._targets.changed()
                     self._loose.discard(object_id)
                     self._preview.pop(object_id, None)
 
@@ -121,7 +121,7 @@ class Contents:
 
     def _moved(self, member: Member) -> None:
         home = self._home[member.id]
-        self._targets.put(member.id, member.shape, member.pose, member.box)
+        self._targets.changed()
         if not home.is_cheap_to_move and member.shape and len(self._loose) < MOST_LOOSE:
             self._leave(member.id)
             self._loose.add(member.id)
@@ -142,7 +142,7 @@ class Contents:
             for member in node.members.values():
                 self._members[member.id] = member
                 self._home[member.id] = node
-                self._targets.put(member.id, member.shape, member.pose, member.box)
+            self._targets.changed()
             self._stale[node.name] = node
 
     def _name(self) -> str:

@@ -127,15 +127,12 @@ class BatchNode:
 class _CloudNode:
     """A cloud at its place, as points."""
 
+    is_cheap_to_move = True
+
     def __init__(self, name: str, member: Member, shape: PartShape, dots: Dots) -> None:
         self.name = name
         self.members = {member.id: member}
         self._serial, self._dots = shape.serial, dots
-
-    @property
-    def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes."""
-        return True
 
     def drawings(self, sight: Sight) -> dict[str, Sprinkle]:
         """Its only node."""
@@ -169,17 +166,14 @@ class _MergedNode:
     one is hidden, marked or moved, the rest is merged anew.
     """
 
+    is_cheap_to_move = False  # all triangles of the node are sent
+
     def __init__(self, name: str, members: Sequence[Member]) -> None:
         self.name = name
         self.members = {member.id: member for member in members}
         boxes = np.stack([member.box for member in members])
         self._low, self._high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
         self._center = (self._low + self._high) / 2
-
-    @property
-    def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes: no, all triangles of the node."""
-        return False
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
         """Its node, and one for each other colour."""

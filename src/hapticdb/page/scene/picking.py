@@ -1,12 +1,12 @@
 """Which object a ray meets first, and where."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.page.scene.shapes import PartShape
+from hapticdb.page.scene.nodes import Member
 
 
 @dataclass(frozen=True)
@@ -18,34 +18,15 @@ class Struck:
     distance: float
 
 
-@dataclass(frozen=True)
-class _Target:
-    shape: PartShape | None
-    pose: NDArray[np.float64]
-    box: NDArray[np.float64]
-
-
 class Targets:
-    """What rays can meet: a shape at a pose for each object, or its box until it has a shape."""
+    """What rays can meet: members by id, each by its shape, or by its box until it has one."""
 
-    def __init__(self) -> None:
-        self._of: dict[int, _Target] = {}
-        self._boxes: NDArray[np.float64] | None = None  # of all targets; None: they have changed
+    def __init__(self, members: Mapping[int, Member]) -> None:
+        self._members = members
+        self._boxes: NDArray[np.float64] | None = None  # of all members; None: they have changed
 
-    def put(
-        self,
-        object_id: int,
-        shape: PartShape | None,
-        pose: NDArray[np.float64],
-        box: NDArray[np.float64],
-    ) -> None:
-        """Set what rays meet of an object; `box` (2, 3) holds it, metres, world frame."""
-        self._of[object_id] = _Target(shape, pose, box)
-        self._boxes = None
-
-    def remove(self, object_id: int) -> None:
-        """Forget an object."""
-        del self._of[object_id]
+    def changed(self) -> None:
+        """Note that members have come, gone or moved."""
         self._boxes = None
 
     def first(
@@ -59,9 +40,9 @@ class Targets:
         start = np.asarray(origin, dtype=np.float64)
         way = np.asarray(direction, dtype=np.float64)
         way = way / np.linalg.norm(way)
-        ids = list(self._of)
+        ids = list(self._members)
         if self._boxes is None:
-            self._boxes = np.array([one.box for one in self._of.values()]).reshape(-1, 2, 3)
+            self._boxes = np.array([one.box for one in self._members.values()]).reshape(-1, 2, 3)
         enters, leaves = _slabs(self._boxes, start, way)
         met = np.flatnonzero((enters <= leaves) & (leaves >= 0))
         nearest: tuple[float, int] | None = None
@@ -71,7 +52,7 @@ class Targets:
             object_id = ids[row]
             if not sees(object_id):
                 continue
-            found = _met(self._of[object_id], start, way, float(enters[row]))
+            found = _met(self._members[object_id], start, way, float(enters[row]))
             if found is not None and (nearest is None or found < nearest[0]):
                 nearest = (found, object_id)
         if nearest is None:
@@ -94,7 +75,7 @@ def _slabs(
 
 
 def _met(
-    target: _Target, start: NDArray[np.float64], way: NDArray[np.float64], enters: float
+    target: Member, start: NDArray[np.float64], way: NDArray[np.float64], enters: float
 ) -> float | None:
     """Distance to an object; None if the ray misses it."""
     if target.shape is None:

@@ -161,6 +161,11 @@ def pose_of_row(position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float6
     return np.asarray(_poses_of(row[None])[0])
 
 
+def row_of_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Position and unit quaternion (7,), scalar first, of a pose (4, 4)."""
+    return np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]])
+
+
 def _poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:
     """Poses (M, 4, 4) of rows whose first columns are `COLUMNS`."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))

@@ -2,6 +2,7 @@
 
 import time
 from collections import deque
+from contextlib import closing
 from pathlib import Path
 
 import numpy as np
@@ -96,7 +97,7 @@ def test_proxies_go_round_a_convex_edge_as_the_coupling_does(tmp_path: Path) -> 
     assert force > 1.0
     with ResidentCells(url, budget_bytes=64 << 20, distances=True) as cells:
         for delay, bound in ((0, 0.08), (10, 0.10), (50, 0.20)):
-            with ContactSource(cells, ball(RADIUS, SIZE, 300), ProxyWish()) as source:
+            with closing(ContactSource(cells, ball(RADIUS, SIZE, 300), ProxyWish())) as source:
                 near = felt(source, places, delay)
                 assert source.share == 1.0  # sliding is no shaking
             error = float(np.sqrt(((near - forces) ** 2).sum(axis=1).mean()))
@@ -112,7 +113,7 @@ def test_a_tip_in_a_narrow_gap_gets_proxies_that_its_client_reads(tmp_path: Path
     tip = PointShell(np.zeros((1, 3)), np.eye(3)[2:], np.zeros(3), is_closed=False)
     with (
         ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells,
-        ContactSource(cells, tip, ProxyWish()) as source,
+        closing(ContactSource(cells, tip, ProxyWish())) as source,
     ):
         for height in np.linspace(0.0, 0.1, 10):
             place = middle + np.array([0.0, 0.0, height * SIZE])
@@ -153,7 +154,7 @@ def test_proxies_of_a_broad_tool_are_merged_and_push_as_the_spring_does(tmp_path
     places = origin + np.column_stack([aside, np.zeros(60), heights])
     with (
         ResidentCells(str(url), budget_bytes=64 << 20, distances=True) as cells,
-        ContactSource(cells, tool, ProxyWish()) as source,
+        closing(ContactSource(cells, tool, ProxyWish())) as source,
     ):
         merged = proxies_of(source, places[:40])
         assert 1 < source._station.follower["merged"] <= 64

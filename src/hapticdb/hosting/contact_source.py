@@ -8,7 +8,6 @@ a proxy computes it, without the interpreter lock.
 import math
 import threading
 import time
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -57,7 +56,7 @@ proxy takes longer."""
 
 
 class ContactSource:
-    """A tool in resident cells that follows a remote hand. Also a context manager.
+    """A tool in resident cells that follows a remote hand.
 
     The source is a reader of the cells until it is closed.
 
@@ -108,12 +107,6 @@ class ContactSource:
         self._clock = 0.0  # of that hand, s
         self.n_sent = 0
         """Proxies computed so far."""
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     @property
     def share(self) -> float:

@@ -24,7 +24,7 @@ from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import row_of_pose
 from hapticdb.query.law import SMOOTH
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
@@ -169,7 +169,7 @@ class SessionHost:
             request = SeatRequest(
                 seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
                 grid=cells.grid, shell=without_surface(shell), coupling=settled,
-                pose=(*pose[:3, 3].tolist(), *quaternion_of(pose[:3, :3])[0].tolist()),
+                pose=tuple(row_of_pose(pose).tolist()),
             )  # fmt: skip
             hand = np.array(request.pose)
             self._board.seats["hand_pose"][seat] = hand

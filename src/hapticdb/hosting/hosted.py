@@ -12,7 +12,7 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import FARTHEST
 from hapticdb.kernels.records import TIME_BIN
 from hapticdb.kernels.rigid import is_rigid
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import row_of_pose
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.report import Spread, spread_of
@@ -94,8 +94,7 @@ class HostedSession:
         if not is_rigid(matrix) or np.abs(matrix[:3, 3]).max() > FARTHEST:
             raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
         seat = self._open_seat()
-        hand = np.concatenate([matrix[:3, 3], quaternion_of(matrix[:3, :3])[0]])
-        self._board.put_hand(seat, time.monotonic_ns(), hand)
+        self._board.put_hand(seat, time.monotonic_ns(), row_of_pose(matrix))
 
     def latest(self) -> Frames | None:
         """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""

@@ -15,10 +15,11 @@ from hapticdb.extraction.problem import corners_of
 from hapticdb.extraction.result import Extraction
 from hapticdb.ingest.geometry import found_parts
 from hapticdb.page import colours
+from hapticdb.page.drawing import put_at
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
 from hapticdb.page.scene.surroundings import add_surroundings
 from hapticdb.pointshell.orientation import Surface
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import row_of_pose
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
 from hapticdb.sweeps.verdict import names_of
@@ -151,25 +152,20 @@ def _move(
 def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
     recording = server.get_scene_serializer()
     for move in moves:  # the player begins again with these; viser sends only what changes
-        _place(move.node, move.poses[-1])
-        _place(move.node, move.poses[0])
+        put_at(move.node, row_of_pose(move.poses[-1]))
+        put_at(move.node, row_of_pose(move.poses[0]))
         move.node.visible = False
         move.node.visible = True
     for move in moves:
         move.words.visible = True
         recording.insert_sleep(PAUSE)
         for pose in move.poses:
-            _place(move.node, pose)
+            put_at(move.node, row_of_pose(pose))
             recording.insert_sleep(1.0 / PICTURES)
         recording.insert_sleep(PAUSE)
         move.node.visible = move.words.visible = False
     recording.insert_sleep(1.0 / PICTURES)
     return str(recording.as_html())
-
-
-def _place(node: "SceneNodeHandle", pose: Floats) -> None:
-    node.position = pose[:3, 3]
-    node.wxyz = quaternion_of(pose[None, :3, :3])[0]
 
 
 def _shown_poses(found: Extraction) -> Floats:

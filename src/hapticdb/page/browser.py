@@ -12,7 +12,6 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.hosted import HostedSession
-from hapticdb.kernels.rigid import poses_of
 from hapticdb.page import checks, colours
 from hapticdb.page.connection import Visitor
 from hapticdb.page.drawing import HandDrawing, add_tool, put_at
@@ -20,7 +19,7 @@ from hapticdb.page.scene.browser import BrowserScene
 from hapticdb.page.site import Site
 from hapticdb.page.tools import HeldTool, start_pose
 from hapticdb.page.wording import plain_name
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import pose_of_row, row_of_pose
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.store.base import Object
 
@@ -156,7 +155,7 @@ class Browser:
 
     def move_hand(self, pose: Floats) -> None:
         """Put the hand at a pose (4, 4), metres."""
-        self.hand = seven(pose)
+        self.hand = row_of_pose(pose)
         session = self.session
         if session is not None and not session.is_over:
             session.move(pose)
@@ -246,11 +245,11 @@ class Browser:
             undo.callback(self.drawing.rest)
             undo.callback(self._unshare)
             session = self.site.host.begin(
-                self.tool.shell, matrix(start), exclude=self._unfelt,
+                self.tool.shell, pose_of_row(start[:3], start[3:]), exclude=self._unfelt,
                 coupling=Coupling(stiffness=self.stiffness), scale=self.scale,
             )  # fmt: skip
             undo.callback(session.end)
-            session.move(matrix(self.hand))
+            session.move(self.matrix_of_hand())
             self._share()
             with self._swapping:
                 if self._is_closed:
@@ -299,13 +298,14 @@ class Browser:
 
     def matrix_of_hand(self) -> Floats:
         """Pose (4, 4) of the hand, metres."""
-        return matrix(self.hand)
+        return pose_of_row(self.hand[:3], self.hand[3:])
 
     def matrix_of_tool(self) -> Floats:
         """Pose (4, 4) of the tool, metres; that of the hand without a session."""
         session = self.session
         frame = None if session is None or session.is_over else session.latest()
-        return matrix(self.hand if frame is None else np.array(frame["tool"][0]))
+        row = self.hand if frame is None else np.array(frame["tool"][0])
+        return pose_of_row(row[:3], row[3:])
 
     def set_stiffness(self, stiffness: float) -> None:
         """Set the spring between hand and tool, N/m."""
@@ -317,7 +317,7 @@ class Browser:
     def _start(self) -> Floats:
         facts = self.site.facts
         pose = start_pose(facts.bounds, facts.up, facts.toward, self.tool.radius, self.number)
-        return seven(pose)
+        return row_of_pose(pose)
 
     def _share(self) -> None:
         """Show the tool to everyone, with the person's name to everyone else."""
@@ -410,16 +410,3 @@ def has_moved(pose: Floats, before: Floats, diagonal: float) -> bool:
     """Whether a pose (7,) looks other than before, in a scene of that diagonal, metres."""
     change = np.abs(pose - before)
     return bool((change[:3] > LEAST_SEEN * diagonal).any() or (change[3:] > LEAST_SEEN).any())
-
-
-def seven(pose: Floats) -> Floats:
-    """Position and unit quaternion (7,) of a pose (4, 4)."""
-    return np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]])
-
-
-def matrix(numbers: Floats) -> Floats:
-    """Pose (4, 4) of position and quaternion (7,)."""
-    poses = np.empty((1, 4, 4))
-    poses_of(np.ascontiguousarray(numbers, dtype=np.float64)[None], poses)
-    found: Floats = poses[0]
-    return found

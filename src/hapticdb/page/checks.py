@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.poses import rotation_of
+from hapticdb.poses import pose_of_row
 
 FARTHEST = 1e6
 """Greatest distance from the origin that a hand may be sent to, metres. Larger: poses in which
@@ -63,10 +63,6 @@ def pose_of(position: object, wxyz: object) -> NDArray[np.float64]:
     """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here."""
     point = numbers_of(position, 3, FARTHEST, "a place")
     turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
-    length = float(np.linalg.norm(turn))
-    if length < 1e-6:
+    if float(np.linalg.norm(turn)) < 1e-6:
         raise UsageError("a turn: give a quaternion that is not zero")
-    pose = np.eye(4)
-    pose[:3, :3] = rotation_of(turn / length)[0]
-    pose[:3, 3] = point
-    return pose
+    return pose_of_row(point, turn)

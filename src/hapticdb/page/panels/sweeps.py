@@ -14,7 +14,7 @@ from hapticdb.page.drawing import add_marks, add_tool, put_at
 from hapticdb.page.panels.working import Progress, Work
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.poses import quaternion_of
+from hapticdb.poses import row_of_pose
 from hapticdb.sweeps.result import PathPlace, Swept
 from hapticdb.sweeps.run import sweep
 from hapticdb.sweeps.verdict import gap_text, percent, verdict_line
@@ -116,7 +116,7 @@ class SweepPanel:
         pose[:3, 3] += pose[:3, :3] @ tools.middle_of(found.shell)
         colour = colours.MARK if swept.hits else self._browser.colour
         node = add_tool(scene, "/swept", ghost, colour, 0.4)
-        put_at(node, np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]]))
+        put_at(node, row_of_pose(pose))
         words = "hit" if swept.hits else f"nearest, {gap_text(swept)},"
         self._drawn = [
             node,

@@ -45,11 +45,10 @@ class Role(IntEnum):
     @classmethod
     def of(cls, word: str) -> "Role":
         """Find the role of that name; a UsageError if there is none."""
-        for role in cls:
-            if role.word == word:
-                return role
-        known = ", ".join(role.word for role in cls)
-        raise UsageError(f"no role {word!r}: choose one of {known}")
+        known = {role.word: role for role in cls}
+        if word not in known:
+            raise UsageError(f"no role {word!r}: choose one of {', '.join(known)}")
+        return known[word]
 
 
 @dataclass

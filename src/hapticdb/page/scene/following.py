@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future
-from dataclasses import dataclass
 from threading import Event, Thread
 
 from hapticdb.environment import Environment
@@ -19,25 +18,17 @@ TRY_AGAIN_S = 1.0
 """Seconds after a failed statement until the next look."""
 
 
-@dataclass(frozen=True)
-class Followed:
-    """What was committed: states of the objects that were written, ids of those that are gone."""
-
-    written: list[Object]
-    removed: list[int]
-    revision: int
-
-
 class Follower:
     """Opens an environment to read, and tells what is committed to it, in a thread of its own.
 
-    tell : called from that thread, first with all objects, then with each change.
+    tell : called from that thread, first with all objects, then with each change: the objects that
+    were written, the ids of those that are gone, and the revision.
     """
 
     grid: Grid
     """The environment's grid, from `start` on."""
 
-    def __init__(self, url: str, tell: Callable[[Followed], None]) -> None:
+    def __init__(self, url: str, tell: Callable[[list[Object], list[int], int], None]) -> None:
         self._url = url
         self._tell = tell
         self._ended = Event()
@@ -101,7 +92,7 @@ class Follower:
         removed = [i for i in gone if self._revisions.pop(i, None) is not None]
         self._revisions.update({obj.id: obj.revision for obj in written})
         self._revision = revision
-        self._tell(Followed(written, removed, revision))
+        self._tell(written, removed, revision)
 
 
 def _may_have_changed(env: Environment) -> bool:

@@ -14,7 +14,7 @@ from hapticdb.grid import Grid
 from hapticdb.page.scene.contents import Contents, is_same_shape
 from hapticdb.page.scene.drawings import Audience
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
-from hapticdb.page.scene.following import Followed, Follower
+from hapticdb.page.scene.following import Follower
 from hapticdb.page.scene.reading import MOST_BLOCKS, ShapedObject, ShapeReader, centred
 from hapticdb.page.scene.shapes import PartShape
 from hapticdb.page.scene.surroundings import add_shadow, add_surroundings
@@ -99,19 +99,19 @@ class SceneView:
             if obj is not None:
                 self.move(object_id, obj.transform)
 
-    def _follow(self, followed: Followed) -> None:
+    def _follow(self, written: list[Object], removed: list[int], revision: int) -> None:
         """Show what was committed: the first time, all objects."""
         with self.contents.lock, self._server.atomic():
-            self.contents.remove(followed.removed)
+            self.contents.remove(removed)
             anew = []
-            for obj in followed.written:
+            for obj in written:
                 known = self.contents.records.get(obj.id)
                 if known is not None and is_same_shape(known, obj):
                     self.contents.move(obj.id, obj.transform, obj)
                 else:
                     anew.append(obj)
             self.contents.add(anew)
-            self.revision = followed.revision
+            self.revision = revision
             self._add_surroundings()
         if anew:
             self._reader.read(anew)

@@ -80,7 +80,7 @@ class Contacts:
         self._served = served
         self._tool_names = {Path(file).stem for file in served.tools} or {*BUILT_IN}
         self._changing = asyncio.Lock()
-        self._threads: ThreadPoolExecutor | None = None
+        self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="contacts")
         self._cells: ResidentCells | None = None
         self._tools: dict[str, PointShell] = {}
         self.n_clients = 0
@@ -144,28 +144,25 @@ class Contacts:
             if self._cells is None:
                 try:
                     await self._served.preparation.done()
-                    await asyncio.to_thread(self._open)
+                    self._cells = await asyncio.to_thread(self._open)
                 except HapticDBError:
                     LOG.exception("contact proxies cannot be served")
             return self._cells
 
-    def _open(self) -> None:
-        served = self._served
-        cells = ResidentCells(served.urls[Role.TOUCHER], distances=True)
+    def _open(self) -> ResidentCells:
+        cells = ResidentCells(self._served.urls[Role.TOUCHER], distances=True)
         try:
-            self._tools = _tools(served.tools, cells)
+            self._tools = _tools(self._served.tools, cells)
         except BaseException:
             cells.close()
             raise
-        self._threads = ThreadPoolExecutor(THREADS, thread_name_prefix="contacts")
-        self._cells = cells
+        return cells
 
     async def _rest(self) -> None:
         """Free cells and tools if nobody feels them."""
         async with self._changing:
-            if not self.n_clients and self._cells is not None and self._threads is not None:
+            if not self.n_clients and self._cells is not None:
                 cells, self._cells = self._cells, None
-                await asyncio.to_thread(self._threads.shutdown, cancel_futures=True)
                 await asyncio.to_thread(cells.close)
 
     # -- one client --------------------------------------------------------------------------

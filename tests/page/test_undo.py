@@ -59,7 +59,7 @@ def url(request: pytest.FixtureRequest, file: Path, tmp_path: Path) -> Iterator[
     if request.param is not None:
         with hapticdb.open(where) as env:
             assert isinstance(env.store, PostgresStore)
-            drop(env.store.connection)
+            drop(env.store._connection)
 
 
 @pytest.fixture

@@ -42,6 +42,7 @@ class Environment(Queries):
         whole = given if scheme_of(given) else os.path.abspath(given)  # noqa: PTH100 - as text
         self._figures = QueryFigures(store)
         super().__init__(store, self._figures, whole)
+        self._listed: tuple[tuple[int, int], list[Object]] | None = None
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -103,8 +104,12 @@ class Environment(Queries):
     # -- objects -----------------------------------------------------------------------------
 
     def objects(self) -> list[Object]:
-        """All objects, ordered by id."""
-        return self._store.objects()
+        """All objects, ordered by id; listed anew only where something was written since."""
+        with self._store.snapshot():
+            now = self._store.revision(), self._store.version()
+            if self._listed is None or self._listed[0] != now:
+                self._listed = now, self._store.objects()
+            return [*self._listed[1]]
 
     def object(self, object_id: int) -> Object:
         """Return one object.
@@ -123,7 +128,7 @@ class Environment(Queries):
         those of `hapticdb.store.finding.find_objects`. A sub-assembly's name chooses all that is
         below it.
         """
-        return find_objects(self._store, words)
+        return find_objects(self, words)
 
     def felt(self, where: Words = (), exclude: Words = ()) -> list[Object]:
         """Objects that a touch with the same `where` and `exclude` feels, ordered by id.
@@ -133,7 +138,7 @@ class Environment(Queries):
         ObjectNotFoundError, UsageError
             As for `touch`.
         """
-        return Filter(where, exclude).felt(self._store.objects(), self.url)
+        return Filter(where, exclude).felt(self.objects(), self.url)
 
     def shell(
         self,

@@ -5,10 +5,11 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fnmatch import translate
 from operator import index
+from typing import Protocol
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.store.attributes import attribute_hint, having_attribute
-from hapticdb.store.base import Object, Store
+from hapticdb.store.base import Object
 from hapticdb.store.refusals import no_object
 
 MOST_IDS = 1 << 63
@@ -21,13 +22,27 @@ Words = Iterable[int | str]
 """Ids, names, patterns and ``attribute=value``, as `find_objects` reads them."""
 
 
-def find_objects(store: Store, words: Words) -> list[Object]:
+class HasObjects(Protocol):
+    """What `find_objects` asks: a store, or an environment, which lists again only what is new."""
+
+    @property
+    def url(self) -> str:
+        """For messages."""
+
+    def objects(self) -> list[Object]:
+        """All objects, ordered by id."""
+
+    def object(self, object_id: int, /) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+
+
+def find_objects(store: HasObjects, words: Words) -> list[Object]:
     """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
 
     Parameters
     ----------
-    store : Store
-        Store of the objects. It is asked for all objects once, and only if a word is no id.
+    store : HasObjects
+        It is asked for all objects once, and only if a word is no id.
     words : iterable of int or str
         An int, or a text of digits, is an id; ``3,4`` is several. Any other text, such as ``007``,
         is a name or a pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one,
@@ -154,7 +169,7 @@ def is_id(piece: str) -> bool:
     return piece.isascii() and piece.isdecimal() and (piece[0] != "0" or piece == "0")
 
 
-def _object_of(store: Store, object_id: int) -> Object:
+def _object_of(store: HasObjects, object_id: int) -> Object:
     if not -MOST_IDS <= object_id < MOST_IDS:
         raise no_object(object_id, store.url)
     return store.object(object_id)

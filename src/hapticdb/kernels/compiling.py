@@ -52,7 +52,7 @@ ENTRIES = {
     "triangles.sweeping": "least_kernel",
     "triangles.motion": "poses_kernel",
     "triangles.piercing": "piercing_kernel",
-    "triangles.parting": "components_kernel depths_kernel farthest_kernel",
+    "triangles.parting": "components_kernel depths_kernel spots_kernel",
     "motion": "play sway survey pull",
     "field.packing": "pack_kernel unpack_kernel",
     "resident.feeling": "bounding_spheres",

@@ -26,7 +26,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.parting import components, depths_of, farthest_of
+from hapticdb.kernels.triangles.parting import components, depths_of, spots_of
 from hapticdb.kernels.triangles.piercing import piercing
 
 Floats = NDArray[np.float64]
@@ -38,16 +38,14 @@ JOIN = 1e-6
 WAYS = np.array([(0.61, 0.53, 0.59), (-0.57, 0.62, -0.54), (0.52, -0.58, -0.63)])
 """Ways by which a surface is shifted, about 1 long and along no likely plane. More: flush surfaces
 are told from cuts more often."""
-SPOTS = 3
-"""Places that each place in a triangle is paired with, to find a spot between them. More: deeper
-cuts of curved surfaces."""
 
 
 class Mesh:
     """A surface with its corners joined.
 
     tree : its triangles; points (V, 3); edges (E, 2), faces (T, 3) : numbers of points, the faces
-    in the order of the tree; lows, highs (3, E) : boxes of the edges; near : length up to which
+    in the order of the tree; point_order (V,), edge_order (E,) : so that near ones mostly follow
+    one another; lows, highs (3, E) : boxes of the edges, in that order; near : length up to which
     places are one, metres.
     """
 
@@ -62,16 +60,18 @@ class Mesh:
         )
         self.points = np.ascontiguousarray(corners[first])
         self.faces = inverse.reshape(-1, 3)
+        self.point_order = np.argsort(first)  # the tree's
         sides = np.stack([self.faces, np.roll(self.faces, -1, axis=1)], axis=2).reshape(-1, 2)
         sides.sort(axis=1)
         keys, which = np.unique(sides @ np.array([len(first), 1]), return_inverse=True)
         self.edges = np.stack(np.divmod(keys, len(first)), axis=1)
-        a, b = self.points.T[:, self.edges.T].swapaxes(0, 1)
-        self.lows, self.highs = np.minimum(a, b), np.maximum(a, b)
         which = which.reshape(-1)
         order = np.argsort(which, kind="stable")
         self._faces_at = order // 3
         self._starts = np.searchsorted(which[order], np.arange(len(self.edges) + 1))
+        self.edge_order = np.argsort(order[self._starts[:-1]])  # the tree's
+        a, b = self.points.T[:, self.edges[self.edge_order].T].swapaxes(0, 1)
+        self.lows, self.highs = np.minimum(a, b), np.maximum(a, b)
 
     def faces_of(self, edges: Ints) -> tuple[Ints, Ints]:
         """Faces (F,) at edges (n,), with the index (F,) of the edge that each is at."""
@@ -107,7 +107,8 @@ def cut(
         pose = one_from_other.copy()
         pose[:3, 3] += shift * way
         here = _cut(one, other, pose, most, known, floor)
-        found = here if found is None or here.depth < found.depth else found
+        if found is None or here.depth < found.depth:
+            found, most = here, min(most, here.depth)  # a deeper one does not matter
         if found.depth <= enough:
             break
     assert found is not None  # noqa: S101 - there are ways
@@ -189,15 +190,17 @@ class _Parted:
         for axis in range(3):
             is_near &= mesh.lows[axis] <= middle[axis] + half[axis]
             is_near &= mesh.highs[axis] >= middle[axis] - half[axis]
-        near = np.flatnonzero(is_near)
+        near = mesh.edge_order[is_near]
         self._pierce(mesh.edges[near], near)
 
     def _pierce(self, edges: Ints, numbers: Ints) -> None:
         """Add places of edges (n, 2), whose numbers are (n,); what is at one place is one."""
         ends = np.ascontiguousarray(self._points[edges].reshape(-1, 2, 3))
         which, triangles, shares = piercing(ends, self._other.tree, self._pose)
+        order = np.lexsort((shares, numbers[which]))
+        which, triangles, shares = which[order], triangles[order], shares[order]
         lengths = np.linalg.norm(ends[which, 1] - ends[which, 0], axis=1)
-        is_next = (np.diff(which, prepend=-1) > 0) | (
+        is_next = (np.diff(which, prepend=-1) != 0) | (
             np.diff(shares, prepend=0.0) * lengths > self._mesh.near
         )
         place_of = len(self.shares) + np.cumsum(is_next) - 1
@@ -226,17 +229,10 @@ class _Parted:
 
         It is between places of the triangle, as far from this surface as such places are found.
         """
-        triangles, which = np.unique(self._triangles, return_inverse=True)
-        order = np.argsort(which, kind="stable")
-        places, which = self.places()[self._place_of[order]], which[order]
-        counts = np.bincount(which, minlength=len(triangles))
-        starts = np.cumsum(counts) - counts
-        steps = np.arange(1, SPOTS + 1) * counts[which][:, None] // (SPOTS + 1)
-        within = np.arange(len(which)) - starts[which]
-        others = starts[which][:, None] + (within[:, None] + steps) % counts[which][:, None]
-        middles = 0.5 * (places[:, None] + places[others])
-        best = farthest_of(self._mesh.tree, middles, np.append(starts, len(which)))
-        return triangles, middles[best[:, 0], best[:, 1]]
+        order = np.argsort(self._triangles, kind="stable")
+        triangles, first = np.unique(self._triangles[order], return_index=True)
+        places, starts = self.places()[self._place_of[order]], np.append(first, len(order))
+        return triangles, spots_of(self._mesh.tree, places, starts, 2.0 * self._mesh.near)
 
     def add(self, triangles: Ints, spots: Floats, mesh_from_other: Floats) -> None:
         """Add edges from spots (S, 3), other frame, on triangles (S,) to their corners."""
@@ -261,7 +257,8 @@ class _Parted:
     def depths(self, is_asked: Flags, floor: float, most: float) -> Floats:
         """How far (P,) the surface gets through at each place that is asked (P,)."""
         n_asked = np.bincount(self.edges, is_asked, len(self._edges))
+        added = np.arange(len(self._mesh.point_order), len(self._points))
         return depths_of(
-            self._points, self._edges, self.edges, self.shares, n_asked[self.edges] > 0.0,
+            self._points, np.concatenate([self._mesh.point_order, added]), self._edges, self.edges, self.shares, n_asked[self.edges] > 0.0,
             self._other.tree, self._pose, floor, most,
         )  # fmt: skip

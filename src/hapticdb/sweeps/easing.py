@@ -119,10 +119,10 @@ def _full_stretches(tree: TriangleTree, reach: float) -> Floats:
     middle = 0.5 * (low + high)
     maps = stretches(low, high, reach) - np.eye(4)  # what they move by
     scales = np.einsum("nii->ni", maps)[:, :3]
-    shifts = maps[:, :3, 3] + scales * middle
-    corners = tree.corners.reshape(-1, 3) - middle
-    squares = corners**2 @ (scales**2).T + 2.0 * corners @ (scales * shifts).T
-    farthest = np.sqrt(np.maximum(squares.max(axis=0) + (shifts**2).sum(axis=1), 0.0))
+    shifts = maps[:, :3, 3] + scales * middle  # along axes that are not scaled
+    few, which = np.unique(scales**2, axis=0, return_inverse=True)
+    squares = ((tree.corners.reshape(-1, 3) - middle) ** 2 @ few.T).max(axis=0)
+    farthest = np.sqrt(squares[which.reshape(-1)] + (shifts**2).sum(axis=1))
     maps = np.eye(4) + maps * (reach / np.maximum(farthest, THIN))[:, None, None]
     return np.asarray(maps[(np.einsum("nii->ni", maps) >= LEAST_STRETCH).all(axis=1)])
 

@@ -260,7 +260,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
     with naming(asked.line):
         if asked.tool is None:
             with render.bar("sampling the parts", "points", lambda *now: now):
-                shell = env.shell(*job.parts, points=points, inset=0.0)
+                shell = env.shell(*job.parts, points=points or 1, inset=0.0)
         else:
             shell = shell_of(asked.tool, options.tool_unit, points, None)
         fit = fitting.compare(

@@ -76,13 +76,21 @@ def is_flat(corners, n, x, y, z, nx, ny, nz, flat):
 
 
 @leaf
-def distance_at(tree, place, own, normal, flat, enough, farthest, waiting, squares):
-    """Distance of a place (x, y, z); normal (x, y, z), the others as for `distances_kernel`."""
+def distance_at(tree, place, own, normal, flat, enough, farthest, hint, waiting, squares):
+    """Distance of a place (x, y, z), and the number of its triangle, or -1.
+
+    normal (x, y, z), the others as for `distances_kernel`; hint : number of a triangle that may be
+    near and counts, or -1.
+    """
     x, y, z = place
     boxes, spans = tree.boxes, tree.spans
     first_leaf = boxes.shape[0] // 2
     n_triangles = tree.corners.shape[0]
-    best = farthest * farthest
+    best, found = farthest * farthest, np.int64(-1)
+    if hint >= 0:
+        square = _square_to_triangle(tree.corners, hint, x, y, z)
+        if square < best:
+            best, found = square, hint
     waiting[0], squares[0] = 0, _square_to_box(boxes, np.int64(0), x, y, z)
     top = 1
     while top > 0 and best > enough * enough:
@@ -108,8 +116,10 @@ def distance_at(tree, place, own, normal, flat, enough, farthest, waiting, squar
                 tree.corners, n, x, y, z, normal[0], normal[1], normal[2], flat
             ):
                 continue
-            best = min(best, _square_to_triangle(tree.corners, n, x, y, z))
-    return np.sqrt(best)
+            square = _square_to_triangle(tree.corners, n, x, y, z)
+            if square < best:
+                best, found = square, np.int64(n)
+    return np.sqrt(best), found
 
 
 @entry(TREE, FLOATS2, INTS, FLOATS2, FLOAT, FLOAT, FLOAT, FLOATS)
@@ -126,7 +136,9 @@ def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
     for q in range(places.shape[0]):
         place = (places[q, 0], places[q, 1], places[q, 2])
         normal = (normals[q, 0], normals[q, 1], normals[q, 2])
-        out[q] = distance_at(tree, place, own[q], normal, flat, enough, farthest, waiting, squares)
+        out[q], _ = distance_at(
+            tree, place, own[q], normal, flat, enough, farthest, np.int64(-1), waiting, squares
+        )
 
 
 def distances_to(

@@ -12,6 +12,8 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, INTS2, entry, leaf
 from hapticdb.kernels.surfaces.nearest import distance_at
 from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree
+from hapticdb.kernels.triangles.nearest import largest
+from hapticdb.kernels.triangles.piercing import ASIDE
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,6 +23,9 @@ SAMPLES = 4
 """Steps in which a part of an edge is measured. More: deeper cuts of curved surfaces."""
 FEW = 16
 """One of so many points is measured first: mostly one of them is far enough, and ends its piece."""
+SPOTS = 3
+"""Places that each place in a triangle is paired with, to find a spot between them. More: deeper
+cuts of curved surfaces."""
 
 
 @leaf
@@ -55,10 +60,11 @@ def components_kernel(links, parents):
 
 
 @leaf
-def _far(tree, pose, x, y, z, enough, most, waiting, squares):
-    """Distance of a place, moved by a pose (4, 4), from the other surface, up to `most`.
+def _far(tree, pose, x, y, z, enough, most, hint, waiting, squares):
+    """Distance of a place, moved by a pose (4, 4), from the other surface, and of which triangle.
 
-    Where it is `enough` or less, it is that of some triangle.
+    Up to `most`; where it is `enough` or less, it is that of some triangle. hint : number of a
+    triangle that may be near, or -1.
     """
     place = (
         pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
@@ -66,31 +72,43 @@ def _far(tree, pose, x, y, z, enough, most, waiting, squares):
         pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
     )
     return distance_at(
-        tree, place, np.int64(-1), (0.0, 0.0, 0.0), -1.0, enough, most, waiting, squares
+        tree, place, np.int64(-1), (0.0, 0.0, 0.0), -1.0, enough, most, hint, waiting, squares
     )
 
 
 @leaf
-def _part_far(points, edges, edge, begin, end, known, tree, pose, most, waiting, squares):
+def _part_far(points, edges, edge, begin, end, known, tree, pose, most, slack, waiting, squares):
     """Greatest distance on a part of an edge, from share to share; `known` if none is greater.
 
-    Where the edge goes through the other surface, the distance is 0.
+    Where the edge goes through the other surface, the distance is `slack` at most, so no place is
+    farther than from there.
     """
     a, b = edges[edge, 0], edges[edge, 1]
-    found = known
+    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    length = math.sqrt(ux * ux + uy * uy + uz * uz)
+    found, hint = known, np.int64(-1)
     for k in range(0 if begin == 0.0 else 1, SAMPLES + 1 if end == 1.0 else SAMPLES):
         share = begin + (end - begin) * k / SAMPLES
-        x = points[a, 0] + share * (points[b, 0] - points[a, 0])
-        y = points[a, 1] + share * (points[b, 1] - points[a, 1])
-        z = points[a, 2] + share * (points[b, 2] - points[a, 2])
-        found = max(found, _far(tree, pose, x, y, z, found, most, waiting, squares))
+        away = math.inf
+        if begin > 0.0:
+            away = share - begin
+        if end < 1.0:
+            away = min(away, end - share)
+        if away * length + slack <= found:
+            continue
+        far, near = _far(
+            tree, pose, points[a, 0] + share * ux, points[a, 1] + share * uy,
+            points[a, 2] + share * uz, found, most, hint, waiting, squares,
+        )  # fmt: skip
+        found = max(found, far)
+        hint = near if near >= 0 else hint
     return found
 
 
 @leaf
 def _measure_parts(
-    points, edges, cuts, shares, asked, tree, pose, floor, most, pieces, parts, far, piece_far,
-    waiting, squares,
+    points, edges, cuts, shares, asked, tree, pose, floor, most, slack, pieces, parts, far,
+    piece_far, waiting, squares,
 ):  # fmt: skip
     """Measure the parts of edges between places, and note the piece of each, parts (2 P,).
 
@@ -115,8 +133,8 @@ def _measure_parts(
             far[n_parts] = floor if is_one else max(piece_far[part], floor)
             if asked[p] and far[n_parts] < most:
                 far[n_parts] = _part_far(
-                    points, edges, edge, begin, end, far[n_parts], tree, pose, most, waiting,
-                    squares,
+                    points, edges, edge, begin, end, far[n_parts], tree, pose, most, slack,
+                    waiting, squares,
                 )  # fmt: skip
             piece_far[part] = max(piece_far[part], far[n_parts])
             n_parts += 1
@@ -124,16 +142,20 @@ def _measure_parts(
 
 
 @leaf
-def _measure_pieces(points, tree, pose, most, pieces, piece_far, waiting, squares):
-    """Measure the points of pieces whose piece_far is 0 or more, until each gets far enough."""
-    n_points = points.shape[0]
+def _measure_pieces(points, order, tree, pose, most, pieces, piece_far, waiting, squares):
+    """Measure the points of pieces whose piece_far is 0 or more, until each gets far enough.
+
+    Neighbours in `order` (V,) are mostly near the same triangle, so that is asked first.
+    """
+    n_points, hint = points.shape[0], np.int64(-1)
     for n in range(n_points + n_points // FEW):  # a few points spread over all come first
-        v = n * FEW if n < n_points // FEW else n - n_points // FEW
+        v = order[n * FEW if n < n_points // FEW else n - n_points // FEW]
         known = piece_far[pieces[v]]
         if 0.0 <= known < most:
             x, y, z = points[v, 0], points[v, 1], points[v, 2]
-            found = _far(tree, pose, x, y, z, known, most, waiting, squares)
+            found, near = _far(tree, pose, x, y, z, known, most, hint, waiting, squares)
             piece_far[pieces[v]] = max(known, found)
+            hint = near if near >= 0 else hint
 
 
 @leaf
@@ -155,11 +177,11 @@ def _through(parts, far, piece_far, at, k, n_parts):
     return max(beside, min(piece_far[left], piece_far[right]))
 
 
-@entry(FLOATS2, INTS2, INTS, FLOATS, BOOLS, TREE, FLOATS2, FLOAT, FLOAT, INTS, FLOATS)
-def depths_kernel(points, edges, cuts, shares, asked, tree, pose, floor, most, parents, out):
+@entry(FLOATS2, INTS, INTS2, INTS, FLOATS, BOOLS, TREE, FLOATS2, FLOAT, FLOAT, INTS, FLOATS)
+def depths_kernel(points, order, edges, cuts, shares, asked, tree, pose, floor, most, parents, out):
     """Find how far out (P,) a surface gets through another one at each place, `floor` to `most`.
 
-    points (V, 3), edges (E, 2): the surface; cuts (P,), shares (P,): edge of each place and share
+    points (V, 3), edges (E, 2): the surface; order (V,): of points, near ones one after another; cuts (P,), shares (P,): edge of each place and share
     of the edge, ascending by both; asked (P,): where it is asked, the same for all places of an
     edge; pose (4, 4) leads into the tree's frame. parents (V,) begins as 0 .. V - 1; afterwards the
     piece of each point.
@@ -180,10 +202,11 @@ def depths_kernel(points, edges, cuts, shares, asked, tree, pose, floor, most, p
             piece_far[parents[edges[cuts[p], 0]]] = floor
             piece_far[parents[edges[cuts[p], 1]]] = floor
     waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
-    _measure_pieces(points, tree, pose, most, parents, piece_far, waiting, squares)
+    slack = ASIDE * largest(tree.boxes)
+    _measure_pieces(points, order, tree, pose, most, parents, piece_far, waiting, squares)
     _measure_parts(
-        points, edges, cuts, shares, asked, tree, pose, floor, most, parents, parts, far, piece_far,
-        waiting, squares,
+        points, edges, cuts, shares, asked, tree, pose, floor, most, slack, parents, parts, far,
+        piece_far, waiting, squares,
     )  # fmt: skip
     first, at = 0, 0
     while first < n_places:
@@ -197,38 +220,71 @@ def depths_kernel(points, edges, cuts, shares, asked, tree, pose, floor, most, p
 
 
 def depths_of(
-    points: Floats, edges: Ints, cuts: Ints, shares: Floats, asked: Flags, tree: TriangleTree,
-    pose: Floats, floor: float, most: float,
+    points: Floats, order: Ints, edges: Ints, cuts: Ints, shares: Floats, asked: Flags,
+    tree: TriangleTree, pose: Floats, floor: float, most: float,
 ) -> Floats:  # fmt: skip
     """How far (P,) a surface gets through at each place, as `depths_kernel` says."""
     out = np.empty(len(cuts))
     depths_kernel(
-        np.ascontiguousarray(points), np.ascontiguousarray(edges), cuts, shares, asked, tree,
+        np.ascontiguousarray(points), order, np.ascontiguousarray(edges), cuts, shares, asked, tree,
         np.ascontiguousarray(pose), float(floor), float(most), np.arange(len(points)), out,
     )  # fmt: skip
     return out
 
 
-@entry(TREE, FLOATS3, INTS, INTS2)
-def farthest_kernel(tree, places, starts, best):
-    """Find the place that is farthest from a surface in each group; its index, best (G, 2).
+@leaf
+def _step(count, k):
+    """How many places after another one its k-th partner is, of `count`."""
+    return (k + 1) * count // (SPOTS + 1)
 
-    places (N, K, 3), tree's frame; group g is starts[g] .. starts[g + 1] - 1 of them, at least one.
+
+@leaf
+def _was_tried(n, m, count, k):
+    """Whether places n and m of a group have been a pair before: m is the k-th partner of n."""
+    if _step(count, k) == _step(count, k - 1) and k > 0:
+        return True
+    for other in range(SPOTS):
+        if m < n and (m + _step(count, other)) % count == n:
+            return True
+    return False
+
+
+@entry(TREE, FLOATS2, INTS, FLOAT, FLOATS2)
+def spots_kernel(tree, places, starts, slack, spots):
+    """Find the spot (G, 3) of each group of places that is farthest from a surface.
+
+    places (N, 3), on the surface but for `slack` metres: group g is starts[g] .. starts[g + 1] - 1
+    of them, at least one. Spots are tried in the middle between a place and `SPOTS` others, so none
+    is farther from the surface than from these.
     """
     waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
-    nowhere = (0.0, 0.0, 0.0)
-    for g in range(best.shape[0]):
-        known = 0.0
-        best[g, 0], best[g, 1] = starts[g], 0
-        for n in range(starts[g], starts[g + 1]):
-            for k in range(places.shape[1]):
-                place = (places[n, k, 0], places[n, k, 1], places[n, k, 2])
-                found = distance_at(
-                    tree, place, np.int64(-1), nowhere, -1.0, known, math.inf, waiting, squares
-                )
+    hint, spot = np.int64(-1), np.empty(3)
+    for g in range(spots.shape[0]):
+        first, count, known = starts[g], starts[g + 1] - starts[g], -1.0
+        for n in range(count):
+            for k in range(SPOTS):
+                m = (n + _step(count, k)) % count
+                if _was_tried(n, m, count, k):
+                    continue
+                square = 0.0
+                for axis in range(3):
+                    a, b = places[first + n, axis], places[first + m, axis]
+                    spot[axis] = 0.5 * (a + b)
+                    square += (a - b) ** 2
+                if count == 1:
+                    found = 0.0  # there is no other one
+                elif 0.5 * math.sqrt(square) + slack <= known:
+                    continue
+                else:
+                    found, near = distance_at(
+                        tree, (spot[0], spot[1], spot[2]), np.int64(-1), (0.0, 0.0, 0.0), -1.0,
+                        max(known, 0.0), math.inf, hint, waiting, squares,
+                    )  # fmt: skip
+                    hint = near if near >= 0 else hint
                 if found > known:
                     known = found
-                    best[g, 0], best[g, 1] = n, k
+                    for axis in range(3):
+                        spots[g, axis] = spot[axis]
 
 
 def components(links: Ints, count: int) -> Ints:
@@ -238,8 +294,8 @@ def components(links: Ints, count: int) -> Ints:
     return parents
 
 
-def farthest_of(tree: TriangleTree, places: Floats, starts: Ints) -> Ints:
-    """Index (G, 2) of the farthest one of places (N, K, 3) in each group, as `farthest_kernel`."""
-    best = np.empty((len(starts) - 1, 2), dtype=np.int64)
-    farthest_kernel(tree, np.ascontiguousarray(places), starts, best)
-    return best
+def spots_of(tree: TriangleTree, places: Floats, starts: Ints, slack: float) -> Floats:
+    """Spots (G, 3) between places (N, 3) of each group, as `spots_kernel` says."""
+    spots = np.empty((len(starts) - 1, 3))
+    spots_kernel(tree, np.ascontiguousarray(places), starts, slack, spots)
+    return spots

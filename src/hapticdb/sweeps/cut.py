@@ -257,8 +257,9 @@ class _Parted:
     def depths(self, is_asked: Flags, floor: float, most: float) -> Floats:
         """How far (P,) the surface gets through at each place that is asked (P,)."""
         n_asked = np.bincount(self.edges, is_asked, len(self._edges))
-        added = np.arange(len(self._mesh.point_order), len(self._points))
+        added = np.arange(len(self._mesh.points), len(self._points))
+        order = np.concatenate([self._mesh.point_order, added])
         return depths_of(
-            self._points, np.concatenate([self._mesh.point_order, added]), self._edges, self.edges, self.shares, n_asked[self.edges] > 0.0,
+            self._points, order, self._edges, self.edges, self.shares, n_asked[self.edges] > 0.0,
             self._other.tree, self._pose, floor, most,
         )  # fmt: skip

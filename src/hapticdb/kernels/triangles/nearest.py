@@ -114,20 +114,44 @@ def plane_gap(one, n, other, m):
 
 
 @leaf
+def _end_along(corners, first, last, x, y, z, sign):
+    """Where triangles first .. last - 1 begin along a direction, or along its opposite: sign -1."""
+    end = math.inf
+    for n in range(first, last):
+        for i in range(3):
+            along = x * corners[n, i, 0] + y * corners[n, i, 1] + z * corners[n, i, 2]
+            end = min(end, sign * along)
+    return end
+
+
+@leaf
 def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
     """Measure the triangles of two leaves; notes what is nearer than out[0] from below.
 
-    The nearest pair from above has its triangles in pair (2,) and its places in out[2:8].
+    The nearest pair from above has its triangles in pair (2,) and its places in out[2:8]. Triangles
+    that keep apart along the direction of these places, as most do, are not measured.
     """
     begin = (other - b.boxes.shape[0] // 2) * LEAF_SIZE
     end = min(begin + LEAF_SIZE, b.corners.shape[0])
     place_corners(b.corners, begin, end, pose, placed)
     first = (node - a.boxes.shape[0] // 2) * LEAF_SIZE
-    for n in range(first, min(first + LEAF_SIZE, a.corners.shape[0])):
+    last = min(first + LEAF_SIZE, a.corners.shape[0])
+    x, y, z = 0.0, 0.0, 0.0
+    if 0.0 < out[1] < math.inf:
+        x, y, z = (out[2] - out[5]) / out[1], (out[3] - out[6]) / out[1], (out[4] - out[7]) / out[1]
+    far = out[0] + PLANE * size
+    high = _end_along(placed, 0, end - begin, x, y, z, -1.0)
+    if _end_along(a.corners, first, last, x, y, z, 1.0) + high >= far:
+        return
+    for n in range(first, last):
+        low = _end_along(a.corners, n, n + 1, x, y, z, 1.0)
+        if low + high >= far:
+            continue
         for m in range(begin, end):
             far = out[0] + PLANE * size
             if (
-                triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]
+                low + _end_along(placed, m - begin, m - begin + 1, x, y, z, -1.0) < far
+                and triangle_gap(a.corners, n, placed, m - begin) < out[0] * out[0]
                 and plane_gap(a.corners, n, placed, m - begin) < far
                 and plane_gap(placed, m - begin, a.corners, n) < far
             ):

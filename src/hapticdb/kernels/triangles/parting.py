@@ -9,7 +9,7 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, INTS2, entry, leaf
+from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, INTS, INTS2, entry, leaf
 from hapticdb.kernels.surfaces.nearest import distance_at
 from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree
 from hapticdb.kernels.triangles.nearest import largest
@@ -84,7 +84,8 @@ def _part_far(points, edges, edge, begin, end, known, tree, pose, most, slack, w
     farther than from there.
     """
     a, b = edges[edge, 0], edges[edge, 1]
-    ux, uy, uz = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1], points[b, 2] - points[a, 2]
+    ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
+    uz = points[b, 2] - points[a, 2]
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
     found, hint = known, np.int64(-1)
     for k in range(0 if begin == 0.0 else 1, SAMPLES + 1 if end == 1.0 else SAMPLES):
@@ -181,10 +182,10 @@ def _through(parts, far, piece_far, at, k, n_parts):
 def depths_kernel(points, order, edges, cuts, shares, asked, tree, pose, floor, most, parents, out):
     """Find how far out (P,) a surface gets through another one at each place, `floor` to `most`.
 
-    points (V, 3), edges (E, 2): the surface; order (V,): of points, near ones one after another; cuts (P,), shares (P,): edge of each place and share
-    of the edge, ascending by both; asked (P,): where it is asked, the same for all places of an
-    edge; pose (4, 4) leads into the tree's frame. parents (V,) begins as 0 .. V - 1; afterwards the
-    piece of each point.
+    points (V, 3), edges (E, 2): the surface; order (V,): of points, near ones one after another;
+    cuts (P,), shares (P,): edge of each place and share of the edge, ascending by both; asked (P,):
+    where it is asked, the same for all places of an edge; pose (4, 4) leads into the tree's frame.
+    parents (V,) begins as 0 .. V - 1; afterwards the piece of each point.
     """
     n_points, n_places = points.shape[0], cuts.shape[0]
     p = 0

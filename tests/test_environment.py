@@ -72,6 +72,18 @@ def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
 # --- moving -------------------------------------------------------------------------------------
 
 
+def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Path) -> None:
+    ids = [obj.id for obj in env.objects()]
+    with hapticdb.open(tmp_path / "e.db") as other:
+        other.remove(ids[1])
+        assert [obj.id for obj in env.objects()] == [ids[0], *ids[2:]]
+        env.remove(ids[2])
+        assert [obj.id for obj in env.find("*")] == [ids[0], *ids[3:]]
+        assert [obj.id for obj in other.felt(exclude=[ids[0]])] == ids[3:]
+    env.objects().clear()
+    assert [obj.id for obj in env.objects()] == [ids[0], *ids[3:]]
+
+
 @pytest.mark.usefixtures("without_child")
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_a_moved_object_is_as_if_imported_there(

@@ -42,7 +42,6 @@ class Environment(Queries):
         whole = given if scheme_of(given) else os.path.abspath(given)  # noqa: PTH100 - as text
         self._figures = QueryFigures(store)
         super().__init__(store, self._figures, whole)
-        self._listed: tuple[tuple[int, int], list[Object]] | None = None
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
@@ -91,7 +90,7 @@ class Environment(Queries):
     def has_distances(self) -> bool:
         """Whether there is an object, and distances to the surface of every object are stored.
 
-        As of the revision that the last frame has read; before the first frame, of the newest. It
+        As of the revision that was read last, by a frame or a list; before, of the newest. It
         costs a statement only before the first frame and after an edit of this environment.
         """
         self._touching.learn_first()
@@ -104,12 +103,8 @@ class Environment(Queries):
     # -- objects -----------------------------------------------------------------------------
 
     def objects(self) -> list[Object]:
-        """All objects, ordered by id; listed anew only where something was written since."""
-        with self._store.snapshot():
-            now = self._store.revision(), self._store.version()
-            if self._listed is None or self._listed[0] != now:
-                self._listed = now, self._store.objects()
-            return [*self._listed[1]]
+        """All objects, ordered by id. Only those are read that were written since the last time."""
+        return self._touching.newest()
 
     def object(self, object_id: int) -> Object:
         """Return one object.

@@ -40,14 +40,16 @@ class KnownObjects:
         self.own_law: ForceLaw = PLANE
         self.version: int | None = None
         self._unfelt: dict[Filter, Unfelt] = {}
+        self._revision = -1
         self._last: Change | None = None
 
     def learn(self) -> bool:
         """List the objects if the snapshot's revision is new; returns whether it is new."""
-        if self._store.version() == self.version:
+        revision = self._store.revision()  # `version` then tells of this snapshot
+        if (self._store.version(), revision) == (self.version, self._revision):
             return False
         self._list()
-        self.version = self._store.version()
+        self.version, self._revision = self._store.version(), revision
         return True
 
     def _list(self) -> None:

@@ -10,7 +10,7 @@ from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.query.touches import Touch
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Store
+from hapticdb.store.base import Object, Store
 from hapticdb.store.filtering import Filter
 
 
@@ -32,9 +32,13 @@ class Touching:
     def learn_first(self) -> None:
         """List the objects, unless a frame has, and no edit came after it."""
         if self.known.version is None:
-            with self._store.snapshot():
-                self._store.revision()  # `version` then tells of this snapshot
-                self.known.learn()
+            self.newest()
+
+    def newest(self) -> list[Object]:
+        """All objects, ordered by id; only those written since the last time are read."""
+        with self._store.snapshot():
+            self._learn()
+            return [*self.known.by_id.values()]
 
     def law_now(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame at the newest revision, whose objects are loaded."""
@@ -92,9 +96,12 @@ class Touching:
 
         UsageError if the law reads distances, and an object has none.
         """
-        self._store.revision()  # `version` then tells of this snapshot
-        if self.known.learn():
-            self._figures.drop_empty_statistics()
+        self._learn()
         if not self.known.fits(law):
             self.known.check_distances()
         return law or self.known.own_law
+
+    def _learn(self) -> None:
+        """Load this snapshot's objects."""
+        if self.known.learn():
+            self._figures.drop_empty_statistics()

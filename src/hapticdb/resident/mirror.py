@@ -125,7 +125,7 @@ class CellMirror:
         version, arrays = self._directory
         if version != self._version:
             cells, which = self._table.cells, slice(self._version % BUFFERS, None)
-            found = [cells.masks]
+            found: list[NDArray[Any]] = [cells.masks]
             if self._across:
                 found += [cells.keys[which][:1], cells.slots[which][:1]]
             parts = [np.ascontiguousarray(one) for one in found]

@@ -5,7 +5,6 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from hapticdb.store import parsing
 from hapticdb.store.base import NO_KEYS, Covering, Keys, Object, Rows, Table
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.postgres.connecting import wire
@@ -14,7 +13,6 @@ from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.asking import WRITE_LOCK, ServerTables
 from hapticdb.store.postgres.tables.loading import TABLES, Loading
 from hapticdb.store.postgres.watching import channel_of
-from hapticdb.store.refusals import older_format
 
 Result = TypeVar("Result")
 

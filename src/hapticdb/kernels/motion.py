@@ -85,6 +85,18 @@ def _angular_velocity(x, y, z, dx, dy, dz):
     )
 
 
+@leaf
+def _swaying(time, waves):
+    """Place, turn, velocity and angular velocity at a time."""
+    px, vx = _wave(time, waves, np.int64(0))
+    py, vy = _wave(time, waves, np.int64(1))
+    pz, vz = _wave(time, waves, np.int64(2))
+    x, dx = _wave(time, waves, np.int64(3))
+    y, dy = _wave(time, waves, np.int64(4))
+    z, dz = _wave(time, waves, np.int64(5))
+    return (px, py, pz), (x, y, z), (vx, vy, vz), _angular_velocity(x, y, z, dx, dy, dz)
+
+
 @entry(FLOAT, FLOATS3, FLOATS2, FLOATS2, FLOATS)
 def sway(time, waves, center, pose, velocity):
     """Pose and velocity at a time of a hand that sways about a pose by sums of sines.
@@ -92,13 +104,9 @@ def sway(time, waves, center, pose, velocity):
     waves (6, K, 4): amplitude (m; rad for the last three axes, which are a turn), rad/s, phase, the
     phase's sine. center (4, 4): the pose. Writes pose (4, 4) and velocity (6,), exact derivatives.
     """
-    px, velocity[0] = _wave(time, waves, np.int64(0))
-    py, velocity[1] = _wave(time, waves, np.int64(1))
-    pz, velocity[2] = _wave(time, waves, np.int64(2))
-    x, dx = _wave(time, waves, np.int64(3))
-    y, dy = _wave(time, waves, np.int64(4))
-    z, dz = _wave(time, waves, np.int64(5))
-    velocity[3], velocity[4], velocity[5] = _angular_velocity(x, y, z, dx, dy, dz)
+    (px, py, pz), (x, y, z), moving, turning = _swaying(time, waves)
+    velocity[0], velocity[1], velocity[2] = moving
+    velocity[3], velocity[4], velocity[5] = turning
     w, x, y, z = product(*quaternion_by(x, y, z), *quaternion_in(center))
     write_pose(px + center[0, 3], py + center[1, 3], pz + center[2, 3], w, x, y, z, pose)
 
@@ -114,13 +122,7 @@ def survey(waves, cycle, n_samples):
     turning = 0.0
     for n in range(n_samples):
         time = n * cycle / n_samples
-        px, vx = _wave(time, waves, np.int64(0))
-        py, vy = _wave(time, waves, np.int64(1))
-        pz, vz = _wave(time, waves, np.int64(2))
-        x, dx = _wave(time, waves, np.int64(3))
-        y, dy = _wave(time, waves, np.int64(4))
-        z, dz = _wave(time, waves, np.int64(5))
-        wx, wy, wz = _angular_velocity(x, y, z, dx, dy, dz)
+        (px, py, pz), _, (vx, vy, vz), (wx, wy, wz) = _swaying(time, waves)
         reach = max(reach, px * px + py * py + pz * pz)
         speed = max(speed, vx * vx + vy * vy + vz * vz)
         turning = max(turning, wx * wx + wy * wy + wz * wz)
@@ -170,15 +172,7 @@ def pull(
     w, x, y, z = product(
         *quaternion_by(rest * body[10], rest * body[11], rest * body[12]), w, x, y, z
     )
-    write_pose(
-        body[0] + rest * body[7],
-        body[1] + rest * body[8],
-        body[2] + rest * body[9],
-        w,
-        x,
-        y,
-        z,
-        pose,
-    )
+    px, py, pz = body[0] + rest * body[7], body[1] + rest * body[8], body[2] + rest * body[9]
+    write_pose(px, py, pz, w, x, y, z, pose)
     for axis in range(6):
         velocity[axis] = body[7 + axis]

@@ -80,6 +80,12 @@ def moment(rx, ry, rz, fx, fy, fz):
 
 
 @leaf
+def gap(x, low, high):
+    """Distance of x from the interval low .. high, 0 inside."""
+    return max(low - x, x - high, 0.0)
+
+
+@leaf
 def length_at(numbers, start):
     """Length of the vector in three numbers from `start` on."""
     x, y, z = numbers[start], numbers[start + 1], numbers[start + 2]
@@ -165,23 +171,20 @@ def pose_of_quaternion(px, py, pz, w, x, y, z, out):
     A session and its replay both use this function, so that they get the same bits.
     """
     write_pose(px, py, pz, w, x, y, z, out)
-    out[3, 0] = 0.0
-    out[3, 1] = 0.0
-    out[3, 2] = 0.0
+    out[3, 0] = out[3, 1] = out[3, 2] = 0.0
     out[3, 3] = 1.0
+
+
+@leaf
+def numbers_of(body):
+    """Position and unit quaternion of a record that has them, as seven numbers."""
+    at, turned = body.position, body.quaternion
+    return at[0], at[1], at[2], turned[0], turned[1], turned[2], turned[3]
 
 
 @entry(FLOATS2, FLOATS3)
 def poses_of(states, out):
     """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
     for m in range(states.shape[0]):
-        pose_of_quaternion(
-            states[m, 0],
-            states[m, 1],
-            states[m, 2],
-            states[m, 3],
-            states[m, 4],
-            states[m, 5],
-            states[m, 6],
-            out[m],
-        )
+        x, y, z = states[m, 0], states[m, 1], states[m, 2]
+        pose_of_quaternion(x, y, z, states[m, 3], states[m, 4], states[m, 5], states[m, 6], out[m])

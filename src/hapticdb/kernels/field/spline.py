@@ -13,7 +13,6 @@ import numpy as np
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import (
-    BEYOND,
     CELL_SIDE,
     HALF_WIDTH,
     STEPS,
@@ -120,18 +119,12 @@ def second_derivatives(payload, slot, x, y, z):
 
 
 @inlined
-def _lowest_centre(x, y, z):
-    """Index of the lowest of the 8 centres around a point, and the way from it to the point."""
+def lower_bound(payload, slot, x, y, z):
+    """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
     tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     bx, by, bz = np.int64(tx < 0.0), np.int64(ty < 0.0), np.int64(tz < 0.0)
     at = cell_place((np.int64(x) & 31) - bx, (np.int64(y) & 31) - by, (np.int64(z) & 31) - bz)
-    return at, tx + bx, ty + by, tz + bz
-
-
-@inlined
-def lower_bound(payload, slot, x, y, z):
-    """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
-    at, lx, ly, lz = _lowest_centre(x, y, z)
+    lx, ly, lz = tx + bx, ty + by, tz + bz
     # squares of the ways to the lower and the upper centres
     ux, uy, uz = (1.0 - lx) * (1.0 - lx), (1.0 - ly) * (1.0 - ly), (1.0 - lz) * (1.0 - lz)
     lx, ly, lz = lx * lx, ly * ly, lz * lz
@@ -144,26 +137,6 @@ def lower_bound(payload, slot, x, y, z):
         u = float(min(payload[slot, index], STEPS)) * VOXELS_A_STEP
         best = max(best, u - math.sqrt(square))
     return max(best - 0.5 * VOXELS_A_STEP, 0.0)
-
-
-@inlined
-def upper_bound(payload, slot, x, y, z):
-    """Voxels: a surface is as near to a point of the slot's cell, by the 8 centres around it.
-
-    Infinite if all of them are farther than h from every surface.
-    """
-    at, lx, ly, lz = _lowest_centre(x, y, z)
-    best = np.inf
-    for corner in range(8):
-        dx = 1.0 - lx if corner & 4 else lx
-        dy = 1.0 - ly if corner & 2 else ly
-        dz = 1.0 - lz if corner & 1 else lz
-        step = payload[
-            slot, at + (corner >> 2) * ALONG_I + ((corner >> 1) & 1) * ALONG_J + (corner & 1)
-        ]
-        if step < BEYOND:
-            best = min(best, step * VOXELS_A_STEP + math.sqrt(dx * dx + dy * dy + dz * dz))
-    return best + 0.5 * VOXELS_A_STEP
 
 
 @inlined

@@ -41,6 +41,7 @@ from hapticdb.kernels._jit import (
 from hapticdb.kernels.curves import compact, z_encode
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, ROW_SIDE, ROW_VALUES, step_of
 from hapticdb.kernels.field.packing import pack
+from hapticdb.kernels.rigid import gap
 from hapticdb.kernels.surfaces.voxelize import normal_of
 
 BRICK = 8
@@ -277,12 +278,6 @@ def _segment_square(x, y, z, u, v, w, inverse):
     t = min(max((x * u + y * v + z * w) * inverse, 0.0), 1.0)
     x, y, z = x - t * u, y - t * v, z - t * w
     return x * x + y * y + z * z
-
-
-@leaf
-def gap(x, low, high):
-    """Distance of x from an interval."""
-    return max(low - x, x - high, 0.0)
 
 
 @inlined

@@ -8,19 +8,19 @@ the caller's choice.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INTS, entry, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, leaf
+from hapticdb.kernels.rigid import gap
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, STACK, TREE, TriangleTree
 
 Floats = NDArray[np.float64]
-Ints = NDArray[np.int64]
 
 
 @leaf
 def _square_to_box(boxes, node, x, y, z):
     """Squared distance from (x, y, z) to the node's box; infinite if it holds no triangle."""
-    dx = max(boxes[node, 0, 0] - x, x - boxes[node, 1, 0], 0.0)
-    dy = max(boxes[node, 0, 1] - y, y - boxes[node, 1, 1], 0.0)
-    dz = max(boxes[node, 0, 2] - z, z - boxes[node, 1, 2], 0.0)
+    dx = gap(x, boxes[node, 0, 0], boxes[node, 1, 0])
+    dy = gap(y, boxes[node, 0, 1], boxes[node, 1, 1])
+    dz = gap(z, boxes[node, 0, 2], boxes[node, 1, 2])
     return dx * dx + dy * dy + dz * dz
 
 
@@ -64,26 +64,13 @@ def _square_to_triangle(corners, n, x, y, z):
 
 
 @leaf
-def is_flat(corners, n, x, y, z, nx, ny, nz, flat):
-    """Whether triangle n lies within `flat` of the plane through (x, y, z) with that normal."""
-    for corner in range(3):
-        off = (corners[n, corner, 0] - x) * nx
-        off += (corners[n, corner, 1] - y) * ny
-        off += (corners[n, corner, 2] - z) * nz
-        if abs(off) > flat:
-            return False
-    return True
+def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
+    """Distance of a place, up to `farthest`, and the number of its triangle, or -1.
 
-
-@leaf
-def distance_at(tree, place, own, normal, flat, enough, farthest, hint, waiting, squares):
-    """Distance of a place (x, y, z), and the number of its triangle, or -1.
-
-    normal (x, y, z), the others as for `distances_kernel`; hint : number of a triangle that may be
-    near and counts, or -1.
+    A distance of `enough` or less ends the search: it is then that of some triangle. hint : number
+    of a triangle that may be near, or -1; waiting, squares (STACK,) are scratch.
     """
-    x, y, z = place
-    boxes, spans = tree.boxes, tree.spans
+    boxes = tree.boxes
     first_leaf = boxes.shape[0] // 2
     n_triangles = tree.corners.shape[0]
     best, found = farthest * farthest, np.int64(-1)
@@ -96,7 +83,7 @@ def distance_at(tree, place, own, normal, flat, enough, farthest, hint, waiting,
     while top > 0 and best > enough * enough:
         top -= 1
         node = waiting[top]
-        if not squares[top] < best or spans[node, 0] == spans[node, 1] == own:
+        if not squares[top] < best:
             continue
         if node < first_leaf:
             near, far = 2 * node + 1, 2 * node + 2
@@ -110,54 +97,24 @@ def distance_at(tree, place, own, normal, flat, enough, farthest, hint, waiting,
             continue
         start = (node - first_leaf) * LEAF_SIZE
         for n in range(start, min(start + LEAF_SIZE, n_triangles)):
-            if tree.bodies[n] == own:
-                continue
-            if flat >= 0.0 and is_flat(
-                tree.corners, n, x, y, z, normal[0], normal[1], normal[2], flat
-            ):
-                continue
             square = _square_to_triangle(tree.corners, n, x, y, z)
             if square < best:
                 best, found = square, np.int64(n)
     return np.sqrt(best), found
 
 
-@entry(TREE, FLOATS2, INTS, FLOATS2, FLOAT, FLOAT, FLOAT, FLOATS)
-def distances_kernel(tree, places, own, normals, flat, enough, farthest, out):
-    """Distance out (Q,) of each of places (Q, 3) to the nearest triangle.
-
-    own (Q,) int64: triangles of this body do not count. Nor do those within `flat` of the plane
-    through the place with the unit normal of normals (Q, 3); a negative `flat` leaves none out. A
-    distance of `enough` or less ends the search of a place: it is then that of some triangle.
-    `farthest` is the greatest distance that is looked for, and given if nothing is nearer.
-    """
+@entry(TREE, FLOATS2, FLOAT, FLOATS)
+def distances_kernel(tree, places, farthest, out):
+    """Distance out (Q,) of each of places (Q, 3) to the nearest triangle, up to `farthest`."""
     waiting = np.empty(STACK, dtype=np.int64)
     squares = np.empty(STACK)
     for q in range(places.shape[0]):
-        place = (places[q, 0], places[q, 1], places[q, 2])
-        normal = (normals[q, 0], normals[q, 1], normals[q, 2])
-        out[q], _ = distance_at(
-            tree, place, own[q], normal, flat, enough, farthest, np.int64(-1), waiting, squares
-        )
+        x, y, z = places[q, 0], places[q, 1], places[q, 2]
+        out[q], _ = distance_at(tree, x, y, z, 0.0, farthest, np.int64(-1), waiting, squares)
 
 
-def distances_to(
-    tree: TriangleTree, places: Floats, enough: float = 0.0, farthest: float = np.inf
-) -> Floats:
-    """Distances (Q,) of places (Q, 3) to a tree's triangles; arguments as for the kernel."""
-    nobody = np.full(len(places), -1, dtype=np.int64)
-    normals = np.zeros((len(places), 3))
-    return distances_to_others(tree, places, nobody, normals, -1.0, farthest, enough)
-
-
-def distances_to_others(
-    tree: TriangleTree, places: Floats, own: Ints, normals: Floats, flat: float, farthest: float,
-    enough: float = 0.0,
-) -> Floats:  # fmt: skip
-    """Distances (Q,) of places (Q, 3) to triangles of other bodies than their `own`."""
+def distances_to(tree: TriangleTree, places: Floats, farthest: float = np.inf) -> Floats:
+    """Distances (Q,) of places (Q, 3) to a tree's triangles, up to `farthest`."""
     out = np.empty(len(places))
-    distances_kernel(
-        tree, np.ascontiguousarray(places), np.ascontiguousarray(own),
-        np.ascontiguousarray(normals), float(flat), float(enough), float(farthest), out,
-    )  # fmt: skip
+    distances_kernel(tree, np.ascontiguousarray(places), float(farthest), out)
     return out

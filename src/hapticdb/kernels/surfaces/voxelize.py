@@ -159,12 +159,14 @@ def slope(along, length):
 
 
 @leaf
-def _edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
-    """Axis square to an edge in the plane of two axes p and q, to be solved for q.
+def _set_edge_axis(axes, row, corners, n, p, q):
+    """Axis square to edge n of a triangle in the plane of two axes p and q, to be solved for q.
 
-    Returns the coefficient of p, the least and the greatest value of ``coefficient * p + rest * q``
+    Sets the coefficient of p, the least and the greatest value of ``coefficient * p + rest * q``
     over the corners of voxels that touch, and 1 / rest.
     """
+    m, o = (n + 1) % 3, (n + 2) % 3
+    from_p, from_q, to_p, to_q = corners[n, p], corners[n, q], corners[m, p], corners[m, q]
     at_p = to_q - from_q
     at_q = from_p - to_p
     if at_q < 0.0:
@@ -172,17 +174,18 @@ def _edge_axis(from_p, from_q, to_p, to_q, other_p, other_q):
         at_q = -at_q
     length = np.sqrt(at_p * at_p + at_q * at_q)
     if length <= NULL_EDGE:
-        return 0.0, -1.0, 1.0, STEEP
+        axes[row, 0], axes[row, 1], axes[row, 2], axes[row, 3] = 0.0, -1.0, 1.0, STEEP
+        return
     edge = at_p * from_p + at_q * from_q
-    other = at_p * other_p + at_q * other_q
+    other = at_p * corners[o, p] + at_q * corners[o, q]
     low = min(edge, other) - TOUCH * length - (max(at_p, 0.0) + at_q)
     high = max(edge, other) + TOUCH * length - min(at_p, 0.0)
-    return at_p, low, high, slope(at_q, length)
+    axes[row, 0], axes[row, 1], axes[row, 2], axes[row, 3] = at_p, low, high, slope(at_q, length)
 
 
 @leaf
 def _set_normal_axis(plane, corners, normal, u, v, w):
-    """Like `set_edge_axis` for the normal: coefficients of u and v, bounds, 1 / that of w."""
+    """Like `_set_edge_axis` for the normal: coefficients of u and v, bounds, 1 / that of w."""
     at_u, at_v, at_w = normal[u], normal[v], normal[w]
     if at_w < 0.0:
         at_u, at_v, at_w = -at_u, -at_v, -at_w
@@ -271,16 +274,9 @@ def _longest_box(triangles, edge):
 def _set_axes(axes, plane, corners, normal, u, v, w):
     """Set the ten axes of a triangle: rows 0-2 of (u, v), 3-5 of (u, w), 6-8 of (v, w); plane."""
     for n in range(3):
-        m, o = (n + 1) % 3, (n + 2) % 3
-        nu, nv, nw = corners[n, u], corners[n, v], corners[n, w]
-        mu, mv, mw = corners[m, u], corners[m, v], corners[m, w]
-        ou, ov, ow = corners[o, u], corners[o, v], corners[o, w]
-        at, low, high, steepness = _edge_axis(nu, nv, mu, mv, ou, ov)
-        axes[n, 0], axes[n, 1], axes[n, 2], axes[n, 3] = at, low, high, steepness
-        at, low, high, steepness = _edge_axis(nu, nw, mu, mw, ou, ow)
-        axes[n + 3, 0], axes[n + 3, 1], axes[n + 3, 2], axes[n + 3, 3] = at, low, high, steepness
-        at, low, high, steepness = _edge_axis(nv, nw, mv, mw, ov, ow)
-        axes[n + 6, 0], axes[n + 6, 1], axes[n + 6, 2], axes[n + 6, 3] = at, low, high, steepness
+        _set_edge_axis(axes, n, corners, n, u, v)
+        _set_edge_axis(axes, n + 3, corners, n, u, w)
+        _set_edge_axis(axes, n + 6, corners, n, v, w)
     _set_normal_axis(plane, corners, normal, u, v, w)
 
 
@@ -452,6 +448,5 @@ def voxelize(
     voxel of Z-order n modulo 8, least significant first. Boxes are closed: a triangle in the plane
     between two layers of voxels marks both. Threads may voxelize different parts at once.
     """
-    corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
-    resume = np.array([0, -1, 0, 0], dtype=np.int64)
-    return sorted_bricks(*voxelize_kernel(corners, bits, resume, 1 << 40))
+    _, keys, occupancy = next(voxelize_pieces(triangles, bits, 1 << 40))
+    return keys, occupancy

@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
 
@@ -33,13 +34,20 @@ rounding of a normal, 2e-16 / `FLAT`, moves what is as far as that."""
 @leaf
 def place_corners(corners, first, last, pose, out):
     """Write triangles first .. last - 1, moved by a pose (4, 4), into out (.., 3, 3)."""
+    transform = transform_of(pose)
     for n in range(first, last):
         for i in range(3):
-            x, y, z = corners[n, i, 0], corners[n, i, 1], corners[n, i, 2]
-            for axis in range(3):
-                out[n - first, i, axis] = (
-                    pose[axis, 0] * x + pose[axis, 1] * y + pose[axis, 2] * z + pose[axis, 3]
-                )
+            x, y, z = moved(transform, corners[n, i, 0], corners[n, i, 1], corners[n, i, 2])
+            out[n - first, i, 0], out[n - first, i, 1], out[n - first, i, 2] = x, y, z
+
+
+@leaf
+def middle_of(boxes, node):
+    """Middle of a box, and half of each edge."""
+    x = 0.5 * (boxes[node, 0, 0] + boxes[node, 1, 0])
+    y = 0.5 * (boxes[node, 0, 1] + boxes[node, 1, 1])
+    z = 0.5 * (boxes[node, 0, 2] + boxes[node, 1, 2])
+    return x, y, z, boxes[node, 1, 0] - x, boxes[node, 1, 1] - y, boxes[node, 1, 2] - z
 
 
 @leaf
@@ -48,12 +56,7 @@ def box_gap(boxes, node, others, other, pose, slack):
     if boxes[node, 0, 0] > boxes[node, 1, 0] or others[other, 0, 0] > others[other, 1, 0]:
         return math.inf
     square = 0.0
-    cx = 0.5 * (others[other, 0, 0] + others[other, 1, 0])
-    cy = 0.5 * (others[other, 0, 1] + others[other, 1, 1])
-    cz = 0.5 * (others[other, 0, 2] + others[other, 1, 2])
-    hx = others[other, 1, 0] - cx
-    hy = others[other, 1, 1] - cy
-    hz = others[other, 1, 2] - cz
+    cx, cy, cz, hx, hy, hz = middle_of(others, other)
     for axis in range(3):
         middle = pose[axis, 0] * cx + pose[axis, 1] * cy + pose[axis, 2] * cz + pose[axis, 3]
         half = abs(pose[axis, 0]) * hx + abs(pose[axis, 1]) * hy + abs(pose[axis, 2]) * hz + slack

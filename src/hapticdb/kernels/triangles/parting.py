@@ -5,11 +5,23 @@ the other surface; `sweeps.cut` says what a depth is.
 """
 
 import math
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, INTS, INTS2, entry, leaf
+from hapticdb.kernels._jit import (
+    BOOLS,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    INTS,
+    INTS2,
+    entry,
+    fields_of,
+    leaf,
+)
+from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import distance_at
 from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree
 from hapticdb.kernels.triangles.nearest import largest
@@ -59,31 +71,56 @@ def components_kernel(links, parents):
         parents[node] = _root(parents, node)
 
 
+class Parted(NamedTuple):
+    """A surface, its places on another one, and how far from that it is measured.
+
+    points (V, 3), edges (E, 2): the surface; order (V,): of points, near ones one after another;
+    cuts (P,), shares (P,): edge of each place and share of the edge, ascending by both; asked (P,):
+    where it is asked, the same for all places of an edge; pose (4, 4) leads into the frame of the
+    other one's tree; floor, most: distances between which it is measured; waiting, squares
+    (STACK,): scratch.
+    """
+
+    points: Floats
+    order: Ints
+    edges: Ints
+    cuts: Ints
+    shares: Floats
+    asked: Flags
+    tree: TriangleTree
+    pose: Floats
+    floor: float
+    most: float
+    waiting: Ints
+    squares: Floats
+
+
+PARTED = fields_of(
+    Parted, FLOATS2, INTS, INTS2, INTS, FLOATS, BOOLS, TREE, FLOATS2, FLOAT, FLOAT, INTS, FLOATS
+)
+
+
 @leaf
-def _far(tree, pose, x, y, z, enough, most, hint, waiting, squares):
-    """Distance of a place, moved by a pose (4, 4), from the other surface, and of which triangle.
+def _far(parted, x, y, z, enough, hint):
+    """Distance of a place from the other surface, and of which triangle.
 
     Up to `most`; where it is `enough` or less, it is that of some triangle. hint : number of a
     triangle that may be near, or -1.
     """
-    place = (
-        pose[0, 0] * x + pose[0, 1] * y + pose[0, 2] * z + pose[0, 3],
-        pose[1, 0] * x + pose[1, 1] * y + pose[1, 2] * z + pose[1, 3],
-        pose[2, 0] * x + pose[2, 1] * y + pose[2, 2] * z + pose[2, 3],
-    )
+    x, y, z = moved(transform_of(parted.pose), x, y, z)
     return distance_at(
-        tree, place, np.int64(-1), (0.0, 0.0, 0.0), -1.0, enough, most, hint, waiting, squares
+        parted.tree, x, y, z, enough, parted.most, hint, parted.waiting, parted.squares
     )
 
 
 @leaf
-def _part_far(points, edges, edge, begin, end, known, tree, pose, most, slack, waiting, squares):
+def _part_far(parted, edge, begin, end, known, slack):
     """Greatest distance on a part of an edge, from share to share; `known` if none is greater.
 
     Where the edge goes through the other surface, the distance is `slack` at most, so no place is
     farther than from there.
     """
-    a, b = edges[edge, 0], edges[edge, 1]
+    points, a, b = parted.points, parted.edges[edge, 0], parted.edges[edge, 1]
     ux, uy = points[b, 0] - points[a, 0], points[b, 1] - points[a, 1]
     uz = points[b, 2] - points[a, 2]
     length = math.sqrt(ux * ux + uy * uy + uz * uz)
@@ -97,26 +134,22 @@ def _part_far(points, edges, edge, begin, end, known, tree, pose, most, slack, w
             away = min(away, end - share)
         if away * length + slack <= found:
             continue
-        far, near = _far(
-            tree, pose, points[a, 0] + share * ux, points[a, 1] + share * uy,
-            points[a, 2] + share * uz, found, most, hint, waiting, squares,
-        )  # fmt: skip
+        x, y = points[a, 0] + share * ux, points[a, 1] + share * uy
+        far, near = _far(parted, x, y, points[a, 2] + share * uz, found, hint)
         found = max(found, far)
         hint = near if near >= 0 else hint
     return found
 
 
 @leaf
-def _measure_parts(
-    points, edges, cuts, shares, asked, tree, pose, floor, most, slack, pieces, parts, far,
-    piece_far, waiting, squares,
-):  # fmt: skip
+def _measure_parts(parted, slack, pieces, parts, far, piece_far):
     """Measure the parts of edges between places, and note the piece of each, parts (2 P,).
 
     Where both parts of an edge are of one piece, they count by themselves, far (2 P,). Else a part
     is passed over if its piece is known to get far enough.
     """
-    n_points, n_places, n_parts = points.shape[0], cuts.shape[0], 0
+    edges, cuts, shares = parted.edges, parted.cuts, parted.shares
+    n_points, n_places, n_parts = parted.points.shape[0], cuts.shape[0], 0
     for p in range(n_places):
         edge = cuts[p]
         one, other = pieces[edges[edge, 0]], pieces[edges[edge, 1]]
@@ -131,30 +164,27 @@ def _measure_parts(
             else:
                 begin, end, part = shares[p], shares[p + 1], n_points + n_parts
             parts[n_parts] = part
-            far[n_parts] = floor if is_one else max(piece_far[part], floor)
-            if asked[p] and far[n_parts] < most:
-                far[n_parts] = _part_far(
-                    points, edges, edge, begin, end, far[n_parts], tree, pose, most, slack,
-                    waiting, squares,
-                )  # fmt: skip
+            far[n_parts] = parted.floor if is_one else max(piece_far[part], parted.floor)
+            if parted.asked[p] and far[n_parts] < parted.most:
+                far[n_parts] = _part_far(parted, edge, begin, end, far[n_parts], slack)
             piece_far[part] = max(piece_far[part], far[n_parts])
             n_parts += 1
     return n_parts
 
 
 @leaf
-def _measure_pieces(points, order, tree, pose, most, pieces, piece_far, waiting, squares):
+def _measure_pieces(parted, pieces, piece_far):
     """Measure the points of pieces whose piece_far is 0 or more, until each gets far enough.
 
-    Neighbours in `order` (V,) are mostly near the same triangle, so that is asked first.
+    Neighbours in `order` are mostly near the same triangle, so that is asked first.
     """
+    points, order = parted.points, parted.order
     n_points, hint = points.shape[0], np.int64(-1)
     for n in range(n_points + n_points // FEW):  # a few points spread over all come first
         v = order[n * FEW if n < n_points // FEW else n - n_points // FEW]
         known = piece_far[pieces[v]]
-        if 0.0 <= known < most:
-            x, y, z = points[v, 0], points[v, 1], points[v, 2]
-            found, near = _far(tree, pose, x, y, z, known, most, hint, waiting, squares)
+        if 0.0 <= known < parted.most:
+            found, near = _far(parted, points[v, 0], points[v, 1], points[v, 2], known, hint)
             piece_far[pieces[v]] = max(known, found)
             hint = near if near >= 0 else hint
 
@@ -178,16 +208,14 @@ def _through(parts, far, piece_far, at, k, n_parts):
     return max(beside, min(piece_far[left], piece_far[right]))
 
 
-@entry(FLOATS2, INTS, INTS2, INTS, FLOATS, BOOLS, TREE, FLOATS2, FLOAT, FLOAT, INTS, FLOATS)
-def depths_kernel(points, order, edges, cuts, shares, asked, tree, pose, floor, most, parents, out):
+@entry(PARTED, INTS, FLOATS)
+def depths_kernel(parted, parents, out):
     """Find how far out (P,) a surface gets through another one at each place, `floor` to `most`.
 
-    points (V, 3), edges (E, 2): the surface; order (V,): of points, near ones one after another;
-    cuts (P,), shares (P,): edge of each place and share of the edge, ascending by both; asked (P,):
-    where it is asked, the same for all places of an edge; pose (4, 4) leads into the tree's frame.
     parents (V,) begins as 0 .. V - 1; afterwards the piece of each point.
     """
-    n_points, n_places = points.shape[0], cuts.shape[0]
+    edges, cuts, asked = parted.edges, parted.cuts, parted.asked
+    n_points, n_places = parted.points.shape[0], cuts.shape[0]
     p = 0
     for e in range(edges.shape[0]):
         while p < n_places and cuts[p] < e:
@@ -200,15 +228,11 @@ def depths_kernel(points, order, edges, cuts, shares, asked, tree, pose, floor, 
     piece_far = np.full(n_points + 2 * n_places, -1.0)
     for p in range(n_places):
         if asked[p]:
-            piece_far[parents[edges[cuts[p], 0]]] = floor
-            piece_far[parents[edges[cuts[p], 1]]] = floor
-    waiting, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
-    slack = ASIDE * largest(tree.boxes)
-    _measure_pieces(points, order, tree, pose, most, parents, piece_far, waiting, squares)
-    _measure_parts(
-        points, edges, cuts, shares, asked, tree, pose, floor, most, slack, parents, parts, far,
-        piece_far, waiting, squares,
-    )  # fmt: skip
+            piece_far[parents[edges[cuts[p], 0]]] = parted.floor
+            piece_far[parents[edges[cuts[p], 1]]] = parted.floor
+    slack = ASIDE * largest(parted.tree.boxes)
+    _measure_pieces(parted, parents, piece_far)
+    _measure_parts(parted, slack, parents, parts, far, piece_far)
     first, at = 0, 0
     while first < n_places:
         last = first
@@ -224,12 +248,13 @@ def depths_of(
     points: Floats, order: Ints, edges: Ints, cuts: Ints, shares: Floats, asked: Flags,
     tree: TriangleTree, pose: Floats, floor: float, most: float,
 ) -> Floats:  # fmt: skip
-    """How far (P,) a surface gets through at each place, as `depths_kernel` says."""
-    out = np.empty(len(cuts))
-    depths_kernel(
-        np.ascontiguousarray(points), order, np.ascontiguousarray(edges), cuts, shares, asked, tree,
-        np.ascontiguousarray(pose), float(floor), float(most), np.arange(len(points)), out,
+    """How far (P,) a surface gets through at each place, as `Parted` and `depths_kernel` say."""
+    out, contiguous = np.empty(len(cuts)), np.ascontiguousarray
+    parted = Parted(
+        contiguous(points), order, contiguous(edges), cuts, shares, asked, tree, contiguous(pose),
+        float(floor), float(most), np.empty(STACK, dtype=np.int64), np.empty(STACK),
     )  # fmt: skip
+    depths_kernel(parted, np.arange(len(points)), out)
     return out
 
 
@@ -278,8 +303,8 @@ def spots_kernel(tree, places, starts, slack, spots):
                     continue
                 else:
                     found, near = distance_at(
-                        tree, (spot[0], spot[1], spot[2]), np.int64(-1), (0.0, 0.0, 0.0), -1.0,
-                        max(known, 0.0), math.inf, hint, waiting, squares,
+                        tree, spot[0], spot[1], spot[2], max(known, 0.0), math.inf, hint, waiting,
+                        squares,
                     )  # fmt: skip
                     hint = near if near >= 0 else hint
                 if found > known:

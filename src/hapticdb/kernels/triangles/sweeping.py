@@ -16,9 +16,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, INTS2, entry, fields_of, leaf
+from hapticdb.kernels.rigid import moved as placed_by
+from hapticdb.kernels.rigid import transform_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.motion import MOTION, Moved, PathMotion, bend, move, velocity
-from hapticdb.kernels.triangles.nearest import largest, place_corners
+from hapticdb.kernels.triangles.nearest import largest, middle_of, place_corners
 from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
 
 Floats = NDArray[np.float64]
@@ -79,15 +81,8 @@ def _box_bound(boxes, node, others, other, moved, slack):
     if boxes[node, 0, 0] > boxes[node, 1, 0] or others[other, 0, 0] > others[other, 1, 0]:
         return math.inf, 0.0
     pose = moved.pose
-    cx = 0.5 * (others[other, 0, 0] + others[other, 1, 0])
-    cy = 0.5 * (others[other, 0, 1] + others[other, 1, 1])
-    cz = 0.5 * (others[other, 0, 2] + others[other, 1, 2])
-    hx = others[other, 1, 0] - cx
-    hy = others[other, 1, 1] - cy
-    hz = others[other, 1, 2] - cz
-    x = pose[0, 0] * cx + pose[0, 1] * cy + pose[0, 2] * cz + pose[0, 3]
-    y = pose[1, 0] * cx + pose[1, 1] * cy + pose[1, 2] * cz + pose[1, 3]
-    z = pose[2, 0] * cx + pose[2, 1] * cy + pose[2, 2] * cz + pose[2, 3]
+    cx, cy, cz, hx, hy, hz = middle_of(others, other)
+    x, y, z = placed_by(transform_of(pose), cx, cy, cz)
     ux, uy, uz, turned = velocity(moved, x, y, z)
     spread = moved.angle[0] * math.sqrt(hx * hx + hy * hy + hz * hz)
     more = spread + bend(moved) * (turned + spread)

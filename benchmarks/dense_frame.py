@@ -9,7 +9,14 @@ from numba import types
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOATS2, FLOATS3, INT, INTS, INTS32, WORDS32_2, entry, leaf
-from hapticdb.kernels.law import NOTHING_NEAR, TANGENT_PLANE, accumulate, average_into, respond
+from hapticdb.kernels.law import (
+    NO_WRENCH,
+    NOTHING_NEAR,
+    TANGENT_PLANE,
+    accumulate,
+    average_into,
+    respond,
+)
 from hapticdb.kernels.query.contact import center_of
 from hapticdb.kernels.resident.cells import (
     CLUSTERS,
@@ -19,7 +26,6 @@ from hapticdb.kernels.resident.cells import (
     HITS,
     PLACE,
     Cells,
-    cell_of_key,
 )
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
@@ -31,7 +37,8 @@ def spread_out(keys: NDArray[np.int64], slots, words, side, bitmap):  # type: ig
     for entry_at in range(keys.shape[0]):
         if keys[entry_at] < 0 or slots[entry_at] == EMPTY_SLOT:
             continue
-        ci, cj, ck = cell_of_key(keys[entry_at])
+        ci, cj = keys[entry_at] >> 32, (keys[entry_at] >> 16) & 0xFFFF
+        ck = keys[entry_at] & 0xFFFF
         for word in range(1024):
             i, j = (ci << 5) | (word >> 5), (cj << 5) | (word & 31)
             bitmap[(i * side + j) * row + ck] = words[slots[entry_at], word]
@@ -45,8 +52,8 @@ def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-un
     ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
     row = np.int64(side) >> 5
     width = np.int64(side)
-    mx, my, mz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
-    fx = fy = fz = tx = ty = tz = weight = deepest = 0.0
+    center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
+    sums, weight, deepest = NO_WRENCH, 0.0, 0.0
     count = n_contacts = 0
     for n in range(points.shape[0]):
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
@@ -61,17 +68,16 @@ def dense_felt(bitmap, shell, pose, place, law, met, out):  # type: ignore[no-un
             continue
         nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
         cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
-        depth, share = respond(law, is_hit, NOTHING_NEAR, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        point = px, py, pz, nx, ny, nz, cx, cy, cz
+        depth, share = respond(law, is_hit, NOTHING_NEAR, *point, size)
         met[count] = n
         count += 1
         weight += share
         if depth > 0.0:
             n_contacts += 1
             deepest = max(deepest, depth)
-            fx, fy, fz, tx, ty, tz = accumulate(
-                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
-            )
-    average_into(out, weight, fx, fy, fz, tx, ty, tz)
+            sums = accumulate(sums, point, center, depth, law.stiffness)
+    average_into(out, weight, sums)
     out[HITS] = count
     out[CONTACTS] = n_contacts
     out[DEEPEST] = deepest

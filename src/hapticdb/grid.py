@@ -10,6 +10,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import GridError
 from hapticdb.kernels import curves
+from hapticdb.kernels.records import GRID
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
@@ -77,6 +78,11 @@ class Grid:
     def curve_code(self) -> int:
         """Number of the curve, for kernels."""
         return CURVE_CODES[self.curve]
+
+    def for_kernels(self, shift: int) -> NDArray[np.void]:
+        """Record () of `kernels.records.GRID`, for rows whose keys are shifted by so many bits."""
+        numbers = (*self.origin, self.voxel_size, self.side, self.bits, self.curve_code, shift)
+        return np.array(numbers, GRID)
 
     @property
     def is_hierarchical(self) -> bool:

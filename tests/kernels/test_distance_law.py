@@ -128,14 +128,13 @@ def on_rows(
     scene: Merged, grid: Grid, shell: PointShell, pose: Array, exclude: list[int]
 ) -> tuple[refining.Refined, NDArray[np.int64]]:
     """A frame on rows, and the pairs of its contacts and the objects that they touch."""
-    origin, excluded = np.array(ORIGIN), np.array(sorted(set(exclude)), dtype=np.int64)
-    placed, asked, keys = contact.locate(
-        shell.points, shell.normals, shell.center, pose, origin, SIZE, BITS, grid.curve_code, 9
-    )
-    rows = (scene.keys, scene.ids, scene.occupancy, scene.values, excluded, origin, SIZE, LAW)
-    felt = refining.refine(placed, asked, keys, *rows)
+    excluded = np.array(sorted(set(exclude)), dtype=np.int64)
+    record = grid.for_kernels(9)
+    located = contact.locate(shell.points, shell.normals, shell.center, pose, record)
+    rows = (scene.keys, scene.ids, scene.occupancy, scene.values, excluded, record, LAW)
+    felt = refining.refine(located, *rows)
     contacts = np.sort(np.concatenate([felt[1][felt[2] > 0], felt[4]]))
-    return felt, refining.pairs_of_points(placed, asked, keys, *rows, contacts)
+    return felt, refining.pairs_of_points(*located, *rows, contacts)
 
 
 @cache

@@ -67,17 +67,14 @@ def test_the_last_key_of_the_largest_grid_is_counted() -> None:
     bounds = as_keys([0, LAST_KEY - 4, LAST_KEY])
     assert gap_rows(LAST_KEY - 1, LAST_KEY, bounds, 8.0) == pytest.approx(2.0)
     assert gap_rows(0, LAST_KEY, bounds, 8.0) == 16.0
-    ends = as_keys([LAST_KEY - 4, LAST_KEY])
-    _, asked, _ = group_by_cost(ends, bounds, 8.0, 1.0, 0.0, ends.copy(), ends.copy())
-    assert asked == pytest.approx(2.0)
+    assert gap_rows(LAST_KEY, LAST_KEY, bounds, 8.0) == 0.0
 
 
 def test_no_keys_have_no_ranges() -> None:
     none = np.empty(0, dtype=np.int64)
     lows, highs = group_by_gap(none, none, none, 500)
     assert len(lows) == len(highs) == 0
-    found = group_by_cost(none, as_keys([0, 9]), 1.0, 1.0, 1.0, none.copy(), none.copy())
-    assert found == (0, 0.0, 0.0)
+    assert group_by_cost(none.copy(), none.copy(), as_keys([0, 9]), 1.0, 1.0, 1.0) == 0
 
 
 # --- boxes --------------------------------------------------------------------------------------

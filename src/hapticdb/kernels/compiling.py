@@ -13,12 +13,14 @@ import gc
 import hashlib
 import importlib
 import os
+import re
 import subprocess
 import sys
 from collections.abc import Callable, Collection
 from concurrent.futures import ThreadPoolExecutor, as_completed
 from fnmatch import fnmatchcase
 from importlib.metadata import version
+from itertools import chain
 from pathlib import Path
 from threading import Lock, Timer
 from types import ModuleType
@@ -26,52 +28,33 @@ from typing import NamedTuple, Self
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
-ENTRIES = {
-    "period.loop": "run",
-    "period.direct": "run_directly",
-    "proxy.linearize": "linearize",
-    "surfaces.distances": "find_blocks rows_of_blocks",
-    "surfaces.voxelize": "voxelize_kernel",
-    "resident.nearest": "find_nearest",
-    "resident.first_hits": "find_first_hits",
-    "resident.budget": "feel_kernel feel_kernel@distances",
-    "query.refining": (
-        "refine_kernel refine_kernel@distances pairs_of_points pairs_of_points@distances "
-        "unpack_asked_kernel wrench_of_addresses depths_of_hits"
-    ),
-    "query.contact": "locate_kernel spans_of_keys",
-    "resident.cell_table": (
-        "insert_cells remove_cells slots_of_cells fill_cells fill_distances slots_to_free publish "
-        "oldest_version_read cells_ahead cells_met"
-    ),
-    "resident.near_voxels": "mark_near_voxels",
-    "resident.clearance": "cells_near",
-    "surfaces.sides": "side_votes_kernel nesting_kernel",
-    "surfaces.nearest": "distances_kernel",
-    "triangles.nearest": "nearest_kernel",
-    "triangles.sweeping": "least_kernel",
-    "triangles.motion": "poses_kernel",
-    "triangles.piercing": "piercing_kernel",
-    "triangles.parting": "components_kernel depths_kernel spots_kernel",
-    "motion": "play sway survey pull",
-    "field.packing": "pack_kernel unpack_kernel",
-    "resident.feeling": "bounding_spheres",
-    "query.grouping": "gap_rows group_by_gap group_by_cost group_spans_by_cost ranges_of_box",
-    "surfaces.sampling": "eliminate_kernel",
-    "curves": "encode_kernel decode_kernel",
-    "rigid": "poses_of first_not_rigid",
-    "surfaces.bricks": "mark_points_kernel brick_voxels_kernel",
-    "hand.handle": "is_somewhere follow",
-    "proxy.evaluate": "evaluate",
-}
-"""Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`); modules
-that take longest to compile come first. The names are listed here so that a process can check for
-compiled entries without loading numba."""
-NAMES = tuple(f"{module}.{name}" for module, names in ENTRIES.items() for name in names.split())
+LONGEST = (
+    *("period.loop", "period.direct", "proxy.linearize", "surfaces.distances"),
+    *("surfaces.voxelize", "resident.nearest", "resident.first_hits", "resident.budget"),
+    *("query.refining", "query.contact"),
+)
+"""Modules of entries that take longest to compile, which come first."""
+ENTRY = re.compile(r"^@entry\((.*?)^def (\w+)", re.MULTILINE | re.DOTALL)
+"""An entry's declaration in a source: its signature and its name."""
+
+
+def _names() -> tuple[str, ...]:
+    """Entries, by their modules' sources: nobody loads numba to check for compiled ones."""
+    folder, found = Path(__file__).parent, {module: list[str]() for module in LONGEST}
+    for source in sorted(folder.rglob("[a-z]*.py")):
+        module = ".".join(source.relative_to(folder).with_suffix("").parts)
+        for signature, name in ENTRY.findall(source.read_text()):
+            found.setdefault(module, []).append(f"{module}.{name}")
+            if "also=" in signature:
+                found[module].append(f"{module}.{name}@distances")
+    return tuple(chain.from_iterable(found.values()))
+
+
+NAMES = _names()
+"""Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`)."""
 TOGETHER = {
     "resident.budget": "period.direct",
     "proxy.linearize": "period.loop",
-    "resident.clearance": "resident.nearest",
 }
 """Modules that are compiled after another module, if it is compiled, too, in the same process: they
 share its leaves."""
@@ -104,7 +87,6 @@ _RESIDENT = (
     "resident.near_voxels.*",
     "resident.feeling.bounding_spheres",
     "field.packing.unpack_kernel",
-    "query.grouping.group_spans_by_cost",
     *_COST,
 )
 _FRAMES = "resident.budget.feel_kernel"

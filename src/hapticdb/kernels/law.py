@@ -28,6 +28,8 @@ A larger number lets a frame of many contacts push harder.
 """
 NOTHING_NEAR = math.inf
 """Sample of a point when the payload holds nothing near the point."""
+NO_WRENCH = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0)
+"""Force and torque of no point."""
 
 
 def _no_sample_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001 - as every such leaf
@@ -110,31 +112,25 @@ share_slot = chosen_by_type(lambda law_type: LEAVES[law_type].share_slot)
 
 
 @leaf
-def accumulate(
-    fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, stiffness
-):  # fmt: skip
+def accumulate(sums, point, center, depth, stiffness):
     """Add one felt point to a frame's force and torque: F = K d n, T = (p - m) x F.
 
-    m is the tool's centre. Sums run in the order of the shell's points.
+    sums: force and torque so far; point: p and n, six numbers and perhaps more; center: m, the
+    tool's. Sums run in the order of the shell's points.
     """
-    x, y, z = stiffness * depth * nx, stiffness * depth * ny, stiffness * depth * nz
-    rx, ry, rz = moment(px - mx, py - my, pz - mz, x, y, z)
+    fx, fy, fz, tx, ty, tz = sums
+    push = stiffness * depth
+    x, y, z = push * point[3], push * point[4], push * point[5]
+    rx, ry, rz = moment(point[0] - center[0], point[1] - center[1], point[2] - center[2], x, y, z)
     return fx + x, fy + y, fz + z, tx + rx, ty + ry, tz + rz
 
 
 @leaf
-def average_into(out, weight, fx, fy, fz, tx, ty, tz):
+def average_into(out, weight, sums):
     """Wrench into out (6+,), divided by a tenth of the weight from `AVERAGE_FROM` on."""
-    out[0] = fx
-    out[1] = fy
-    out[2] = fz
-    out[3] = tx
-    out[4] = ty
-    out[5] = tz
-    if weight >= AVERAGE_FROM:
-        tenth = weight / 10.0
-        for axis in range(6):
-            out[axis] /= tenth
+    tenth = weight / 10.0 if weight >= AVERAGE_FROM else 1.0
+    for axis in range(6):
+        out[axis] = sums[axis] / tenth
 
 
 # --- the tangent plane ---------------------------------------------------------------------------

@@ -74,6 +74,18 @@ def pose_numbers(record: NDArray[np.void]) -> NDArray[np.float64]:
     return np.ndarray((7,), np.float64, record, start)
 
 
+GRID: Layout = _record(
+    [
+        *((name, "<f8") for name in "xyz"),  # origin, m
+        ("size", "<f8"),  # of a voxel, m
+        ("side", "<f8"),  # voxels on an axis
+        ("bits", "<i8"),  # on an axis
+        ("curve", "<i8"),  # its code
+        ("shift", "<i8"),  # from a voxel's key to its row's: 0, or 9 for bricks
+    ]
+)
+"""The grid of an environment and its rows, for a frame on rows."""
+
 RESULTS = 10
 """Numbers of a frame's result; `kernels.resident.cells` names them."""
 
@@ -226,7 +238,6 @@ CONTACT_MODEL: Layout = _record(
         ("rows", "<f8", (MOST_PLANES, 7)),  # gradient, its moment, depth
         ("is_active", "<i8", MOST_PLANES),
         ("matrix", "<f8", (6, 6)),
-        ("series", "<f8", (6, 6)),
         ("right", "<f8", 6),
         ("step", "<f8", 6),
     ]

@@ -237,8 +237,7 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
     shift = row_shift(store.layout)
     places = rng.choice(quantiles.bounds, size=64)
     centers = grid.centers(grid.decode(places << shift))
-    origin = np.array(grid.origin)
-    grid_codes = (grid.bits, grid.curve_code)
+    record = grid.for_kernels(shift)
     middle = np.zeros(3)
     middle.flags.writeable = False
     probes = []
@@ -253,11 +252,9 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
         # A tool lies on a surface or just below it; farther inside, gaps would hold more rows.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
-        _, asked, keys = contact.locate(
-            points, normals, middle, pose, origin, grid.voxel_size, *grid_codes, shift
-        )
+        _, asked, keys = contact.locate(points, normals, middle, pose, record)
         if not len(keys):
             continue
-        first, last = contact.spans_of_keys(asked, keys, *grid_codes, shift)
+        first, last = contact.spans_of_keys(asked, keys, record)
         probes.append(_Probe(keys, first, last))
     return probes

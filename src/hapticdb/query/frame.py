@@ -109,11 +109,8 @@ class HapticQuery:
         self._store = store
         self._quantiles_and_costs = quantiles_and_costs
         self._grouping_threshold = grouping_threshold(store)
-        grid = store.grid
         self._shift = row_shift(store.layout)
-        self._origin = np.array(grid.origin)
-        self._size = grid.voxel_size
-        self._curve = (grid.bits, grid.curve_code, self._shift)
+        self._grid = store.grid.for_kernels(self._shift)
 
     def run(
         self,
@@ -171,9 +168,8 @@ class HapticQuery:
         """Answer of a frame from its rows; rows of other poses may lie among them."""
         row_keys, row_ids, occupancy, _ = rows
         wrench, hits, depths, ids, apart, apart_depths = refining.refine(
-            *located, row_keys, row_ids, occupancy, payload, exclude, self._origin, self._size,
-            law.for_kernels,
-        )  # fmt: skip
+            located, row_keys, row_ids, occupancy, payload, exclude, self._grid, law.for_kernels
+        )
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         return Answer(
             wrench,
@@ -202,9 +198,8 @@ class HapticQuery:
         payload = self._distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_points(  # type: ignore[no-any-return]
-            *located, keys, ids, occupancy, payload, exclude, self._origin, self._size,
-            law.for_kernels, points,
-        )  # fmt: skip
+            *located, keys, ids, occupancy, payload, exclude, self._grid, law.for_kernels, points
+        )
 
     def run_many(
         self,
@@ -254,19 +249,9 @@ class HapticQuery:
         """Place a shell (N points) at a pose (4, 4), and compute the row keys to ask for."""
         if pose.shape != (4, 4):
             raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
-        bits, curve, shift = self._curve
+        points, normals, center = shell.points, shell.normals, shell.center
         try:
-            return contact.locate(
-                shell.points,
-                shell.normals,
-                shell.center,
-                pose,
-                self._origin,
-                self._size,
-                bits,
-                curve,
-                shift,
-            )
+            return contact.locate(points, normals, center, pose, self._grid)
         except ValueError as error:
             raise UsageError(f"{error}: give finite numbers and a rotation") from error
 
@@ -286,7 +271,7 @@ class HapticQuery:
             return ("points", len(keys), len(keys), len(rows)), rows
         ranges: Ranges | None = None
         if strategy == "maxgap":
-            first, last = contact.spans_of_keys(asked, keys, *self._curve)
+            first, last = contact.spans_of_keys(asked, keys, self._grid)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":
             ranges = cbgroup(keys, *self._figures(distances=distances))
@@ -323,7 +308,10 @@ class HapticQuery:
             ordinals, ids = store.statement_hits(frame)
         pairs = np.stack([ordinals, ids], axis=1)
         hits = np.unique(ordinals)
-        depths = refining.depths_of_hits(placed, hits, self._origin, self._size)
+        depths = np.empty(len(hits))
+        refining.wrench_of_addresses(
+            placed, hits, addresses[hits], self._grid, law.for_kernels, depths
+        )
         touched = np.unique(ids).tolist()
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)

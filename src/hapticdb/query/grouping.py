@@ -55,17 +55,7 @@ def cbgroup(keys: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
     The gap between keys p < q covers p+1 .. q-1. The costs of gaps add up, so deciding each gap by
     itself gives the least cost over all groupings.
     """
-    lows, highs = np.empty_like(keys), np.empty_like(keys)
-    count, _, _ = kernels.group_by_cost(
-        keys,
-        quantiles.bounds,
-        quantiles.rows_per_bucket,
-        costs.row_in_gap,
-        costs.descent,
-        lows,
-        highs,
-    )
-    return Ranges(lows[:count], highs[:count])
+    return group_spans(keys, keys, quantiles, costs)
 
 
 def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
@@ -74,10 +64,10 @@ def group_spans(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostM
     The gap between two spans is closed on the same condition as between two keys.
     """
     lows, highs = lows.copy(), highs.copy()
-    count = kernels.group_spans_by_cost(
+    count = kernels.group_by_cost(
         lows, highs, quantiles.bounds, quantiles.rows_per_bucket, costs.row_in_gap, costs.descent
     )
-    return Ranges(lows[:count].copy(), highs[:count].copy())
+    return Ranges(lows[:count], highs[:count])
 
 
 def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:

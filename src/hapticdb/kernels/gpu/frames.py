@@ -80,7 +80,7 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
         law, place, shell, transform, first, step, keys, slots, words, gate, payload, sums
     ):  # fmt: skip
         total = shell.shape[1] - 1
-        mx, my, mz = _moved(transform, shell[0, total], shell[1, total], shell[2, total])
+        center = _moved(transform, shell[0, total], shell[1, total], shell[2, total])
         for row in range(SUMS):
             sums[row] = 0.0
         size, side = place.size, place.side
@@ -105,7 +105,8 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
             cx = place.x + size * (float(i) + 0.5)
             cy = place.y + size * (float(j) + 0.5)
             cz = place.z + size * (float(k) + 0.5)
-            depth, counted = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+            point = px, py, pz, nx, ny, nz, cx, cy, cz
+            depth, counted = respond(law, is_hit, sample, *point, size)
             share = share_at(law, payload, slot, x, y, z, nx, ny, nz, sample)
             depth *= share
             sums[WEIGHT] += counted * share
@@ -113,10 +114,10 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
             if depth > 0.0:
                 sums[CONTACTS] += 1.0
                 sums[DEEPEST] = max(sums[DEEPEST], depth)
+                wrench = sums[0], sums[1], sums[2], sums[3], sums[4], sums[5]
                 sums[0], sums[1], sums[2], sums[3], sums[4], sums[5] = _accumulate(
-                    sums[0], sums[1], sums[2], sums[3], sums[4], sums[5], px, py, pz, nx, ny, nz,
-                    mx, my, mz, depth, law.stiffness,
-                )  # fmt: skip
+                    wrench, point, center, depth, law.stiffness
+                )
 
     return on_gpu(add_points)
 
@@ -140,7 +141,7 @@ def _add_up(both, t):
 @cuda.jit(device=True)
 def _write(sums, n, total, out):
     """Write frame n of `total` from its sums (SUMS,), as `frames_under` has it."""
-    _average_into(sums, sums[WEIGHT], sums[0], sums[1], sums[2], sums[3], sums[4], sums[5])
+    _average_into(sums, sums[WEIGHT], sums)
     for axis in range(3):
         out[3 * n + axis] = sums[axis]
         out[3 * total + 3 * n + axis] = sums[3 + axis]

@@ -6,10 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import (
-    FLOAT,
-    FLOATS,
     FLOATS2,
-    INT,
     INTS,
     INTS2,
     READ_FLOATS,
@@ -18,9 +15,11 @@ from hapticdb.kernels._jit import (
     inlined,
     leaf,
     maker,
+    record_of,
 )
 from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
 from hapticdb.kernels.query.sorting import sorting_order
+from hapticdb.kernels.records import GRID
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 Floats = NDArray[np.float64]
@@ -51,17 +50,11 @@ def _place_shell(points, normals, center, transform, placed):
     total = points.shape[0]
     for n in range(total):
         x, y, z = moved(transform, points[n, 0], points[n, 1], points[n, 2])
-        placed[n, 0] = x
-        placed[n, 1] = y
-        placed[n, 2] = z
+        placed[n, 0], placed[n, 1], placed[n, 2] = x, y, z
         x, y, z = turned(transform, normals[n, 0], normals[n, 1], normals[n, 2])
-        placed[n, 3] = x
-        placed[n, 4] = y
-        placed[n, 5] = z
+        placed[n, 3], placed[n, 4], placed[n, 5] = x, y, z
     x, y, z = moved(transform, center[0], center[1], center[2])
-    placed[total, 0] = x
-    placed[total, 1] = y
-    placed[total, 2] = z
+    placed[total, 0], placed[total, 1], placed[total, 2] = x, y, z
     placed[total, 3] = placed[total, 4] = placed[total, 5] = 0.0
 
 
@@ -96,29 +89,15 @@ def sort_keys(found, count, asked, keys):
 
 
 @entry(
-    READ_FLOATS2,
-    READ_FLOATS2,
-    READ_FLOATS,
-    FLOATS2,
-    FLOATS,
-    FLOAT,
-    INT,
-    INT,
-    INT,
-    FLOATS2,
-    INTS2,
-    INTS,
-)
-def locate_kernel(
-    points, normals, center, pose, origin, size, bits, curve, shift, placed, asked, keys
-):
+    READ_FLOATS2, READ_FLOATS2, READ_FLOATS, FLOATS2, record_of(GRID), FLOATS2, INTS2, INTS
+)  # fmt: skip
+def locate_kernel(points, normals, center, pose, grid, placed, asked, keys):
     """`locate` into placed, asked and keys (N,); returns U, or -1 when the pose is not rigid."""
     if not is_rigid(pose):
         return -1
     _place_shell(points, normals, center, transform_of(pose), placed)
-    total = points.shape[0]
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    side = float(1 << bits)
+    place, total = grid[()], points.shape[0]
+    size, side, bits, curve, shift = place.size, place.side, place.bits, place.curve, place.shift
     capacity = 16
     while capacity < 2 * total:
         capacity *= 2
@@ -127,9 +106,9 @@ def locate_kernel(
     count = 0
     last_key, last_number = -1, -1  # points next to each other in the shell often share a row
     for n in range(total):
-        x = np.floor((placed[n, 0] - ox) / size)
-        y = np.floor((placed[n, 1] - oy) / size)
-        z = np.floor((placed[n, 2] - oz) / size)
+        x = np.floor((placed[n, 0] - place.x) / size)
+        y = np.floor((placed[n, 1] - place.y) / size)
+        z = np.floor((placed[n, 2] - place.z) / size)
         if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
             asked[0, n] = -1
             asked[1, n] = -1
@@ -155,16 +134,12 @@ def locate(
     normals: Floats,
     center: Floats,
     pose: Floats,
-    origin: Floats,
-    size: float,
-    bits: int,
-    curve: int,
-    shift: int,
+    grid: NDArray[np.void],
 ) -> Located:
     """Place a shell in the grid and collect the distinct row keys that it asks for.
 
-    points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; origin (3,)
-    and size in metres; shift 0 for voxel rows, 9 for brick rows.
+    points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; grid () of
+    `records.GRID`.
 
     Returns placed (N + 1, 6): each point in metres and its normal, world frame, last the centre;
     asked (2, N): each point's address and slot, both -1 outside the grid; keys (U,): distinct row
@@ -181,9 +156,7 @@ def locate(
     placed = np.empty((total + 1, 6))
     asked = np.empty((2, total), dtype=np.int64)
     keys = np.empty(total, dtype=np.int64)
-    count = locate_kernel(
-        points, normals, center, pose, origin, size, bits, curve, shift, placed, asked, keys
-    )
+    count = locate_kernel(points, normals, center, pose, grid, placed, asked, keys)
     if count < 0:
         raise ValueError("a pose that is no rigid transform")
     return Located(placed, asked, keys[:count])
@@ -202,12 +175,13 @@ def voxel_at(address, bits, curve, shift):
     )
 
 
-@entry(INTS2, INTS, INT, INT, INT)
-def spans_of_keys(asked, keys, bits, curve, shift):
+@entry(INTS2, INTS, record_of(GRID))
+def spans_of_keys(asked, keys, grid):
     """Lowest and highest voxel key (2, U) that a shell asks for under each row key.
 
     asked, keys as `locate` returns them.
     """
+    bits, curve, shift = grid[()].bits, grid[()].curve, grid[()].shift
     spans = np.empty((2, keys.shape[0]), dtype=np.int64)
     for at in range(keys.shape[0]):
         spans[0, at] = LARGEST

@@ -63,11 +63,11 @@ def _rows_up_to(x, after, bounds, rows_per_bucket):
 
 
 @leaf
-def _rows_between(left, right, bounds, rows_per_bucket):
-    """Expected rows with a key in [left, right]."""
+def _rows_between(left, right, bounds, rows_per_bucket, start):
+    """Expected rows with a key in [left, right]; no bound below index `start` is >= left."""
     if right < left:
         return 0.0
-    at = first_bound(left, bounds, np.int64(0))
+    at = first_bound(left, bounds, start)
     after = _bound_after(right, bounds, at)
     return _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
         left, at, bounds, rows_per_bucket
@@ -77,7 +77,7 @@ def _rows_between(left, right, bounds, rows_per_bucket):
 @entry(INT, INT, INTS, FLOAT)
 def gap_rows(left, right, bounds, rows_per_bucket):
     """Expected rows with a key in [left, right]. bounds (R + 1,) int64, ascending -> float."""
-    return _rows_between(left, right, bounds, rows_per_bucket)
+    return _rows_between(left, right, bounds, rows_per_bucket, np.int64(0))
 
 
 @entry(INTS, INTS, INTS, INT)
@@ -101,53 +101,20 @@ def group_by_gap(keys, first, last, maxgap):
     return lows[:count], highs[:count]
 
 
-@entry(INTS, INTS, FLOAT, FLOAT, FLOAT, INTS, INTS)
-def group_by_cost(keys, bounds, rows_per_bucket, row_cost, descent_cost, lows, highs):
+@entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)
+def group_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
     """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
 
-    keys (U,) row keys, ascending; bounds (R + 1,) int64, the quantile vector; both costs in the
-    same unit. The ranges' lowest and highest row keys go into lows and highs, (U,) int64.
-
-    Returns
-    -------
-    count : int
-        Number G of ranges.
-    asked, scanned : float
-        Expected rows under the keys themselves, and expected rows in the gaps that were closed.
+    lows, highs (U,) int64: closed spans of row keys, ascending and disjoint, which are merged in
+    place; bounds (R + 1,) int64, the quantile vector; both costs in the same unit. Returns the
+    number of ranges.
     """
-    total = keys.shape[0]
-    count = 0
-    asked = 0.0
-    scanned = 0.0
-    above = 0.0
-    at = 0
-    for n in range(total):
-        at = first_bound(keys[n], bounds, at)
-        below = _rows_below_bound(keys[n], at, bounds, rows_per_bucket)
-        gap = below - above
-        if n > 0 and gap * row_cost <= descent_cost:
-            highs[count - 1] = keys[n]
-            scanned += gap
-        else:
-            lows[count] = keys[n]
-            highs[count] = keys[n]
-            count += 1
-        at = _bound_after(keys[n], bounds, at)
-        above = _rows_up_to(keys[n], at, bounds, rows_per_bucket)
-        asked += above - below
-    return count, asked, scanned
-
-
-@entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)
-def group_spans_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
-    """CBGroup over closed spans (U,) of row keys, ascending and disjoint; merges them in place.
-
-    Returns the number of ranges.
-    """
-    count = 0
+    count = at = np.int64(0)
     for n in range(lows.shape[0]):
         if count > 0:
-            expected = _rows_between(highs[count - 1] + 1, lows[n] - 1, bounds, rows_per_bucket)
+            first = highs[count - 1] + 1
+            at = first_bound(first, bounds, at)
+            expected = _rows_between(first, lows[n] - 1, bounds, rows_per_bucket, at)
             if expected * row_cost <= descent_cost:
                 highs[count - 1] = highs[n]
                 continue

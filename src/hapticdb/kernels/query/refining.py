@@ -12,10 +12,8 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import (
     BYTES2,
-    FLOAT,
     FLOATS,
     FLOATS2,
-    INT,
     INTS,
     INTS2,
     NONE,
@@ -23,23 +21,25 @@ from hapticdb.kernels._jit import (
     entry,
     inlined,
     maker,
+    record_of,
 )
 from hapticdb.kernels.field.lattice import ROW_VALUES
 from hapticdb.kernels.field.law import DISTANCE_FIELD
 from hapticdb.kernels.field.packing import unpack_rows
 from hapticdb.kernels.law import (
+    NO_WRENCH,
     NOTHING_NEAR,
     TANGENT_PLANE,
     accumulate,
     average_into,
-    depth_below_plane,
     reach,
     respond,
     sample_rows,
     share_rows,
 )
-from hapticdb.kernels.query.contact import center_of, voxel_at
+from hapticdb.kernels.query.contact import Located, center_of, voxel_at
 from hapticdb.kernels.query.sorting import insert_distinct
+from hapticdb.kernels.records import GRID
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -126,86 +126,88 @@ def _distinct_ids(touched, row_ids, met, start):
     return count
 
 
+BY_DISTANCE = {NONE: BYTES2, TANGENT_PLANE: DISTANCE_FIELD}
+
+
 @inlined
-def _touch_near_rows(
-    law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
-    px, py, pz, nx, ny, nz, cx, cy, cz, size,
-):  # fmt: skip
+def _point_at(placed, n, place):
+    """Point n of a placed shell, its normal, and the centre of its voxel: nine numbers, metres."""
+    x, y, z = placed[n, 0], placed[n, 1], placed[n, 2]
+    return (
+        x, y, z, placed[n, 3], placed[n, 4], placed[n, 5], center_of(x, place.x, place.size),
+        center_of(y, place.y, place.size), center_of(z, place.z, place.size),
+    )  # fmt: skip
+
+
+@inlined
+def _in_grid(placed, n, place):
+    """Point n of a placed shell in voxels from the grid's origin."""
+    x, y, z = placed[n, 0] - place.x, placed[n, 1] - place.y, placed[n, 2] - place.z
+    return x / place.size, y / place.size, z / place.size
+
+
+@inlined
+def _share_of(law, payload, counts, first, end, at, point, sample):
+    """Share of a point, at a place `at` in voxels, by rows first .. end - 1."""
+    return share_rows(law, payload, counts, first, end, *at, point[3], point[4], point[5], sample)
+
+
+@inlined
+def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size, sample, is_hit):
     """Mark the rows of the objects that a felt point touches, by each object's own sample.
 
     These are the objects that the point would feel alone. Between two objects the least distances,
     interpolated, may be below the onset although each object's own distance is not: then it is the
     nearest object. Nothing is marked under a law without samples, which feels hits alone.
     """
-    if sample <= reach(law):
-        n_touched = np.int64(0)
-        nearest = np.int64(-1)
-        least = NOTHING_NEAR
-        for row in range(first, end):
-            if counts[row]:
-                own = sample_rows(law, payload, counts, row, row + 1, x, y, z)
-                if own < least:
-                    least = own
-                    nearest = np.int64(row)
-                if own <= reach(law):
-                    depth, _ = respond(
-                        law, is_hit, own, px, py, pz, nx, ny, nz, cx, cy, cz, size
-                    )  # fmt: skip
-                    if depth > 0.0:
-                        depth *= share_rows(
-                            law, payload, counts, row, row + 1, x, y, z, nx, ny, nz, own
-                        )
-                    if depth > 0.0:
-                        touched[row] = True
-                        n_touched += 1
-        if n_touched == 0:
-            touched[nearest] = True
+    if not sample <= reach(law):
+        return
+    n_touched, nearest, least = np.int64(0), np.int64(-1), NOTHING_NEAR
+    for row in range(first, end):
+        if not counts[row]:
+            continue
+        own = sample_rows(law, payload, counts, row, row + 1, *at)
+        if own < least:
+            nearest, least = np.int64(row), own
+        if own <= reach(law):
+            depth, _ = respond(law, is_hit, own, *point, size)
+            if depth > 0.0:
+                depth *= _share_of(law, payload, counts, row, row + 1, at, point, own)
+            if depth > 0.0:
+                touched[row] = True
+                n_touched += 1
+    if n_touched == 0:
+        touched[nearest] = True
 
 
 @entry(
-    FLOATS2,
-    INTS2,
-    INTS,
-    INTS,
-    INTS,
-    READ_BYTES,
-    NONE,
-    INTS,
-    FLOATS,
-    FLOAT,
-    TANGENT_PLANE,
-    FLOATS,
-    INTS,
-    also={NONE: BYTES2, TANGENT_PLANE: DISTANCE_FIELD},
-)
+    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, NONE, INTS, record_of(GRID), TANGENT_PLANE,
+    FLOATS, INTS, also=BY_DISTANCE,
+)  # fmt: skip
 def refine_kernel(
-    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
-    felt, met,
-):  # fmt: skip
+    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
+):
     """`refine` into felt (6 + 2 N,) and met (2 N + R,) -> H, A and I.
 
     felt takes the wrench, from 6 on the depths of the H hits, and from 6 + N on those of the A
     points that are felt only. met takes the H indices, from N on the A indices, and from 2 N on
     the I ids.
     """
-    total = asked.shape[1]
+    place, total = grid[()], asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    mx, my, mz = placed[total, 0], placed[total, 1], placed[total, 2]
-    fx = fy = fz = tx = ty = tz = weight = 0.0
+    center = placed[total, 0], placed[total, 1], placed[total, 2]
+    sums, weight = NO_WRENCH, 0.0
     n_hits = n_apart = np.int64(0)
     for n in range(total):
-        at = asked[1, n]
-        if at < 0:
+        if asked[1, n] < 0:
             continue
-        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
-        first, end = starts[at], ends[at]
+        first, end = starts[asked[1, n]], ends[asked[1, n]]
         if first == end:
             continue
-        x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
-        sample = sample_rows(law, payload, counts, first, end, x, y, z)
+        at = _in_grid(placed, n, place)
+        sample = sample_rows(law, payload, counts, first, end, *at)
         is_hit = False
         for row in range(first, end):
             if counts[row] and _has_voxel(occupancy, row, asked[0, n]):
@@ -213,10 +215,9 @@ def refine_kernel(
                 touched[row] = True
         if not is_hit and not sample <= reach(law):
             continue
-        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
-        cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
-        depth, counted = respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size)
-        share = share_rows(law, payload, counts, first, end, x, y, z, nx, ny, nz, sample)
+        point = _point_at(placed, n, place)
+        depth, counted = respond(law, is_hit, sample, *point, place.size)
+        share = _share_of(law, payload, counts, first, end, at, point, sample)
         depth *= share
         weight += counted * share
         if is_hit:
@@ -229,42 +230,36 @@ def refine_kernel(
             n_apart += 1
         if depth > 0.0:
             _touch_near_rows(
-                law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
-                px, py, pz, nx, ny, nz, cx, cy, cz, size,
-            )  # fmt: skip
-            fx, fy, fz, tx, ty, tz = accumulate(
-                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
+                law, payload, counts, touched, first, end, at, point, place.size, sample, is_hit
             )
-    average_into(felt, weight, fx, fy, fz, tx, ty, tz)
+            sums = accumulate(sums, point, center, depth, law.stiffness)
+    average_into(felt, weight, sums)
     return n_hits, n_apart, _distinct_ids(touched, row_ids, met, 2 * total)
 
 
 def refine(
-    placed: Floats,
-    asked: Ints,
-    keys: Ints,
+    located: Located,
     row_keys: Ints,
     row_ids: Ints,
     occupancy: NDArray[np.uint8],
     payload: NDArray[np.uint8] | None,
     exclude: Ints,
-    origin: Floats,
-    size: float,
+    grid: NDArray[np.void],
     law: Any,  # noqa: ANN401 - a NamedTuple that `kernels.law` knows
 ) -> Refined:
     """Drop the false hits of a frame's rows and sum the wrench of the points that are felt.
 
-    placed, asked, keys as `locate` returns them; row_keys (R,) int64 ascending, row_ids (R,) int64,
-    occupancy (64 R,) uint8, or empty for voxel rows; payload (R, 1000) uint8, the rows' distances,
-    or None for a law that reads none; exclude (E,) int64; origin (3,) and size of a voxel, metres.
+    row_keys (R,) int64 ascending, row_ids (R,) int64; occupancy (64 R,) uint8, or empty for voxel
+    rows; payload (R, 1000) uint8, the rows' distances, or None for a law that reads none; exclude
+    (E,) int64, ascending; grid () of `records.GRID`.
     """
+    placed, asked, keys = located
     total = asked.shape[1]
     felt = np.empty(6 + 2 * total)
     met = np.empty(2 * total + row_ids.shape[0], dtype=np.int64)
     n_hits, n_apart, n_ids = refine_kernel(
-        placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law,
-        felt, met,
-    )  # fmt: skip
+        placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
+    )
     wrench, hits, depths = felt[:6], met[:n_hits], felt[6 : 6 + n_hits]
     ids = met[2 * total : 2 * total + n_ids]
     if n_apart == 0:
@@ -274,44 +269,40 @@ def refine(
 
 
 @entry(
-    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, NONE, INTS, FLOATS, FLOAT, TANGENT_PLANE, INTS,
-    also={NONE: BYTES2, TANGENT_PLANE: DISTANCE_FIELD},
+    FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, NONE, INTS, record_of(GRID), TANGENT_PLANE, INTS,
+    also=BY_DISTANCE,
 )  # fmt: skip
 def pairs_of_points(
-    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, origin, size, law, chosen
+    placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, chosen
 ):
     """Every (point, object) pair of chosen points (C,) of a frame, (P, 2) int64, ordered by both.
 
     A point touches the objects in whose voxel it is, and those of `_touch_near_rows`. The other
     arguments are those of `refine`.
     """
+    place = grid[()]
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
-    ox, oy, oz = origin[0], origin[1], origin[2]
     most = 0
     for c in range(chosen.shape[0]):
-        at = asked[1, chosen[c]]
-        most += ends[at] - starts[at]
+        slot = asked[1, chosen[c]]
+        most += ends[slot] - starts[slot]
     pairs = np.empty((most, 2), dtype=np.int64)
     count = 0
     for c in range(chosen.shape[0]):
         n = chosen[c]
-        at = asked[1, n]
-        first, end = starts[at], ends[at]
+        first, end = starts[asked[1, n]], ends[asked[1, n]]
         is_hit = False
         for row in range(first, end):
             touched[row] = counts[row] and _has_voxel(occupancy, row, asked[0, n])
             is_hit |= touched[row]
-        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
-        x, y, z = (px - ox) / size, (py - oy) / size, (pz - oz) / size
-        sample = sample_rows(law, payload, counts, first, end, x, y, z)
-        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
-        cx, cy, cz = center_of(px, ox, size), center_of(py, oy, size), center_of(pz, oz, size)
+        at = _in_grid(placed, n, place)
+        sample = sample_rows(law, payload, counts, first, end, *at)
+        point = _point_at(placed, n, place)
         _touch_near_rows(
-            law, payload, counts, touched, first, end, x, y, z, sample, is_hit,
-            px, py, pz, nx, ny, nz, cx, cy, cz, size,
-        )  # fmt: skip
+            law, payload, counts, touched, first, end, at, point, place.size, sample, is_hit
+        )
         for row in range(first, end):
             if touched[row]:
                 pairs[count, 0] = n
@@ -320,25 +311,15 @@ def pairs_of_points(
     return pairs[:count]
 
 
-@maker
-def is_asked(keys, row_keys):
-    """Mask (R,) bool of the rows whose key is among those that a shell asks for: no false hits.
-
-    keys (U,) and row_keys (R,) int64, both ascending.
-    """
-    found = np.empty(row_keys.shape[0], dtype=np.bool_)
-    at = 0
-    for row in range(row_keys.shape[0]):
-        while at < keys.shape[0] and keys[at] < row_keys[row]:
-            at += 1
-        found[row] = at < keys.shape[0] and keys[at] == row_keys[row]
-    return found
-
-
 @entry(INTS, INTS, READ_BYTES, INTS, BYTES2)
 def unpack_asked_kernel(keys, row_keys, data, ends, out):
     """`unpack_asked` into out (R, 1000); return the first row that is damaged, or -1."""
-    return unpack_rows(data, ends, is_asked(keys, row_keys), out)
+    starts, after = _rows_of_keys(keys, row_keys)
+    is_asked = np.zeros(row_keys.shape[0], dtype=np.bool_)
+    for n in range(keys.shape[0]):
+        for row in range(starts[n], after[n]):
+            is_asked[row] = True
+    return unpack_rows(data, ends, is_asked, out)
 
 
 def unpack_asked(
@@ -364,47 +345,29 @@ def unpack_asked(
     return out
 
 
-@entry(FLOATS2, INTS, INTS, FLOATS, FLOAT, INT, INT, INT, TANGENT_PLANE)
-def wrench_of_addresses(placed, ordinals, addresses, origin, size, bits, curve, shift, law):
+@entry(FLOATS2, INTS, INTS, record_of(GRID), TANGENT_PLANE, FLOATS)
+def wrench_of_addresses(placed, ordinals, addresses, grid, law, depths):
     """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
 
     The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone. For laws
-    that read no payload.
+    that read no payload. depths (H,) takes each hit's depth, metres, 0 above its tangent plane.
     """
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    last = placed.shape[0] - 1
-    mx, my, mz = placed[last, 0], placed[last, 1], placed[last, 2]
-    fx = fy = fz = tx = ty = tz = weight = 0.0
+    place, last = grid[()], placed.shape[0] - 1
+    size = place.size
+    center = placed[last, 0], placed[last, 1], placed[last, 2]
+    sums, weight = NO_WRENCH, 0.0
     for h in range(ordinals.shape[0]):
-        i, j, k = voxel_at(addresses[h], bits, curve, shift)
+        i, j, k = voxel_at(addresses[h], place.bits, place.curve, place.shift)
         n = ordinals[h]
-        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
-        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
-        cx = ox + size * (i + 0.5)
-        cy = oy + size * (j + 0.5)
-        cz = oz + size * (k + 0.5)
-        depth, share = respond(law, True, NOTHING_NEAR, px, py, pz, nx, ny, nz, cx, cy, cz, size)
+        point = (
+            placed[n, 0], placed[n, 1], placed[n, 2], placed[n, 3], placed[n, 4], placed[n, 5],
+            place.x + size * (i + 0.5), place.y + size * (j + 0.5), place.z + size * (k + 0.5),
+        )  # fmt: skip
+        depth, share = respond(law, True, NOTHING_NEAR, *point, size)
         weight += share
+        depths[h] = max(depth, 0.0)
         if depth > 0.0:
-            fx, fy, fz, tx, ty, tz = accumulate(
-                fx, fy, fz, tx, ty, tz, px, py, pz, nx, ny, nz, mx, my, mz, depth, law.stiffness
-            )
+            sums = accumulate(sums, point, center, depth, law.stiffness)
     wrench = np.empty(6)
-    average_into(wrench, weight, fx, fy, fz, tx, ty, tz)
+    average_into(wrench, weight, sums)
     return wrench
-
-
-@entry(FLOATS2, INTS, FLOATS, FLOAT)
-def depths_of_hits(placed, hits, origin, size):
-    """Depths (H,) in metres of hits (H,) int64, 0 where the point is above its tangent plane."""
-    depths = np.empty(hits.shape[0])
-    ox, oy, oz = origin[0], origin[1], origin[2]
-    for h in range(hits.shape[0]):
-        n = hits[h]
-        px, py, pz = placed[n, 0], placed[n, 1], placed[n, 2]
-        nx, ny, nz = placed[n, 3], placed[n, 4], placed[n, 5]
-        cx = center_of(px, ox, size)
-        cy = center_of(py, oy, size)
-        cz = center_of(pz, oz, size)
-        depths[h] = max(depth_below_plane(px, py, pz, nx, ny, nz, cx, cy, cz), 0.0)
-    return depths

@@ -36,14 +36,16 @@ from hapticdb.kernels.resident.cells import (
     UNKNOWNS,
     Clusters,
     begin_frame,
+    cells_of_box,
     end_frame,
+    in_voxels,
     key_of_cell,
     seen_in,
     slot_of,
     with_missed,
 )
-from hapticdb.kernels.resident.feeling import felt, felt_margin, felt_words
-from hapticdb.kernels.resident.runs import is_block_free, is_sphere_free, placed_center
+from hapticdb.kernels.resident.feeling import felt, felt_where
+from hapticdb.kernels.resident.runs import is_block_free, is_sphere_free
 from hapticdb.kernels.rigid import is_rigid, transform_of
 
 HASH_FACTOR, LOW_32 = 0x45D9F3B, 0xFFFFFFFF
@@ -161,17 +163,16 @@ def choose_points(budget, count, points, columns, run):
 @leaf
 def _runs_beside_unknown(seen, spheres, listed, count, transform, place, margin, missed):
     """Number of the listed runs whose box meets an unknown cell; these cells go into `missed`."""
-    top, n_missed, n_runs = place.side - 1.0, missed[LISTED], 0
+    n_missed, n_runs = missed[LISTED], 0
     for m in range(count):
         n = listed[m]
-        x, y, z = placed_center(spheres, n, transform, place)
+        x, y, z = in_voxels(transform, place, spheres[n, 0], spheres[n, 1], spheres[n, 2])
         r = spheres[n, 3] / place.size + margin
+        first_i, last_i, first_j, last_j, first_k, last_k = cells_of_box(x, y, z, r, place.side)
         is_beside = False
-        for ci in range(np.int64(max(x - r, 0.0)) >> 5, (np.int64(min(x + r, top)) >> 5) + 1):
-            for cj in range(np.int64(max(y - r, 0.0)) >> 5, (np.int64(min(y + r, top)) >> 5) + 1):
-                for ck in range(
-                    np.int64(max(z - r, 0.0)) >> 5, (np.int64(min(z + r, top)) >> 5) + 1
-                ):
+        for ci in range(first_i, last_i + 1):
+            for cj in range(first_j, last_j + 1):
+                for ck in range(first_k, last_k + 1):
                     key = key_of_cell(ci, cj, ck)
                     if slot_of(seen.keys, seen.slots, seen.which, key) < 0:
                         is_beside = True
@@ -188,8 +189,8 @@ def felt_within(law, cells, which, shell, pose, place, met, missed, budget, coun
     Without a budget `counts` stays as it is.
     """
     points, center, spheres, _, run, columns, scratch = shell
-    listed, transform, margin = budget.listed, transform_of(pose), felt_margin(law)
-    seen = seen_in(cells, which, felt_words(law, cells.words, cells.near))
+    felt_in, margin, _ = felt_where(law, cells.words, cells.near)
+    listed, transform, seen = budget.listed, transform_of(pose), seen_in(cells, which, felt_in)
     count, part, is_beyond = np.int64(0), shell, False
     if listed.shape[0] > 0:
         count = list_near_runs(seen, shell, listed, transform, place, margin)

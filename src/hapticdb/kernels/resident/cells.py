@@ -41,6 +41,7 @@ from hapticdb.kernels._jit import (
 )
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident.fence import fence
+from hapticdb.kernels.rigid import moved
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -162,15 +163,30 @@ def key_of_cell(ci, cj, ck):
 
 
 @leaf
-def cell_of_key(key):
-    """Cell (ci, cj, ck) of a key; undoes `key_of_cell`."""
-    return key >> 32, (key >> 16) & 0xFFFF, key & 0xFFFF
-
-
-@leaf
 def cell_key(i, j, k):
     """Key of the cell that holds voxel (i, j, k)."""
     return key_of_cell(i >> 5, j >> 5, k >> 5)
+
+
+@inlined
+def cells_of_box(x, y, z, reach, side):
+    """First and last cell on each axis, i, j, k, of the part of a cube that is in the grid.
+
+    (x, y, z), reach: the cube's centre and half its side, voxels.
+    """
+    top = side - 1.0
+    return (
+        np.int64(max(x - reach, 0.0)) >> 5, np.int64(min(x + reach, top)) >> 5,
+        np.int64(max(y - reach, 0.0)) >> 5, np.int64(min(y + reach, top)) >> 5,
+        np.int64(max(z - reach, 0.0)) >> 5, np.int64(min(z + reach, top)) >> 5,
+    )  # fmt: skip
+
+
+@inlined
+def in_voxels(transform, place, x, y, z):
+    """A point of the tool, metres, placed by a pose, in voxels from the grid's origin."""
+    x, y, z = moved(transform, x, y, z)
+    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
 
 
 @leaf

@@ -5,7 +5,7 @@ front of the scratch, then come normals, depths and sums. In one long loop a pro
 hardly more than one point at a time, waits for each look-up, and takes 1.6 times as long. Where a
 run meets few cells, all of them known, no loop branches. The sums run in the order of the points,
 and a point that does not push adds zero, so the results are those of the frames on rows, bit for
-bit. What differs between laws: `felt_words`, `_felt_anyway` and `_weigh`.
+bit. What differs between laws: `felt_where` and `_weigh`.
 """
 
 from typing import Any
@@ -17,6 +17,7 @@ from hapticdb.kernels.field.corners import fetch_corners, interpolated
 from hapticdb.kernels.field.lattice import CELL_VALUES, VOXELS_A_STEP, cell_place, place_before
 from hapticdb.kernels.field.law import AHEAD, DistanceFieldLaw, agreement, depth_and_weight
 from hapticdb.kernels.law import (
+    NO_WRENCH,
     TangentPlaneLaw,
     accumulate,
     average_into,
@@ -66,42 +67,19 @@ numbers that a float has exactly.
 """
 
 
-def _voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
-    """Words of the voxels in which a law may feel a point: the occupied ones."""
-    return words
+def _in_near_voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
+    """Where the distance law may feel a point."""
+    return near, 0.0, np.int64(0)
 
 
-def _near_voxels(law, words, near):  # noqa: ARG001 - likewise
-    """Words of the voxels in which the distance law may feel a point."""
-    return near
+def _in_voxels_alone(law, words, near):  # noqa: ARG001 - likewise
+    """Where the tangent-plane law may feel a point."""
+    return words, 0.0, np.int64(0)
 
 
-def _no_margin(law):  # noqa: ARG001 - likewise
-    """Voxels that are added to the near ones: none."""
-    return 0.0
-
-
-def _margin(law):
-    """Voxels around an occupied one in which another law may feel a point."""
-    return felt_within(law)
-
-
-felt_words = chosen_by_type(lambda law: _near_voxels if law is DistanceFieldLaw else _voxels)
-felt_margin = chosen_by_type(lambda law: _no_margin if law is DistanceFieldLaw else _margin)
-
-
-def _all(law):  # noqa: ARG001 - likewise
-    """Bit of every voxel, for a law of which only its margin is known."""
-    return np.int64(1)
-
-
-def _none(law):  # noqa: ARG001 - likewise
-    """Bit of no voxel, for a law that feels no point but in the voxels of `felt_words`."""
-    return np.int64(0)
-
-
-BY_WORDS = (DistanceFieldLaw, TangentPlaneLaw)
-_felt_anyway = chosen_by_type(lambda law: _none if law in BY_WORDS else _all)
+def _around_voxels(law, words, near):  # noqa: ARG001 - likewise
+    """Where a law may feel a point of which only its margin is known."""
+    return words, felt_within(law), np.int64(1)
 
 
 @inlined
@@ -173,9 +151,7 @@ def _turn_normals(points, transform, scratch, count):
     for at in range(count):
         n = np.int64(scratch[INDEX, at])
         nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
-        scratch[NORMAL, at] = nx
-        scratch[NORMAL + 1, at] = ny
-        scratch[NORMAL + 2, at] = nz
+        scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at] = nx, ny, nz
 
 
 @inlined
@@ -270,16 +246,14 @@ def _weigh_by_leaves(law, cells, points, transform, place, scratch, count):
         scratch[WEIGHT, at] = weight * share
 
 
-def _weigh_under(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are untyped
-    """What weighs points under that type of law."""
-    of_laws: dict[type, Any] = {
-        DistanceFieldLaw: _weigh_by_distance,
-        TangentPlaneLaw: _weigh_by_plane,
-    }
-    return of_laws.get(law_type, _weigh_by_leaves)
-
-
-_weigh = chosen_by_type(_weigh_under)
+OF_LAWS: dict[type, Any] = {
+    DistanceFieldLaw: (_in_near_voxels, _weigh_by_distance),
+    TangentPlaneLaw: (_in_voxels_alone, _weigh_by_plane),
+}
+OF_OTHERS = _around_voxels, _weigh_by_leaves
+felt_where = chosen_by_type(lambda law: OF_LAWS.get(law, OF_OTHERS)[0])
+"""Where a law may feel a point: words of voxels; voxels around them; 1 if also beside those."""
+_weigh = chosen_by_type(lambda law: OF_LAWS.get(law, OF_OTHERS)[1])
 """Turned normal, depth (at least 0) and weight of the first points of the scratch."""
 
 
@@ -292,11 +266,12 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
     """
     points, _, spheres, groups, run, columns, scratch = shell
-    words, margin, anyway = cells.words, felt_margin(law), _felt_anyway(law)
-    seen = seen_in(cells, which, felt_words(law, words, cells.near))
+    words = cells.words
+    felt_in, margin, anyway = felt_where(law, words, cells.near)
+    seen = seen_in(cells, which, felt_in)
     transform = transform_of(pose)
-    mx, my, mz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
-    fx = fy = fz = tx = ty = tz = weight = deepest = 0.0
+    center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
+    sums, weight, deepest = NO_WRENCH, 0.0, 0.0
     last = np.int64(-1), np.int64(UNKNOWN), np.uint64(0), 0.0
     n_hits = n_contacts = n_unknown = n_missed = cluster = start = np.int64(0)
     while start < points.shape[0]:
@@ -329,12 +304,12 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
             weight += scratch[WEIGHT, at]
             n_contacts += depth > 0.0
             deepest = max(deepest, depth)
-            fx, fy, fz, tx, ty, tz = accumulate(
-                fx, fy, fz, tx, ty, tz, scratch[0, at], scratch[1, at], scratch[2, at],
+            point = (
+                scratch[0, at], scratch[1, at], scratch[2, at],
                 scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at],
-                mx, my, mz, depth, law.stiffness,
             )  # fmt: skip
-    average_into(out, weight, fx, fy, fz, tx, ty, tz)
+            sums = accumulate(sums, point, center, depth, law.stiffness)
+    average_into(out, weight, sums)
     out[HITS], out[CONTACTS] = n_hits, n_contacts
     out[UNKNOWNS], out[DEEPEST] = n_unknown, deepest
     missed[LISTED] = n_missed

@@ -93,12 +93,9 @@ class _Force:
             self._frame.placed,
             hits[:, 0].copy(),
             hits[:, 1].copy(),
-            np.array(self._grid.origin),
-            self._grid.voxel_size,
-            self._grid.bits,
-            self._grid.curve_code,
-            row_shift(self._layout),
+            self._grid.for_kernels(row_shift(self._layout)),
             laws.TangentPlaneLaw(self._frame.stiffness),
+            np.empty(len(hits)),
         )
         return wrench.tobytes()
 

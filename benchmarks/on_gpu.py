@@ -56,7 +56,7 @@ BOUND = 1e-12
 PACKAGES = ("numpy", "numba", "numba-cuda")
 REPEATS = 1000
 """Frames whose times are sorted."""
-SEARCHES = ("resident.first_hits.find_first_hits", "resident.clearance.cells_near")
+SEARCHES = ("resident.first_hits.find_first_hits", "resident.cell_table.cells_met")
 PATIENCE = 5.0
 """Seconds of the processors' frames of one shell, at most about."""
 

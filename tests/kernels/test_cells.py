@@ -67,7 +67,7 @@ def test_cells_met_within_reach_are_those_of_the_boxes_around_the_points(
             expected |= {int(cell_key(32 * i, 32 * j, 32 * k)) for i, j, k in product(*sides)}
     found = np.full(2048, -1, dtype=np.int64)
     place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-    assert kernels.cells_met(points, reach, pose, place, found, 500) == (1, len(expected))
+    assert kernels.cells_met(points, 0, 40, reach, pose, place, found, 500) == (1, len(expected))
     assert set(found[found >= 0].tolist()) == expected
 
 

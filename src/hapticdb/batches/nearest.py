@@ -5,7 +5,7 @@ from numpy.typing import NDArray
 
 from hapticdb.batches.threads import BatchThreads, ThreadMemory
 from hapticdb.errors import UsageError
-from hapticdb.kernels.resident import clearance, first_hits
+from hapticdb.kernels.resident import cell_table, first_hits
 from hapticdb.kernels.resident import nearest as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.resident.frames import SMALL, ResidentFrames
@@ -118,8 +118,8 @@ class NearestSearch:
         """Fetch the cells within reach of the shell, from a point at the first of poses on."""
         residency, around = self._frames.residency, self._frames.surroundings
         found = np.full(1 << (2 * self._most).bit_length(), UNKNOWN, dtype=np.int64)
-        clearance.cells_near(
-            around.places, poses, residency.place, around.place_of(point), 1,
-            self._around * residency.grid.voxel_size, found, self._most,
+        cell_table.cells_met(
+            around.places, around.place_of(point), 0, self._around, poses, residency.place, found,
+            self._most,
         )  # fmt: skip
         residency.make_resident(np.sort(found[found >= 0]))

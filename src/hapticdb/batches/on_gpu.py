@@ -237,9 +237,8 @@ class GpuFrames:
         poses (B, 4, 4), rigid; reach: voxels.
         """
         self.mirror.update()
-        keys, slots, masks, used = self.mirror.directory()
         squares, points = np.empty(len(poses)), np.empty(len(poses), dtype=np.int64)
-        search = searches.search_kernel(searches.THREADS)
+        seen, search = self.mirror.seen(), searches.search_kernel(searches.THREADS)
         for start in range(0, len(poses), PIECE_POSES):
             part = slice(start, min(start + PIECE_POSES, len(poses)))
             found = (
@@ -247,8 +246,8 @@ class GpuFrames:
                 cuda.device_array(part.stop - start, np.int64),
             )
             search[min(part.stop - start, MOST_BLOCKS), searches.THREADS](
-                self._frames.residency.place, self._shell, cuda.to_device(poses[part]), keys, slots,
-                self.mirror.arrays[2], masks, used, reach, *found,
+                self._frames.residency.place, self._shell, cuda.to_device(poses[part]), seen, reach,
+                *found,
             )  # fmt: skip
             squares[part], points[part] = (one.copy_to_host() for one in found)
         return squares, points

@@ -31,7 +31,7 @@ from hapticdb.kernels.hand.near_points import (
     U,
 )
 from hapticdb.kernels.records import MOST_MISSED, views_of
-from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place, Seen
+from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
 from hapticdb.query.law import SMOOTH, ForceLaw, is_smooth
 from hapticdb.realtime.stations import Station
 from hapticdb.resident.mirror import CellMirror
@@ -185,7 +185,7 @@ class GpuLooks:
         """Look at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
         follower, station = self._follower, self._station
         self._mirror.update(int(station.cells.readers[station.reader * READER_STRIDE]))
-        self._mirror.directory()  # in the arrays that the launches read
+        self._mirror.seen()  # in the arrays that the launches read
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
         self._epoch += int(follower.anew) == POINTS_ANEW
@@ -251,9 +251,8 @@ class GpuLooks:
 
     def _launch_look(self) -> None:
         """Launches and copies of a look."""
-        keys, slots, masks, _ = self._mirror.directory()
         place, stream, sight = self._place, self._stream, self._sight
-        seen = Seen(keys, slots, self._mirror.arrays[2], masks, sight.used, 0)
+        seen = self._mirror.seen()._replace(used=sight.used)
         sight.asked.copy_to_device(self._asked, stream=stream)
         kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, sight)
         self._kernel[self._of_points, kernels.THREADS, stream](

@@ -229,7 +229,9 @@ class ResidentFrames:
         for places, reach in ((around.places, around.reach), (self.clusters.points, 0.0)):
             room = max(LEAST_FOUND, 4 * most, (32 if reach > 0.0 else 4) * len(places))
             found = np.full(1 << (room - 1).bit_length(), UNKNOWN, dtype=np.int64)
-            n_poses, count = kernels.cells_met(places, reach, poses, residency.place, found, most)
+            n_poses, count = kernels.cells_met(
+                places, 0, len(places), reach, poses, residency.place, found, most
+            )
             if count <= most:
                 break
         cells = found[found >= 0]

@@ -16,6 +16,7 @@ from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     UNKNOWN,
     Cells,
+    Seen,
 )
 from hapticdb.resident.table import CellTable
 
@@ -117,10 +118,10 @@ class CellMirror:
         self.n_copied += n_slots
         return n_slots
 
-    def directory(self) -> tuple[Any, ...]:
-        """keys, slots, masks and used of the cells that are there, as searches take them.
+    def seen(self) -> Seen:
+        """Voxels of the cells that are there, as searches see them.
 
-        The arrays are the same each time; `used` has what its kernels write.
+        The arrays are the same each time; `used` has what kernels write.
         """
         version, arrays = self._directory
         if version != self._version:
@@ -136,14 +137,15 @@ class CellMirror:
             for array, part in zip((arrays[2], *arrays[:2]), parts, strict=False):
                 array.copy_to_device(part)
             self._directory = self._version, arrays
-        return arrays
+        keys, slots, masks, used = arrays
+        return Seen(keys, slots, self.arrays[2], masks, used, 0)
 
     def _listed(self, cells: Cells, which: int) -> NDArray[np.int32]:
         """Slots (1, n) of all cells of the grid, in the published directory."""
         found = np.full((1, self._across**3), UNKNOWN, np.int32)
         filled = np.flatnonzero(cells.keys[which] >= 0)
         of_cells = cells.keys[which][filled]
-        i, j, k = of_cells >> 32, (of_cells >> 16) & 0xFFFF, of_cells & 0xFFFF  # `cell_of_key`
+        i, j, k = of_cells >> 32, (of_cells >> 16) & 0xFFFF, of_cells & 0xFFFF  # `key_of_cell`
         found[0, (i * self._across + j) * self._across + k] = cells.slots[which][filled]
         return found
 

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import DatabaseError
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel, machine_name
@@ -16,7 +17,6 @@ from hapticdb.query.grouping import group_spans
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
-    BRICK_SHIFT,
     CELL_SHIFT,
     Keys,
     Rows,
@@ -86,26 +86,28 @@ class CellSource:
         costs = self._costs if payload is None else self._costs.with_distances
         ranges = group_spans(lows, highs, self._quantiles, costs)
         rows = self.store.scan(*ranges, distances=payload is not None)
+        cells_of_rows = rows.keys >> (CELL_SHIFT - shift)
+        at = np.minimum(np.searchsorted(on_curve, cells_of_rows), len(on_curve) - 1)
+        is_felt = (on_curve[at] == cells_of_rows) & ~np.isin(rows.ids, self.exclude)
+        row_slots = np.where(is_felt, slots[order][at], UNKNOWN)
         words[slots] = 0
         masks[slots] = 0
         kernels.fill_cells(
-            rows.keys, rows.ids, rows.occupancy, self.exclude, on_curve, slots[order], grid.bits,
-            grid.curve_code, shift, words, masks,
-        )  # fmt: skip
+            rows.keys, row_slots, rows.occupancy, grid.bits, grid.curve_code, words, masks
+        )
         if payload is not None:
-            self._fill_distances(rows, on_curve, slots[order], payload, masks)
+            self._fill_distances(rows, row_slots, payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
         return _CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
 
     def _fill_distances(
         self,
         rows: Rows,
-        on_curve: Keys,
-        slots: Keys,
+        row_slots: Keys,
         payload: NDArray[np.uint8],
         masks: NDArray[np.uint64],
     ) -> None:
-        """Write the distances of rows into the slots (n,) of cells (n,), ascending on the curve.
+        """Write the distances of rows into the slots (R,) of their cells.
 
         Raises
         ------
@@ -117,19 +119,16 @@ class CellSource:
             part = rows.part(at, at + ROWS_AT_ONCE)
             if part.distances is None:
                 raise DatabaseError(f"{self.store.url} has given no distances: import it again")
-            cells = part.keys >> (CELL_SHIFT - BRICK_SHIFT)
-            place = np.minimum(np.searchsorted(on_curve, cells), len(on_curve) - 1)
-            wanted = (on_curve[place] == cells) & ~np.isin(part.ids, self.exclude)
+            slots = row_slots[at : at + ROWS_AT_ONCE]
             try:
-                values = unpack(part.distances.data, part.distances.ends, wanted)
+                values = unpack(part.distances.data, part.distances.ends, slots >= 0)
             except ValueError as error:
                 raise DatabaseError(
                     f"{self.store.url} is damaged ({error}): run 'hapticdb check {self.store.url}'"
                 ) from None
             slot = kernels.fill_distances(
-                part.keys, part.ids, values, self.exclude, on_curve, slots, grid.bits,
-                grid.curve_code, slot, payload, masks,
-            )  # fmt: skip
+                part.keys, slots, values, grid.bits, grid.curve_code, slot, payload, masks
+            )
 
 
 def costs_at_start(

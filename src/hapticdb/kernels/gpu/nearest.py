@@ -12,15 +12,16 @@ from numba import cuda, float64, int64
 
 from hapticdb.kernels import rigid
 from hapticdb.kernels.gpu.sources import on_gpu
-from hapticdb.kernels.resident import clearance
+from hapticdb.kernels.resident import cells
+from hapticdb.kernels.resident import nearest as searches
 
 THREADS = 64
 """Threads of a block. More of them search side by side, with a bound that is renewed seldomer."""
 NO_POINT, UNDECIDED = -1, -2
 """In the place of a pose's nearest point: nothing within reach; a cell in reach is unknown."""
 
-_moved, _transform_of = on_gpu(rigid.moved), on_gpu(rigid.transform_of)
-_nearest_voxel = on_gpu(clearance.nearest_voxel)
+_transform_of, _in_voxels = on_gpu(rigid.transform_of), on_gpu(cells.in_voxels)
+_nearest_voxel = on_gpu(searches.nearest_voxel)
 
 
 @cuda.jit(device=True)
@@ -41,13 +42,12 @@ def agree(squares, points, t):
 def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
     """Kernel that searches, for blocks of so many threads (a power of two).
 
-    Its arguments: place; shell (6, N + 1), as in `frames`; poses (B, 4, 4), rigid; keys
-    (1, capacity), slots (1, capacity), words (S, 1024), masks (S,), used (S,) as
-    `resident.cells.Cells`; reach, voxels; found squares (B,) of distances, voxels, and points (B,).
+    Its arguments: place; shell (6, N + 1), as in `frames`; poses (B, 4, 4), rigid; seen, of
+    `resident.cells.Seen`; reach, voxels; found squares (B,) of distances, voxels, and points (B,).
     """
 
     @cuda.jit
-    def search(place, shell, poses, keys, slots, words, masks, used, reach, squares, points):
+    def search(place, shell, poses, seen, reach, squares, points):
         best = cuda.shared.array(threads, float64)
         nearest = cuda.shared.array(threads, int64)
         t, total = cuda.threadIdx.x, shell.shape[1] - 1
@@ -58,14 +58,8 @@ def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are un
                 at = first + t
                 best[t], nearest[t] = square, point
                 if at < total and point >= 0:
-                    x, y, z = _moved(transform, shell[0, at], shell[1, at], shell[2, at])
-                    x = (x - place.x) / place.size
-                    y = (y - place.y) / place.size
-                    z = (z - place.z) / place.size
-                    found, voxel = _nearest_voxel(
-                        keys, slots, words, masks, used, 0, x, y, z, square, np.int64(-1),
-                        place.side,
-                    )  # fmt: skip
+                    x, y, z = _in_voxels(transform, place, shell[0, at], shell[1, at], shell[2, at])
+                    found, voxel = _nearest_voxel(seen, x, y, z, square, np.int64(-1), place.side)
                     if voxel == UNDECIDED:
                         best[t], nearest[t] = -1.0, np.int64(UNDECIDED)
                     elif voxel >= 0:

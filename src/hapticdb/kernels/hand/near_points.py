@@ -6,8 +6,10 @@ farthest point at which the point is looked at next. The same holds for runs of 
 """
 
 import math
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.field.lattice import HALF_WIDTH
@@ -27,10 +29,10 @@ from hapticdb.kernels.resident.cells import (
     brick_bit,
     cell_key,
     enter_cell,
+    in_voxels,
     seen_in,
 )
-from hapticdb.kernels.resident.clearance import room_around
-from hapticdb.kernels.resident.runs import placed_center
+from hapticdb.kernels.resident.nearest import room_around
 from hapticdb.kernels.rigid import moment, moved, transform_of
 
 MARGIN = 0.5
@@ -88,10 +90,12 @@ Larger: points that were left out come back later, and the number of points chan
 
 
 @leaf
-def clamped_into(x, side):
-    """A coordinate in voxels, moved into the grid, and by how much."""
-    inside = min(max(x, 0.0), side - 1e-6)
-    return inside, x - inside
+def clamped_into(place, px, py, pz):
+    """A point, m, moved into the grid, and the way back out of it: six numbers, voxels."""
+    size, last = place.size, place.side - 1e-6
+    px, py, pz = (px - place.x) / size, (py - place.y) / size, (pz - place.z) / size
+    x, y, z = min(max(px, 0.0), last), min(max(py, 0.0), last), min(max(pz, 0.0), last)
+    return x, y, z, px - x, py - y, pz - z
 
 
 @leaf
@@ -108,8 +112,9 @@ def _outside_grid(u, gx, gy, gz, bound, dx, dy, dz):
 
 
 @inlined
-def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
-    """Distance, gradient and bound at (x, y, z) in the grid plus the way (dx, dy, dz) out of it."""
+def distance_at(payload, slot, mask, at):
+    """Distance u, gradient (3) and bound at a point `clamped_into` the grid: five numbers."""
+    x, y, z, dx, dy, dz = at
     i, j, k = np.int64(x), np.int64(y), np.int64(z)
     u, gx, gy, gz = HALF_WIDTH, 0.0, 0.0, 0.0
     if (mask >> brick_bit(i, j, k)) & np.uint64(1):
@@ -125,8 +130,9 @@ def distance_at(payload, slot, mask, x, y, z, dx, dy, dz):
 
 
 @inlined
-def bound_at(payload, slot, mask, x, y, z, dx, dy, dz):
+def bound_at(payload, slot, mask, at):
     """The bound of `distance_at` alone."""
+    x, y, z, dx, dy, dz = at
     if (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
         bound = nearest_bound(payload, slot, x, y, z)
         if bound < ENOUGH:
@@ -136,14 +142,6 @@ def bound_at(payload, slot, mask, x, y, z, dx, dy, dz):
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
         bound = max(bound, math.sqrt(dx * dx + dy * dy + dz * dz))
     return bound
-
-
-@leaf
-def _write_row(field, rows, m, gx, gy, gz, rx, ry, rz):
-    """Write the gradient of near point m, with lever r, and its moment into its rows."""
-    field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m] = gx, gy, gz
-    ax, ay, az = moment(rx, ry, rz, gx, gy, gz)
-    field[rows + ABOUT, m], field[rows + ABOUT + 1, m], field[rows + ABOUT + 2, m] = ax, ay, az
 
 
 @leaf
@@ -186,17 +184,16 @@ def bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
 
 
 @leaf
-def _write_bend(field, row, m, curvature, vx, vy, vz, rx, ry, rz):
-    """Write one bend of near point m into rows from `row` on; r: the point's lever."""
-    field[row, m] = curvature
-    field[row + 1, m], field[row + 2, m], field[row + 3, m] = vx, vy, vz
-    ax, ay, az = moment(rx, ry, rz, vx, vy, vz)
-    field[row + 4, m], field[row + 5, m], field[row + 6, m] = ax, ay, az
+def _write_along(field, row, m, lever, x, y, z):
+    """Write a direction at near point m and its moment about the centre, six rows from `row` on."""
+    field[row, m], field[row + 1, m], field[row + 2, m] = x, y, z
+    x, y, z = moment(lever[0], lever[1], lever[2], x, y, z)
+    field[row + 3, m], field[row + 4, m], field[row + 5, m] = x, y, z
 
 
 @leaf
-def _bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
-    """Write both bends of near point m, at (x, y, z) voxels with lever r, into its rows."""
+def _bend_at(payload, slot, mask, x, y, z, lever, field, rows, m):
+    """Write both bends of near point m, at (x, y, z) voxels, into its rows."""
     row = rows + BENDS
     field[row, m] = field[row + BEND_ROWS, m] = 0.0
     if not (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
@@ -204,8 +201,9 @@ def _bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m):
     gx, gy, gz = field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m]
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
     c, vx, vy, vz, d, wx, wy, wz = bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
-    _write_bend(field, row, m, c, vx, vy, vz, rx, ry, rz)
-    _write_bend(field, row + BEND_ROWS, m, d, wx, wy, wz, rx, ry, rz)
+    field[row, m], field[row + BEND_ROWS, m] = c, d
+    _write_along(field, row + 1, m, lever, vx, vy, vz)
+    _write_along(field, row + BEND_ROWS + 1, m, lever, wx, wy, wz)
 
 
 @inlined
@@ -215,26 +213,45 @@ def _goes_nearer(u, bound, last_u, last_bound):
 
 
 @inlined
-def write_near(
-    payload, slot, mask, x, y, z, rx, ry, rz, u, gx, gy, gz, bound, is_bent, field, rows, m
-):
-    """Write near point m, at (x, y, z) voxels with lever r, into its rows."""
+def write_near(payload, slot, mask, at, lever, found, is_bent, field, rows, m):
+    """Write near point m into its rows.
+
+    at: `clamped_into` the grid; lever (3), m; found: of `distance_at` there.
+    """
+    u, gx, gy, gz, bound = found
     field[rows + U, m], field[rows + BOUND, m] = u, bound
-    _write_row(field, rows, m, gx, gy, gz, rx, ry, rz)
+    _write_along(field, rows + ALONG, m, lever, gx, gy, gz)
     if is_bent and u < ONSET:
-        _bend_at(payload, slot, mask, x, y, z, rx, ry, rz, field, rows, m)
+        _bend_at(payload, slot, mask, at[0], at[1], at[2], lever, field, rows, m)
     else:
         field[rows + BENDS, m] = field[rows + BENDS + BEND_ROWS, m] = 0.0
 
 
+class Grasp(NamedTuple):
+    """What the looks of a tool read and write.
+
+    cells, of `Cells` with distances, and which of their directories a frame reads; shell, of
+    `Clusters`; place: the grid; follower: a record of FOLLOWER; field (FIELD_ROWS, N) float64, met
+    (MET_ROWS, N) int64; missed (1 + MOST_MISSED,) int64: the unknown cells, as `felt` has them.
+    """
+
+    cells: Any
+    which: int
+    shell: Any
+    place: Any
+    follower: Any
+    field: NDArray[np.float64]
+    met: NDArray[np.int64]
+    missed: NDArray[np.int64]
+
+
 @leaf
-def _look_at_run(
-    cells, which, points, start, end, run, transform, place, center, follower, field, met, missed
-):
-    """Look at points start .. end, of run number `run` -> OPEN, or what ended it; see `look`."""
-    seen = seen_in(cells, which, cells.words)
-    payload, size, side = cells.payload, place.size, place.side
-    cx, cy, cz = center[0], center[1], center[2]
+def _look_at_run(grasp, run, transform, center):
+    """Look at the points of run number `run` -> OPEN, or what ended it; see `look`."""
+    cells, which, shell, place, follower, field, met, missed = grasp
+    seen, points = seen_in(cells, which, cells.words), shell.points
+    start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
+    payload, (cx, cy, cz) = cells.payload, center
     half = 1 - follower.side
     base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
     travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
@@ -250,10 +267,8 @@ def _look_at_run(
             return CROWDED
         n_looked += 1
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
-        x, dx = clamped_into((px - place.x) / size, side)
-        y, dy = clamped_into((py - place.y) / size, side)
-        z, dz = clamped_into((pz - place.z) / size, side)
-        key = cell_key(np.int64(x), np.int64(y), np.int64(z))
+        at = clamped_into(place, px, py, pz)
+        key = cell_key(np.int64(at[0]), np.int64(at[1]), np.int64(at[2]))
         if key != last_key:
             last_key = key
             slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
@@ -262,12 +277,13 @@ def _look_at_run(
             field[DUE, n] = run_due = -NEVER
             continue
         if n & (merged - 1):  # another point's contact stands for this one
-            bound = bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+            bound = bound_at(payload, slot, mask, at)
             if bound >= LEAST_BOUND:
                 field[DUE, n] = travelled + bound - FAR
                 run_due = min(run_due, field[DUE, n])
                 continue
-        u, gx, gy, gz, bound = distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
+        looked = distance_at(payload, slot, mask, at)
+        u, bound = looked[0], looked[4]
         field[DUE, n] = travelled + bound - FAR
         run_due = min(run_due, field[DUE, n])
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
@@ -277,10 +293,8 @@ def _look_at_run(
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
         met[near, n_near] = n
-        write_near(
-            payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
-            follower.is_bent, field, base, n_near,
-        )  # fmt: skip
+        lever = px - cx, py - cy, pz - cz
+        write_near(payload, slot, mask, at, lever, looked, follower.is_bent, field, base, n_near)
         n_near += 1
     field[RUN_DUE, run] = run_due
     follower.n_tried, follower.n_looked, missed[LISTED] = n_near, n_looked, n_missed
@@ -291,44 +305,45 @@ def _look_at_run(
 @leaf
 def rest_of_sphere(seen, spheres, run, transform, place):
     """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
-    x, y, z = placed_center(spheres, run, transform, place)
+    x, y, z = in_voxels(transform, place, spheres[run, 0], spheres[run, 1], spheres[run, 2])
     return room_around(seen, x, y, z, spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side)
 
 
 @leaf
-def _look_at_due_runs(
-    cells, which, shell, transform, place, center, way, follower, field, met, missed
-):
+def n_runs_of(shell):
+    """Number of a shell's runs."""
+    return (shell.points.shape[0] + shell.run - 1) // shell.run
+
+
+@leaf
+def _look_at_due_runs(grasp, transform, center, way):
     """Look at the points of all runs that are due -> OPEN, SHUT, CROWDED or MANY.
 
     The sphere of a run that was near at the last look, a way ago, is not tested.
     """
-    points, run, travelled = shell.points, shell.run, follower.travelled
+    cells, which, shell, place, follower, field, _, missed = grasp
+    travelled = follower.travelled
     follower.n_tried = follower.n_unknown = follower.n_looked = follower.n_left_out = 0
     missed[LISTED] = 0
-    for start in range(0, points.shape[0], run):
-        at = start // run
-        if travelled < field[RUN_DUE, at]:
+    for run in range(n_runs_of(shell)):
+        due = field[RUN_DUE, run]
+        if travelled < due:
             continue
-        is_new = field[RUN_DUE, at] == -NEVER or field[RUN_DUE, at] >= travelled - way
-        if follower.is_large and is_new:
+        if follower.is_large and (due == -NEVER or due >= travelled - way):
             rest = rest_of_sphere(
-                seen_in(cells, which, cells.words), shell.spheres, at, transform, place
+                seen_in(cells, which, cells.words), shell.spheres, run, transform, place
             )
             if rest > 0.0:
-                field[RUN_DUE, at] = travelled + rest
+                field[RUN_DUE, run] = travelled + rest
                 continue
-        found = _look_at_run(
-            cells, which, points, start, min(start + run, points.shape[0]), at, transform, place,
-            center, follower, field, met, missed,
-        )  # fmt: skip
+        found = _look_at_run(grasp, run, transform, center)
         if found != OPEN:
             return found
     return OPEN
 
 
 @leaf
-def look(cells, which, shell, pose, place, way, is_walking, follower, field, met, missed):
+def look(grasp, pose, way, is_walking):
     """Look at the tool at a pose (4, 4) -> OPEN, SHUT or NOT_KNOWN.
 
     way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
@@ -340,6 +355,7 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     only the bounds are computed, so that no point passes a surface. A GPU may look instead
     (`kernels.gpu.looks`): then it is called.
     """
+    shell, follower, field = grasp.shell, grasp.follower, grasp.field
     follower.travelled += way
     follower.is_walking, follower.way = is_walking, way
     follower.n_looks += 1
@@ -349,9 +365,7 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     while True:
-        found = _look_at_due_runs(
-            cells, which, shell, transform, place, center, way, follower, field, met, missed
-        )
+        found = _look_at_due_runs(grasp, transform, center, way)
         if found == CROWDED:  # points that were seen to be far are not looked at again
             follower.stride *= 2
         elif found == MANY:
@@ -362,7 +376,7 @@ def look(cells, which, shell, pose, place, way, is_walking, follower, field, met
     if found == SHUT:
         return SHUT
     travelled, least = follower.travelled, NEVER
-    for run in range((shell.points.shape[0] + shell.run - 1) // shell.run):
+    for run in range(n_runs_of(shell)):
         least = min(least, field[RUN_DUE, run])
     follower.tried_clearance = least - travelled + FAR
     return OPEN if follower.n_unknown == 0 else NOT_KNOWN

@@ -21,9 +21,9 @@ from hapticdb.kernels.hand.near_points import (
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE, IS_SNAPPING, IS_SOFTER
 from hapticdb.kernels.period.memory import TOUCHING
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH
+from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH, in_voxels
 from hapticdb.kernels.resident.fence import fence
-from hapticdb.kernels.rigid import length_at, moved, transform_of, turn, turned
+from hapticdb.kernels.rigid import length_at, moved, transform_of, turned
 
 HELD, FADING, CLUTCH_OPEN, IN_OBJECT = 1, 2, 4, 8
 """Bits of a frame's state, as `hapticdb.recording.frame.State` names them."""
@@ -66,19 +66,13 @@ def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
     """
     step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
     count = 0
+    transform = transform_of(pose)
     for hit in range(0, n_hits, step):
         n = met[hit]
-        x, y, z = shell.points[n, 0], shell.points[n, 1], shell.points[n, 2]
-        i = np.int64(
-            (turn(pose[0, 0], pose[0, 1], pose[0, 2], x, y, z) + pose[0, 3] - place.x) / place.size
+        x, y, z = in_voxels(
+            transform, place, shell.points[n, 0], shell.points[n, 1], shell.points[n, 2]
         )
-        j = np.int64(
-            (turn(pose[1, 0], pose[1, 1], pose[1, 2], x, y, z) + pose[1, 3] - place.y) / place.size
-        )
-        k = np.int64(
-            (turn(pose[2, 0], pose[2, 1], pose[2, 2], x, y, z) + pose[2, 3] - place.z) / place.size
-        )
-        session.asked[count] = key_of(i, j, k, bits, curve)
+        session.asked[count] = key_of(np.int64(x), np.int64(y), np.int64(z), bits, curve)
         count += 1
     session.n_asked = count
 

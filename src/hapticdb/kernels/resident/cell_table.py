@@ -26,7 +26,6 @@ from hapticdb.kernels.field.lattice import (
     cell_place,
     row_place,
 )
-from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     PLACE,
@@ -35,16 +34,16 @@ from hapticdb.kernels.resident.cells import (
     VERSION,
     Ints,
     brick_bit,
-    cell_key,
-    cell_of_key,
+    cells_of_box,
     column_of,
+    in_voxels,
     key_of_cell,
     place_in_set,
     slot_of,
     spread_key,
 )
 from hapticdb.kernels.resident.fence import fence
-from hapticdb.kernels.rigid import moved, transform_of
+from hapticdb.kernels.rigid import transform_of
 
 NEVER_AGAIN = 0x7FFFFFFFFFFFFFFF
 """`wanted_at` of a slot that is already chosen for freeing: later than every `since`."""
@@ -88,13 +87,6 @@ def slots_of_cells(keys, slots, which, asked, out):
 
 
 @leaf
-def _is_in(number, numbers):
-    """Whether a number is among numbers (n,), ascending."""
-    at = first_bound(number, numbers, np.int64(0))
-    return at < numbers.shape[0] and numbers[at] == number
-
-
-@leaf
 def _mark_brick(masks, slot, i, j, k):
     """Mark the brick that holds voxel (i, j, k) in the mask of its cell's slot."""
     masks[slot] |= np.uint64(1) << brick_bit(i, j, k)
@@ -119,32 +111,18 @@ def _fill_brick(words, slot, i, j, k, occupancy, start):
     return has_any
 
 
-@entry(INTS, INTS, READ_BYTES, INTS, INTS, INTS, INT, INT, INT, WORDS32_2, WORDS)
-def fill_cells(
-    row_keys, row_ids, occupancy, exclude, cell_keys, places, bits, curve, shift, words, masks
-):
+@entry(INTS, INTS, READ_BYTES, INT, INT, WORDS32_2, WORDS)
+def fill_cells(row_keys, row_slots, occupancy, bits, curve, words, masks):
     """Fill empty cells from rows of the index table.
 
-    row_keys (R,) ascending, row_ids (R,), occupancy (64 R,) or empty for voxel rows; exclude (E,)
-    ids to leave out, ascending; cell_keys (n,) of the cells on the curve (voxel keys >> 15),
-    ascending; places (n,) their slots in words (S, 1024) uint32 and masks (S,) uint64. Rows of
-    other cells are skipped.
+    row_keys (R,); row_slots (R,): slot of each row's cell in words (S, 1024) uint32 and masks (S,)
+    uint64, below 0 for a row that is left out; occupancy (64 R,) or empty for voxel rows.
     """
-    n_cells = cell_keys.shape[0]
     has_bits = occupancy.shape[0] > 0
-    at = 0
     for row in range(row_keys.shape[0]):
-        row_key = row_keys[row]
-        cell = row_key >> (15 - shift)
-        while at < n_cells and cell_keys[at] < cell:
-            at += 1
-        if at == n_cells:
-            break
-        if cell_keys[at] != cell:
+        row_key, slot = row_keys[row], row_slots[row]
+        if slot < 0:
             continue
-        if _is_in(row_ids[row], exclude):
-            continue
-        slot = places[at]
         if has_bits:
             i, j, k = voxel_of(row_key, max(bits - 3, 0), curve)
             i, j, k = i << 3, j << 3, k << 3
@@ -179,10 +157,8 @@ def _merge_row(payload, slot, i, j, k, last, values, row):
                 payload[slot, at + 8] = min(payload[slot, at + 8], values[row, start + 8])
 
 
-@entry(INTS, INTS, BYTES2, INTS, INTS, INTS, INT, INT, INT, BYTES2, WORDS)
-def fill_distances(
-    row_keys, row_ids, values, exclude, cell_keys, places, bits, curve, before, payload, masks
-):
+@entry(INTS, INTS, BYTES2, INT, INT, INT, BYTES2, WORDS)
+def fill_distances(row_keys, row_slots, values, bits, curve, before, payload, masks):
     """Fill the distances of cells from rows of the band; `fill_cells` has filled their voxels.
 
     row_keys (R,) of bricks, ascending; values (R, 1000) uint8, unpacked; payload (S, 34^3) uint8;
@@ -190,20 +166,11 @@ def fill_distances(
     are those of `fill_cells`. What a slot held is forgotten when its first row comes; a slot
     without a row stays as it was, and its mask has no bit. Returns the slot that was filled last.
     """
-    n_cells = cell_keys.shape[0]
-    at = 0
     last_brick = min(1 << bits, 32) - 8
     for row in range(row_keys.shape[0]):
-        cell = row_keys[row] >> 6
-        while at < n_cells and cell_keys[at] < cell:
-            at += 1
-        if at == n_cells:
-            break
-        if cell_keys[at] != cell:
+        slot = row_slots[row]
+        if slot < 0:
             continue
-        if _is_in(row_ids[row], exclude):
-            continue
-        slot = places[at]
         if slot != before:
             before = slot
             for n in range(CELL_VALUES):
@@ -317,39 +284,31 @@ def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
     return count
 
 
-@entry(FLOATS2, FLOAT, FLOATS3, PLACE, INTS, INT)
-def cells_met(points, reach, poses, place, found, most):
-    """Distinct cells within `reach` of points (N, 3+) at the first of the poses.
+@entry(FLOATS2, INT, INT, FLOAT, FLOATS3, PLACE, INTS, INT)
+def cells_met(points, first, least, reach, poses, place, found, most):
+    """Distinct cells within `reach` voxels of points (N, 3+) at the first of poses (M, 4, 4).
 
-    reach in voxels, at most 16; poses (M, 4, 4). The cells go into found (capacity,) int64, an
-    open-addressing set, all -1 before. Its capacity is a power of two, at least 2 (most + 8 N), or
-    2 (most + N) if reach is 0. Returns the number of poses taken and the number of cells: at least
-    one pose is taken, and more as long as there are at most `most` cells.
+    At poses[0] only points from `first` on count. The cells go into found (capacity,) int64, an
+    open-addressing set, all -1 before; its capacity is a power of two. The search ends before there
+    are more than `most` cells, but not before point `least` of the first pose. Returns the number
+    of poses of which all cells are there, and the number of cells.
     """
-    ox, oy, oz, size, side = place.x, place.y, place.z, place.size, place.side
-    r, top = reach, side - 1.0
-    count = 0
-    low_memo = high_memo = np.int64(-1)
-    before = np.empty((8 if r > 0.0 else 1) * points.shape[0], dtype=np.int64)
+    end, count = place.side + reach, np.int64(0)
+    memo = cells_of_box(-1.0, -1.0, -1.0, 0.0, place.side)
     for n in range(poses.shape[0]):
         transform = transform_of(poses[n])
-        added = 0
-        for p in range(points.shape[0]):
-            x, y, z = moved(transform, points[p, 0], points[p, 1], points[p, 2])
-            x, y, z = (x - ox) / size, (y - oy) / size, (z - oz) / size
-            if not (-r <= x < side + r and -r <= y < side + r and -r <= z < side + r):
+        for p in range(first if n == 0 else 0, points.shape[0]):
+            x, y, z = in_voxels(transform, place, points[p, 0], points[p, 1], points[p, 2])
+            if not (-reach <= x < end and -reach <= y < end and -reach <= z < end):
                 continue
-            low = cell_key(
-                np.int64(max(x - r, 0.0)), np.int64(max(y - r, 0.0)), np.int64(max(z - r, 0.0))
-            )
-            high = cell_key(
-                np.int64(min(x + r, top)), np.int64(min(y + r, top)), np.int64(min(z + r, top))
-            )
-            if low == low_memo and high == high_memo:
+            box = cells_of_box(x, y, z, reach, place.side)
+            if box == memo:
                 continue
-            low_memo, high_memo = low, high
-            low_i, low_j, low_k = cell_of_key(low)
-            high_i, high_j, high_k = cell_of_key(high)
+            memo = box
+            low_i, high_i, low_j, high_j, low_k, high_k = box
+            n_cells = (high_i - low_i + 1) * (high_j - low_j + 1) * (high_k - low_k + 1)
+            if count + n_cells > most and (n > 0 or p >= least):
+                return n, count
             for ci in range(low_i, high_i + 1):
                 for cj in range(low_j, high_j + 1):
                     for ck in range(low_k, high_k + 1):
@@ -357,11 +316,5 @@ def cells_met(points, reach, poses, place, found, most):
                         at = place_in_set(found, key)
                         if found[at] < 0:
                             found[at] = key
-                            before[added] = at
-                            added += 1
-        if n > 0 and count + added > most:
-            for p in range(added):  # newest first: no run of entries gets a hole
-                found[before[added - 1 - p]] = -1
-            return n, count
-        count += added
+                            count += 1
     return poses.shape[0], count

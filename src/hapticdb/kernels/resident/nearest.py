@@ -14,18 +14,29 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS3, INT, INTS, entry, inlined, leaf, record_of
+from hapticdb.kernels.bits import highest_bit, lowest_bit
 from hapticdb.kernels.records import NEAR_CUBE
 from hapticdb.kernels.resident.cells import (
     CELLS,
     CLUSTERS,
+    EMPTY_SLOT,
     GROUP,
     PLACE,
+    Seen,
     begin_frame,
+    cells_of_box,
     end_frame,
+    in_voxels,
+    key_of_cell,
+    slot_of,
     spread_key,
 )
-from hapticdb.kernels.resident.clearance import nearest_voxel, packed, square_to
-from hapticdb.kernels.rigid import moved, transform_of
+from hapticdb.kernels.rigid import gap, transform_of
+
+AXIS_BITS = 21
+"""Bits of each coordinate of a packed voxel, i uppermost. Three coordinates must fit an int64."""
+AXIS_MASK = (1 << AXIS_BITS) - 1
+
 
 CAUTION = 1e-6
 """Voxels by which a bound is lowered, so that rounding errors cannot make it wrong."""
@@ -44,6 +55,181 @@ NOT_KNOWN = np.zeros((), NEAR_CUBE)
 cubes of its own: an array (F,) of such records, F a power of two, in which one replaces another."""
 NOT_KNOWN["key"] = NOT_KNOWN["nearest"] = -1
 NOT_KNOWN["bound"] = -1.0
+
+
+@leaf
+def packed(i, j, k):
+    """Voxel (i, j, k) as one number."""
+    return (i << (2 * AXIS_BITS)) | (j << AXIS_BITS) | k
+
+
+@leaf
+def unpacked(voxel):
+    """Voxel (i, j, k) of a number; undoes `packed`."""
+    return voxel >> (2 * AXIS_BITS), (voxel >> AXIS_BITS) & AXIS_MASK, voxel & AXIS_MASK
+
+
+@leaf
+def _window_of(x, radius, first):
+    """First and last voxel, 0 to 31, of a cell from `first` on whose gap to x may be below radius.
+
+    Voxels of a cell that lies wholly on one side of x give its border voxel.
+    """
+    low = np.int64(min(max(math.floor(x - radius) - first, 0), 31))
+    high = np.int64(min(max(math.floor(x + radius) - first, 0), 31))
+    return low, high
+
+
+@inlined
+def _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel):
+    """Least squared distance from (x, y, z) to a voxel of one cell, and that voxel, packed.
+
+    Returns `square` and `voxel` as given if no voxel is nearer. All lengths in voxels. Only columns
+    within the radius are looked at, so the loops hardly branch: a fifth off a search.
+    """
+    radius, words, mask = math.sqrt(square), seen.words, seen.masks[slot]
+    i0, j0, k0 = ci << 5, cj << 5, ck << 5
+    first_i, last_i = _window_of(x, radius, i0)
+    first_j, last_j = _window_of(y, radius, j0)
+    low, high = _window_of(z, radius, k0)
+    # columns begin at the place's own height
+    middle = np.int64(min(max(math.floor(z) - k0, 0), 31))
+    window = (np.int64(2) << high) - (np.int64(1) << low)
+    for bi in range(first_i >> 3, (last_i >> 3) + 1):
+        di = gap(x, i0 + 8.0 * bi, i0 + 8.0 * bi + 8.0)
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+            continue
+        for bj in range(first_j >> 3, (last_j >> 3) + 1):
+            bricks = np.int64((mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF))
+            dj = gap(y, j0 + 8.0 * bj, j0 + 8.0 * bj + 8.0)
+            if not bricks or di * di + dj * dj >= square:
+                continue
+            height, kept = np.inf, np.int64(0)  # squared gap to the bricks that may be near
+            for bk in range(low >> 3, (high >> 3) + 1):
+                if (bricks >> bk) & 1:
+                    dk = gap(z, k0 + (bk << 3), k0 + (bk << 3) + 8.0)
+                    if di * di + dj * dj + dk * dk < square:
+                        height = min(height, dk * dk)
+                        kept |= np.int64(0xFF) << (bk << 3)
+            kept &= window
+            if not kept:
+                continue
+            for i in range(max(first_i, bi << 3), min(last_i, (bi << 3) | 7) + 1):
+                dx = gap(x, i0 + i, i0 + i + 1.0)
+                for j in range(max(first_j, bj << 3), min(last_j, (bj << 3) | 7) + 1):
+                    met = np.int64(words[slot, (i << 5) | j]) & kept
+                    if not met:
+                        continue
+                    dy = gap(y, j0 + j, j0 + j + 1.0)
+                    column = dx * dx + dy * dy
+                    if column + height >= square:
+                        continue
+                    above, below = met >> middle, met & ((np.int64(1) << middle) - 1)
+                    if above:
+                        k = k0 + middle + lowest_bit(above)
+                        dz = gap(z, k, k + 1.0)
+                        if column + dz * dz < square:
+                            square = column + dz * dz
+                            voxel = packed(i0 + i, j0 + j, k)
+                    if below:
+                        k = k0 + highest_bit(below)
+                        dz = gap(z, k, k + 1.0)
+                        if column + dz * dz < square:
+                            square = column + dz * dz
+                            voxel = packed(i0 + i, j0 + j, k)
+    return square, voxel
+
+
+@leaf
+def square_to(x, y, z, voxel):
+    """Squared distance to the box of a packed voxel, all in voxels."""
+    i, j, k = unpacked(voxel)
+    dx, dy, dz = gap(x, i, i + 1.0), gap(y, j, j + 1.0), gap(z, k, k + 1.0)
+    return dx * dx + dy * dy + dz * dz
+
+
+@inlined
+def nearest_voxel(seen, x, y, z, square, voxel, side):
+    """Occupied voxel nearest to (x, y, z), all in voxels, if nearer than the root of `square`.
+
+    Returns its box's squared distance and the voxel, packed, or both as given; voxel -2 when a cell
+    in reach is not resident.
+    """
+    box = cells_of_box(x, y, z, math.sqrt(square), side)
+    first_i, last_i, first_j, last_j, first_k, last_k = box
+    for ci in range(first_i, last_i + 1):
+        di = gap(x, 32.0 * ci, 32.0 * ci + 32.0)
+        for cj in range(first_j, last_j + 1):
+            dj = gap(y, 32.0 * cj, 32.0 * cj + 32.0)
+            for ck in range(first_k, last_k + 1):
+                dk = gap(z, 32.0 * ck, 32.0 * ck + 32.0)
+                if di * di + dj * dj + dk * dk >= square:
+                    continue
+                slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(ci, cj, ck))
+                if slot < 0:
+                    return square, np.int64(-2)
+                if slot == EMPTY_SLOT:
+                    continue
+                seen.used[slot] = 1
+                square, voxel = _nearest_in_cell(seen, slot, ci, cj, ck, x, y, z, square, voxel)
+    return square, voxel
+
+
+@leaf
+def room_around(seen, x, y, z, half, most, side):
+    """How far a cube may grow on each side before it meets an occupied brick or an unknown cell.
+
+    (x, y, z), half: the cube's centre and half its side, voxels. The result is at most `most`, and
+    not above zero if the cube meets one already.
+    """
+    least = half + most
+    first_i, last_i, first_j, last_j, first_k, last_k = cells_of_box(x, y, z, least, side)
+    for ci in range(first_i, last_i + 1):
+        di = gap(x, 32.0 * ci, 32.0 * ci + 32.0)
+        for cj in range(first_j, last_j + 1):
+            dj = max(di, gap(y, 32.0 * cj, 32.0 * cj + 32.0))
+            if dj >= least:
+                continue
+            for ck in range(first_k, last_k + 1):
+                dk = max(dj, gap(z, 32.0 * ck, 32.0 * ck + 32.0))
+                if dk >= least:
+                    continue
+                slot = slot_of(seen.keys, seen.slots, seen.which, key_of_cell(ci, cj, ck))
+                if slot == EMPTY_SLOT:
+                    continue
+                if slot < 0:
+                    least = dk
+                else:
+                    seen.used[slot] = 1
+                    least = _nearest_brick(
+                        seen.masks[slot], 32.0 * ci, 32.0 * cj, 32.0 * ck, x, y, z, least
+                    )
+                if least <= half:
+                    return least - half
+    return least - half
+
+
+@leaf
+def _nearest_brick(mask, i, j, k, x, y, z, least):
+    """Distance on the axis where it is largest, from (x, y, z) to the nearest brick of a cell.
+
+    mask: of the cell, whose lowest corner is (i, j, k); all in voxels. `least` if none is nearer.
+    """
+    for bi in range(4):
+        if not (mask >> np.uint64(bi << 4)) & np.uint64(0xFFFF):
+            continue
+        di = gap(x, i + 8.0 * bi, i + 8.0 * bi + 8.0)
+        if di >= least:
+            continue
+        for bj in range(4):
+            four = (mask >> np.uint64((bi << 4) | (bj << 2))) & np.uint64(0xF)
+            dj = max(di, gap(y, j + 8.0 * bj, j + 8.0 * bj + 8.0))
+            if not four or dj >= least:
+                continue
+            for bk in range(4):
+                if (four >> np.uint64(bk)) & np.uint64(1):
+                    least = min(least, max(dj, gap(z, k + 8.0 * bk, k + 8.0 * bk + 8.0)))
+    return least
 
 
 @inlined
@@ -73,13 +259,6 @@ def _ball_at(points, spheres, groups, run, point, level):
 
 
 @leaf
-def in_voxels(transform, place, x, y, z):
-    """A point of the tool, metres, placed by a pose, in voxels from the grid's origin."""
-    x, y, z = moved(transform, x, y, z)
-    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
-
-
-@leaf
 def _bounded_by(x, y, z, square, voxel):
     """Squared distance to a voxel, or -1, with which a search begins: the voxel if it is nearer."""
     if voxel >= 0 and square_to(x, y, z, voxel) < square:
@@ -94,9 +273,7 @@ def length(x, y, z):
 
 
 @inlined
-def bound_at(
-    cubes, keys, slots, words, masks, used, which, x, y, z, wanted, near, shift, side
-):  # fmt: skip
+def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
     """Lower bound of the distance from (x, y, z) to an occupied voxel, and a voxel near it or -1.
 
     All in voxels. Looks the place's cube up, or searches around its middle as far as decides
@@ -113,9 +290,7 @@ def bound_at(
     far = wanted + 0.5 * math.sqrt(3.0) * edge
     if cube.key != key or (cube.nearest < 0 and cube.bound < far):
         square, voxel = _bounded_by(mx, my, mz, far * far, near)
-        square, voxel = nearest_voxel(
-            keys, slots, words, masks, used, which, mx, my, mz, square, voxel, side
-        )
+        square, voxel = nearest_voxel(seen, mx, my, mz, square, voxel, side)
         if voxel == -2:
             return 0.0, np.int64(-1)
         cube.key = key
@@ -142,11 +317,12 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
     or -1 while nothing is nearer; done (B,): points searched. With fewer than N a pose has met a
     cell that is not resident, and a later call continues there.
     """
-    _, _, keys, slots, words, masks, used, _, _ = cells
     points, _, spheres, groups, run, _, _ = shell
     size, side, total = place.size, place.side, points.shape[0]
     seed = hot = near = np.int64(-1)
     which = begin_frame(cells, reader)
+    # made here: references to what a leaf returns are not counted
+    seen = Seen(cells.keys, cells.slots, cells.words, cells.masks, cells.used, which)
     for n in range(poses.shape[0]):
         if done[n] >= total:
             continue
@@ -166,7 +342,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                 x, y, z = in_voxels(transform, place, x, y, z)
                 radius /= size
                 bound, voxel = bound_at(
-                    cubes, keys, slots, words, masks, used, which, x, y, z, within + radius, near,
+                    cubes, seen, x, y, z, within + radius, near,
                     fine if level == POINT else CUBE_OF_BALL, side,
                 )  # fmt: skip
                 near = voxel if voxel >= 0 else near
@@ -179,9 +355,7 @@ def find_nearest(cells, reader, shell, poses, place, largest, fine, cubes, squar
                     continue
                 elif bound < within:
                     limit, voxel = _bounded_by(x, y, z, within * within, voxel)
-                    limit, voxel = nearest_voxel(
-                        keys, slots, words, masks, used, which, x, y, z, limit, voxel, side
-                    )
+                    limit, voxel = nearest_voxel(seen, x, y, z, limit, voxel, side)
                     if voxel == -2:
                         break
                     if voxel >= 0:

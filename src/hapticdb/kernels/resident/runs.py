@@ -11,6 +11,7 @@ from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     GROUP,
     UNKNOWN,
+    in_voxels,
     key_of_cell,
     slot_of,
 )
@@ -95,20 +96,13 @@ def _is_something_near(seen, low_i, low_j, low_k, high_i, high_j, high_k):
 
 
 @inlined
-def placed_center(spheres, n, transform, place):
-    """Centre of sphere n of a placed shell, voxels."""
-    x, y, z = moved(transform, spheres[n, 0], spheres[n, 1], spheres[n, 2])
-    return (x - place.x) / place.size, (y - place.y) / place.size, (z - place.z) / place.size
-
-
-@inlined
 def is_sphere_free(seen, spheres, n, transform, place, reached):
     """Whether no voxel is in the box around sphere n of a placed shell, wider by `reached` voxels.
 
     Unknown cells count as occupied; space outside the grid is free.
     """
     side = place.side
-    x, y, z = placed_center(spheres, n, transform, place)
+    x, y, z = in_voxels(transform, place, spheres[n, 0], spheres[n, 1], spheres[n, 2])
     radius = spheres[n, 3] / place.size + reached
     if x + radius < 0.0 or y + radius < 0.0 or z + radius < 0.0:
         return True
@@ -172,9 +166,7 @@ def place_run(columns, start, count, transform, place, scratch):
     for at in range(count):
         x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
         x, y, z = moved(transform, x, y, z)
-        scratch[0, at] = x
-        scratch[1, at] = y
-        scratch[2, at] = z
+        scratch[0, at], scratch[1, at], scratch[2, at] = x, y, z
     for at in range(count):
         scratch[3, at] = (scratch[0, at] - ox) / size
     for at in range(count):

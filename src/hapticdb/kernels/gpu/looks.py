@@ -152,10 +152,8 @@ def _look_at_point(n, place, asked, seen, payload, sight):
     """Look at point n, which is due -> when it is due again; see `near_points.look`."""
     points, center, transform = sight.points, sight.points.shape[1] - 1, asked.pose
     px, py, pz = _moved(transform, points[0, n], points[1, n], points[2, n])
-    x, dx = _clamped_into((px - place.x) / place.size, place.side)
-    y, dy = _clamped_into((py - place.y) / place.size, place.side)
-    z, dz = _clamped_into((pz - place.z) / place.size, place.side)
-    key = _cell_key(np.int64(x), np.int64(y), np.int64(z))
+    inside = _clamped_into(place, px, py, pz)
+    key = _cell_key(np.int64(inside[0]), np.int64(inside[1]), np.int64(inside[2]))
     slot, mask = _slot_of(seen.keys, seen.slots, seen.which, key), np.uint64(0)
     if slot < 0:
         cuda.atomic.add(sight.found, UNKNOWNS, 1.0)
@@ -165,19 +163,20 @@ def _look_at_point(n, place, asked, seen, payload, sight):
         seen.used[slot] = 1
         mask = seen.masks[slot]
     if n & (asked.merged - 1):  # another point's contact stands for this one
-        bound = _bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+        bound = _bound_at(payload, slot, mask, inside)
         if bound >= LEAST_BOUND:
             return asked.travelled + bound - FAR
-    u, gx, gy, gz, bound = _distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
+    looked = _distance_at(payload, slot, mask, inside)
+    u, bound = looked[0], looked[4]
     if u < ONSET + MARGIN or bound < LEAST_BOUND:
         at = np.int64(cuda.atomic.add(sight.found, NEARS, 1.0))
         if at < sight.numbers.shape[0]:
             cx, cy, cz = _moved(transform, points[0, center], points[1, center], points[2, center])
             sight.numbers[at] = n
+            lever = px - cx, py - cy, pz - cz
             _write_near(
-                payload, slot, mask, x, y, z, px - cx, py - cy, pz - cz, u, gx, gy, gz, bound,
-                asked.is_bent, sight.rows, 0, at,
-            )  # fmt: skip
+                payload, slot, mask, inside, lever, looked, asked.is_bent, sight.rows, 0, at
+            )
     return asked.travelled + bound - FAR
 
 

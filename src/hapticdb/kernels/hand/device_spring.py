@@ -8,7 +8,16 @@ import math
 from typing import NamedTuple
 
 from hapticdb.kernels._jit import FLOAT, fields_of, leaf
-from hapticdb.kernels.rigid import length_at, moment, product, turn, turn_of, turned_by
+from hapticdb.kernels.rigid import (
+    length_at,
+    moment,
+    moved,
+    numbers_of,
+    product,
+    transform_of,
+    turn_of,
+    turned_by,
+)
 
 BEYOND_CAP = 1.2
 """Most force of the spring, in caps of the device. Larger: the tool is pressed harder than the hand
@@ -52,21 +61,27 @@ def contact_stiffness(spring, size):
 
 
 @leaf
+def pull_to(pull, hand, lever, at, turned):
+    """Write the stretch, m, and the turn from a tool to a hand into pull (6,).
+
+    hand: position and unit quaternion, seven numbers; lever: from there to the tool's centre in the
+    hand; at, turned: the centre and the unit quaternion of the tool.
+    """
+    for axis in range(3):
+        pull[axis] = hand[axis] + lever[axis] - at[axis]
+    pull[3], pull[4], pull[5] = turn_of(
+        *product(hand[3], hand[4], hand[5], hand[6], turned[0], -turned[1], -turned[2], -turned[3])
+    )
+
+
+@leaf
 def measure_pull(spring, tool, hand, pose, center, follower):
     """Stretch and turn from tool to hand: see `stretch`.
 
     center (3,): the tool's, in the tool's frame.
     """
-    hw, hx, hy, hz = hand.quaternion[0], hand.quaternion[1], hand.quaternion[2], hand.quaternion[3]
-    rx, ry, rz = lever_in_hand(hand, center)
-    x, y, z = center[0], center[1], center[2]
-    pull, position, turned = follower.pull, hand.position, tool.quaternion
-    for axis in range(3):
-        at = turn(pose[axis, 0], pose[axis, 1], pose[axis, 2], x, y, z) + pose[axis, 3]
-        pull[axis] = position[axis] + (rx if axis == 0 else (ry if axis == 1 else rz)) - at
-    pull[3], pull[4], pull[5] = turn_of(
-        *product(hw, hx, hy, hz, turned[0], -turned[1], -turned[2], -turned[3])
-    )
+    at = moved(transform_of(pose), center[0], center[1], center[2])
+    pull_to(follower.pull, numbers_of(hand), lever_in_hand(hand, center), at, tool.quaternion)
     stretch(
         follower, follower.share * spring.stiffness / spring.scale,
         follower.share * spring.turn_stiffness * spring.scale, BEYOND_CAP * spring.cap,

@@ -11,7 +11,15 @@ import numpy as np
 
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.near_points import NOT_KNOWN, OPEN, SHUT, look, settle
-from hapticdb.kernels.rigid import length_at, pose_of_quaternion, product, quaternion_by, turn
+from hapticdb.kernels.rigid import (
+    length_at,
+    moved,
+    pose_of_quaternion,
+    product,
+    quaternion_by,
+    transform_of,
+    turned,
+)
 
 STRIDE = 0.98
 """Length of a stride, in lower bounds of the least distance. Larger: fewer looks; below 1, or the
@@ -27,37 +35,22 @@ period takes longer."""
 
 
 @leaf
-def _place_next(turned, center, pose, next_pose, step, vx, vy, vz, wx, wy, wz):
-    """Pose after a step at constant velocities, into next_pose (4, 4) -> position, quaternion.
-
-    turned (4,): unit quaternion of pose (4, 4); step in s, velocities of the centre, m/s and rad/s.
-    """
-    w, x, y, z = product(
-        *quaternion_by(step * wx, step * wy, step * wz), turned[0], turned[1], turned[2], turned[3]
-    )
-    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
-    w, x, y, z = scale * w, scale * x, scale * y, scale * z
-    pose_of_quaternion(0.0, 0.0, 0.0, w, x, y, z, next_pose)
-    cx, cy, cz = center[0], center[1], center[2]
-    # position: the moved centre, minus the centre's lever in the turned frame
-    px = turn(pose[0, 0], pose[0, 1], pose[0, 2], cx, cy, cz) + pose[0, 3] + step * vx
-    py = turn(pose[1, 0], pose[1, 1], pose[1, 2], cx, cy, cz) + pose[1, 3] + step * vy
-    pz = turn(pose[2, 0], pose[2, 1], pose[2, 2], cx, cy, cz) + pose[2, 3] + step * vz
-    px -= turn(next_pose[0, 0], next_pose[0, 1], next_pose[0, 2], cx, cy, cz)
-    py -= turn(next_pose[1, 0], next_pose[1, 1], next_pose[1, 2], cx, cy, cz)
-    pz -= turn(next_pose[2, 0], next_pose[2, 1], next_pose[2, 2], cx, cy, cz)
-    pose_of_quaternion(px, py, pz, w, x, y, z, next_pose)
-    return px, py, pz, w, x, y, z
-
-
-@leaf
 def place_on_way(tool, center, follower, done):
     """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
-    step = follower.step
-    return _place_next(
-        tool.quaternion, center, tool.pose, tool.tried_pose, done,
-        step[0], step[1], step[2], step[3], step[4], step[5],
+    step, before, pose = follower.step, tool.quaternion, tool.tried_pose
+    w, x, y, z = product(
+        *quaternion_by(done * step[3], done * step[4], done * step[5]),
+        before[0], before[1], before[2], before[3],
     )  # fmt: skip
+    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    w, x, y, z = scale * w, scale * x, scale * y, scale * z
+    pose_of_quaternion(0.0, 0.0, 0.0, w, x, y, z, pose)
+    # position: the moved centre, minus the centre's lever in the turned frame
+    px, py, pz = moved(transform_of(tool.pose), center[0], center[1], center[2])
+    rx, ry, rz = turned(transform_of(pose), center[0], center[1], center[2])
+    px, py, pz = px + done * step[0] - rx, py + done * step[1] - ry, pz + done * step[2] - rz
+    pose_of_quaternion(px, py, pz, w, x, y, z, pose)
+    return px, py, pz, w, x, y, z
 
 
 @leaf
@@ -67,24 +60,22 @@ def way_of_step(follower, radius, size):
 
 
 @leaf
-def _stride_on(cells, which, shell, place, way, done, tool, follower, field, met, missed):
+def _stride_on(grasp, way, done, tool):
     """Make one stride from share `done` of the step -> where the tool is then, and what was found.
 
     SHUT: not even a short stride is allowed, or the period has no looks left.
     """
+    follower = grasp.follower
     stride = min(1.0 - done, STRIDE * max(follower.clearance, LEAST_STRIDE) / max(way, 1e-300))
     part = stride
     while part >= SHORTEST * stride and follower.n_looks < MOST_LOOKS:
         end = 1.0 if part >= 1.0 - done else done + part
-        place_on_way(tool, shell.center, follower, end)
-        moved = way * (end - done)
-        found = look(
-            cells, which, shell, tool.tried_pose, place, follower.astray + moved, np.bool_(True),
-            follower, field, met, missed,
-        )  # fmt: skip
-        follower.astray = moved
+        place_on_way(tool, grasp.shell.center, follower, end)
+        passed = way * (end - done)
+        found = look(grasp, tool.tried_pose, follower.astray + passed, np.bool_(True))
+        follower.astray = passed
         if found == OPEN:
-            settle(follower, field, met)
+            settle(follower, grasp.field, grasp.met)
             return end, found
         if found == NOT_KNOWN:
             return done, found
@@ -93,29 +84,28 @@ def _stride_on(cells, which, shell, place, way, done, tool, follower, field, met
 
 
 @leaf
-def keep_pose(tool, follower, px, py, pz, w, x, y, z):
-    """Make a pose the tool's, which the near points belong to."""
-    pose_of_quaternion(px, py, pz, w, x, y, z, tool.pose)
-    position, turned, looked_at = tool.position, tool.quaternion, follower.looked_at
-    position[0], position[1], position[2] = px, py, pz
-    turned[0], turned[1], turned[2], turned[3] = w, x, y, z
-    looked_at[0], looked_at[1], looked_at[2] = px, py, pz
-    looked_at[3], looked_at[4], looked_at[5], looked_at[6] = w, x, y, z
+def keep_pose(tool, follower, at):
+    """Make a pose of seven numbers the tool's, which the near points belong to."""
+    pose_of_quaternion(*at, tool.pose)
+    for n in range(7):
+        follower.looked_at[n] = at[n]
+    for n in range(3):
+        tool.position[n] = at[n]
+    for n in range(4):
+        tool.quaternion[n] = at[3 + n]
 
 
 @leaf
-def walk(cells, which, shell, place, radius, tool, follower, field, met, missed):
+def walk(grasp, radius, tool):
     """Walk the step as far as the tool may go -> share of the step, and what the last look found.
 
     radius, m: distance of the farthest point from the tool's centre.
     """
-    way = way_of_step(follower, radius, place.size)
+    follower = grasp.follower
+    way = way_of_step(follower, radius, grasp.place.size)
     done, found = 0.0, OPEN
     while done < 1.0 and found == OPEN:
-        done, found = _stride_on(
-            cells, which, shell, place, way, done, tool, follower, field, met, missed
-        )
+        done, found = _stride_on(grasp, way, done, tool)
     if done > 0.0:
-        px, py, pz, w, x, y, z = place_on_way(tool, shell.center, follower, done)
-        keep_pose(tool, follower, px, py, pz, w, x, y, z)
+        keep_pose(tool, follower, place_on_way(tool, grasp.shell.center, follower, done))
     return done, found

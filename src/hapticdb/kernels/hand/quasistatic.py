@@ -64,7 +64,7 @@ from hapticdb.kernels.hand.steadying import (
 )
 from hapticdb.kernels.hand.step import solve_step
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, WRENCH
-from hapticdb.kernels.rigid import pose_of_quaternion
+from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
 IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
 """Marks of a period, beside those of `holding`: the tool lies in something and feels nothing; the
@@ -116,8 +116,9 @@ def _meet_change(follower, field, met):
 
 
 @leaf
-def _look_here(cells, which, shell, place, tool, follower, field, met, missed):
+def _look_here(grasp, tool):
     """Look at the tool where it is, at the start or in a new version -> whether all is known."""
+    follower, field, met = grasp.follower, grasp.field, grasp.met
     is_first = tool.version == 0
     if is_first:
         forget(follower, field)
@@ -125,19 +126,13 @@ def _look_here(cells, which, shell, place, tool, follower, field, met, missed):
         follower.is_loose = follower.is_braked = follower.is_bent = False
     else:
         look_anew(follower, field)
-    position, turned = tool.position, tool.quaternion
-    px, py, pz = position[0], position[1], position[2]
-    w, x, y, z = turned[0], turned[1], turned[2], turned[3]
-    pose_of_quaternion(px, py, pz, w, x, y, z, tool.tried_pose)
-    found = look(
-        cells, which, shell, tool.tried_pose, place, 0.0, np.bool_(False), follower, field, met,
-        missed,
-    )  # fmt: skip
+    pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
+    found = look(grasp, tool.tried_pose, 0.0, np.bool_(False))
     if found == NOT_KNOWN:
         return False
     is_sunk = not has_moved(tool, follower) and _meet_change(follower, field, met)
     settle(follower, field, met)
-    keep_pose(tool, follower, px, py, pz, w, x, y, z)
+    keep_pose(tool, follower, numbers_of(tool))
     if is_first:
         fix_onsets(follower, field, met)
         is_sunk = least_distance(follower, field) < FLOOR
@@ -146,21 +141,15 @@ def _look_here(cells, which, shell, place, tool, follower, field, met, missed):
 
 
 @leaf
-def _look_at_more(cells, which, shell, place, tool, follower, field, met, missed):
+def _look_at_more(grasp, tool):
     """Look where the tool is, at points left out before -> OPEN or NOT_KNOWN.
 
     A point that comes back feels contact from where it is, so that no force jumps. It goes no
     nearer to a surface than it is, if it is nearer than FLOOR.
     """
-    position, turned = tool.position, tool.quaternion
-    pose_of_quaternion(
-        position[0], position[1], position[2], turned[0], turned[1], turned[2], turned[3],
-        tool.tried_pose,
-    )  # fmt: skip
-    found = look(
-        cells, which, shell, tool.tried_pose, place, follower.astray, np.bool_(False), follower,
-        field, met, missed,
-    )  # fmt: skip
+    follower, field, met = grasp.follower, grasp.field, grasp.met
+    pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
+    found = look(grasp, tool.tried_pose, follower.astray, np.bool_(False))
     if found == OPEN:
         _meet_change(follower, field, met)
         settle(follower, field, met)
@@ -168,21 +157,19 @@ def _look_at_more(cells, which, shell, place, tool, follower, field, met, missed
 
 
 @leaf
-def _follow_loosely(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
+def _follow_loosely(grasp, spring, tool, hand):
     """Put a tool that lies in something at the hand -> OPEN or NOT_KNOWN."""
-    measure_pull(spring, tool, hand, tool.pose, shell.center, follower)
+    follower, field, met, center = grasp.follower, grasp.field, grasp.met, grasp.shell.center
+    measure_pull(spring, tool, hand, tool.pose, center, follower)
     for axis in range(6):
         follower.step[axis] = follower.pull[axis]
-    way = way_of_step(follower, spring.radius, place.size)
-    px, py, pz, w, x, y, z = place_on_way(tool, shell.center, follower, 1.0)
-    found = look(
-        cells, which, shell, tool.tried_pose, place, follower.astray + way, np.bool_(False),
-        follower, field, met, missed,
-    )  # fmt: skip
+    way = way_of_step(follower, spring.radius, grasp.place.size)
+    at = place_on_way(tool, center, follower, 1.0)
+    found = look(grasp, tool.tried_pose, follower.astray + way, np.bool_(False))
     follower.astray = way
     if found == OPEN:
         settle(follower, field, met)
-        keep_pose(tool, follower, px, py, pz, w, x, y, z)
+        keep_pose(tool, follower, at)
         follower.n_active = 0
         if least_distance(follower, field) >= FLOOR:
             follower.is_loose = False
@@ -191,20 +178,19 @@ def _follow_loosely(cells, which, shell, place, spring, tool, hand, follower, fi
 
 
 @leaf
-def follow(cells, which, shell, place, spring, tool, hand, follower, field, met, missed):
+def follow(grasp, spring, tool, hand):
     """Move the tool to where spring and contacts balance -> what the last look found.
 
     SHUT: the tool is held back, by a surface or because the period has no looks left.
     """
-    size, most = place.size, BEYOND_CAP * spring.cap
+    follower, size, most = grasp.follower, grasp.place.size, BEYOND_CAP * spring.cap
     stiffness = contact_stiffness(spring, size)
-    at, turned = hand.position, hand.quaternion
     found = OPEN
     for n in range(STEPS + 1):
-        measure_pull(spring, tool, hand, tool.pose, shell.center, follower)
+        measure_pull(spring, tool, hand, tool.pose, grasp.shell.center, follower)
         brake = STOPPING * most / size if follower.is_braked else 0.0
         turn_brake = brake * spring.radius * spring.radius
-        solve_step(follower, field, met, size, stiffness, brake, turn_brake)
+        solve_step(follower, grasp.field, grasp.met, size, stiffness, brake, turn_brake)
         way = way_of_step(follower, spring.radius, size)
         follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
         if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
@@ -213,15 +199,11 @@ def follow(cells, which, shell, place, spring, tool, hand, follower, field, met,
             for axis in range(6):
                 follower.pull[axis] -= follower.step[axis]
             break
-        done, found = walk(
-            cells, which, shell, place, spring.radius, tool, follower, field, met, missed
-        )
+        done, found = walk(grasp, spring.radius, tool)
         if found == NOT_KNOWN:
             break
         if done == 1.0 and follower.n_active == 0 and not follower.is_braked:
-            keep_pose(
-                tool, follower, at[0], at[1], at[2], turned[0], turned[1], turned[2], turned[3]
-            )
+            keep_pose(tool, follower, numbers_of(hand))
         follower.is_braked = done < SHORT_CUT
     return found
 
@@ -285,9 +267,10 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
 
 
 @leaf
-def finish(spring, shell, place, servo, follower, field, met, is_held, found, dt):
+def finish(grasp, spring, servo, is_held, found, dt):
     """Send the wrench and the marks of the period; contacts into tool.felt."""
     flags, tool, hand, wrench = 0, servo.tool, servo.hand, servo.sent.wrench
+    follower, size = grasp.follower, grasp.place.size
     if is_held:
         follower.n_trail = 0  # a speed over a gap says nothing
     else:
@@ -295,53 +278,44 @@ def finish(spring, shell, place, servo, follower, field, met, is_held, found, dt
         is_over = follower.n_looks >= MOST_LOOKS
         is_felt = follower.n_active > 0 or (found == SHUT and not is_over)
         is_felt = is_felt and not follower.is_loose
-        flags |= _push_hand(spring, tool, hand, shell.center, follower, is_felt, dt, wrench)
+        flags |= _push_hand(spring, tool, hand, grasp.shell.center, follower, is_felt, dt, wrench)
         for n in range(6):
             tool.kept[n] = wrench[n] if is_finite(wrench) else 0.0
-        _record_felt(
-            follower, field, met, place.size, contact_stiffness(spring, place.size), tool.felt
-        )
+        stiffness = contact_stiffness(spring, size)
+        _record_felt(follower, grasp.field, grasp.met, size, stiffness, tool.felt)
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
         flags |= IS_LOOSE if follower.is_loose else 0
     send(spring, servo, is_held, flags, dt)
 
 
 @leaf
-def _move_tool(
-    cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
-):
+def _move_tool(grasp, version, spring, tool, hand):
     """Move the tool after the hand, in the present version of the cells -> what was found."""
     found = OPEN
-    if tool.version != version or has_moved(tool, follower):
-        if not _look_here(cells, which, shell, place, tool, follower, field, met, missed):
+    if tool.version != version or has_moved(tool, grasp.follower):
+        if not _look_here(grasp, tool):
             return NOT_KNOWN
         tool.version = version
-    elif take_more_points(follower, field):
-        found = _look_at_more(cells, which, shell, place, tool, follower, field, met, missed)
-    if found == OPEN:
-        if follower.is_loose:
-            found = _follow_loosely(
-                cells, which, shell, place, spring, tool, hand, follower, field, met, missed
-            )
-        else:
-            found = follow(
-                cells, which, shell, place, spring, tool, hand, follower, field, met, missed
-            )
-    return found
+    elif take_more_points(grasp.follower, grasp.field):
+        found = _look_at_more(grasp, tool)
+    if found != OPEN:
+        return found
+    if grasp.follower.is_loose:
+        return _follow_loosely(grasp, spring, tool, hand)
+    return follow(grasp, spring, tool, hand)
 
 
 @leaf
-def advance(cells, which, version, shell, place, spring, servo, follower, dt, field, met, missed):
+def advance(grasp, version, spring, servo, dt):
     """Move the tool for one period of dt seconds, in a version of the cells.
 
     servo, a record of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
-    missed, as `felt` fills it, between periods. follower, of FOLLOWER, field (FIELD_ROWS, N)
-    float64 and met (MET_ROWS, N) int64 are the coupling's own from period to period; it starts
-    anew, whatever they hold, while `tool.version` is 0. The caller may put the tool back to an
-    earlier pose, but must not put back these three.
+    grasp.missed between periods. Follower, field and met are the coupling's own from period to
+    period; it starts anew, whatever they hold, while `tool.version` is 0. The caller may put the
+    tool back to an earlier pose, but must not put back these three.
 
     If a step would take points into unknown cells, the tool stays before it. The wrench is kept for
-    `hold` seconds, then falls to zero within `fade` seconds; `sent.unknown` and missed then belong
+    `hold` seconds, then falls to zero within `fade` seconds; sent.unknown and missed then belong
     to the pose that was tried. After that, and after the first frame, the wrench rises to its full
     size within `fade` seconds and at least RISE_FRAMES frames. While the clutch is open the wrench
     falls to zero, and the tool still follows the handle. While the hand is not finite, tool and
@@ -355,7 +329,7 @@ def advance(cells, which, version, shell, place, spring, servo, follower, dt, fi
     push, which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
     """
     dt = max(dt, 0.0)
-    tool, hand, sent = servo.tool, servo.hand, servo.sent
+    tool, hand, sent, follower = servo.tool, servo.hand, servo.sent, grasp.follower
     is_hand = is_somewhere(hand)
     is_held = hand.is_stale or not is_hand
     place_lost(tool, hand, is_hand)
@@ -363,11 +337,9 @@ def advance(cells, which, version, shell, place, spring, servo, follower, dt, fi
     follower.most_left_out = 0
     found = OPEN
     if not is_held:
-        found = _move_tool(
-            cells, which, version, shell, place, spring, tool, hand, follower, field, met, missed
-        )
+        found = _move_tool(grasp, version, spring, tool, hand)
     is_held = is_held or found == NOT_KNOWN
-    finish(spring, shell, place, servo, follower, field, met, is_held, found, dt)
+    finish(grasp, spring, servo, is_held, found, dt)
     sent.unknown = follower.n_unknown if found == NOT_KNOWN else 0
     sent.left_out = follower.most_left_out
     if follower.n_active > 0:  # a period in contact without a look rests on the last look

@@ -29,42 +29,18 @@ the set is right more often in corners, and the worst period takes longer."""
 @leaf
 def add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
     """Add a row to the step's equations: weight J J^T to the lower triangle, weight d J."""
-    matrix, right = follower.matrix, follower.right
-    wx, wy, wz = weight * jx, weight * jy, weight * jz
-    bx, by, bz = weight * ax, weight * ay, weight * az
-    matrix[0, 0] += wx * jx
-    matrix[1, 0] += wy * jx
-    matrix[1, 1] += wy * jy
-    matrix[2, 0] += wz * jx
-    matrix[2, 1] += wz * jy
-    matrix[2, 2] += wz * jz
-    matrix[3, 0] += bx * jx
-    matrix[3, 1] += bx * jy
-    matrix[3, 2] += bx * jz
-    matrix[3, 3] += bx * ax
-    matrix[4, 0] += by * jx
-    matrix[4, 1] += by * jy
-    matrix[4, 2] += by * jz
-    matrix[4, 3] += by * ax
-    matrix[4, 4] += by * ay
-    matrix[5, 0] += bz * jx
-    matrix[5, 1] += bz * jy
-    matrix[5, 2] += bz * jz
-    matrix[5, 3] += bz * ax
-    matrix[5, 4] += bz * ay
-    matrix[5, 5] += bz * az
-    right[0] += wx * depth
-    right[1] += wy * depth
-    right[2] += wz * depth
-    right[3] += bx * depth
-    right[4] += by * depth
-    right[5] += bz * depth
+    matrix, right, row = follower.matrix, follower.right, (jx, jy, jz, ax, ay, az)
+    for n in range(6):
+        weighed = weight * row[n]
+        for m in range(n + 1):
+            matrix[n, m] += weighed * row[m]
+        right[n] += weighed * depth
 
 
 @leaf
 def factor(follower):
-    """Cholesky factor L of the step's matrix, in its lower triangle; step = L^-T L^-1 right."""
-    matrix, right, step = follower.matrix, follower.right, follower.step
+    """Cholesky factor L of the step's matrix, in its lower triangle."""
+    matrix = follower.matrix
     for row in range(6):
         for column in range(row + 1):
             total = matrix[row, column]
@@ -74,6 +50,12 @@ def factor(follower):
                 matrix[row, row] = math.sqrt(max(total, 1e-300))
             else:
                 matrix[row, column] = total / matrix[column, column]
+
+
+@leaf
+def solve(follower):
+    """Solve the step's equations by the factor L of their matrix: step = L^-T L^-1 right."""
+    matrix, right, step = follower.matrix, follower.right, follower.step
     for row in range(6):
         total = right[row]
         for n in range(row):
@@ -172,5 +154,6 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
             if follower.is_bent and depth > 0.0:
                 _add_bends(follower, stiffness * depth / size, field, base, m)
         factor(follower)
+        solve(follower)
         if not _predict_contacts(follower, field, met, size):
             return

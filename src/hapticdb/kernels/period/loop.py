@@ -17,7 +17,7 @@ from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.handle import follow_reading
 from hapticdb.kernels.hand.holding import IS_HELD
-from hapticdb.kernels.hand.near_points import FELT_POINTS
+from hapticdb.kernels.hand.near_points import FELT_POINTS, Grasp
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE, advance
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
@@ -52,7 +52,7 @@ from hapticdb.kernels.resident.cells import (
     end_frame,
 )
 from hapticdb.kernels.resident.fence import fence
-from hapticdb.kernels.rigid import is_rigid, pose_of_quaternion
+from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
 GIVEN, BOARD, DEVICE = 0, 1, 2
 """Sources of a session's hand: the caller has written it; it arrives on the board; a device's
@@ -66,13 +66,6 @@ contacts. Larger: less computing, and what is shown is older."""
 WITHDRAWN_NS = 250_000_000
 """Nanoseconds. A request for ids is withdrawn once the database has answered this much later: by
 then the objects are named, and whoever wants to know has read them."""
-
-
-@leaf
-def _place(body, pose):
-    """Write the pose (4, 4) of a tool or a hand."""
-    at, w = body.position, body.quaternion
-    pose_of_quaternion(at[0], at[1], at[2], w[0], w[1], w[2], w[3], pose)
 
 
 @leaf
@@ -98,11 +91,9 @@ def _move_by_coupling(law, station, seat, shell, place, dt, memory):
     tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
     _, felt, missed, met, field = memory
     which = begin_frame(cells, station.reader)
-    advance(
-        cells, which, cells.readers[at], shell, place, spring, servo, follower, dt, field, met,
-        missed,
-    )  # fmt: skip
-    _place(tool, memory.pose)
+    grasp = Grasp(cells, which, shell, place, follower, field, met, missed)
+    advance(grasp, cells.readers[at], spring, servo, dt)
+    pose_of_quaternion(*numbers_of(tool), memory.pose)
     if seat.is_recorded and not sent.marks & IS_HELD:
         left_out = _feel(law, station, cells, which, shell, place, memory, met[FELT])
         for n in range(RESULTS):
@@ -121,7 +112,7 @@ def _move_directly(law, station, seat, shell, place, dt, memory):  # noqa: ARG00
     """Put the tool at the hand, and send the law's frame there; returns as above."""
     cells, servo = voxels_of(station), station.servo
     sent = servo.sent
-    _place(servo.hand, memory.pose)
+    pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
     if is_rigid(memory.pose):
         which = begin_frame(cells, station.reader)
         sent.left_out = _feel(
@@ -130,7 +121,7 @@ def _move_directly(law, station, seat, shell, place, dt, memory):  # noqa: ARG00
         sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
         end_frame(cells, station.reader)
     render(spring_of(station), shell.center, servo, memory.felt, dt)
-    _place(servo.tool, memory.pose)
+    pose_of_quaternion(*numbers_of(servo.tool), memory.pose)
     return FELT_POINTS, sent.hits
 
 

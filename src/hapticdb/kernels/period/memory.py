@@ -59,10 +59,10 @@ else:
 
 
 @maker
-def _voxels_of(station):
-    """The arrays of a session's cells that have no distances."""
+def _cells_with(station, payload, near):
+    """Cells of a session with those distances, or None."""
     n_slots, capacity = station.n_slots, station.capacity
-    return (
+    return Cells(
         array_at(station.control, (station.n_control,), np.int64),
         array_at(station.readers, (station.n_readers * READER_STRIDE,), np.int64),
         array_at(station.keys, (BUFFERS, capacity), np.int64),
@@ -70,32 +70,23 @@ def _voxels_of(station):
         array_at(station.words, (n_slots, CELL_WORDS), np.uint32),
         array_at(station.masks, (n_slots,), np.uint64),
         array_at(station.used, (n_slots,), np.uint8),
+        payload,
+        near,
     )
 
 
 @maker
 def voxels_of(station):
     """Cells of a session, without distances."""
-    control, readers, keys, slots, words, masks, used = _voxels_of(station)
-    return Cells(control, readers, keys, slots, words, masks, used, None, None)
+    return _cells_with(station, None, None)
 
 
 @maker
 def cells_of(station):
     """Cells of a session, with distances."""
-    control, readers, keys, slots, words, masks, used = _voxels_of(station)
-    n_slots = station.n_slots
-    return Cells(
-        control,
-        readers,
-        keys,
-        slots,
-        words,
-        masks,
-        used,
-        array_at(station.payload, (n_slots, CELL_VALUES), np.uint8),
-        array_at(station.near, (n_slots, CELL_WORDS), np.uint32),
-    )
+    payload = array_at(station.payload, (station.n_slots, CELL_VALUES), np.uint8)
+    near = array_at(station.near, (station.n_slots, CELL_WORDS), np.uint32)
+    return _cells_with(station, payload, near)
 
 
 @maker

@@ -13,11 +13,11 @@ alone, not on earlier periods.
 import math
 
 from hapticdb.kernels._jit import FLOATS, entry, leaf, record_of
-from hapticdb.kernels.hand.device_spring import BEYOND_CAP, stretch, wrench_of
+from hapticdb.kernels.hand.device_spring import BEYOND_CAP, pull_to, stretch, wrench_of
 from hapticdb.kernels.hand.path import way_of_step
-from hapticdb.kernels.hand.step import add_row, begin_equations, factor
+from hapticdb.kernels.hand.step import add_row, begin_equations, factor, solve
 from hapticdb.kernels.records import CONTACT_MODEL
-from hapticdb.kernels.rigid import moment, product, quaternion_by, turn_of, turned_by
+from hapticdb.kernels.rigid import moment, product, quaternion_by, turned_by
 
 STEPS = 5
 """Most Gauss-Newton steps of an evaluation. Larger: nearer to the balance far from the proxy's pose
@@ -34,16 +34,9 @@ that push."""
 
 
 @leaf
-def measure_pull(model, hand, rx, ry, rz):
-    """Stretch and turn from tool to hand: see `device_spring.stretch`.
-
-    r: lever from the handle's origin to the tool's centre in the hand.
-    """
-    pull, at, turned = model.pull, model.position, model.quaternion
-    pull[0], pull[1], pull[2] = hand[0] + rx - at[0], hand[1] + ry - at[1], hand[2] + rz - at[2]
-    pull[3], pull[4], pull[5] = turn_of(
-        *product(hand[3], hand[4], hand[5], hand[6], turned[0], -turned[1], -turned[2], -turned[3])
-    )
+def measure_pull(model, hand, lever):
+    """Stretch and turn from tool to hand: see `device_spring.stretch`."""
+    pull_to(model.pull, hand, lever, model.position, model.quaternion)
     most, most_turn = BEYOND_CAP * model.cap, BEYOND_CAP * model.turn_cap
     stretch(model, model.spring, model.turn_spring, most, most_turn)
 
@@ -125,7 +118,7 @@ def _add_hollow(model, n):
 
 
 @leaf
-def solve(model):
+def _solve_step(model):
     """Solve for the step (6,), m and rad about the tool's centre, and its contact set."""
     for axis in range(6):
         model.step[axis] = 0.0
@@ -142,6 +135,7 @@ def solve(model):
                 if row[6] > 0.0:
                     _add_hollow(model, n)
         factor(model)
+        solve(model)
         if not _predict(model):
             return
 
@@ -160,17 +154,6 @@ def _take_step(model):
     return way_of_step(model, model.radius, 1.0)
 
 
-@leaf
-def _way_of_hand(model, hand, rx, ry, rz):
-    """Way that no point of the tool in the hand has exceeded since the proxy's pose, m."""
-    first = model.hand
-    x, y, z = hand[0] + rx - first[0], hand[1] + ry - first[1], hand[2] + rz - first[2]
-    a, b, c = turn_of(
-        *product(hand[3], hand[4], hand[5], hand[6], first[3], -first[4], -first[5], -first[6])
-    )
-    return math.sqrt(x * x + y * y + z * z) + model.radius * math.sqrt(a * a + b * b + c * c)
-
-
 @entry(record_of(CONTACT_MODEL), FLOATS, FLOATS)
 def evaluate(model_record, hand, result):
     """Evaluate a proxy with the handle at (7,), into result (RESULTS,).
@@ -181,22 +164,23 @@ def evaluate(model_record, hand, result):
     """
     model = model_record[()]
     center = model.center
-    rx, ry, rz = turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
+    lever = turned_by(hand[3], hand[4], hand[5], hand[6], center[0], center[1], center[2])
     for axis in range(3):
         model.position[axis] = model.tool[axis]
     for part in range(4):
         model.quaternion[part] = model.tool[3 + part]
     for n in range(RESULTS):
         result[n] = 0.0
-    result[WAY] = _way_of_hand(model, hand, rx, ry, rz)
+    pull_to(model.step, hand, lever, model.hand, model.hand[3:])
+    result[WAY] = way_of_step(model, model.radius, 1.0)
     if model.n_planes == 0:
         return
     for n in range(model.n_planes):
         model.is_active[n] = 0
     for _ in range(STEPS):
-        measure_pull(model, hand, rx, ry, rz)
+        measure_pull(model, hand, lever)
         _place_contacts(model)
-        solve(model)
+        _solve_step(model)
         if _take_step(model) < SETTLED:
             break
     count = 0
@@ -204,9 +188,9 @@ def evaluate(model_record, hand, result):
         count += model.is_active[n]
     if count == 0:
         return
-    measure_pull(model, hand, rx, ry, rz)
+    measure_pull(model, hand, lever)
     x, y, z, a, b, c = wrench_of(model, model.cap, model.turn_cap)
-    mx, my, mz = moment(rx, ry, rz, x, y, z)
+    mx, my, mz = moment(*lever, x, y, z)
     result[WRENCH], result[WRENCH + 1], result[WRENCH + 2] = x, y, z
     result[WRENCH + 3], result[WRENCH + 4], result[WRENCH + 5] = a + mx, b + my, c + mz
     result[ACTIVE] = count

@@ -27,7 +27,7 @@ from hapticdb.kernels.hand.device_spring import (
 )
 from hapticdb.kernels.hand.holding import IS_CUT, IS_HELD
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE
-from hapticdb.kernels.hand.step import add_row, factor
+from hapticdb.kernels.hand.step import add_row, factor, solve
 from hapticdb.kernels.proxy.planes import (
     ALONG,
     BEND,
@@ -133,28 +133,21 @@ def _add_contacts(model, rows, count):
 
 @leaf
 def _write_stiffness(model, rows, count):
-    """Write K6 into model.stiffness, from the rows in contact and the springs."""
-    for row in range(6):
-        for column in range(6):
-            model.stiffness[row, column] = 0.0
+    """Write K6 into model.stiffness, which is zero, from the rows in contact and the springs."""
     _add_spring(model, 0, model.spring, model.cap)
     _add_spring(model, 3, model.turn_spring, model.turn_cap)
-    spring, series = model.rows, model.series
+    spring = model.rows
     for row in range(6):
         for column in range(6):
             spring[row, column] = model.stiffness[row, column]
             model.matrix[row, column] = spring[row, column]
         model.matrix[row, row] += 1e-9 * (model.spring if row < 3 else model.turn_spring)
     _add_contacts(model, rows, count)
-    for row in range(6):
-        for column in range(6):
-            series[row, column] = model.matrix[row, column]
+    factor(model)
     for column in range(6):
         for row in range(6):
             model.right[row] = spring[row, column]
-            for other in range(6):
-                model.matrix[row, other] = series[row, other]
-        factor(model)
+        solve(model)
         for row in range(6):
             total = spring[row, column]
             for other in range(6):

@@ -78,7 +78,7 @@ def find_rows(cells, which, shell, place, tool, follower, field, rows):
     payload = cells.payload
     transform = transform_of(tool.pose)
     cx, cy, cz = moved(transform, shell.center[0], shell.center[1], shell.center[2])
-    size, side, points, run = place.size, place.side, shell.points, shell.run
+    size, points, run = place.size, shell.points, shell.run
     count, trust, merged = 0, 1e30, max(follower.merged, 1)
     for start in range(0, points.shape[0], run):
         bound = field[RUN_DUE, start // run] - follower.travelled + FAR
@@ -87,9 +87,8 @@ def find_rows(cells, which, shell, place, tool, follower, field, rows):
             continue
         for n in range(start, min(start + run, points.shape[0])):
             px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
-            x, dx = clamped_into((px - place.x) / size, side)
-            y, dy = clamped_into((py - place.y) / size, side)
-            z, dz = clamped_into((pz - place.z) / size, side)
+            at = clamped_into(place, px, py, pz)
+            x, y, z, dx, dy, dz = at
             i, j, k = np.int64(x), np.int64(y), np.int64(z)
             slot = slot_of(keys, slots, which, cell_key(i, j, k))
             if slot < 0:
@@ -97,11 +96,11 @@ def find_rows(cells, which, shell, place, tool, follower, field, rows):
                 continue
             mask = masks[slot]
             if n & (merged - 1):
-                bound = bound_at(payload, slot, mask, x, y, z, dx, dy, dz)
+                bound = bound_at(payload, slot, mask, at)
                 if bound >= LEAST_BOUND:
                     trust = min(trust, bound - LEAST_BOUND)
                     continue
-            u, gx, gy, gz, bound = distance_at(payload, slot, mask, x, y, z, dx, dy, dz)
+            u, gx, gy, gz, bound = distance_at(payload, slot, mask, at)
             length = math.sqrt(gx * gx + gy * gy + gz * gz)
             if u >= REACH or length < 0.5:
                 trust = min(trust, max(bound, min(u, HALF_WIDTH)) - ONSET)

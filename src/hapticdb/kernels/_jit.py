@@ -21,7 +21,7 @@ from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
-from hapticdb.kernels._linking import EntryCompiler, compile_once
+from hapticdb.kernels._linking import EntryCompiler, compile_once, note_nothing
 
 INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -57,6 +57,7 @@ if IN_WORKER in os.environ:
     _ENTRY_OPTIONS |= {"pipeline_class": EntryCompiler}
     _LEAF_OPTIONS |= {"no_cpython_wrapper": True}
     compile_once()
+    note_nothing()
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped

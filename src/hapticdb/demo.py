@@ -131,7 +131,7 @@ def prepare(
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    make_ready("import", "touch")
+    make_ready("demo")
     shell = PointShell.from_file(files.wrench, points)
     imported = []
     first = beside(home / "demo", "car") if url is None else beside(url, f"{name_of(url)}_demo_car")

@@ -128,7 +128,7 @@ FEEL = "feel a.db --tool s/wrench.stl --device s/path.csv --seconds 0.5 --record
 VERBS: tuple[tuple[str, str], ...] = (
     ("", "sample s --frames 20"),
     ("import", "import a.db s/car.glb --bits 7"),
-    ("touch", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
+    ("shell,touch by distance", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
     ("feel,coupling", FEEL),
     ("frames by distance", "replay a.hdbrec a.db"),
     ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),

@@ -132,6 +132,7 @@ def pieces_of_points(
     points: NDArray[np.float64], bits: int
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
     """Bricks of the voxels that hold points, as `voxelize.voxelize_pieces` yields them."""
+    make_ready("points")
     end = max(len(points), 1)
     for first in range(0, end, POINTS_AT_ONCE):
         some = points[first : first + POINTS_AT_ONCE]

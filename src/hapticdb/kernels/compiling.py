@@ -68,13 +68,13 @@ _SHELL = ("surfaces.sampling.*", "surfaces.sides.*", "curves.encode_kernel")
 _VOXELIZE = (
     "surfaces.voxelize.*",
     "surfaces.distances.*",
-    "surfaces.bricks.mark_points_kernel",
     "curves.encode_kernel",
     "field.packing.pack_kernel",
 )
 _RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel")
+_LOCATE = "query.contact.locate_kernel"
 _COST = (
-    "query.contact.locate_kernel",
+    _LOCATE,
     "query.contact.spans_of_keys",
     "query.refining.wrench_of_addresses",
     "query.grouping.gap_rows",
@@ -92,11 +92,27 @@ _RESIDENT = (
 _FRAMES = "resident.budget.feel_kernel"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
-    "move": (*_VOXELIZE, *_RANGES),
+    "points": ("surfaces.bricks.mark_points_kernel",),
+    "move": (*_VOXELIZE, *_RANGES, "surfaces.bricks.mark_points_kernel"),
+    "demo": (
+        *_VOXELIZE,
+        *_SHELL,
+        *_COST,
+        "query.refining.refine_kernel",
+        "query.refining.pairs_of_points",
+    ),
     "copy": ("surfaces.bricks.*", "curves.*", "query.grouping.gap_rows", *_RANGES),
     "shell": _SHELL,
     "calibrate": _COST,
-    "touch": (*_SHELL, *_COST, "query.contact.*", "query.refining.*"),
+    "touch": (_LOCATE, "query.refining.refine_kernel"),
+    "touch by distance": (
+        _LOCATE,
+        "query.refining.refine_kernel@distances",
+        "query.refining.unpack_asked_kernel",
+    ),
+    "pairs": ("query.refining.pairs_of_points",),
+    "pairs by distance": ("query.refining.pairs_of_points@distances",),
+    "statement": (_LOCATE, "query.refining.wrench_of_addresses"),
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "hand.handle.*", "motion.*", "rigid.*"),
     "coupling": ("period.loop.*",),

@@ -16,7 +16,8 @@ from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
-from hapticdb.query.law import PLANE, ForceLaw, TangentPlane
+from hapticdb.query.law import PLANE, ForceLaw, TangentPlane, frames_by
+from hapticdb.ready import make_ready
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
 from hapticdb.store.parsing import damaged
 
@@ -122,6 +123,7 @@ class HapticQuery:
         law: ForceLaw = TangentPlane(),  # noqa: B008 - frozen, and a frame counts microseconds
     ) -> Answer:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        make_ready("statement" if strategy == "statement" else frames_by(law, "touch"))
         started = time.perf_counter_ns()
         if strategy not in STRATEGIES:
             raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
@@ -194,6 +196,7 @@ class HapticQuery:
         points: NDArray[np.int64],
     ) -> NDArray[np.int64]:
         """Every (point, object) pair (P, 2) of points of a frame: of its hits under the plane."""
+        make_ready(frames_by(law, "pairs"))
         reads = laws.reads_distances(law.for_kernels)
         payload = self._distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
@@ -212,6 +215,7 @@ class HapticQuery:
 
         Such a statement is counted in the first pose's answer only.
         """
+        make_ready(frames_by(law, "touch"))
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
         for pose in poses:
@@ -257,6 +261,7 @@ class HapticQuery:
 
     def _figures(self, *, distances: bool) -> "tuple[QuantileVector, CostModel]":
         """Quantile vector, and the cost model of rows with their distances or without."""
+        make_ready("calibrate")
         quantiles, costs = self._quantiles_and_costs()
         return quantiles, costs.with_distances if distances else costs
 
@@ -271,6 +276,7 @@ class HapticQuery:
             return ("points", len(keys), len(keys), len(rows)), rows
         ranges: Ranges | None = None
         if strategy == "maxgap":
+            make_ready("calibrate")
             first, last = contact.spans_of_keys(asked, keys, self._grid)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":

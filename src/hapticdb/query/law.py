@@ -134,6 +134,6 @@ def is_smooth(law: ForceLaw | LawName) -> bool:
     return law == SMOOTH.name or isinstance(law, DistanceField)
 
 
-def frames_by(law: ForceLaw | LawName) -> str:
-    """Purpose (`kernels.compiling.PURPOSES`) of frames of a law over resident cells."""
-    return "frames by distance" if is_smooth(law) else "frames"
+def frames_by(law: ForceLaw | LawName, what: str = "frames") -> str:
+    """Purpose (`kernels.compiling.PURPOSES`) of what a law does: frames over resident cells."""
+    return f"{what} by distance" if is_smooth(law) else what

@@ -9,7 +9,6 @@ from hapticdb.query.frame import Answer, HapticQuery, Strategy
 from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.query.touches import Touch
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Store
 from hapticdb.store.filtering import Filter
 
@@ -59,7 +58,6 @@ class Touching:
         law: ForceLaw | None,
     ) -> Touch:
         """Compute one frame."""
-        make_ready("touch")
         try:
             answer = self._answer(shell, pose, strategy, maxgap, felt, law)
         except ConnectionLostError:

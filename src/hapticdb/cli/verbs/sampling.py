@@ -78,7 +78,7 @@ def demo(
     from hapticdb.pictures.demo import draw
     from hapticdb.store.connect import redact
 
-    render.compile_kernels("import", "touch")
+    render.compile_kernels("demo")
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
         scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)

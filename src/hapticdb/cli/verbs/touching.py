@@ -140,7 +140,7 @@ def touch(
         name: LawName = law or ("smooth" if env.has_distances else "plane")
         chosen: ForceLaw = smooth if name == "smooth" else plane
         felt = felt_objects(env, where, exclude)
-        render.compile_kernels("shell", "touch" if out is None else frames_by(name), files=[tool])
+        render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
         fit = fitting.compare(

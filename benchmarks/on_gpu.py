@@ -3,17 +3,18 @@
     python benchmarks/on_gpu.py --prepare FOLDER    # anywhere: a scene, a tool and poses
     python benchmarks/on_gpu.py --scene FOLDER      # where a GPU is: results/gpu.json
 
-It checks first that both feel the same: equal counts, sums within 1e-12, and each answer repeated
-bit for bit. Then it times frames, pose in and wrench out, of 300 to 10^7 points, and poses a second
-of 300 points that are far from everything, within a few voxels, or touching. Cells are resident.
-Last come sessions of `feel`: a hand that comes to what it touches, its looks on either side.
+It tells how far both are apart, and whether each answer repeats bit for bit. It times frames, pose
+in and wrench out, of 300 to 10^7 points, and poses a second of 300 points that are far from
+everything, within a few voxels, or touching; all cells are resident. Last come sessions of `feel`:
+a hand that comes to what it touches, its looks on either side.
 """
 
 import argparse
 import os
 import time
-from importlib.metadata import version
-from importlib.util import find_spec
+from collections.abc import Callable
+from functools import partial
+from importlib.metadata import distributions
 from pathlib import Path
 from typing import Any
 
@@ -51,14 +52,15 @@ BATCH = 1_000_000
 """Poses of a batch on the GPU; the processors get `MOST_POSES`."""
 TABLE = 2 << 30
 """Bytes for cells."""
-BOUND = 1e-12
-"""Largest difference of the sums, relative to the largest of all poses."""
 PACKAGES = ("numpy", "numba", "numba-cuda")
 REPEATS = 1000
 """Frames whose times are sorted."""
-SEARCHES = ("resident.first_hits.find_first_hits", "resident.cell_table.cells_met")
+SEARCHES = tuple(
+    f"resident.{one}"
+    for one in ("first_hits.find_first_hits", "nearest.find_nearest", "cell_table.cells_met")
+)
 PATIENCE = 5.0
-"""Seconds of the processors' frames of one shell, at most about."""
+"""Seconds of the frames of one shell on one side, at most about."""
 
 
 def prepare(folder: Path, bits: int, most: int) -> None:
@@ -132,6 +134,17 @@ def compared(feeler: Feeler, gpu: GpuFrames, poses: Floats) -> dict[str, Any]:
     }
 
 
+def seconds_of(feel: Callable[[Floats], object], poses: Floats, repeats: int) -> list[float]:
+    """Seconds of one frame after another, for `PATIENCE` at most about."""
+    times: list[float] = []
+    while sum(times) < PATIENCE and len(times) < repeats:
+        one = poses[len(times) % len(poses)]
+        began = time.perf_counter()
+        feel(one)
+        times.append(time.perf_counter() - began)
+    return times
+
+
 def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
     """Check frames of one shell, and time them one by one on both."""
     gpu = feeler._gpu  # noqa: SLF001 - measured
@@ -140,19 +153,8 @@ def frames_of(feeler: Feeler, poses: Floats, repeats: int) -> dict[str, Any]:
     feeler.touch(poses)  # fetches the cells
     some = poses[: max(2, min(len(poses), 10_000_000 // n_points))]
     equality = compared(feeler, gpu, some)
-    equality["one_by_one"] = bool((results_of(gpu, some) == [gpu.feel(one) for one in some]).all())
-    times: list[float] = []
-    for n in range(repeats):
-        one = poses[n % len(poses)]
-        began = time.perf_counter()
-        gpu.feel(one)
-        times.append(time.perf_counter() - began)
-    cpu: list[float] = []
-    while sum(cpu) < PATIENCE and len(cpu) < repeats:
-        one = poses[len(cpu) % len(poses)][None]
-        began = time.perf_counter()
-        on_processor(feeler, one)
-        cpu.append(time.perf_counter() - began)
+    times = seconds_of(gpu.feel, poses, repeats)
+    cpu = seconds_of(lambda one: on_processor(feeler, one[None]), poses, repeats)
     found = {"points": n_points, "equal": equality, "gpu": percentiles(times)}
     return found | {"one_processor": percentiles(cpu)}
 
@@ -236,15 +238,10 @@ def by_triangles(
     found: dict[str, Any] = {"triangles": len(triangles)}
     for reach in (2.5, 32.0):
         for situation, poses in situations.items():
-            many = np.resize(poses, (batch, 4, 4))
-            times = []
-            for _ in range(3):
-                began = time.perf_counter()
-                mesh.distances(many, reach * env.grid.voxel_size)
-                times.append(time.perf_counter() - began)
-            found[f"{situation}_within_{reach:g}_voxels_poses_per_s"] = batch / float(
-                np.median(times)
-            )
+            many = np.resize(poses, (1, batch, 4, 4))
+            ask = partial(mesh.distances, reach=reach * env.grid.voxel_size)
+            rate = batch / float(np.median(seconds_of(ask, many, 3)))
+            found[f"{situation}_within_{reach:g}_voxels_poses_per_s"] = rate
     return found
 
 
@@ -252,11 +249,7 @@ def measure(
     folder: Path, sizes: tuple[int, ...], batch: int, repeats: int, *, quick: bool = False
 ) -> dict[str, Any]:
     """Measure all; results as records for JSON."""
-    began = time.perf_counter()
-    compile_missing(
-        [*entries_for("frames", "frames by distance"), "resident.nearest.find_nearest", *SEARCHES]
-    )
-    print(f"compiled after {time.perf_counter() - began:.0f} s", flush=True)
+    compile_missing([*entries_for("frames", "frames by distance"), *SEARCHES])
     few, many = PointShell.load(folder / "few.npz"), PointShell.load(folder / "many.npz")
     situations = dict(np.load(folder / "poses.npz"))
     frames, batches, hands = [], [], []
@@ -271,7 +264,6 @@ def measure(
                 batches.append(found | clearance_of(on_gpu, on_cpu, poses))
                 print(batches[-1], flush=True)
         triangles = by_triangles(env, few, situations, min(batch, 200_000))
-        print(triangles, flush=True)
         voxel = env.grid.voxel_size
         for n_points in sizes:
             shell = few if n_points == len(few) else larger(many, n_points, 0.3 * voxel)
@@ -284,11 +276,7 @@ def measure(
     about = {
         "card": name.decode() if isinstance(name, bytes) else str(name),
         "machine": records.machine(),
-        "versions": {
-            package: version(package)
-            for package in PACKAGES
-            if find_spec(package.replace("-", "_"))
-        },
+        "versions": {one.name: one.version for one in distributions() if one.name in PACKAGES},
         "memory_for_cells": TABLE,
     }
     return about | {"frames": frames, "hands": hands, "batches": batches, "warp": triangles}

@@ -84,6 +84,29 @@ def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Pa
     assert [obj.id for obj in env.objects()] == [ids[0], *ids[3:]]
 
 
+def test_a_list_that_failed_is_read_again(
+    env: Environment, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    wanted = env.objects()
+    env.remove(wanted[0].id)
+
+    def failing(*_: object) -> None:
+        raise KeyboardInterrupt
+
+    with hapticdb.open(tmp_path / "e.db") as other, monkeypatch.context() as patch:
+        patch.setattr(other.store, "objects", failing)
+        with pytest.raises(KeyboardInterrupt):
+            other.objects()
+        patch.undo()
+        assert [obj.id for obj in other.objects()] == [obj.id for obj in wanted[1:]]
+        env.remove(wanted[1].id)
+        patch.setattr(other.store, "object", failing)
+        with pytest.raises(KeyboardInterrupt):
+            other.objects()
+        patch.undo()
+        assert [obj.id for obj in other.objects()] == [obj.id for obj in wanted[2:]]
+
+
 @pytest.mark.usefixtures("without_child")
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_a_moved_object_is_as_if_imported_there(

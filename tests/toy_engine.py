@@ -353,6 +353,7 @@ class MemoryStore:
                 old = held.get(row[:2], row)
                 if row.revision >= old.revision:
                     held[row[:2]] = row._replace(because=old.because, shapes=old.shapes)
+            held[MARK] = marked._replace(at_least=len(held) - 1.0)
             self._keep(held)
             return mark
 

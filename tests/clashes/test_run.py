@@ -248,6 +248,22 @@ def test_what_another_writes_meanwhile_is_looked_at(path: Path) -> None:
         assert full_findings(env) == kept
 
 
+@pytest.mark.parametrize(
+    "statement",
+    [
+        "DELETE FROM pair WHERE (a, b) = (2, 3)",
+        "UPDATE pair SET kind = 'far', setting = 'of an older program' WHERE (a, b) = (2, 3)",
+    ],
+)
+def test_what_knows_of_no_mark_may_write(path: Path, statement: str) -> None:
+    with hapticdb.open(path) as env:
+        find_clashes(env)
+    with closing(sqlite3.connect(path)) as connection, connection:
+        connection.execute(statement)
+    with hapticdb.open(path) as env:
+        assert {one[:2] for one in find_clashes(env).pairs} == {(1, 2), (2, 3), (3, 4)}
+
+
 def on_server(place: Place, path: Path) -> str:
     """The environment on a server."""
     url = place()

@@ -40,44 +40,54 @@ class KnownObjects:
         self.own_law: ForceLaw = PLANE
         self.version: int | None = None
         self._unfelt: dict[Filter, Unfelt] = {}
-        self._revision = -1
         self._last: Change | None = None
 
     def learn(self) -> bool:
         """List the objects if the snapshot's revision is new; returns whether it is new."""
-        revision = self._store.revision()  # `version` then tells of this snapshot
-        if (self._store.version(), revision) == (self.version, self._revision):
+        self._store.revision()  # `version` then tells of this snapshot
+        if self._store.version() == self.version:
             return False
-        self._list()
-        self.version, self._revision = self._store.version(), revision
+        self.learn_newest()
         return True
+
+    def learn_newest(self) -> None:
+        """List the objects as they are now, whatever was known."""
+        self._store.revision()
+        version = self._store.version()  # before they are read: another may write meanwhile
+        self._list()
+        self.version = version
 
     def _list(self) -> None:
         """Read the objects that were written since the last time; all if that is not known."""
-        log = self._writes_since()
+        log, last = self._writes_since()
+        if log == []:
+            return
         if log is None:
             self.by_id = {obj.id: obj for obj in self._store.objects()}
-        elif log:
+        else:
             found = self.by_id.copy()
             for object_id in {change.id for change in log}:
                 found.pop(object_id, None)
                 with contextlib.suppress(ObjectNotFoundError):
                     found[object_id] = self._store.object(object_id)
             self.by_id = dict(sorted(found.items()))
+        self._last = last  # only now, since a read may fail
         self._unfelt = {}
         objects = self.by_id.values()
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
         self.own_law = SMOOTH if self.have_distances else PLANE
 
-    def _writes_since(self) -> list[Change] | None:
-        """Writes since the last listing; None for too many, or if the log is another one by now."""
+    def _writes_since(self) -> tuple[list[Change] | None, Change | None]:
+        """Writes since the last listing, and the last of all.
+
+        None for too many, or if the log is another one by now.
+        """
         revision, known = self._store.revision(), self._last
         is_near = known is not None and 0 <= revision - known.revision <= MOST_READ
         first = known.revision if known is not None and is_near else revision
         log = list(self._store.changes(first - 1))
-        self._last = log[-1] if log else None
         is_same = known is not None and bool(log) and _are_equal(log[0], known)
-        return log[1:] if is_same else None
+        return (log[1:] if is_same else None), (log[-1] if log else None)
 
     def forget(self) -> None:
         """Make the next frame list the objects again."""

@@ -152,6 +152,8 @@ class PageKeeper:
 
     async def answers(self) -> bool:
         """Whether the page answers now."""
+        if not self.is_ready:
+            return False
         self._has_answered.clear()
         self.tell("ping")
         try:

@@ -24,6 +24,8 @@ INSERT INTO pair ({COLUMNS}) {{values}}
        revision = excluded.revision, setting = excluded.setting
  WHERE excluded.revision >= pair.revision"""
 """Writes rows, given as each engine gives values."""
+COUNT = "UPDATE pair SET at_least = (SELECT count(*) - 1 FROM pair) WHERE (a, b) = (%s, %s)"
+"""Notes in the mark's row how many other rows there are."""
 HELD = "SELECT setting, revision FROM pair WHERE (a, b) = (%s, %s)"
 MARK = (0, 1)
 """Key of the row that is no pair but the mark. No object has the id 0."""
@@ -98,6 +100,16 @@ class KeptPairs:
         row = checked(rows[0]) if has_mark else None
         self.mark = Mark() if row is None else Mark(row.setting, row.revision)
         self.rows, self._checked = rows[has_mark:], checked
+        self._n_marked = 0 if row is None else row.at_least
+
+    def fit(self, setting: str) -> bool:
+        """Whether rows are as the mark's writer left them: so many, of that setting or accepted.
+
+        Programs that know of no mark, and people, write without changing it.
+        """
+        return self._n_marked == len(self.rows) and all(
+            row[-3] == setting or row[-2] is not None for row in self.rows
+        )
 
     def __iter__(self) -> Iterator[PairRow]:
         return map(self._checked, self.rows)

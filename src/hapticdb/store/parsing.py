@@ -324,6 +324,7 @@ def _doubles(stored: object, count: int) -> Floats | None:
         found = np.frombuffer(stored, dtype="<f8")
     elif isinstance(stored, list) and all(_is_finite(value) for value in stored):
         found = np.array(stored, dtype=np.float64)
+        found.flags.writeable = False  # of an object that many share
     else:
         return None
     return found if len(found) == count and np.isfinite(found).all() else None

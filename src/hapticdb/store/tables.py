@@ -29,6 +29,7 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.pairs import (
     ALL,
+    COUNT,
     HELD,
     MARK,
     Ids,
@@ -315,6 +316,7 @@ class Tables(ABC):
         def work() -> MaybeMark:
             mark, row = Mark.after(self._do(HELD, MARK), was, now)
             self._exchange_pairs([*gone, MARK], [*rows, row])
+            self._do(COUNT, MARK)
             return mark
 
         if not self.has_table(parsing.PAIR):

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
-from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.kernels.triangles.nearest import nearest, own_gap, own_slack
 from hapticdb.kernels.triangles.piercing import piercing
 
 Floats = NDArray[np.float64]
@@ -121,6 +121,29 @@ def test_two_trees_are_as_near_as_their_nearest_triangles() -> None:
         limited = nearest(mine, other, pose[None], np.array([0.5 * at_least]))
         assert limited.at_least[0] == 0.5 * at_least
         assert limited.pairs[0].tolist() == [-1, -1]
+
+
+def test_boxes_are_not_told_farther_apart_along_the_axes_of_the_turned_one() -> None:
+    rng = np.random.default_rng(12)
+    grid = np.stack(np.meshgrid(*3 * [np.linspace(0.0, 1.0, 7)]), axis=-1).reshape(-1, 3)
+    n_apart = 0
+    for n in range(300):
+        low = rng.uniform(-1.0, 1.0, (2, 3))
+        boxes = np.stack([low, low + rng.uniform(0.0, 0.5, (2, 3))], axis=1)
+        pose = np.eye(4)
+        pose[:3, :3] = Rotation.random(rng=rng).as_matrix()
+        if n % 2:  # no exact rotation
+            pose[:3, :3] @= np.eye(3) + rng.uniform(-1e-7, 1e-7, (3, 3))
+        pose[:3, 3] = rng.uniform(-1.0, 1.0, 3)
+        mine, other = (box[0] + grid * (box[1] - box[0]) for box in boxes)
+        other = other @ pose[:3, :3].T + pose[:3, 3]
+        samples = np.linalg.norm(mine[:, None] - other, axis=2)
+        told = own_gap(boxes[:1], 0, boxes[1:], 0, pose, own_slack(pose, 5.0)) ** 0.5
+        assert told <= samples.min()
+        n_apart += told > 0.0
+    assert n_apart > 100
+    assert own_slack(np.eye(4), 5.0) == np.inf  # not turned
+    assert own_slack(pose @ np.diag([2.0, 1.0, 1.0, 1.0]), 5.0) == np.inf  # stretched
 
 
 def test_an_edge_goes_through_faces_and_their_common_edges() -> None:

@@ -274,6 +274,24 @@ def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
     assert not file.notes
 
 
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-32", "iso-8859-1"])
+def test_a_collada_file_is_read_in_the_encoding_that_it_declares(
+    tmp_path: Path, encoding: str
+) -> None:
+    path = tmp_path / "a.dae"
+    declared = encoding.removesuffix("-be")
+    content = COLLADA.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
+    path.write_bytes(content.encode(encoding))
+    assert len(parse_in_process(path).parts[0].triangles()) == 4
+
+
+def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path) -> None:
+    path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', 'meter="0,01"'))
+    assert not parse_in_process(path).names_unit
+    path = text(tmp_path / "b.dae", COLLADA.replace('<unit meter="0.01"/>', '<unit name="m"/>'))
+    assert parse_in_process(path).names_unit
+
+
 def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
     strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
     spline = "<geometry id='s'><spline/></geometry></library_geometries>"

@@ -35,8 +35,12 @@ _INSTANCES = ("instance_geometry", "instance_controller", "instance_node")
 
 def read(path: Path) -> Parsed:
     """Parts of the document's scene, in its unit and with its axes."""
+    content = path.read_bytes()
+    plain = recoded(content)
+    # What was recoded still declares the encoding that it had.
+    parser = ET.XMLParser(encoding=None if plain is content else "utf-8")  # noqa: S314 - expat stops entities that multiply
     try:
-        root = ET.fromstring(recoded(path.read_bytes()))  # noqa: S314 - expat stops entities that multiply
+        root = ET.fromstring(plain, parser)  # noqa: S314
     except ET.ParseError as error:
         raise UnreadableError(f"its XML is damaged or cut short: {error}") from None
     if not root.tag.endswith("COLLADA"):
@@ -57,14 +61,23 @@ def read(path: Path) -> Parsed:
             name = "/".join(filter(None, (node.name for node in nodes)))
             name = name or str(geometry.name or geometry.id)
             placements.append(Placement(name, shapes[key], world_from_node))
-    unit = document.assetInfo.unitmeter if document.assetInfo is not None else None
     return Parsed(
         [_shape(geometry, palette) for geometry, palette in geometries],
         placements,
-        metres=1.0 if unit is None else float(unit),
+        metres=_metres(root),
         up=_UP_AXES.get(str(getattr(document.assetInfo, "upaxis", None))),
         notes=[*left_out, *_notes(root, document)],
     )
+
+
+def _metres(root: ET.Element) -> float | None:
+    """Length of the document's unit, 1 m if it names none; None if what it names is no number."""
+    asset = next((child for child in root if _tag(child) == "asset"), ())
+    unit = next((child.get("meter", "1") for child in asset if _tag(child) == "unit"), "1")
+    try:
+        return float(unit)
+    except ValueError:
+        return None
 
 
 def _tag(element: ET.Element) -> str:

@@ -405,9 +405,15 @@ def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path
         other = archive.read("3D/3dmodel.model")
     with zipfile.ZipFile(path, "a") as archive:
         archive.writestr("3D/Other.model", other)
+        archive.writestr("3D/My%20Other.model", other)
         archive.writestr("backup/3D/3dmodel.model", "no XML")
     assert names(parse_in_process(path)) == ["new"]
-    for target in ("/3D/Other.model", "3D/Other.model", "3D/%4Fther.model"):
+    for target in (
+        "/3D/Other.model",
+        "3D/%4Fther.model",
+        "./3D/Other.model",
+        "3D/My%20Other.model",
+    ):
         named = tmp_path / "named.3mf"
         shutil.copy(path, named)
         with zipfile.ZipFile(named, "a") as archive:

@@ -5,6 +5,7 @@ nested assemblies lose instances, and keeps one of two build items of the same p
 """
 
 import array
+import posixpath
 import re
 import zipfile
 from collections import Counter, defaultdict
@@ -121,12 +122,17 @@ def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
     except ET.ParseError:
         return usual
     targets = [one.get("Target", "") for one in links if one.get("Type", "").endswith("/3dmodel")]
-    return unquote(targets[0]).lower().strip("/") if targets else usual
+    return _member(targets[0]) if targets else usual
+
+
+def _member(name: str) -> str:
+    """One spelling of a member: programs escape names, and mix their letters, on either side."""
+    return posixpath.normpath(unquote(name)).lower().strip("/")
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
     """Root model, and the models that hold its components."""
-    members = {name.lower().strip("/"): name for name in archive.namelist()}
+    members = {_member(name): name for name in archive.namelist()}
     root = _root(archive, members)
     if root not in members:
         raise UnreadableError(f"it is no 3MF file: no {root} in it")
@@ -240,7 +246,7 @@ def _index(word: str) -> int:
 def _link(attributes: dict[str, str], member: str) -> Link:
     """Object that a component or build item places, and its transform."""
     file = next((v for k, v in attributes.items() if k.endswith(" path")), member)
-    key = (file.lower().strip("/"), attributes["objectid"])
+    key = (_member(file), attributes["objectid"])
     transform = np.eye(4)
     words = attributes.get("transform")
     if words is not None:

@@ -122,6 +122,8 @@ def test_the_clearance_of_a_point_above_a_floor_is_its_height(tmp_path: Path) ->
         assert found.at_least is not None
         assert np.allclose(found.at_least, np.clip(heights - 0.001, 0.0, 0.039), atol=1e-12)
         assert env.clearance(cloud(3), poses).at_least is None
+        poses[:, :3, 3] = np.ldexp(1.0, 70) * np.array([[1.0, 0.0, -1.0]] * 6)
+        assert env.clearance(shell, poses, 0.04).distances.tolist() == [0.04] * 6
 
 
 def test_nothing_is_within_reach_of_an_empty_environment(tmp_path: Path) -> None:

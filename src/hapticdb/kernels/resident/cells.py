@@ -172,13 +172,14 @@ def cell_key(i, j, k):
 def cells_of_box(x, y, z, reach, side):
     """First and last cell on each axis, i, j, k, of the part of a cube that is in the grid.
 
-    (x, y, z), reach: the cube's centre and half its side, voxels.
+    (x, y, z), reach: the cube's centre and half its side, voxels. However far it is from the grid,
+    no first cell is beyond it: no integer holds the largest coordinates.
     """
     top = side - 1.0
     return (
-        np.int64(max(x - reach, 0.0)) >> 5, np.int64(min(x + reach, top)) >> 5,
-        np.int64(max(y - reach, 0.0)) >> 5, np.int64(min(y + reach, top)) >> 5,
-        np.int64(max(z - reach, 0.0)) >> 5, np.int64(min(z + reach, top)) >> 5,
+        np.int64(min(max(x - reach, 0.0), side)) >> 5, np.int64(min(x + reach, top)) >> 5,
+        np.int64(min(max(y - reach, 0.0), side)) >> 5, np.int64(min(y + reach, top)) >> 5,
+        np.int64(min(max(z - reach, 0.0), side)) >> 5, np.int64(min(z + reach, top)) >> 5,
     )  # fmt: skip
 
 

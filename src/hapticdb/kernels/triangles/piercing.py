@@ -11,9 +11,10 @@ from hapticdb.kernels.triangles.pairs import edge_goes_through
 BESIDE = 1e-9
 """Share of a triangle's height by which an edge may pass beside it and still goes through. Without
 it, rounding lets an edge slip between two triangles."""
-ASIDE = 4.0 * BESIDE
+ASIDE = 8.0 * BESIDE
 """Greatest distance of a place on an edge from the triangle that the edge goes through there, as a
-share of the surface's largest coordinate: more than `BESIDE` of any height."""
+share of the surface's largest coordinate: beside a corner it is `BESIDE` of two sides, and no side
+is longer than the diagonal of a box of twice that coordinate."""
 TOGETHER = 8
 """Edges that walk through the tree together. More: fewer walks, through more boxes."""
 

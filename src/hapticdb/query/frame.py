@@ -124,6 +124,8 @@ class HapticQuery:
     ) -> Answer:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
         make_ready("statement" if strategy == "statement" else frames_by(law, "touch"))
+        if strategy in {"maxgap", "cbgroup"}:
+            make_ready("calibrate")
         started = time.perf_counter_ns()
         if strategy not in STRATEGIES:
             raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
@@ -276,7 +278,6 @@ class HapticQuery:
             return ("points", len(keys), len(keys), len(rows)), rows
         ranges: Ranges | None = None
         if strategy == "maxgap":
-            make_ready("calibrate")
             first, last = contact.spans_of_keys(asked, keys, self._grid)
             ranges = maxgap(keys, first, last, gap)
         elif strategy == "cbgroup":

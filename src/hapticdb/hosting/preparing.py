@@ -53,8 +53,9 @@ class Preparation:
                     if message.word == "done":
                         return
                     now: Compiled = message.content
-                    left = f"about {max(over - time.monotonic(), 3.0):.0f} s left"
-                    text = f"compiling what the hand needs, once: {now.done} of {now.total}, {left}"
+                    left = f", about {max(over - time.monotonic(), 3.0):.0f} s left"
+                    text = f"compiling what the hand needs, once: {now.done} of {now.total}"
+                    text += left if now.done < now.total else ""
                     loop.call_soon_threadsafe(self._tell, text)
                 elif process.wait(0.0):
                     raise HapticDBError("the process that compiles kernels ended too early")

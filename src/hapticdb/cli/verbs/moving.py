@@ -53,6 +53,8 @@ def copy(
         render.say_json(vars(report))
     else:
         render.say(_copied(report))
+        if layout == "voxel":
+            render.note("the layout voxel has no distances, so the smooth law cannot be felt there")
 
 
 def _bar(doing: str) -> "AbstractContextManager[CopyCallback | None]":

@@ -205,7 +205,8 @@ def sweep(
                 _show(told)
         finally:  # also when who reads, such as head, has enough
             if picture is not None:
-                _draw(picture, env, told, up)
+                with render.bar("drawing", "pictures", lambda *now: now):
+                    _draw(picture, env, told, up)
     if picture is not None and not json and csv != STDOUT:
         render.say(f"picture: {picture}")
     raise typer.Exit(told.code)

@@ -37,11 +37,9 @@ LOADER = re.compile(
 TITLE = "<title>Viser</title>"
 HIDING = (
     "<style>#webgl-software-rendering,[data-dock-header] .mantine-ActionIcon-root"
-    "{display:none!important}"
-    "[data-floating-window]:has(input[value*='://']){display:none!important}</style>"
+    "{display:none!important}</style>"
 )
-"""Hides viser's own settings, also those that show an address before the scene is connected, and
-its note about drawing in software."""
+"""Hides viser's own settings, and its note about drawing in software."""
 
 
 class ClientPage(NamedTuple):

@@ -77,7 +77,7 @@ def pose_numbers(record: NDArray[np.void]) -> NDArray[np.float64]:
 GRID: Layout = _record(
     [
         *((name, "<f8") for name in "xyz"),  # origin, m
-        ("size", "<f8"),  # of a voxel, m
+        ("voxel", "<f8"),  # edge, m; NumPy has a `size` of its own
         ("side", "<f8"),  # voxels on an axis
         ("bits", "<i8"),  # on an axis
         ("curve", "<i8"),  # its code

@@ -97,7 +97,7 @@ def locate_kernel(points, normals, center, pose, grid, placed, asked, keys):
         return -1
     _place_shell(points, normals, center, transform_of(pose), placed)
     place, total = grid[()], points.shape[0]
-    size, side, bits, curve, shift = place.size, place.side, place.bits, place.curve, place.shift
+    size, side, bits, curve, shift = place.voxel, place.side, place.bits, place.curve, place.shift
     capacity = 16
     while capacity < 2 * total:
         capacity *= 2

@@ -134,8 +134,8 @@ def _point_at(placed, n, place):
     """Point n of a placed shell, its normal, and the centre of its voxel: nine numbers, metres."""
     x, y, z = placed[n, 0], placed[n, 1], placed[n, 2]
     return (
-        x, y, z, placed[n, 3], placed[n, 4], placed[n, 5], center_of(x, place.x, place.size),
-        center_of(y, place.y, place.size), center_of(z, place.z, place.size),
+        x, y, z, placed[n, 3], placed[n, 4], placed[n, 5], center_of(x, place.x, place.voxel),
+        center_of(y, place.y, place.voxel), center_of(z, place.z, place.voxel),
     )  # fmt: skip
 
 
@@ -143,7 +143,7 @@ def _point_at(placed, n, place):
 def _in_grid(placed, n, place):
     """Point n of a placed shell in voxels from the grid's origin."""
     x, y, z = placed[n, 0] - place.x, placed[n, 1] - place.y, placed[n, 2] - place.z
-    return x / place.size, y / place.size, z / place.size
+    return x / place.voxel, y / place.voxel, z / place.voxel
 
 
 @inlined
@@ -216,7 +216,7 @@ def refine_kernel(
         if not is_hit and not sample <= reach(law):
             continue
         point = _point_at(placed, n, place)
-        depth, counted = respond(law, is_hit, sample, *point, place.size)
+        depth, counted = respond(law, is_hit, sample, *point, place.voxel)
         share = _share_of(law, payload, counts, first, end, at, point, sample)
         depth *= share
         weight += counted * share
@@ -230,7 +230,7 @@ def refine_kernel(
             n_apart += 1
         if depth > 0.0:
             _touch_near_rows(
-                law, payload, counts, touched, first, end, at, point, place.size, sample, is_hit
+                law, payload, counts, touched, first, end, at, point, place.voxel, sample, is_hit
             )
             sums = accumulate(sums, point, center, depth, law.stiffness)
     average_into(felt, weight, sums)
@@ -301,7 +301,7 @@ def pairs_of_points(
         sample = sample_rows(law, payload, counts, first, end, *at)
         point = _point_at(placed, n, place)
         _touch_near_rows(
-            law, payload, counts, touched, first, end, at, point, place.size, sample, is_hit
+            law, payload, counts, touched, first, end, at, point, place.voxel, sample, is_hit
         )
         for row in range(first, end):
             if touched[row]:
@@ -353,7 +353,7 @@ def wrench_of_addresses(placed, ordinals, addresses, grid, law, depths):
     that read no payload. depths (H,) takes each hit's depth, metres, 0 above its tangent plane.
     """
     place, last = grid[()], placed.shape[0] - 1
-    size = place.size
+    size = place.voxel
     center = placed[last, 0], placed[last, 1], placed[last, 2]
     sums, weight = NO_WRENCH, 0.0
     for h in range(ordinals.shape[0]):

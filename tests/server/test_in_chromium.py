@@ -20,6 +20,14 @@ INJECTED = """() => {
     return window.injected ?? null;
 }"""
 """Adds a script to the page, as a part's name with markup would."""
+WATCHING = """setInterval(() => {
+    for (const button of document.querySelectorAll("button")) {
+        if (button.textContent !== "Save Canvas") continue;
+        window.laid_out = true;
+        window.shown ||= button.checkVisibility({visibilityProperty: true});
+    }
+}, 5)"""
+"""Notes whether viser's own settings are part of the page, and whether a person sees them."""
 LONG = 30_000.0
 """Longest wait for the page, milliseconds."""
 
@@ -46,6 +54,7 @@ def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, 
 
     page.on("console", hear)
     token = next(token for token, role in TOKENS.items() if role is Role.EDITOR)
+    page.add_init_script(WATCHING)
     page.goto(f"{server.address}?token={token}", timeout=LONG)
     page.get_by_text("is a editor").wait_for(timeout=LONG)
     assert page.locator("canvas").count() >= 1
@@ -53,6 +62,7 @@ def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, 
     box.focus()
     page.keyboard.press("ArrowRight")
     page.get_by_text("slider 0.6").wait_for(timeout=LONG)
+    assert page.evaluate("[window.laid_out, window.shown]") == [True, False]
     cookies = page.context.cookies()
     assert [(c["httpOnly"], c["sameSite"]) for c in cookies] == [(True, "Strict")]
     assert complaints == []

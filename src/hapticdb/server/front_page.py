@@ -35,11 +35,18 @@ LOADER = re.compile(
     re.DOTALL,
 )
 TITLE = "<title>Viser</title>"
+SETTINGS = ".mantine-TextInput-root input[value*='://']"
+"""Viser's own settings begin with the server's address."""
 HIDING = (
-    "<style>#webgl-software-rendering,[data-dock-header] .mantine-ActionIcon-root"
-    "{display:none!important}</style>"
+    "<style>#webgl-software-rendering,"
+    ".mantine-ActionIcon-root:has(.tabler-icon-adjustments,.tabler-icon-share)"
+    f"{{display:none!important}}.mantine-Stack-root:has(>{SETTINGS}),"
+    f".mantine-Paper-root:has([aria-hidden=false]>div>.mantine-Stack-root>{SETTINGS})"
+    "{visibility:hidden!important}</style>"
 )
-"""Hides viser's own settings, and its note about drawing in software."""
+"""Hides viser's note about drawing in software, its settings and their buttons, and its panel until
+the scene's first widget takes the place of the settings. All stays laid out, because viser measures
+it."""
 
 
 class ClientPage(NamedTuple):

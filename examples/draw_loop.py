@@ -44,7 +44,7 @@ PATIENCE = 120.0
 """Seconds that each wait lasts at most."""
 STRIP = 84
 """Height of the strip with the curve, pixels."""
-NEWTONS_A_METRE = 220.0
+NEWTONS_A_METRE = 90.0
 """Force whose arrow is a metre long. Larger: shorter arrows."""
 FREE: colours.Colour = (58, 160, 92)
 CAUGHT: colours.Colour = (214, 52, 58)
@@ -112,9 +112,9 @@ def _curve(picture: Image.Image, forces: Floats, now: int, top: float) -> Image.
 
 def wrench(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
     """Pictures of the wrench that slides under the smooth law, with its force."""
-    shell = stage.env.tool(tool, points=400)
+    shell = stage.env.tool(tool)
     poses = hapticdb.read_poses(path)[FIRST:LAST]
-    felt = np.array([stage.env.touch(shell, pose).force for pose in poses])
+    felt = stage.env.touch(shell, poses=poses).forces
     forces = np.linalg.norm(felt, axis=1)
     held = tools.from_files([str(tool)], stage.env.grid.voxel_size, smooth=True)[0]
     scene = stage.client.scene
@@ -173,7 +173,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder, sync_playwright() as play:
         files = write_sample(folder)
         url = Path(folder) / "car.db"
-        hapticdb.import_files(url, [files.car], ImportOptions(grid=GridOptions(bits=9)))
+        grid = GridOptions(bits=10, extent=1.6)
+        hapticdb.import_files(url, [files.car], ImportOptions(grid=grid))
         browser = play.chromium.launch(
             executable_path="/usr/bin/chromium-headless-shell",
             args=[

@@ -59,6 +59,9 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
         assert len(repr(result)) < 200
     assert "<td>box0</td>" in touch._repr_html_()
     assert swept.verdict in swept._repr_html_()
+    most = float(np.linalg.norm(felt.forces, axis=1).max())
+    assert f"at most {most:.4g} N" in repr(felt)
+    assert f"<td>{most:.4g}</td>" in felt._repr_html_()
     assert hapticdb.plot(felt).get_xlabel() == "pose"
     assert "mm" in hapticdb.plot(touch).get_ylabel()
     assert hapticdb.plot(swept).get_title() == swept.verdict

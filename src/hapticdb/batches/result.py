@@ -1,6 +1,7 @@
 """Results of batches: an entry for each pose, in the order in which the poses were given."""
 
 from collections.abc import Mapping
+from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -60,10 +61,26 @@ class TouchBatch:
         return len(self.forces)
 
     def __repr__(self) -> str:
+        most = np.linalg.norm(self.forces, axis=1).max(initial=0.0)
         return (
             f"TouchBatch({len(self)} poses, {np.count_nonzero(self.hits)} hit, "
-            f"{np.count_nonzero(self.n_contacts)} in contact, revision {self.revision})"
+            f"{np.count_nonzero(self.n_contacts)} in contact, at most {most:.4g} N, "
+            f"revision {self.revision})"
         )
+
+    def _repr_html_(self) -> str:
+        """What the pose with the greatest of each felt, for notebooks."""
+        measures = {
+            "force, N": np.linalg.norm(self.forces, axis=1),
+            "torque, N m": np.linalg.norm(self.torques, axis=1),
+            "depth, m": self.deepest,
+        }
+        rows = "".join(
+            f"<tr><td>{name}</td><td>{values.max():.4g}</td><td>at pose {values.argmax()}</td></tr>"
+            for name, values in measures.items()
+            if len(values)
+        )
+        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
 
     @property
     def offsets(self) -> Ints:

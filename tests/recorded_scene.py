@@ -2,6 +2,7 @@
 
 # ruff: noqa: ANN401 - properties of viser's nodes
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -76,7 +77,7 @@ def drawn(shared: RecordedScene, own: RecordedScene | None = None) -> NDArray[np
         ):
             if size.any():
                 turn = Rotation.from_quat(np.roll(wxyz, -1)).as_matrix()
-                found.append((corners * size) @ turn.T + position)
+                found.append((corners * size) @ turn.T + position + props["position"])
     return np.concatenate(found)
 
 
@@ -95,25 +96,27 @@ def _moments(triangles: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([triangles.mean(axis=1), squares.reshape(-1, 9)], axis=1)
 
 
-def write_parts(folder: Path, n_balls: int = 30) -> Path:
+def write_parts(folder: Path, n_balls: int = 30, where: Sequence[float] = (0.0, 0.0, 0.0)) -> Path:
     """An environment of equal balls, one of them mirrored, boxes, and a red rod; its path."""
     scene = trimesh.Scene()
+    placed = trimesh.transformations.translation_matrix(where)
     ball = trimesh.creation.icosphere(1, 0.03)
     for n in range(n_balls):
         at = trimesh.transformations.rotation_matrix(0.3 * n, [1, 2, 3])
         at[:3, 3] = 0.1 * (n % 8), 0.1 * (n // 8), 0.0
         if n == 3:
             at[:3, :3] = at[:3, :3] @ np.diag([1.0, -1.0, 1.0])
-        scene.add_geometry(ball, f"ball-{n}", geom_name="ball", transform=at)
+        scene.add_geometry(ball, f"ball-{n}", geom_name="ball", transform=placed @ at)
     for n in range(3):
         box = trimesh.creation.box((0.2, 0.1, 0.05 + 0.01 * n))
         at = trimesh.transformations.translation_matrix([0.1, 0.2, 0.2 + 0.1 * n])
-        scene.add_geometry(box, f"frame-{n}", geom_name=f"box-{n}", transform=at)
+        scene.add_geometry(box, f"frame-{n}", geom_name=f"box-{n}", transform=placed @ at)
     rod = trimesh.creation.cylinder(0.02, 0.4, sections=24)
     rod.visual.vertex_colors = [[200, 40, 40, 255]] * len(rod.vertices)
-    scene.add_geometry(rod, "rod", geom_name="rod", transform=np.diag([1.0, 2.0, 1.0, 1.0]))
+    stretched = placed @ np.diag([1.0, 2.0, 1.0, 1.0])
+    scene.add_geometry(rod, "rod", geom_name="rod", transform=stretched)
     scene.export(folder / "parts.glb")
-    grid = hapticdb.Grid(0.01, (-0.5, -0.5, -0.5), 8)
+    grid = hapticdb.Grid(0.01, tuple(np.array(placed[:3, 3] - 0.5).tolist()), 8)
     with hapticdb.create(folder / "parts.db", grid, distances=False) as env:
         env.add(folder / "parts.glb")
     return folder / "parts.db"

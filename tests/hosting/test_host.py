@@ -10,8 +10,10 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
+import hapticdb
 from banded import write_points
 from children import child, until
 from hapticdb import Environment, PointShell
@@ -171,10 +173,23 @@ def test_a_new_coupling_is_felt(session: HostedSession) -> None:
     press([session], lambda: 0.0 < pushed(session) < 0.5 * before)
 
 
-@pytest.mark.parametrize("pose", [np.zeros((4, 4)), np.full((4, 4), np.nan), at(1e9, 0.0, 0.0)])
+@pytest.mark.parametrize("pose", [np.zeros((4, 4)), np.full((4, 4), np.nan), at(2e9, 0.0, 0.0)])
 def test_a_pose_that_is_none_is_refused(session: HostedSession, pose: Floats) -> None:
     with pytest.raises(UsageError):
         session.move(pose)
+
+
+def test_a_scene_at_survey_coordinates_is_felt(tmp_path: Path, sphere: PointShell) -> None:
+    where = np.array([515_369.0, 4_918_340.0, 2_322.0])
+    box = trimesh.creation.box((0.2, 0.2, 0.1))
+    box.vertices += where - (0.0, 0.0, 0.05)  # its top is at `where`
+    (tmp_path / "box.obj").write_text(trimesh.exchange.obj.export_obj(box, digits=9))
+    hapticdb.import_files(tmp_path / "far.db", [tmp_path / "box.obj"])
+    with SessionHost(str(tmp_path / "far.db"), rate=RATE, budget_bytes=8 << 20) as host:
+        x, y, z = where
+        session = host.begin(sphere, at(x, y, z + 0.02))
+        press([session], lambda: pushed(session) > 0.5, at(x, y, z + 0.004))
+        session.end()
 
 
 def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell) -> None:

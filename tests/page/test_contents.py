@@ -65,6 +65,14 @@ def test_boxes_come_first_and_then_every_triangle_once(shown: Shown) -> None:
     assert are_same(drawn(shown.scene), shown.of(set(shown.triangles)))
 
 
+def test_parts_at_survey_coordinates_are_drawn_in_place(tmp_path: Path) -> None:
+    """A browser has vertices and places in float32, which knows half metres there."""
+    where = np.array([515_369.0, 4_918_340.0, 2_322.0])
+    shown = Shown(write_parts(tmp_path, where=where.tolist()))
+    wanted = shown.of(set(shown.triangles)) - where
+    assert are_same(drawn(shown.scene) - where, wanted)
+
+
 def test_parts_have_the_file_s_colours_and_glass_is_seen_through(
     tmp_path: Path, path: Path
 ) -> None:

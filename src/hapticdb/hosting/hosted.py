@@ -88,7 +88,7 @@ class HostedSession:
         Raises
         ------
         UsageError
-            If the pose is no rigid transform or is beyond 1e6 m, or the session is over.
+            If the pose is no rigid transform or is beyond 1e9 m, or the session is over.
         """
         matrix = pose_at(pose)
         if not is_rigid(matrix) or np.abs(matrix[:3, 3]).max() > FARTHEST:

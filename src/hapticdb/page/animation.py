@@ -118,11 +118,11 @@ def _recorded(
     add_surroundings(server, box, axis)
     server.scene.world_axes.visible = False
     exclude |= {obj.id for found in steps for obj in found.parts}
-    facets = _standing(env, box, exclude)
+    facets, middle = _sent(_standing(env, box, exclude))
     if len(facets.faces):
         server.scene.add_mesh_simple(
             "/standing", facets.vertices, facets.faces, color=STANDING, opacity=SEEN_THROUGH,
-            side="double", cast_shadow=False, receive_shadow=False,
+            side="double", cast_shadow=False, receive_shadow=False, position=middle,
         )  # fmt: skip
     top = box.mean(axis=0)
     top[axis] = box[1, axis]
@@ -139,14 +139,16 @@ def _move(
     """Add the parts of a step in a colour of their own, and the words about it."""
     surface = found.shell.surface
     assert isinstance(surface, Surface)  # noqa: S101 - parts have a surface
-    facets = _of_triangles(surface.triangles)
+    facets, middle = _sent([_of_triangles(surface.triangles)])
     node = server.scene.add_mesh_simple(
         f"/part_{number}", facets.vertices, facets.faces, color=colours.of_object(number),
         side="double", cast_shadow=False, receive_shadow=False,
     )  # fmt: skip
     words = f"{number + 1}. {names_of(found.parts)}: {found.verdict}"
     label = server.scene.add_label(f"/words_{number}", words, position=tuple(top), visible=False)
-    return _Move(node, poses, label)
+    from_middle = np.eye(4)
+    from_middle[:3, 3] = middle
+    return _Move(node, poses @ from_middle, label)
 
 
 def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
@@ -188,7 +190,7 @@ def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
     return np.stack([every.min(axis=0), every.max(axis=0)])
 
 
-def _standing(env: Environment, box: Floats, exclude: set[int]) -> Facets:
+def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
     """Triangles of what stands in the surroundings of a box (2, 3), the smallest objects first."""
     reach = AROUND * float((box[1] - box[0]).max())
     near = [
@@ -210,28 +212,30 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> Facets:
         if total > MOST_TRIANGLES:
             break
         kept.append(facets)
-    return _joined(kept)
+    return kept
 
 
 def _of_triangles(triangles: Floats) -> Facets:
-    """Triangles (F, 3, 3) as they are drawn."""
+    """Triangles (F, 3, 3) with smooth and sharp edges."""
     faces = np.arange(3 * len(triangles), dtype=np.int64).reshape(-1, 3)
-    return _joined([sharpened(Facets(triangles.reshape(-1, 3), faces))])
+    return sharpened(Facets(triangles.reshape(-1, 3), faces))
 
 
 def _of_voxels(env: Environment, obj: Object) -> Facets:
     blocks = block_facets(coarsened(env.voxels(obj.id), MOST_BLOCKS))
     corners = np.asarray(env.grid.origin) + env.grid.voxel_size * blocks.vertices
-    return _joined([Facets(corners, blocks.faces)])
+    return Facets(corners, blocks.faces)
 
 
-def _joined(several: Sequence[Facets]) -> Facets:
-    """All triangles in one mesh, as it is sent: float32 and uint32."""
+def _sent(several: Sequence[Facets]) -> tuple[Facets, Floats]:
+    """All triangles in one mesh, as it is sent: float32, about a middle (3,), and uint32."""
     if not several:
-        return Facets(np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint32))
+        return Facets(
+            np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint32)
+        ), np.zeros(3)
     first = np.cumsum([0, *(len(facets.vertices) for facets in several)])
     faces = [one.faces + start for one, start in zip(several, first.tolist(), strict=False)]
-    return Facets(
-        np.concatenate([one.vertices for one in several]).astype(np.float32),
-        np.concatenate(faces).astype(np.uint32),
-    )
+    vertices = np.concatenate([one.vertices for one in several]).astype(np.float64)
+    middle = vertices.mean(axis=0)
+    sent = Facets((vertices - middle).astype(np.float32), np.concatenate(faces).astype(np.uint32))
+    return sent, middle

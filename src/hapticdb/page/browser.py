@@ -78,7 +78,7 @@ class Browser:
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
         self._plumbed_at = -np.inf
-        self.drawing = HandDrawing(client, site.facts.diagonal, CAP)
+        self.drawing = HandDrawing(client, site.facts.bounds, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
     # -- what a page with panels shows, too ------------------------------------------------------

@@ -12,9 +12,9 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.poses import pose_of_row
 
-FARTHEST = 1e6
-"""Greatest distance from the origin that a hand may be sent to, metres. Larger: poses in which
-distances of a voxel are lost in rounding are let through."""
+FARTHEST = 1e9
+"""Greatest coordinate that a browser may send, metres, as of poses in files. Larger: places at
+which a voxel is lost in rounding are let through."""
 
 
 def number_of(value: object, low: float, high: float, what: str) -> float:

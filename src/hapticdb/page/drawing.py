@@ -3,7 +3,7 @@
 from typing import TYPE_CHECKING
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.page import colours
 from hapticdb.page.tools import HeldTool
@@ -60,8 +60,8 @@ def add_marks(
     """Mark places (N, 3), metres, with words beside the first; returns the nodes."""
     return [
         scene.add_point_cloud(
-            name, places, (255, 214, 0), point_size=size, point_shape="circle",
-            precision="float32",
+            name, places - places[0], (255, 214, 0), point_size=size, point_shape="circle",
+            precision="float32", position=places[0],
         ),
         scene.add_label(f"{name}_words", words, position=tuple(places[0]), anchor="bottom-left"),
     ]  # fmt: skip
@@ -76,13 +76,16 @@ def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
 class HandDrawing:
     """Hand and tool of the person who looks, in their view alone.
 
-    diagonal : of the scene's box, metres, which sizes of arrows and marks follow; cap : greatest
-    force that is sent, N.
+    bounds (2, 3) : the scene's box, metres: sizes of arrows and marks follow its diagonal, and
+    points are sent from its middle, since a browser has them in float32; cap : greatest force that
+    is sent, N.
     """
 
-    def __init__(self, client: "ClientHandle", diagonal: float, cap: float) -> None:
+    def __init__(self, client: "ClientHandle", bounds: Floats, cap: float) -> None:
         self._client = client
-        self._diagonal = diagonal
+        self._diagonal = diagonal = max(float(np.linalg.norm(bounds[1] - bounds[0])), 1e-9)
+        self.middle = bounds.mean(axis=0)
+        """Position of the nodes whose points are sent from it."""
         self.cap = cap
         self._ghost: MeshHandle | None = None
         self._seen = np.full(12, 1e300)
@@ -96,26 +99,28 @@ class HandDrawing:
         nothing = np.zeros((1, 2, 3))
         self._force = scene.add_arrows(
             "/force", nothing, colours.FORCE, shaft_radius=shaft, head_radius=head,
-            head_length=2.2 * head, visible=False,
+            head_length=2.2 * head, visible=False, position=self.middle,
         )  # fmt: skip
         self._torque = scene.add_arrows(
             "/torque", nothing, colours.TORQUE, shaft_radius=0.7 * shaft, head_radius=0.8 * head,
-            head_length=1.8 * head, visible=False,
+            head_length=1.8 * head, visible=False, position=self.middle,
         )  # fmt: skip
         self._tether = scene.add_line_segments(
             "/tether", nothing, (120, 120, 130), thickness=2.0, thickness_units="screen",
-            visible=False,
+            visible=False, position=self.middle,
         )  # fmt: skip
         self._plumb = scene.add_line_segments(
-            "/plumb", nothing, PLUMB, thickness=1.5, thickness_units="screen", visible=False
-        )
+            "/plumb", nothing, PLUMB, thickness=1.5, thickness_units="screen", visible=False,
+            position=self.middle,
+        )  # fmt: skip
         self._spot = scene.add_point_cloud(
             "/spot", np.zeros((1, 3)), PLUMB, point_size=3 * CONTACT_SHARE * diagonal,
             point_shape="circle", point_shading="flat", precision="float32", visible=False,
+            position=self.middle,
         )  # fmt: skip
         self._contacts = scene.add_point_cloud(
             "/contacts", np.zeros((1, 3)), colours.FORCE, point_size=CONTACT_SHARE * diagonal,
-            point_shape="circle", precision="float32", visible=False,
+            point_shape="circle", precision="float32", visible=False, position=self.middle,
         )  # fmt: skip
 
     def hold(self, tool: HeldTool, colour: colours.Colour, pose: Floats) -> None:
@@ -141,18 +146,22 @@ class HandDrawing:
             apart = float(np.linalg.norm(hand[:3] - middle))
             self._tether.visible = apart > 0.002 * self._diagonal
             if self._tether.visible:
-                self._tether.points = np.array([[middle, hand[:3]]], dtype=np.float32)
+                self._tether.points = self._sent([[middle, hand[:3]]])
+
+    def _sent(self, points: ArrayLike) -> NDArray[np.float32]:
+        """Points as their nodes have them."""
+        return np.asarray(np.asarray(points) - self.middle, np.float32)
 
     def _arrow(self, arrow: "ArrowsHandle", start: Floats, way: Floats) -> None:
         length, longest = float(np.linalg.norm(way)), LONGEST_ARROW * self._diagonal
         is_seen = length > ARROW_BEGINS * longest
         if is_seen:
             way = way * (min(length, longest) / length)
-            arrow.points = np.array([[start, start + way]], dtype=np.float32)
+            arrow.points = self._sent([[start, start + way]])
         arrow.visible = is_seen
 
     def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
-        """Let an arrow show a force (3,), N, at a place."""
+        """Let an arrow, whose node is at `middle`, show a force (3,), N, at a place."""
         self._arrow(arrow, start, force * (LONGEST_ARROW * self._diagonal / self.cap))
 
     def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:
@@ -164,7 +173,7 @@ class HandDrawing:
         if is_touching and is_other:
             self._marked = points
             with self._client.atomic():
-                self._contacts.points = np.asarray(points, dtype=np.float32)
+                self._contacts.points = self._sent(points)
                 self._contacts.colors = palette
         self._contacts.visible = is_touching
 
@@ -174,7 +183,7 @@ class HandDrawing:
             self._plumb.visible = self._spot.visible = False
             return
         with self._client.atomic():
-            ends = np.array([[hand, below]], dtype=np.float32)
+            ends = self._sent([[hand, below]])
             if not (self._plumb.visible and np.array_equal(self._plumb.points, ends)):
                 self._plumb.points, self._spot.points = ends, ends[0, 1:]
             self._plumb.visible = self._spot.visible = True

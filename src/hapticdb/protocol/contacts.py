@@ -27,9 +27,10 @@ UNIT = 32767.0
 """The number that stands for 1 in a normal, and for the tool's radius in a lever."""
 FINE = 1.0 / 8192.0
 """Step of depths, in voxels, and of curvatures, in 1/voxel. Both reach to 4 voxels."""
-FARTHEST = 1e6
-"""Largest credible coordinate, speed, force, torque or stiffness of a spring. A larger one is
-malformed."""
+FARTHEST = 1e9
+"""Largest credible coordinate of a place, metres. A larger one is malformed."""
+LARGEST = 1e6
+"""Largest credible speed, force, torque or stiffness of a spring. A larger one is malformed."""
 STIFFEST = 1e12
 """Largest credible stiffness of a contact, N/m: it grows as voxels get smaller, since one point
 stops a spring's force within a part of a voxel."""
@@ -179,7 +180,7 @@ def unpack_wish(message: bytes) -> ProxyWish:
     tool, numbers = _unpacked(message, Kind.HELLO, 4)
     if len(tool.encode()) > MOST_NAME:
         raise ProtocolError(f"a tool's name of more than {MOST_NAME} bytes")
-    _check_range("a spring", np.array(numbers), 0.0)
+    _check_range("a spring", np.array(numbers), 0.0, LARGEST)
     return ProxyWish(tool, *numbers)
 
 
@@ -191,9 +192,9 @@ def pack_terms(terms: ProxyTerms) -> bytes:
 def unpack_terms(message: bytes) -> ProxyTerms:
     """Read the server's WELCOME; ProtocolError if it is malformed."""
     tool, (x, y, z, *numbers) = _unpacked(message, Kind.WELCOME, 12)
-    _check_range("a centre", np.array([x, y, z]))
+    _check_range("a centre", np.array([x, y, z]), -FARTHEST, FARTHEST)
     for name, number in zip(ProxyTerms._fields[2:], numbers, strict=True):
-        most = STIFFEST if name == "contact" else FARTHEST
+        most = STIFFEST if name == "contact" else LARGEST
         if not 0.0 < number <= most:
             raise ProtocolError(
                 f"a WELCOME whose {name} is {number:g}: it must be above 0, {most:g} at most"
@@ -216,7 +217,8 @@ def unpack_hand(message: bytes) -> HandState:
     if rest:
         raise ProtocolError(f"a message with {len(rest)} bytes after its last field")
     position, velocity = body["position"].copy(), body["velocity"].astype(np.float64)
-    _check_range("a hand", np.concatenate([position, velocity]))
+    _check_range("a hand", position, -FARTHEST, FARTHEST)
+    _check_range("a hand", velocity)
     if not np.isfinite(body["clock"]):
         raise ProtocolError("a clock that is not finite")
     return HandState(
@@ -248,12 +250,13 @@ def unpack_proxy(message: bytes) -> ProxyState:
     wrench, lower = body["wrench"].astype(np.float64), body["stiffness"].astype(np.float64)
     offset = body["tool_offset"].astype(np.float64)
     position = body["position"].copy()
-    _check_range("a proxy", np.concatenate([wrench, lower, offset, position]))
+    _check_range("a proxy", position, -FARTHEST, FARTHEST)
+    _check_range("a proxy", np.concatenate([wrench, lower, offset]))
     times = np.array([body["clock"], body["echo_clock"], body["kept"]], dtype=np.float64)
     if not np.isfinite(times).all():
         raise ProtocolError("a proxy with a clock that is not finite")
     springs = np.array([body["spring"], body["turn_spring"], body["trust"]], dtype=np.float64)
-    _check_range("a proxy", springs, 0.0)
+    _check_range("a proxy", springs, 0.0, LARGEST)
     stiffness = np.zeros((6, 6))
     stiffness[LOWER] = lower
     stiffness.T[LOWER] = lower
@@ -304,8 +307,10 @@ def _expect(message: bytes, kind: Kind) -> MessageHeader:
     return header
 
 
-def _check_range(what: str, numbers: Floats, least: float = -FARTHEST) -> None:
-    if not ((numbers >= least) & (numbers <= FARTHEST)).all():  # NaN fails, too
+def _check_range(
+    what: str, numbers: Floats, least: float = -LARGEST, most: float = LARGEST
+) -> None:
+    if not ((numbers >= least) & (numbers <= most)).all():  # NaN fails, too
         raise ProtocolError(f"{what} with a number that is not finite or out of its range")
 
 

@@ -18,7 +18,7 @@ Floats = NDArray[np.float64]
 Hand = NDArray[np.void]
 """A record () of `kernels.records.HAND`."""
 MOST_SCALE = 1e6
-"""Greatest scale. A larger one would move any hand beyond the 1e6 m that a reading may have."""
+"""Greatest scale: a millimetre of the hand is a kilometre of the scene."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and unit quaternion of no move and no turn."""
 
@@ -31,7 +31,7 @@ class Handle:
     """The handle: the hand's pose in the scene, to which the tool is pulled.
 
     While the clutch is open the hand moves and the handle stays; when the clutch closes the handle
-    moves on from its place. After a reading that is not finite, or beyond 1e6 m, m/s or rad/s, the
+    moves on from its place. After a reading that is not finite, or beyond 1e9 m, m/s or rad/s, the
     handle has no place (its x is NaN) until the next valid reading. A handle has the state of one
     session.
 

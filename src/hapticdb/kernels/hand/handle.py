@@ -6,9 +6,9 @@ from hapticdb.kernels._jit import FLOATS, FLOATS2, INT, entry, leaf, record_of
 from hapticdb.kernels.records import HAND, HANDLE
 from hapticdb.kernels.rigid import product, quaternion_in
 
-FARTHEST = 1e6
-"""Largest credible number in a hand's pose or velocity, in m, m/s or rad/s. A larger one means that
-the device is wrong, and the hand is refused."""
+FARTHEST = 1e9
+"""Largest credible number in a hand's pose or velocity, in m, m/s or rad/s: places of surveys have
+seven digits. A larger one means that the device is wrong, and the hand is refused."""
 
 
 @leaf

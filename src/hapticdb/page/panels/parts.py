@@ -215,9 +215,11 @@ class PartsPanel:
         def draw(places: Floats) -> None:
             if not is_wanted():  # the box was cleared, or another part chosen, meanwhile
                 return
+            middle = self._browser.drawing.middle
             self._voxels = self._client.scene.add_point_cloud(
-                "/voxels", places, colours.of_object(obj.id), point_shape="square",
+                "/voxels", places - middle, colours.of_object(obj.id), point_shape="square",
                 point_size=0.9 * self._browser.site.facts.voxel_size, precision="float32",
+                position=middle,
             )  # fmt: skip
             if not self._voxel_box.value:
                 self._clear_voxels()

@@ -132,6 +132,7 @@ class RecordPanel:
 
     def _draw(self, recording: Recording) -> None:
         scene, size = self._browser.client.scene, self._browser.site.facts.diagonal
+        middle = self._browser.drawing.middle
         shell = recording.header.shell
         assert self._replay is not None  # noqa: S101 - just read
         way = self._replay.tools[:: max(1, len(self._replay.tools) // 500), :3]
@@ -141,16 +142,17 @@ class RecordPanel:
         )  # fmt: skip
         arrow = scene.add_arrows(
             "/replay_force", np.zeros((1, 2, 3)), colours.FORCE, shaft_radius=0.0035 * size,
-            head_radius=0.01 * size, head_length=0.02 * size, visible=False,
+            head_radius=0.01 * size, head_length=0.02 * size, visible=False, position=middle,
         )  # fmt: skip
         self._drawn = [cloud, arrow]
         if len(way) > 1:
-            segments = np.stack([way[:-1], way[1:]], axis=1)
+            segments = np.stack([way[:-1], way[1:]], axis=1) - middle
             self._drawn.append(
                 scene.add_line_segments(
-                    "/replay_way", segments, colours.TORQUE, thickness=2.0, thickness_units="screen"
+                    "/replay_way", segments, colours.TORQUE, thickness=2.0,
+                    thickness_units="screen", position=middle,
                 )
-            )
+            )  # fmt: skip
 
     def _slide(self, event: "GuiEvent[Any]") -> None:
         if event.client is None or self._replay is None:

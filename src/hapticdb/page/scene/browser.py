@@ -154,15 +154,17 @@ class BrowserScene:
         scene = self._client.scene
         with self._client.atomic():
             scene.add_line_segments(
-                "/distance/line", ends[None], colors=INK, thickness=3.0, thickness_units="screen"
-            )
+                "/distance/line", ends[None] - ends[0], colors=INK, thickness=3.0,
+                thickness_units="screen", position=ends[0],
+            )  # fmt: skip
             scene.add_point_cloud(
                 "/distance/ends",
-                ends,
+                ends - ends[0],
                 colors=MARKED,
                 point_size=max(distance, 1e-9) * 0.02,
                 point_shape="circle",
                 precision="float32",
+                position=ends[0],
             )
             scene.add_label(
                 "/distance/label",

@@ -133,7 +133,7 @@ class Audience:
             return
         colours = sent(drawing.colours)
         for prop, value in (
-            ("batched_positions", drawing.positions.astype(np.float32)),
+            ("batched_positions", (drawing.positions - mesh.position).astype(np.float32)),
             ("batched_wxyzs", drawing.wxyzs.astype(np.float32)),
             ("batched_scales", drawing.sizes.astype(np.float32)),
             ("batched_colors", colours),
@@ -147,12 +147,13 @@ class Audience:
         if isinstance(drawing, Sprinkle):
             return self._sprinkled(name, drawing)
         vertices, faces = drawing.geometry.make()
+        middle = drawing.positions.mean(axis=0)  # a browser has places in float32
         return self._scene.add_batched_meshes_simple(
             name,
             vertices,
             faces,
             drawing.wxyzs,
-            drawing.positions,
+            drawing.positions - middle,
             batched_scales=drawing.sizes,
             batched_colors=sent(drawing.colours),
             lod=drawing.geometry.coarser(len(vertices)),  # type: ignore[arg-type]
@@ -160,6 +161,7 @@ class Audience:
             side="double",
             cast_shadow=False,
             receive_shadow=False,
+            position=middle,
         )
 
     def _sprinkled(self, name: str, drawing: Sprinkle) -> "PointCloudHandle":

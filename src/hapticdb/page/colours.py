@@ -100,8 +100,10 @@ def few(colours: NDArray[np.uint8] | None) -> tuple[list[Rgba], NDArray[np.int64
     """At most `MOST_COLOURS` colours, and the number in them of each of the given ones (n, 4)."""
     if colours is None or not len(colours):
         return [], np.empty(0, dtype=np.int64)
-    palette, number = np.unique(colours, axis=0, return_inverse=True)
-    number = number.reshape(-1)
+    # as numbers, which sort ten times faster than rows
+    packed = np.ascontiguousarray(colours).view(">u4").reshape(-1).astype(np.uint32)
+    shades, number = np.unique(packed, return_inverse=True)
+    palette = shades.astype(">u4").view(np.uint8).reshape(-1, 4)
     if len(palette) > MOST_COLOURS:
         from PIL import Image  # noqa: PLC0415 - extra `view`
 

@@ -61,12 +61,13 @@ def sharpened_each(several: Sequence[Facets]) -> list[Facets]:
     points = _welded(vertices, np.repeat(np.arange(len(several)), n_vertices))[faces]
     corners = _smooth_pairs(vertices[faces], points)
     graph = coo_array((np.ones(len(corners), dtype=np.int8), corners.T), shape=(faces.size,) * 2)
-    _, found = connected_components(graph, directed=False)
+    n_found, found = connected_components(graph, directed=False)
     # numbers in the order of the corners, so that those of each shape are neighbours
-    _, seen_first, label = np.unique(found, return_index=True, return_inverse=True)
-    order = np.empty(len(seen_first), dtype=np.int64)
-    order[np.argsort(seen_first)] = np.arange(len(seen_first))
-    label = order[label].reshape(-1, 3)
+    seen_first = np.empty(n_found, dtype=np.int64)
+    seen_first[found[::-1]] = np.arange(len(found))[::-1]  # the last one that is written stays
+    order = np.empty(n_found, dtype=np.int64)
+    order[np.argsort(seen_first)] = np.arange(n_found)
+    label = order[found].reshape(-1, 3)
     split = vertices[faces.reshape(-1)[np.sort(seen_first)]]
     made, start, begin = [], 0, 0
     for facets in several:

@@ -22,6 +22,7 @@ from hapticdb.hosting import host as hosting
 from hapticdb.hosting.attached import AttachedHost
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
+from hapticdb.poses import row_of_pose
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
@@ -65,7 +66,7 @@ def press(
 
     def is_true() -> object:
         for session in sessions:
-            session.move(pose)
+            session.move(row_of_pose(pose))
         return claim()
 
     until(is_true, every=0.02)
@@ -86,7 +87,7 @@ def test_the_hand_moves_in_steps_of_the_loop_between_arrivals(
     session.record(tmp_path / "way.hdbrec")
     poses = [at(0.0, 0.0, z) for z in np.linspace(0.02, 0.05, 16)]
     for pose in poses:  # 1 m/s at 33 Hz: 2 mm a step, 30 mm in all
-        session.move(pose)
+        session.move(row_of_pose(pose))
         time.sleep(0.03)
     until(lambda: _height(session) == pytest.approx(0.05, abs=1e-9))
     assert session.stop_recording() > 0
@@ -120,7 +121,7 @@ def test_a_recording_replays_bit_for_bit(
     with pytest.raises(UsageError, match="recorded already"):
         session.record(tmp_path / "second.hdbrec")
     for z in np.linspace(0.004, 0.0, 20):
-        session.move(at(0.001, 0.0, z))
+        session.move(row_of_pose(at(0.001, 0.0, z)))
         time.sleep(0.02)
     n_frames = session.stop_recording()
     frames = recorded(path)
@@ -173,7 +174,10 @@ def test_a_new_coupling_is_felt(session: HostedSession) -> None:
     press([session], lambda: 0.0 < pushed(session) < 0.5 * before)
 
 
-@pytest.mark.parametrize("pose", [np.zeros((4, 4)), np.full((4, 4), np.nan), at(2e9, 0.0, 0.0)])
+@pytest.mark.parametrize(
+    "pose",
+    [np.eye(4), np.zeros(7), np.full(7, np.nan), row_of_pose(at(2e9, 0.0, 0.0)), np.ones(7)],
+)
 def test_a_pose_that_is_none_is_refused(session: HostedSession, pose: Floats) -> None:
     with pytest.raises(UsageError):
         session.move(pose)
@@ -197,7 +201,7 @@ def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell)
     session.end()
     session.end()
     assert session.is_over
-    for use in (lambda: session.move(ABOVE), session.latest, session.figures):
+    for use in (lambda: session.move(row_of_pose(ABOVE)), session.latest, session.figures):
         with pytest.raises(UsageError, match="is over"):
             use()
 
@@ -272,7 +276,7 @@ def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
         os.kill(host.pids[0], signal.SIGKILL)
         until(lambda: session.is_over)
         with pytest.raises(UsageError, match="is over"):
-            session.move(ABOVE)
+            session.move(row_of_pose(ABOVE))
         session.end()
         another = host.begin(sphere, ABOVE)
         press([another], lambda: pushed(another) > 0.5)

@@ -7,6 +7,7 @@ import pytest
 
 from hapticdb.errors import UsageError
 from hapticdb.page import checks
+from hapticdb.poses import pose_of_row
 
 
 @pytest.mark.parametrize(
@@ -32,7 +33,8 @@ def test_a_choice_is_in_the_list_and_a_text_is_one_line_and_a_box_is_ticked_or_n
 
 
 def test_a_pose_is_a_rotation_whatever_the_quaternions_length() -> None:
-    pose = checks.pose_of((1.0, 2.0, 3.0), (2.0, 0.0, 0.0, 2.0))
+    row = checks.row_of((1.0, 2.0, 3.0), (2.0, 0.0, 0.0, 2.0))
+    pose = pose_of_row(row[:3], row[3:])
     quarter = np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]])
     assert np.allclose(pose[:3, :3], quarter)
     assert np.allclose(pose[:3, 3], (1.0, 2.0, 3.0))
@@ -52,4 +54,4 @@ def test_a_pose_is_a_rotation_whatever_the_quaternions_length() -> None:
 )
 def test_no_other_pose_moves_a_hand(place: object, turn: object) -> None:
     with pytest.raises(UsageError):
-        checks.pose_of(place, turn)
+        checks.row_of(place, turn)

@@ -1,5 +1,6 @@
 """HostedSession: one hand that a host runs, seen from the process that moves it."""
 
+import math
 import os
 import time
 from typing import NamedTuple, Protocol
@@ -7,12 +8,9 @@ from typing import NamedTuple, Protocol
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import FARTHEST
 from hapticdb.kernels.records import TIME_BIN
-from hapticdb.kernels.rigid import is_rigid
-from hapticdb.poses import row_of_pose
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.report import Spread, spread_of
@@ -80,7 +78,7 @@ class HostedSession:
         return self.seat
 
     def move(self, pose: ArrayLike) -> None:
-        """Put the hand at a pose (4, 4) of the scene, metres; the newest one counts.
+        """Put the hand at a pose (7,), as `poses.row_of_pose` makes it; the newest one counts.
 
         The hand moves there from where it is, in about the time between two calls, so that calls at
         20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
@@ -88,13 +86,14 @@ class HostedSession:
         Raises
         ------
         UsageError
-            If the pose is no rigid transform or is beyond 1e9 m, or the session is over.
+            If that is no position within 1e9 m and unit quaternion, or the session is over.
         """
-        matrix = pose_at(pose)
-        if not is_rigid(matrix) or np.abs(matrix[:3, 3]).max() > FARTHEST:
-            raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
-        seat = self._open_seat()
-        self._board.put_hand(seat, time.monotonic_ns(), row_of_pose(matrix))
+        row = np.asarray(pose, dtype=np.float64)
+        if row.shape != (7,) or not (
+            np.abs(row).max() <= FARTHEST and abs(math.hypot(*row[3:]) - 1.0) <= 1e-6
+        ):
+            raise UsageError("a hand moves to a position (3,) and a unit quaternion (4,), as a row")
+        self._board.put_hand(self._open_seat(), time.monotonic_ns(), row)
 
     def latest(self) -> Frames | None:
         """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""

@@ -144,7 +144,7 @@ class Browser:
         """Move the hand; on the event loop, so that events keep their order."""
 
         def act(event: Event) -> None:
-            self.move_hand(checks.pose_of(event.target.position, event.target.wxyz))
+            self.move_hand(checks.row_of(event.target.position, event.target.wxyz))
             self.has_moved = True
             if event.phase == "end":
                 self.hand_moved()
@@ -154,17 +154,11 @@ class Browser:
     # -- the session -------------------------------------------------------------------------
 
     def move_hand(self, pose: Floats) -> None:
-        """Put the hand at a pose (4, 4), metres."""
-        self.hand = row_of_pose(pose)
+        """Put the hand at a pose (7,), metres."""
+        self.hand = pose
         session = self.session
         if session is not None and not session.is_over:
             session.move(pose)
-
-    def put_hand(self, pose: Floats) -> None:
-        """Put hand and gizmo at a pose (4, 4)."""
-        self.move_hand(pose)
-        put_at(self.drawing.gizmo, self.hand)
-        self.hand_moved()
 
     def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
         """Hold another tool, at a pose (7,) or at the start."""
@@ -249,7 +243,7 @@ class Browser:
                 coupling=Coupling(stiffness=self.stiffness), scale=self.scale,
             )  # fmt: skip
             undo.callback(session.end)
-            session.move(self.matrix_of_hand())
+            session.move(self.hand)
             self._share()
             with self._swapping:
                 if self._is_closed:

@@ -10,7 +10,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.poses import pose_of_row
 
 FARTHEST = 1e9
 """Greatest coordinate that a browser may send, metres, as of poses in files. Larger: places at
@@ -59,10 +58,11 @@ def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.floa
     return numbers
 
 
-def pose_of(position: object, wxyz: object) -> NDArray[np.float64]:
-    """Pose (4, 4) of a gizmo: position in metres, quaternion scalar first, made unit here."""
+def row_of(position: object, wxyz: object) -> NDArray[np.float64]:
+    """Pose (7,) of a gizmo: position in metres, quaternion scalar first, made unit here."""
     point = numbers_of(position, 3, FARTHEST, "a place")
     turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
-    if float(np.linalg.norm(turn)) < 1e-6:
+    length = math.hypot(*turn)
+    if length < 1e-6:
         raise UsageError("a turn: give a quaternion that is not zero")
-    return pose_of_row(point, turn)
+    return np.concatenate([point, turn / length])

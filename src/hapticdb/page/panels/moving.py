@@ -14,6 +14,7 @@ from hapticdb.page.browser import Browser
 from hapticdb.page.editing import PersonsEdits
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import short_name
+from hapticdb.poses import pose_of_row
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:
@@ -129,7 +130,8 @@ class MovingControls:
         """Write the part's new placement when it is let go of, by a person who is still there."""
 
         def act(event: "TransformControlsEvent") -> None:
-            pose = checks.pose_of(event.target.position, event.target.wxyz)
+            row = checks.row_of(event.target.position, event.target.wxyz)
+            pose = pose_of_row(row[:3], row[3:])
             with self._lock:
                 if held is not self._held:  # the gizmo was put elsewhere: this drag is over
                     if event.phase == "end":

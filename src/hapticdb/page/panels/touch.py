@@ -110,8 +110,7 @@ class TouchPanel:
             return
         browser = self._browser
         position = checks.numbers_of(event.target.value, 3, checks.FARTHEST, "a place")
-        pose = checks.pose_of(position, browser.hand[3:])
-        browser.move_hand(pose)
+        browser.move_hand(checks.row_of(position, browser.hand[3:]))
         browser.drawing.gizmo.position = position
 
     def _stiffen(self, event: "GuiEvent[Any]") -> None:

@@ -3,12 +3,12 @@
 import os
 from collections.abc import Iterable
 from dataclasses import replace
-from typing import Self
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.batches.queries import Queries
+from hapticdb.closing import Closes
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
@@ -31,7 +31,7 @@ from hapticdb.store.refusals import check_unwritten, wants_distances
 from hapticdb.store.urls import scheme_of
 
 
-class Environment(Queries):
+class Environment(Queries, Closes):
     """An opened database with a static scene. Only the thread that opened it may use it.
 
     Use `hapticdb.open` and `hapticdb.create` to make one. It is also a context manager.
@@ -45,12 +45,6 @@ class Environment(Queries):
 
     def __repr__(self) -> str:
         return f"Environment({self.url!r}, {self.layout} layout, {self.grid.describe()})"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close the connection to the database."""

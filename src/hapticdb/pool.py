@@ -5,15 +5,15 @@ import os
 import time
 from collections.abc import Iterator
 from threading import Condition
-from typing import Self
 
+from hapticdb.closing import Closes
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import BusyError, ConnectionLostError, DatabaseError, UsageError
 from hapticdb.store.threads import NOBODY, this_thread
 
 
-class Pool:
+class Pool(Closes):
     """A limited number of open environments of one database, lent to threads one at a time.
 
     Opening costs a connection, the statistics and the cost model. In a pool each member pays them
@@ -64,12 +64,6 @@ class Pool:
 
     def __repr__(self) -> str:
         return f"Pool({self._shown!r}, size={self._size})"
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Close all members; lent members are closed when they are given back."""

@@ -41,12 +41,13 @@ FLOORS: list[set[str]] = [
     {"grid", "ready"},
     {"kernels"},
     {"protocol", "units"},
-    {"errors", "interrupting"},
+    {"closing", "errors", "interrupting"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
 # domains that may import less than their floor allows -> what they may import
 NARROW: dict[str, set[str]] = {
     "kernels": set(),
+    "closing": set(),
     "errors": set(),
     "interrupting": set(),
     "poses": {"errors", "units"},

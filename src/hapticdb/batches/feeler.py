@@ -3,7 +3,7 @@
 from collections.abc import Callable, Iterator
 from contextlib import closing
 from functools import partial
-from typing import TYPE_CHECKING, Literal, Self, TypeVar, get_args
+from typing import TYPE_CHECKING, Literal, TypeVar, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -12,6 +12,7 @@ from hapticdb.batches.nearest import DEFAULT_REACH, NearestSearch, first_hits_at
 from hapticdb.batches.order import order_of
 from hapticdb.batches.result import ClearanceBatch, Named, TouchBatch
 from hapticdb.batches.threads import BatchThreads, ThreadMemory, available_jobs
+from hapticdb.closing import Closes
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.law import reads_distances
@@ -49,7 +50,7 @@ BatchDevice = Literal["cpu", "cuda"]
 _Answer = TypeVar("_Answer")
 
 
-class Feeler:
+class Feeler(Closes):
     """A tool in an environment, with the cells around it in memory, for batches of poses.
 
     `Environment.feeler` makes one. It uses the environment's connection, so only the thread that
@@ -109,12 +110,6 @@ class Feeler:
             f"Feeler({self._store.url!r}, {len(self.shell)} points, {self._threads.jobs} threads, "
             f"{self.n_loaded} cells read)"
         )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """End the threads and free the memory; the environment stays open."""

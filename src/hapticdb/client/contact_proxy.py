@@ -12,13 +12,14 @@ import math
 import threading
 import time
 from contextlib import suppress
-from typing import Any, NamedTuple, Self
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.client.contact_connection import ContactConnection, connect
 from hapticdb.client.proxy_force import ForceState, ProxyForce
+from hapticdb.closing import Closes
 from hapticdb.devices.profiles import HAND_STIFFNESS
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import ConnectionLostError, HapticDBError, UsageError
@@ -55,7 +56,7 @@ class _LinkFigures(NamedTuple):
     losses: int
 
 
-class ContactProxy:
+class ContactProxy(Closes):
     """A hand in an environment on a server. Also a context manager.
 
     Parameters
@@ -131,12 +132,6 @@ class ContactProxy:
         ]
         for thread in self._threads:
             thread.start()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Disconnect; a second call does nothing."""

@@ -8,11 +8,11 @@ share voxels. What it does there is left to sweeps.
 """
 
 from contextlib import ExitStack, closing
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.closing import Closes
 from hapticdb.extraction.problem import Problem, guarded_shell
 from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
@@ -93,7 +93,7 @@ class Room:
         return all(self.are_free(poses[some]).all() for some in _from_coarse_to_fine(len(poses)))
 
 
-class FreeSpace:
+class FreeSpace(Closes):
     """Rooms of a problem's parts. It is also a context manager.
 
     Attributes
@@ -116,10 +116,8 @@ class FreeSpace:
             )
             self._close = stack.pop_all().close
 
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
+    def close(self) -> None:
+        """Free the cells."""
         self._close()
 
     @property

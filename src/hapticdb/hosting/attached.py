@@ -3,10 +3,11 @@
 import logging
 import socket
 from collections.abc import Callable
-from typing import Any, Self
+from typing import Any
 
 from numpy.typing import ArrayLike
 
+from hapticdb.closing import Closes
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.channel import Ask, AskingChannel
 from hapticdb.hosting.hosted import Calls, HostedSession
@@ -18,7 +19,7 @@ from hapticdb.realtime.coupling import Coupling
 LOG = logging.getLogger("hapticdb.hosting")
 
 
-class AttachedHost:
+class AttachedHost(Closes):
     """The `SessionHost` of another process, which serves the other end of `sock`.
 
     Frames, contacts and hands are in memory that both processes share; all else goes over the
@@ -40,12 +41,6 @@ class AttachedHost:
             self._channel.close()
             raise HapticDBError("no host answers at the other end of the socket") from error
         self._board = Board(descriptor)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def begin(
         self,

@@ -8,11 +8,12 @@ import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
-from typing import Any, Self
+from typing import Any
 
 import numpy as np
 from numpy.typing import ArrayLike
 
+from hapticdb.closing import Closes
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
@@ -45,7 +46,7 @@ LARGEST_SCALE = 1e6
 """Greatest scale of a session, as of `hapticdb.realtime.handle`."""
 
 
-class SessionHost:
+class SessionHost(Closes):
     """Hands in an environment, `MOST_SESSIONS` at once, each felt in real time.
 
     Sessions run in worker processes, many in each. All sessions that feel the same objects share
@@ -88,12 +89,6 @@ class SessionHost:
         ]
         for thread in self._tending:
             thread.start()
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def begin(
         self,

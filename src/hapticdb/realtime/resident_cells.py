@@ -5,8 +5,9 @@ import os
 import threading
 import time
 from contextlib import suppress
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
+from hapticdb.closing import Closes
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.ready import make_ready
@@ -65,7 +66,7 @@ def without_distances(url: str) -> str:
     )
 
 
-class ResidentCells:
+class ResidentCells(Closes):
     """Cells of an environment in memory, fetched by a separate process.
 
     Sessions that feel the same objects may share one. Also a context manager.
@@ -168,12 +169,6 @@ class ResidentCells:
 
     def _begun(self) -> Process:
         return Process(FETCH, self._request, [self.table.descriptor], PURPOSES)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __del__(self) -> None:
         with suppress(Exception):

@@ -4,10 +4,11 @@ import os
 import time
 from contextlib import ExitStack, suppress
 from dataclasses import asdict
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING
 
 import numpy as np
 
+from hapticdb.closing import Closes
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
@@ -48,7 +49,7 @@ DEFAULT_STALENESS = 1.0
 """Default of `staleness`, seconds without an answer of the database."""
 
 
-class Session:
+class Session(Closes):
     """A hand in an environment, felt in real time.
 
     The loop and the fetching of its cells run in two separate processes. This object starts and
@@ -257,12 +258,6 @@ class Session:
             coupling=asdict(self.coupling),
             budget_points=self.budget_points,
         )
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __del__(self) -> None:
         with suppress(Exception):

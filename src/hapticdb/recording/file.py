@@ -14,11 +14,11 @@ import zlib
 from collections.abc import Iterator
 from functools import cached_property
 from pathlib import Path
-from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.closing import Closes
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels.rigid import poses_of
 from hapticdb.recording.chunks import HEAD, MOST_FRAMES, Chunk, Scan, read_bytes, scan
@@ -170,7 +170,7 @@ class Recording:
             return scan(file, self._start, self._size)
 
 
-class Recorder:
+class Recorder(Closes):
     """Writes frames to a recording; a context manager, which closes the recording.
 
     Chunks that `flush` or a full buffer has written survive the process. `close` writes all to
@@ -239,12 +239,6 @@ class Recorder:
             if self._beside is not None or not (append or replace):  # made just now
                 (self._beside or self.path).unlink(missing_ok=True)
             raise
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def __len__(self) -> int:
         return self._n_written + self._n_waiting

@@ -12,11 +12,12 @@ import threading
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import DTypeLike, NDArray
 
+from hapticdb.closing import Closes
 from hapticdb.errors import UsageError
 from hapticdb.kernels.field.lattice import BEYOND, CELL_VALUES
 from hapticdb.kernels.records import FIGURES, SESSION
@@ -115,7 +116,7 @@ def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
     return low
 
 
-class CellTable:
+class CellTable(Closes):
     """A table of cells in memory that processes share.
 
     Parameters
@@ -183,12 +184,6 @@ class CellTable:
         if table.cells.payload is not None:
             table.cells.payload[kernels.EMPTY_SLOT] = BEYOND
         return table
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     def close(self) -> None:
         """Free the memory in this process; other processes keep their mappings."""

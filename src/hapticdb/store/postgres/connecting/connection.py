@@ -3,11 +3,12 @@
 import contextlib
 import time
 from collections.abc import Callable, Iterator, Sequence
-from typing import Any, Self, TypeVar
+from typing import Any, TypeVar
 
 import psycopg
 from psycopg import sql
 
+from hapticdb.closing import Closes
 from hapticdb.errors import ConnectionLostError, DatabaseError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
@@ -30,7 +31,7 @@ WRITE_TRIES = 3
 """Tries of a write whose server goes away. A larger value survives more losses in a row."""
 
 
-class ServerConnection(Link):
+class ServerConnection(Link, Closes):
     """One connection to one environment's schema; belongs to the thread that opened it.
 
     is_loading : whether `Loading` is under way; is_closed : whether `close` was called; a lost
@@ -43,12 +44,6 @@ class ServerConnection(Link):
         self.is_loading = False
         self.is_closed = False
         super().__init__(address, conninfo, read_only=read_only)
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        self.close()
 
     # -- the connection ----------------------------------------------------------------------
 

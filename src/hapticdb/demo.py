@@ -26,7 +26,8 @@ from hapticdb.query.touches import Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
-from hapticdb.store.connect import beside, name_of, redact
+from hapticdb.store.connect import beside, name_of
+from hapticdb.store.urls import redact
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"

@@ -22,9 +22,9 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
 )
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
-from hapticdb.store.connect import redact
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
+from hapticdb.store.urls import redact
 from servers import Place
 
 

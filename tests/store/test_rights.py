@@ -28,11 +28,12 @@ from hapticdb.difference import diff_environments
 from hapticdb.errors import AccessError, HapticDBError, ReadOnlyError, UsageError
 from hapticdb.query import cost_model, quantiles
 from hapticdb.query.frame import STRATEGIES
-from hapticdb.store.connect import grant, redact
+from hapticdb.store.connect import grant
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
+from hapticdb.store.urls import redact
 from hapticdb.testing import floor_voxels, write_voxels
 from hapticdb.transfer import copy_environment
 from servers import SETTINGS, Place

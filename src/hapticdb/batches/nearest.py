@@ -42,19 +42,10 @@ def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) 
 class NearestSearch:
     """Searches the voxels nearest to a shell, within a reach.
 
-    Parameters
-    ----------
-    frames : ResidentFrames
-        Frames of the shell; cells around its points are fetched into their table.
-    threads : BatchThreads
-        Threads of the same frames.
-    reach : float
-        Voxels; greater distances are not searched.
+    frames : frames of the shell; cells around its points are fetched into their table; threads :
+    of the same frames; reach : voxels; greater distances are not searched.
 
-    Raises
-    ------
-    UsageError
-        If the cells within reach of one point are more than the table can hold.
+    Raises `UsageError` if the cells within reach of one point are more than the table can hold.
     """
 
     def __init__(self, frames: ResidentFrames, threads: BatchThreads, reach: float) -> None:

@@ -9,10 +9,10 @@ from numba import config, cuda
 from numpy.typing import NDArray
 
 from hapticdb.batches.nearest import NearestSearch
-from hapticdb.batches.order import order_of
+from hapticdb.batches.order import not_rigid, order_of
 from hapticdb.batches.result import TouchBatch
 from hapticdb.batches.threads import BatchThreads
-from hapticdb.errors import MissingExtraError, UsageError, pip_line
+from hapticdb.errors import MissingExtraError, pip_line
 from hapticdb.kernels import rigid
 from hapticdb.kernels.gpu import frames as kernels
 from hapticdb.kernels.gpu import nearest as searches
@@ -60,12 +60,7 @@ class RawFrames(NamedTuple):
 class GpuNearest(NearestSearch):
     """The same search on the GPU, whose table is that of the processors' frames.
 
-    Parameters
-    ----------
-    frames, threads, reach
-        As for `NearestSearch`.
-    gpu : GpuFrames
-        Frames of the same shell.
+    frames, threads, reach : as for `NearestSearch`; gpu : frames of the same shell.
     """
 
     def __init__(
@@ -129,10 +124,7 @@ class _Lane:
 class GpuFrames:
     """Frames of one shell on the GPU, on the cells of its residency.
 
-    Parameters
-    ----------
-    frames : ResidentFrames
-        Frames of the shell on the processor, which fetch cells.
+    frames : frames of the shell on the processor, which fetch cells.
     """
 
     def __init__(self, frames: ResidentFrames) -> None:
@@ -166,13 +158,10 @@ class GpuFrames:
         The pose travels with the launch, and the results come without a copy: a tenth of the time
         of `run` for one pose.
 
-        Raises
-        ------
-        UsageError
-            If the pose is not rigid.
+        Raises `UsageError` if the pose is not rigid.
         """
         if rigid.first_not_rigid(pose[None]) == 0:
-            raise _not_rigid(0)
+            raise not_rigid(0)
         self.mirror.update()
         self._one(
             self._frames.law, self._frames.residency.place, self._shell,
@@ -204,10 +193,7 @@ class GpuFrames:
     def run(self, poses: Floats) -> Iterator[tuple[slice, RawFrames]]:
         """Results of poses (B, 4, 4), piece by piece, in the cells that are in memory.
 
-        Raises
-        ------
-        UsageError
-            If a pose is not rigid.
+        Raises `UsageError` if a pose is not rigid.
         """
         self.mirror.update()
         piece = min(self._piece, len(poses))
@@ -263,8 +249,7 @@ class GpuFrames:
     def _ended(lane: _Lane) -> tuple[slice, RawFrames]:
         found = lane.results()
         if len(found.unknown) and found.unknown.min() == kernels.NOT_RIGID:
-            pose = lane.part.start + int(found.unknown.argmin())
-            raise _not_rigid(pose)
+            raise not_rigid(lane.part.start + int(found.unknown.argmin()))
         return lane.part, found
 
     def _copy(self, to: Floats, poses: Floats) -> None:
@@ -292,9 +277,3 @@ class GpuFrames:
         parts = [slice(start, min(start + step, n)) for start in range(0, n, step)]
         for _ in self._copiers.map(work, parts) if len(parts) > 1 else map(work, parts):
             pass
-
-
-def _not_rigid(pose: int) -> UsageError:
-    return UsageError(
-        f"pose {pose}: a pose that is no rigid transform: give finite numbers and a rotation"
-    )

@@ -14,6 +14,13 @@ AT_ONCE = 1 << 14
 """Poses that are copied at once to be checked, 2 MB. A larger value takes more memory."""
 
 
+def not_rigid(pose: int) -> UsageError:
+    """Build the error for a pose of that number that is not rigid."""
+    return UsageError(
+        f"pose {pose}: a pose that is no rigid transform: give finite numbers and a rotation"
+    )
+
+
 def order_of(
     poses: NDArray[np.float64], center: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.int64]:
@@ -21,20 +28,14 @@ def order_of(
 
     The poses may lie in a file that is mapped into memory. center (3,), tool frame, metres.
 
-    Raises
-    ------
-    UsageError
-        If a pose is not rigid; it names the first one.
+    Raises `UsageError` if a pose is not rigid; it names the first one.
     """
     keys = np.empty(len(poses), dtype=np.int64)
     for start in range(0, len(poses), AT_ONCE):
         part = np.array(poses[start : start + AT_ONCE])
         first = rigid.first_not_rigid(part)
         if first < len(part):
-            raise UsageError(
-                f"pose {start + first}: a pose that is no rigid transform: give finite numbers "
-                "and a rotation"
-            )
+            raise not_rigid(start + first)
         places = grid.to_voxel_units(part[:, :3, :3] @ center + part[:, :3, 3])
         voxels = np.clip(places, 0, grid.side - 1).astype(np.int64)
         keys[start : start + AT_ONCE] = grid.encode(voxels)

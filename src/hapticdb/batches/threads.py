@@ -45,10 +45,7 @@ ChunkWork = Callable[[ThreadMemory, slice], None]
 def available_jobs(jobs: int | None) -> int:
     """Number of threads: as given, or one for each processor that this process may use.
 
-    Raises
-    ------
-    UsageError
-        If it is less than 1, or more than `MOST_JOBS`.
+    Raises `UsageError` if it is less than 1, or more than `MOST_JOBS`.
     """
     if jobs is None:
         able = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
@@ -61,12 +58,7 @@ def available_jobs(jobs: int | None) -> int:
 class BatchThreads:
     """Runs kernels on slices of a batch, in as many threads as there are jobs.
 
-    Parameters
-    ----------
-    frames : ResidentFrames
-        Frames of the shell; its table is joined once for each thread.
-    jobs : int
-        Threads.
+    frames : frames of the shell; its table is joined once for each thread; jobs : threads.
     """
 
     def __init__(self, frames: ResidentFrames, jobs: int) -> None:

@@ -33,12 +33,8 @@ def show(
 ) -> None:
     """Print how the loop kept its time, beside the empty loop, and what happened in it.
 
-    Parameters
-    ----------
-    recording : str or None
-        File that the session was recorded to.
-    path_speed : float or None
-        Speed assumed for a path without times, m/s.
+    recording : file that the session was recorded to; path_speed : speed assumed for a path without
+    times, m/s.
     """
     if json:
         more = {"path_speed": path_speed, "shell": shell_record(shell)}

@@ -58,17 +58,14 @@ def read_sweeps(path: str, given: Asked) -> list[Asked]:
     try:
         unknown = [name for name in reader.fieldnames or () if name not in COLUMNS]
         if unknown or "path" not in (reader.fieldnames or ()):
-            raise FileError(f"--batch {path}: {_unknown(unknown)}{_HINT}")
+            which = f"no column {unknown[0][:40]!r} is known; " if unknown else ""
+            raise FileError(f"--batch {path}: {which}{_HINT}")
         asked = [_asked(row, given, f"{path}, line {reader.line_num}") for row in reader]
     except csv.Error as error:
         raise FileError(f"--batch {path}, line {reader.line_num}: {error}; {_HINT}") from error
     if not asked:
         raise FileError(f"--batch {path}: no sweep after its header; {_HINT}")
     return asked
-
-
-def _unknown(names: list[str]) -> str:
-    return f"no column {names[0][:40]!r} is known; " if names else ""
 
 
 def _asked(row: dict[str, str | None], given: Asked, line: str) -> Asked:

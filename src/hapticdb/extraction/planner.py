@@ -67,18 +67,10 @@ class _Share(NamedTuple):
 class Planner:
     """Plans for one problem.
 
-    Parameters
-    ----------
-    problem, space :
-        What is to come out, and where it is free.
-    pulls : Pulls
-        Pulls tried before: planning starts where they end.
-    goals : Goals
-        What is to be reached.
-    leaving : Exit or None
-        Where the parts are out; None: they are to reach a pose.
-    seed, most_motions, until :
-        Seed of the planner; questions that it may ask; time of `time.monotonic` at which it ends.
+    problem, space : what is to come out, and where it is free. pulls : tried before; planning
+    starts where they end. goals : what is to be reached. leaving : where the parts are out; None
+    where they are to reach a pose. seed, most_motions, until : of the planner; questions that it
+    may ask; time of `time.monotonic` at which it ends.
     """
 
     def __init__(
@@ -115,10 +107,7 @@ class Planner:
 
         Searched in the wide room first, and by shifts alone; then in all that is free.
 
-        Raises
-        ------
-        MissingExtraError
-            If OMPL is not installed.
+        Raises `MissingExtraError` if OMPL is not installed.
         """
         if self._starts is None:
             self._starts = self._found_starts()

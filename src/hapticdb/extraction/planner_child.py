@@ -41,10 +41,7 @@ class PlanRequest(NamedTuple):
 def plan(request: PlanRequest, sender: MessageSender) -> None:
     """Search a path and send it: the word ``motion`` asks, ``path`` ends.
 
-    Raises
-    ------
-    MissingExtraError
-        If OMPL is not installed.
+    Raises `MissingExtraError` if OMPL is not installed.
     """
     try:
         import ompl  # noqa: F401, PLC0415 - only in this process

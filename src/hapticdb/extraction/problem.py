@@ -72,12 +72,8 @@ def problem_of(
 ) -> Problem:
     """Read the parts that words choose, and look up what stands.
 
-    Raises
-    ------
-    ObjectNotFoundError
-        If a word chooses nothing.
-    UsageError
-        If no word is given, a part is a point cloud, or nothing else stands.
+    Raises `ObjectNotFoundError` if a word chooses nothing. Raises `UsageError` if no word is given,
+    a part is a point cloud, or nothing else stands.
     """
     parts = env.find(*words)
     left_out: tuple[int | str, ...] = (*(obj.id for obj in parts), *exclude)

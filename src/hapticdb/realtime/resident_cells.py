@@ -16,9 +16,10 @@ from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import DEFAULT_BUDGET, HEARTBEAT, LOST, STOP, CellTable
-from hapticdb.store.connect import open_store, redact
+from hapticdb.store.connect import open_store
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
+from hapticdb.store.urls import redact
 
 FETCH, PURPOSES = "hapticdb.realtime.fetching:fetch", ("resident",)
 """What a fetching process runs, and what it calls kernels for."""

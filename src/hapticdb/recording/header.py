@@ -19,9 +19,9 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
 from hapticdb.query.law import ForceLaw, TangentPlane, law_named
-from hapticdb.store.connect import redact
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
+from hapticdb.store.urls import redact
 
 MAGIC = b"HDBREC\r\n"
 """First bytes of each recording."""

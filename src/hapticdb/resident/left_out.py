@@ -4,7 +4,6 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from hapticdb.errors import ObjectNotFoundError
 from hapticdb.store.base import NO_KEYS, Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter
 
@@ -44,15 +43,10 @@ class LeftOutObjects:
 
     def _read_again(self, store: Store, ids: set[int]) -> bool:
         """Read written objects; returns whether the words may choose otherwise now."""
-        is_other = False
-        for object_id in ids:
-            before = self._objects.pop(object_id, None)
-            try:
-                now = self._objects[object_id] = store.object(object_id)
-            except ObjectNotFoundError:
-                now = None
-            is_other |= _read_by_words(before) != _read_by_words(now)
-        return is_other
+        before = {i: self._objects.pop(i, None) for i in ids}
+        now = {obj.id: obj for obj in store.objects(ids)}
+        self._objects.update(now)
+        return any(_read_by_words(before[i]) != _read_by_words(now.get(i)) for i in ids)
 
 
 def _read_by_words(obj: Object | None) -> object:

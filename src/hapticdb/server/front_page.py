@@ -61,10 +61,8 @@ class ClientPage(NamedTuple):
 def client_page(title: str) -> ClientPage:
     """Read viser's client and give it a title of plain words.
 
-    Raises
-    ------
-    MissingExtraError
-        If viser is not installed, or in a version whose client is of another form.
+    Raises `MissingExtraError` if viser is not installed, or in a version whose client is of another
+    form.
     """
     spec = importlib.util.find_spec("viser")
     if spec is None or spec.origin is None:

@@ -28,17 +28,11 @@ LASTING = 60.0
 class PageKeeper:
     """Keeps a page process running.
 
-    Parameters
-    ----------
-    work : str
-        Function of the process, as `Process` takes it; it sends ``ready`` with its port.
-    request : callable
-        Makes the request of each process, of the descriptors of its sockets to the server and to
-        the host, and of the secret that the server's connections show.
-    serve_host : callable
-        Takes the socket at whose other end the page begins its sessions.
-    prepare : callable
-        Compiles what hands call; the page asks for it when somebody first takes a tool in hand.
+    work : function of the process, as `Process` takes it; it sends ``ready`` with its port.
+    request : makes the request of a process, of its sockets to the server and to the host, and of
+    the secret that the server's connections show. serve_host : takes the socket at whose other end
+    the page begins its sessions. prepare : compiles what hands call; the page asks for it when
+    somebody first takes a tool in hand.
     """
 
     def __init__(
@@ -73,12 +67,8 @@ class PageKeeper:
     async def start(self) -> None:
         """Start a page process and wait until it is ready.
 
-        Raises
-        ------
-        HapticDBError
-            With which the page ended, or because it did not become ready.
-        OSError
-            If the machine has no room for another process, or for its sockets.
+        Raises `HapticDBError` with which the page ended, or because it did not become ready. Raises
+        `OSError` if the machine has no room for another process, or for its sockets.
         """
         process, ours, host_ours = await self._begun()
         self._process = process  # `stop` can end it from now on

@@ -20,19 +20,6 @@ from hapticdb.store.engines import (
 from hapticdb.store.refusals import check_distances
 from hapticdb.store.urls import redact
 
-__all__ = [
-    "backup_environment",
-    "beside",
-    "check_curve",
-    "create_store",
-    "exists",
-    "grant",
-    "name_of",
-    "open_store",
-    "redact",
-    "restore_environment",
-]
-
 
 def open_store(url: Url, *, read_only: bool = False) -> Store:
     """Open an existing environment: a bare path, ``sqlite:///path``, ``postgresql://...``."""

@@ -33,24 +33,12 @@ class Filter:
     It holds words and no objects, so that an object that is added later, or has another name or
     other attributes later, is felt or not by the same words.
 
-    Parameters
-    ----------
-    where : iterable of int or str
-        Words as `hapticdb.store.finding.find_objects` reads them; all objects if there are none.
-    exclude : iterable of int or str
-        Words of the same kind.
+    where, exclude : words as `hapticdb.store.finding.find_objects` reads them, all objects if
+    `where` has none; as attributes, texts of digits have become ids.
+    is_empty, is_fixed : whether every object is felt; whether the same ids are left out, whatever
+    objects there are.
 
-    Attributes
-    ----------
-    where, exclude : tuple of int or str
-        The words; texts of digits have become ids.
-    is_empty, is_fixed : bool
-        Whether every object is felt; whether the same ids are left out, whatever objects there are.
-
-    Raises
-    ------
-    UsageError
-        When a word is neither an int nor a text.
+    Raises `UsageError` when a word is neither an int nor a text.
     """
 
     def __init__(self, where: Words = (), exclude: Words = ()) -> None:
@@ -82,12 +70,8 @@ class Filter:
     def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
         """Objects that are not felt; a word that chooses nothing is noted, and chooses nothing.
 
-        Parameters
-        ----------
-        objects : sequence of Object
-            All objects of one revision, ascending by id.
-        url : str
-            Their environment, for messages.
+        objects : all objects of one revision, ascending by id; url : their environment, for
+        messages.
         """
         missing: list[ObjectNotFoundError] = []
         listing = Listing(objects, url)
@@ -135,10 +119,7 @@ class FiltersOfWords:
     def of(self, where: Words, exclude: Words) -> Filter:
         """Filter of the words; the same one for the same words.
 
-        Raises
-        ------
-        UsageError
-            As for `Filter`.
+        Raises `UsageError` as for `Filter`.
         """
         if not isinstance(where, (tuple, list)) or not isinstance(exclude, (tuple, list)):
             return Filter(where, exclude)

@@ -71,12 +71,7 @@ def find_objects(store: HasObjects, words: Words) -> list[Object]:
 class Listing:
     """All objects of one revision, for words to choose from by the rules of `find_objects`.
 
-    Parameters
-    ----------
-    objects : sequence of Object
-        In the order in which they are chosen.
-    url : str
-        URL of their environment, for messages.
+    objects : in the order in which they are chosen; url : URL of their environment, for messages.
     """
 
     def __init__(self, objects: Sequence[Object], url: str) -> None:
@@ -89,12 +84,8 @@ class Listing:
     ) -> list[Object]:
         """Objects that words choose, each once.
 
-        Parameters
-        ----------
-        words : iterable of int or str
-            As for `find_objects`.
-        missing : list or None
-            Takes the errors of words that choose nothing; without it, the first one is raised.
+        words : as for `find_objects`; missing : takes the errors of words that choose nothing;
+        without it, the first one is raised.
         """
         errors: list[ObjectNotFoundError] = []
         found: set[int] = set()

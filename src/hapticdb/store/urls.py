@@ -42,10 +42,7 @@ def redact(url: str) -> str:
 def with_partitions(url: str, servers: str) -> str:
     """URL of a new environment whose rows get onto those servers: hosts or URLs, commas between.
 
-    Raises
-    ------
-    UsageError
-        When its engine has no partitions.
+    Raises `UsageError` when its engine has no partitions.
     """
     if scheme_of(url) not in {"postgresql", "postgres"}:
         raise UsageError(f"{redact(url)}: only environments on PostgreSQL have partitions")

@@ -44,10 +44,8 @@ class Way:
     def of(cls, poses: ArrayLike, corners: Floats, center: Floats) -> "Way":
         """Motion of a tool with corners (V, 3) through poses (M, 4, 4); center (3,), its frame.
 
-        Raises
-        ------
-        UsageError
-            If there is no pose, a pose is not rigid, or the path is too long for numbers.
+        Raises `UsageError` if there is no pose, a pose is not rigid, or the path is too long for
+        numbers.
         """
         given = checked_poses(poses)
         quaternions = quaternion_of(given[:, :3, :3])

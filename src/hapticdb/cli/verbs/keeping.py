@@ -229,7 +229,7 @@ def grant(
     Example: hapticdb grant postgresql://me@host/plant anna --as editor
     """
     from hapticdb.store.connect import grant as grant_right
-    from hapticdb.store.connect import redact
+    from hapticdb.store.urls import redact
 
     grant_right(url, role, right)
     if json:

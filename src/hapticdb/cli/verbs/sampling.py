@@ -76,7 +76,7 @@ def demo(
 
     from hapticdb.demo import compare, prepare
     from hapticdb.pictures.demo import draw
-    from hapticdb.store.connect import redact
+    from hapticdb.store.urls import redact
 
     render.compile_kernels("demo")
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
@@ -108,7 +108,7 @@ def _show_scene(scene: "DemoScene") -> None:
 
 
 def _import_text(one: "Imported") -> str:
-    from hapticdb.store.connect import redact
+    from hapticdb.store.urls import redact
 
     where = redact(one.url)
     size = (

@@ -143,9 +143,10 @@ def touch(
         render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
+        step = 1 if out is None else max(1, len(path) // MOST_COMPARED)
         fit = fitting.compare(
-            env, shell, path if out is None else _some_of(path), exclude=felt.left_out,
-            tool=tool, tool_unit=tool_unit, path_unit=path_unit, is_moving=False, reach=reach,
+            env, shell, path[::step], exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
+            path_unit=path_unit, is_moving=False, reach=reach,
         )  # fmt: skip
         if out is not None:
             pieces = env.touch_pieces(
@@ -180,11 +181,6 @@ def _path_of(
     if out is None or unit not in {None, "m"}:
         raise UsageError(f"--poses {poses}: a .npy file is for --out, and in metres")
     return map_poses(poses)
-
-
-def _some_of(path: "NDArray[np.float64]") -> "NDArray[np.float64]":
-    """Poses all along a path, at most about twice `MOST_COMPARED`."""
-    return path[:: max(1, len(path) // MOST_COMPARED)]
 
 
 def _touch_into(

@@ -1,12 +1,12 @@
 """The thread that follows what is committed to the environment."""
 
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from concurrent.futures import Future
 from threading import Event, Thread
 
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
-from hapticdb.errors import HapticDBError, ObjectNotFoundError
+from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.resident.changes import writes_since
 from hapticdb.store.base import Object, SupportsWatch
@@ -86,7 +86,7 @@ class Follower:
                 gone = self._revisions.keys() - {obj.id for obj in there}
             else:
                 ids = {change.id for change in changes}
-                there = list(_those_there(env, ids))
+                there = env.store.objects(ids)
                 gone = ids - {obj.id for obj in there}
         written = [obj for obj in there if self._revisions.get(obj.id) != obj.revision]
         removed = [i for i in gone if self._revisions.pop(i, None) is not None]
@@ -98,11 +98,3 @@ class Follower:
 def _may_have_changed(env: Environment) -> bool:
     """Whether something may have been committed since the last look."""
     return env.store.has_changed() if isinstance(env.store, SupportsWatch) else True
-
-
-def _those_there(env: Environment, ids: Iterable[int]) -> Iterable[Object]:
-    for object_id in sorted(ids):
-        try:
-            yield env.object(object_id)
-        except ObjectNotFoundError:
-            continue

@@ -38,11 +38,8 @@ class Address(NamedTuple):
 def parse(url: str) -> Address:
     """Take a URL apart.
 
-    Raises
-    ------
-    UsageError
-        When the environment's name cannot be a schema's, or is given twice; when the text is no
-        URL; when the URL names a user or a database that no server can have.
+    Raises `UsageError` when the environment's name cannot be a schema's, or is given twice; when
+    the text is no URL; when the URL names a user or a database that no server can have.
     """
     parts = _split(url)
     _check_login(parts, url)
@@ -119,10 +116,7 @@ def with_environment(url: str, name: str) -> str:
 def partition_urls(address: Address) -> list[str]:
     """URLs of the partitions: each a URL, or a host whose user and database are the address's.
 
-    Raises
-    ------
-    UsageError
-        When one is neither.
+    Raises `UsageError` when one is neither.
     """
     own = _split(address.conninfo)
     login = own.netloc.rpartition("@")[0]
@@ -144,10 +138,7 @@ def partition_urls(address: Address) -> list[str]:
 def check_name(name: str, what: str) -> None:
     """Refuse a name that the server refuses, or that it would cut off at 63 bytes.
 
-    Raises
-    ------
-    UsageError
-        When it is no text, empty, or longer than 63 bytes in UTF-8.
+    Raises `UsageError` when it is no text, empty, or longer than 63 bytes in UTF-8.
     """
     if not isinstance(name, str):
         raise UsageError(f"{what} {name!r}: give a str, not {type(name).__name__}")

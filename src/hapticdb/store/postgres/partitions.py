@@ -77,12 +77,7 @@ def spread(
 ) -> "Callable[[ServerConnection], None]":
     """Make the partitions of a new environment; returns what its own transaction does then.
 
-    Parameters
-    ----------
-    address : Address
-        Of the environment, with its `partitions`.
-    connect : callable
-        Connects to a partition's URL.
+    address : of the environment, with its `partitions`; connect : connects to a partition's URL.
     """
     urls = partition_urls(address)
     if not urls:

@@ -88,21 +88,12 @@ class PrivateServer:
     ) -> "PrivateServer":
         """Find the server in a folder, or set one up where the folder is new or empty.
 
-        Parameters
-        ----------
-        folder : path
-            Folder for the server alone. A missing folder is made, with its parents.
-        binaries : Binaries, optional
-            Programs to run; by default those that fit the folder, for a new folder the first found.
-        settings : mapping, optional
-            PostgreSQL's settings by name, for a start by this object. All other settings are those
-            of ``data/postgresql.conf`` in the folder.
+        folder : for the server alone; made, with its parents, where it is missing. binaries : by
+        default those that fit the folder, for a new one the first found. settings : PostgreSQL's
+        for a start by this object; all others are those of ``data/postgresql.conf``.
 
-        Raises
-        ------
-        DatabaseError
-            The folder holds something else, or data of a major version that is not found; no
-            PostgreSQL is found at all; the folder cannot be set up.
+        Raises `DatabaseError` if the folder holds something else, or data of a major version that
+        is not found; if no PostgreSQL is found at all; if the folder cannot be set up.
         """
         where = Path(folder).expanduser().resolve()
         if not Path("/proc/self/stat").exists():
@@ -121,10 +112,7 @@ class PrivateServer:
     def start(self) -> None:
         """Start the server, or join it where it runs; returns when it accepts connections.
 
-        Raises
-        ------
-        DatabaseError
-            The server does not start; the message ends with the end of the server's log.
+        Raises `DatabaseError` if it does not; the message ends with the end of the server's log.
         """
         with self._locked():
             deadline = time.monotonic() + ORPHANS_S

@@ -59,23 +59,13 @@ SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
 def grant(connection: ServerConnection, role: str, right: Right) -> None:
     """Give a role that right on an environment, and no more; one transaction.
 
-    Parameters
-    ----------
-    connection : ServerConnection
-        Connection of the environment's owner.
-    role : str
-        Name of a role of the server, a person's or a group's, written as it is.
-    right : {"viewer", "toucher", "editor", "nobody"}
-        Replaces the role's former right on this environment. Rights that the role has through a
-        group stay.
+    connection : of the environment's owner; role : a person's or a group's, written as it is;
+    right : replaces the role's former one on this environment. Rights that the role has through a
+    group stay.
 
-    Raises
-    ------
-    AccessError
-        When the connection's user does not own the environment.
-    UsageError
-        When there is no such role; when the role may do everything anyway; when the name is longer
-        than 63 bytes, so that the server would cut it off to another name.
+    Raises `AccessError` when the connection's user does not own the environment. Raises
+    `UsageError` when there is no such role; when the role may do everything anyway; when the name
+    is longer than 63 bytes, so that the server would cut it off to another name.
     """
     check_name(role, "a role's name")
     if right not in GRANTED:

@@ -79,10 +79,8 @@ def _versions(folders: list[Path]) -> Iterator[Binaries]:
 def fitting(data: Path, wanted: Binaries | None) -> Binaries:
     """Binaries of the version of a data folder; the first found if the folder does not exist.
 
-    Raises
-    ------
-    DatabaseError
-        No binaries are found, or none of that major version; or the folder holds no PostgreSQL.
+    Raises `DatabaseError` if no binaries are found, or none of that major version; or if the folder
+    holds no PostgreSQL.
     """
     offered = find_binaries() if wanted is None else [wanted]
     if not offered:
@@ -106,10 +104,8 @@ def fitting(data: Path, wanted: Binaries | None) -> Binaries:
 def account_for(folder: Path, binaries: Binaries) -> Account:
     """Who runs a server in a folder: its owner, anybody but root.
 
-    Raises
-    ------
-    DatabaseError
-        There is no account but root, or the account cannot enter the folder or reach the programs.
+    Raises `DatabaseError` if there is no account but root, or the account cannot enter the folder
+    or reach the programs.
     """
     if os.geteuid() != 0:
         # initdb needs a name for its user, and a user id in a container may have none

@@ -64,10 +64,6 @@ class FileConnection:
             with sqlite_file.named_errors(self.url):
                 raise
 
-    def execute(self, sql: str, bindings: Sequence[Any] = ()) -> apsw.Cursor:
-        """One statement of a write, inside `writing`."""
-        return self.driver.execute(sql, bindings)
-
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
         """All reads inside see one committed revision. May be nested."""

@@ -76,10 +76,7 @@ def check_log(path: Path, log_path: Path | None = None) -> bytes | None:
     Returns None if no mark can be read. After a power loss page 2 may be half written; the log then
     holds the whole page. `log_path` is another path of the log, for a log whose name is gone.
 
-    Raises
-    ------
-    DamagedError
-        When the log has commits that cannot be applied to this file.
+    Raises `DamagedError` when the log has commits that cannot be applied to this file.
     """
     for attempt in range(ATTEMPTS):
         if attempt:

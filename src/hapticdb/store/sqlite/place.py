@@ -32,12 +32,8 @@ Stamp = tuple[int, int, bool]
 class OpenedFile:
     """The file that a path led to when it was opened; its engine keeps reading that one.
 
-    Raises
-    ------
-    ConnectionLostError
-        When it cannot be reached.
-    DamagedError
-        When the log beside it belongs to another file.
+    Raises `ConnectionLostError` when it cannot be reached. Raises `DamagedError` when the log
+    beside it belongs to another file.
     """
 
     def __init__(self, path: Path) -> None:
@@ -57,10 +53,7 @@ class OpenedFile:
     def settle(self, connection: apsw.Connection, *, is_immutable: bool) -> None:
         """Note the files that SQLite keeps beside the file, after the first read.
 
-        Raises
-        ------
-        ConnectionLostError
-            When the path leads to another file by now.
+        Raises `ConnectionLostError` when the path leads to another file by now.
         """
         self._connection = connection
         _OPEN.add(self)
@@ -81,12 +74,8 @@ class OpenedFile:
     def look(self, *, has_committed: bool = False) -> None:
         """Refuse to go on when the path leads to another file or to other contents.
 
-        Raises
-        ------
-        ConnectionLostError
-            When the file, or SQLite's files beside it, were moved, deleted, replaced or cut short.
-        DamagedError
-            When another file was copied over it.
+        Raises `ConnectionLostError` when the file, or SQLite's files beside it, were moved,
+        deleted, replaced or cut short. Raises `DamagedError` when another file was copied over it.
         """
         lost = "what was written last is not in it; open it again"
         if self._found() != self.identity:
@@ -107,10 +96,7 @@ class OpenedFile:
 
         For files that were opened as immutable: SQLite takes no locks on them.
 
-        Raises
-        ------
-        BusyError
-            When somebody has written.
+        Raises `BusyError` when somebody has written.
         """
         if self.has_new_stamp():
             raise BusyError(f"{self._path} has been written since it was opened: open it again")

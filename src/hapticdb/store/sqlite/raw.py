@@ -26,10 +26,7 @@ PAGE_COUNT_AT = 28
 def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
     """Give access to the bytes of a database file, for as long as the block lasts.
 
-    Raises
-    ------
-    OSError
-        When the file is not there or may not be read.
+    Raises `OSError` when the file is not there or may not be read.
     """
     os.stat(path)  # noqa: PTH116 - its error says why; SQLite's would not
     if not os.access(path, os.R_OK):

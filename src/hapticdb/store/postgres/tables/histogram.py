@@ -55,17 +55,9 @@ def with_common_values(
 ) -> Keys:
     """Equi-count bounds (R + 1,) of all rows, from a histogram without the most common keys.
 
-    Parameters
-    ----------
-    bounds : (B + 1,) int64
-        Equi-count bounds of the rows whose keys are not among the common ones; may be empty.
-    common, shares : (C,) int64 and float64
-        Most common keys, and the share of all rows that each has.
-    resolution : int
-        R, buckets of the result.
+    bounds (B + 1,) : of the rows whose keys are not among the common ones; may be empty; common,
+    shares (C,) : most common keys, and the share of all rows that each has; resolution : R.
 
-    Notes
-    -----
     The rows of a bucket count at its upper bound, those of a common key at that key. Bound i is the
     least key up to which the share of rows is i / R, right to within a bucket of the histogram.
     """

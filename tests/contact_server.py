@@ -15,7 +15,8 @@ from hapticdb.hosting.contact_source import ContactSource
 from hapticdb.protocol.contacts import HandState
 from hapticdb.server import contacts
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving, run
+from hapticdb.server.running import run
+from hapticdb.server.served import Serving
 from serving import urls
 
 TOKEN = "a-token-for-tests-only"  # noqa: S105 - of no use elsewhere

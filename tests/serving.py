@@ -17,7 +17,8 @@ from websockets.typing import Subprotocol
 
 from children import PATIENCE, joined
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving, run
+from hapticdb.server.running import run
+from hapticdb.server.served import Serving
 
 PROTOCOL = [Subprotocol(f"viser-v{viser.__version__}")]
 TOKENS = {f"a-token-for-{role.word}": role for role in Role}

@@ -13,7 +13,7 @@ from hapticdb.clashes.run import find_clashes
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.page import colours
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from serving import TOKENS, running, urls
 
 pytestmark = pytest.mark.browser

@@ -36,7 +36,7 @@ from hapticdb.page.scene.surroundings import framing
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.site import SceneFacts
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from serving import TOKENS, Running, running, urls
 
 pytestmark = pytest.mark.browser

@@ -29,7 +29,7 @@ from hapticdb.errors import AccessError, ConnectionLostError, UsageError
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.protocol.contacts import unpack_proxy
 from hapticdb.server import contacts
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from serving import TOKENS, running, urls
 
 

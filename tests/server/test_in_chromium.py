@@ -8,7 +8,7 @@ from playwright.sync_api import ConsoleMessage, Page
 
 from chromium import chromium
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from serving import TOKENS, Running, running, urls
 
 pytestmark = pytest.mark.browser

@@ -15,7 +15,7 @@ from assemblies import row_of_boxes
 from children import until
 from hapticdb import Grid, find_clashes
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from hapticdb.store.connect import grant
 from hapticdb.store.postgres.address import parse
 from hapticdb.testing import blob, write_voxels

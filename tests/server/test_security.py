@@ -20,7 +20,7 @@ from hapticdb.realtime.processes import Process
 from hapticdb.server import access, page_keeper, relay
 from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
-from hapticdb.server.running import Serving, check
+from hapticdb.server.served import Serving, check
 from serving import CAMERA, TOKENS, Running, close_code, running, sent, text_until, urls
 
 EDITOR = "a-token-for-editor"

@@ -16,7 +16,7 @@ from children import PATIENCE, finished
 from hapticdb.client.opening import open_websocket, parse_address
 from hapticdb.errors import AccessError, FileError
 from hapticdb.server.access import Role
-from hapticdb.server.running import Serving
+from hapticdb.server.served import Serving
 from hapticdb.server.transports import StrictWebSocket
 from serving import CAMERA, PROTOCOL, TOKENS, Running, running, sent, text_until, urls
 

@@ -5,7 +5,6 @@ Host and Origin, so both are checked: Host against rebound names (DNS rebinding)
 WebSocket and on every request that changes something.
 """
 
-import ipaddress
 import logging
 import socket
 from collections.abc import Sequence
@@ -14,6 +13,8 @@ from urllib.parse import urlsplit
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from hapticdb.server.served import is_address
 
 LOG = logging.getLogger("hapticdb.server")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
@@ -86,15 +87,6 @@ class Guards:
         except ValueError:
             return False
         return name in self._names or is_address(name)
-
-
-def is_address(name: str) -> bool:
-    """Whether a host is an address in digits."""
-    try:
-        ipaddress.ip_address(name)
-    except ValueError:
-        return False
-    return True
 
 
 def _is_same(origin: str, host: str) -> bool:

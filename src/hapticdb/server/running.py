@@ -2,13 +2,9 @@
 
 import asyncio
 import contextlib
-import ipaddress
 import logging
-import re
 import socket
-import ssl
-from collections.abc import Awaitable, Callable, Iterator, Mapping
-from dataclasses import dataclass, field
+from collections.abc import Awaitable, Callable, Iterator
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -23,68 +19,24 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
 from hapticdb.server.figures import Figures
 from hapticdb.server.front_page import client_page
-from hapticdb.server.guards import is_address
 from hapticdb.server.health import Doctor, HostCollector
-from hapticdb.server.limits import Limits
 from hapticdb.server.messages import LARGEST
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
-from hapticdb.server.served import Served
+from hapticdb.server.served import Served, Serving, check
 from hapticdb.server.transports import limited
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp
 
 LOG = logging.getLogger("hapticdb.server")
-PAGE = "hapticdb.page.process:work"
-"""The page's process."""
 PING_EVERY = 20.0
 """Seconds between two pings to a browser. Larger: a browser that vanished is noticed later."""
 PING_PATIENCE = 60.0
 """Seconds for the answer to a ping, which waits behind the scene on a slow network. Larger: a
 browser that vanished holds its session longer."""
-PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
-"""What a prefix may be."""
 HEADER_BYTES = 16 << 10
 """Most bytes of the headers of a request."""
-
-
-@dataclass(frozen=True)
-class Serving:
-    """What a server is started with.
-
-    urls : the environment's address for each role; tools : files; tokens : the role that each
-    gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
-    it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
-    recordings of sessions, None: nobody records; page : function of the page's process;
-    awaits_devices : whether what hands call is compiled from the start, for devices on other
-    machines, and not when somebody first feels something.
-    """
-
-    urls: Mapping[Role, str]
-    tools: tuple[str, ...] = ()
-    tokens: Mapping[str, Role] = field(default_factory=dict)
-    open_role: Role | None = None
-    host: str = "127.0.0.1"
-    port: int = 0
-    prefix: str = ""
-    host_names: tuple[str, ...] = ()
-    certificate: str | None = None
-    key: str | None = None
-    title: str = "hapticdb"
-    recordings: str | None = None
-    limits: Limits = field(default_factory=Limits)
-    page: str = PAGE
-    awaits_devices: bool = False
-
-    def address(self, port: int, token: str = "") -> str:
-        """Address for a browser on this machine."""
-        scheme = "http" if self.certificate is None else "https"
-        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)  # noqa: S104 - compared
-        if ":" in host and not host.startswith("["):
-            host = f"[{host}]"
-        query = f"?token={token}" if token else ""
-        return f"{scheme}://{host}:{port}{self.prefix}/{query}"
 
 
 class _Server(uvicorn.Server):
@@ -106,37 +58,6 @@ class _Config(uvicorn.Config):
         super().load()
         if self.ssl is not None:
             self.ssl.num_tickets = 0
-
-
-def check(serving: Serving) -> None:
-    """Refuse what must not be served, by a UsageError.
-
-    That is a server without a token that another machine could reach; a prefix, or files of TLS,
-    that cannot be used.
-    """
-    if not is_near(serving.host) and serving.open_role is not None:
-        raise UsageError(
-            f"--host {serving.host}: other machines can reach that address, so clients need a "
-            "token; add --token"
-        )
-    if not PREFIX.fullmatch(serving.prefix):
-        raise UsageError(f"--prefix {serving.prefix}: write it as /name")
-    if (serving.certificate is None) != (serving.key is None):
-        raise UsageError("--tls-cert and --tls-key belong together: give both")
-    if serving.certificate is not None:
-        try:
-            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
-                serving.certificate, serving.key
-            )
-        except (OSError, ssl.SSLError) as error:
-            raise UsageError(f"--tls-cert {serving.certificate}: cannot be used: {error}") from None
-
-
-def is_near(host: str) -> bool:
-    """Whether only this machine reaches that address."""
-    if is_address(host):
-        return ipaddress.ip_address(host).is_loopback
-    return host == "localhost"
 
 
 def listening(serving: Serving) -> socket.socket:

@@ -1,13 +1,103 @@
-"""What the parts of one server share."""
+"""What a server is started with, and what its parts share; reading this loads nothing slow."""
 
+import ipaddress
+import re
+import ssl
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING
 
-from hapticdb.hosting.host import SessionHost
-from hapticdb.hosting.preparing import Preparation
+from hapticdb.errors import UsageError
 from hapticdb.server.access import Access, Role
-from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
+
+if TYPE_CHECKING:
+    from hapticdb.hosting.host import SessionHost
+    from hapticdb.hosting.preparing import Preparation
+    from hapticdb.server.figures import Figures
+
+PAGE = "hapticdb.page.process:work"
+"""The page's process."""
+PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
+"""What a prefix may be."""
+
+
+@dataclass(frozen=True)
+class Serving:
+    """What a server is started with.
+
+    urls : the environment's address for each role; tools : files; tokens : the role that each
+    gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
+    it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
+    recordings of sessions, None: nobody records; page : function of the page's process;
+    awaits_devices : whether what hands call is compiled from the start, for devices on other
+    machines, and not when somebody first feels something.
+    """
+
+    urls: Mapping[Role, str]
+    tools: tuple[str, ...] = ()
+    tokens: Mapping[str, Role] = field(default_factory=dict)
+    open_role: Role | None = None
+    host: str = "127.0.0.1"
+    port: int = 0
+    prefix: str = ""
+    host_names: tuple[str, ...] = ()
+    certificate: str | None = None
+    key: str | None = None
+    title: str = "hapticdb"
+    recordings: str | None = None
+    limits: Limits = field(default_factory=Limits)
+    page: str = PAGE
+    awaits_devices: bool = False
+
+    def address(self, port: int, token: str = "") -> str:
+        """Address for a browser on this machine."""
+        scheme = "http" if self.certificate is None else "https"
+        host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)  # noqa: S104 - compared
+        if ":" in host and not host.startswith("["):
+            host = f"[{host}]"
+        query = f"?token={token}" if token else ""
+        return f"{scheme}://{host}:{port}{self.prefix}/{query}"
+
+
+def check(serving: Serving) -> None:
+    """Refuse what must not be served, by a UsageError.
+
+    That is a server without a token that another machine could reach; a prefix, or files of TLS,
+    that cannot be used.
+    """
+    if not is_near(serving.host) and serving.open_role is not None:
+        raise UsageError(
+            f"--host {serving.host}: other machines can reach that address, so clients need a "
+            "token; add --token"
+        )
+    if not PREFIX.fullmatch(serving.prefix):
+        raise UsageError(f"--prefix {serving.prefix}: write it as /name")
+    if (serving.certificate is None) != (serving.key is None):
+        raise UsageError("--tls-cert and --tls-key belong together: give both")
+    if serving.certificate is not None:
+        try:
+            ssl.SSLContext(ssl.PROTOCOL_TLS_SERVER).load_cert_chain(
+                serving.certificate, serving.key
+            )
+        except (OSError, ssl.SSLError) as error:
+            raise UsageError(f"--tls-cert {serving.certificate}: cannot be used: {error}") from None
+
+
+def is_near(host: str) -> bool:
+    """Whether only this machine reaches that address."""
+    if is_address(host):
+        return ipaddress.ip_address(host).is_loopback
+    return host == "localhost"
+
+
+def is_address(name: str) -> bool:
+    """Whether a host is an address in digits."""
+    try:
+        ipaddress.ip_address(name)
+    except ValueError:
+        return False
+    return True
 
 
 @dataclass(frozen=True)
@@ -18,6 +108,6 @@ class Served:
     tools: tuple[str, ...]
     access: Access
     limits: Limits
-    figures: Figures
-    host: SessionHost
-    preparation: Preparation
+    figures: "Figures"
+    host: "SessionHost"
+    preparation: "Preparation"

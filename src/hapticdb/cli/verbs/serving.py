@@ -15,7 +15,7 @@ from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:
     from hapticdb.server.access import Role
-    from hapticdb.server.running import Serving
+    from hapticdb.server.served import Serving
 
 
 ToolsOption = Annotated[
@@ -173,8 +173,8 @@ def _serving(
     """What to serve; refuses an environment, a tool or a folder that is not there."""
     from contextlib import closing
 
-    from hapticdb.realtime.fork_server import prepare
     from hapticdb.server.access import Role
+    from hapticdb.server.served import Serving
     from hapticdb.store.connect import open_store
 
     urls = dict.fromkeys(Role, url)
@@ -189,9 +189,6 @@ def _serving(
             raise UsageError(f"--tool {tool}: no such file")
     if recordings is not None and not Path(recordings).is_dir():
         raise UsageError(f"--recordings {recordings}: no such folder")
-    prepare("hapticdb.page.process:work", [])  # loads while the server does here
-    from hapticdb.server.running import Serving
-
     return Serving(
         urls=urls, tools=tuple(tools or ()), tokens=tokens,
         open_role=None if tokens else Role.EDITOR,
@@ -244,12 +241,16 @@ def _run(
     import asyncio
     import logging
 
-    from hapticdb.server import logs, running
+    from hapticdb.realtime.fork_server import prepare
+    from hapticdb.server import served
 
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")
-    running.check(serving)
-    if not running.is_near(serving.host) and serving.certificate is None:
+    served.check(serving)
+    prepare(served.PAGE, [])  # loads while the server does here
+    from hapticdb.server import logs, running
+
+    if not served.is_near(serving.host) and serving.certificate is None:
         render.note(
             "tokens and forces cross the network unencrypted; give --tls-cert and --tls-key, or "
             "put a proxy with TLS in front"

@@ -29,24 +29,26 @@ _READY: set[str] = set()
 _COMPILING = Lock()
 
 
-def make_ready(*purposes: str) -> None:
+def make_ready(*purposes: str, progress: Callable[[Compiled], None] | None = None) -> int:
     """Compile what those purposes call and this machine has not compiled yet, side by side.
 
-    purposes : as `hapticdb.kernels.compiling.PURPOSES` names them. Once a process; a line on
-    standard error says what it waits for.
+    purposes : as `hapticdb.kernels.compiling.PURPOSES` names them; progress : as for `warm_up`;
+    without it a line on standard error says what is waited for. Returns how many were compiled.
     """
     if _READY.issuperset(purposes):
-        return
+        return 0
     with _COMPILING:
         names = missing(entries_for(*purposes))
-        if names:
+        if names and progress is None:
+            kernels = f"{len(names)} kernel{'s' * (len(names) > 1)}"
             sys.stderr.write(
-                f"hapticdb: compiling {len(names)} kernels, once on this machine: about "
+                f"hapticdb: compiling {kernels}, once on this machine: about "
                 f"{seconds_of(names):.0f} s ...\n"
             )
             sys.stderr.flush()
-            compile_missing(names)
+        n_compiled = compile_missing(names, progress) if names else 0
         _READY.update(purposes)
+        return n_compiled
 
 
 def warm_up(progress: Callable[[Compiled], None] | None = None) -> None:

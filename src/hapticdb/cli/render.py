@@ -158,7 +158,7 @@ def shares(counts: Mapping[str, int]) -> str:
 
 
 def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
-    """Compile the kernels of those purposes that this machine has not compiled yet, and say so.
+    """Compile the kernels of those purposes that this machine has not compiled yet, with a bar.
 
     purposes: as `hapticdb.kernels.compiling.PURPOSES` names them; files: what the verb is going to
     read: if none of them exists, nothing is compiled, so that the error about them comes at once.
@@ -166,15 +166,13 @@ def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
     """
     if files and not any(map(os.path.exists, files)):
         return 0
-    from hapticdb.kernels.compiling import compile_missing, entries_for, missing
+    from hapticdb.kernels.compiling import entries_for, missing
+    from hapticdb.ready import make_ready
 
-    names = missing(entries_for(*purposes))
-    if not names:
+    if not missing(entries_for(*purposes)):
         return 0
-    if not sys.stderr.isatty():
-        note(f"compiling, once: {counted(len(names), 'kernel')}, some seconds ...")
     with bar("compiling, once", "kernels", lambda now: (now.done, now.total)) as progress:
-        return compile_missing(names, progress)
+        return make_ready(*purposes, progress=progress)
 
 
 def import_bar() -> "AbstractContextManager[ImportCallback | None]":

@@ -35,10 +35,7 @@ FIRST_AT_ONCE = 4
 class Room:
     """Where the points of one shell are free.
 
-    Attributes
-    ----------
-    n_poses : int
-        Number of poses looked at so far.
+    n_poses : number of poses looked at so far.
     """
 
     def __init__(self, frames: ResidentFrames, problem: Problem) -> None:
@@ -96,12 +93,8 @@ class Room:
 class FreeSpace(Closes):
     """Rooms of a problem's parts. It is also a context manager.
 
-    Attributes
-    ----------
-    room, wide : Room
-        Where the parts are free, and where they keep `GUARD` voxels of clearance.
-    start : Touch
-        What is near the parts at the start: points are in its voxels.
+    room, wide : where the parts are free, and where they keep `GUARD` voxels of clearance; start :
+    what is near the parts at the start: points are in its voxels.
     """
 
     def __init__(self, problem: Problem, budget_bytes: int) -> None:

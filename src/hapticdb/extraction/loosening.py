@@ -81,10 +81,7 @@ class Twist(NamedTuple):
 class Loosening:
     """Searches motions out of contact, shifts and turns one after another, best places first.
 
-    Attributes
-    ----------
-    n_motions : int
-        Number of motions tried so far.
+    n_motions : number of motions tried so far.
     """
 
     def __init__(self, problem: Problem, space: FreeSpace, seed: int) -> None:

@@ -1,7 +1,7 @@
 """Straight pulls: how far a part goes in each direction before something is in the way."""
 
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -18,8 +18,7 @@ from hapticdb.extraction.directions import (
 from hapticdb.extraction.free_space import STEP, FreeSpace
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.problem import Exit, Problem
-from hapticdb.extraction.result import WayOut
-from hapticdb.store.base import Object
+from hapticdb.extraction.result import WayOut, ids_of
 from hapticdb.sweeps.run import SweepCallback
 
 Floats = NDArray[np.float64]
@@ -69,10 +68,7 @@ class Pull(NamedTuple):
 class Pulls:
     """Pulls in all candidate directions, until a deadline.
 
-    Attributes
-    ----------
-    done : list of Pull
-        In the order in which they were tried: those that are swept first.
+    done : in the order in which they were tried: those that are swept first.
     """
 
     def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
@@ -120,7 +116,7 @@ class Pulls:
             if not (way.in_way or way.swept.is_free):
                 continue  # the time was over
             self._swept.add(n)
-            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
+            blockers = ids_of(way.in_way[:1])  # it ends at the first
             free = way.free_share * length
             self.done.append(Pull(direction, length, 0.0, free, blockers, is_swept=True))
             if way.swept.is_free:
@@ -134,11 +130,14 @@ class Pulls:
             ways = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
             contact, end = self._followed(direction, ways)
             if contact == len(ways):  # still in contact where it should be out
-                touching, blockers = length, _ids(self._space.start.objects)
+                touching, blockers = length, ids_of(self._space.start.objects)
             else:
                 touching = float(ways[contact]) if contact < end else 0.0
                 free = float(ways[end - 1]) * (end > contact)
-                blockers = () if end == len(ways) else self._hit_at(direction * ways[end])
+                blockers = ()
+                if end < len(ways):
+                    hit = self._space.touch(shifted(direction * ways[end]))
+                    blockers = ids_of(hit.objects)
         return Pull(direction, length, touching, free, blockers)
 
     def _followed(self, direction: Floats, ways: Floats) -> tuple[int, int]:
@@ -160,19 +159,12 @@ class Pulls:
                 return contact, first + slides + int(later[0])
         return contact, len(ways)
 
-    def _hit_at(self, shift: Floats) -> tuple[int, ...]:
-        return _ids(self._space.touch(shifted(shift)).objects)
-
     def _opposing(self, direction: Floats) -> tuple[int, ...]:
         """Ids of the objects whose contacts at the start a direction presses against."""
         start = self._space.start
         against = start.contacts[start.contact_normals @ direction < AGAINST]
         pairs = start.contact_pairs[np.isin(start.contact_pairs[:, 0], against)]
         return tuple(np.unique(pairs[:, 1]).tolist())
-
-
-def _ids(objects: Sequence[Object]) -> tuple[int, ...]:
-    return tuple(obj.id for obj in objects)
 
 
 def _blocks(n: int) -> Iterator[tuple[int, int]]:

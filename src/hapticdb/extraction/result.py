@@ -1,5 +1,6 @@
 """Results of a search for a way out, in metres and displacements."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
@@ -14,6 +15,11 @@ Floats = NDArray[np.float64]
 
 WayOutVerdict = Literal["comes out", "slides", "not decided", "no way found"]
 How = Literal["pull", "screw", "plan"]
+
+
+def ids_of(parts: Sequence[Object]) -> tuple[int, ...]:
+    """Ids of parts, in their order."""
+    return tuple(obj.id for obj in parts)
 
 
 class Blocker(NamedTuple):

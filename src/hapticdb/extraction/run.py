@@ -21,7 +21,7 @@ from hapticdb.extraction.judge import judge
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Exit, Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
-from hapticdb.extraction.result import Blocker, Extraction, WayOut
+from hapticdb.extraction.result import Blocker, Extraction, WayOut, ids_of
 from hapticdb.extraction.screws import unscrewed
 from hapticdb.ready import make_ready
 from hapticdb.resident.table import DEFAULT_BUDGET
@@ -223,7 +223,7 @@ def _best_pull(problem: Problem, pulls: Pulls) -> WayOut | None:
         if way.swept.is_free:
             return way
         if way.in_way:
-            blockers = tuple(obj.id for obj in way.in_way[:1])  # it ends at the first
+            blockers = ids_of(way.in_way[:1])  # it ends at the first
             free = way.free_share * pull.length
             pulls.done[n] = pull._replace(free=free, blockers=blockers, is_swept=True)
         elif undecided is None:

@@ -11,7 +11,7 @@ from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
 from hapticdb.cli.options import ClusterOption, CsvOption, JsonOption, UrlArgument
-from hapticdb.cli.values import numbers_of
+from hapticdb.cli.values import budget_bytes, numbers_of
 from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
@@ -174,7 +174,7 @@ def clashes(
     ):
         found = find_clashes(
                 env, within=MM * within, contact=MM * contact, of=of or (), against=against or (),
-                seconds=seconds, budget=int(budget * 2**20), progress=progress, on=on,
+                seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
             )  # fmt: skip
         told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
         if table:

@@ -1,18 +1,12 @@
 """Results of a search for an order in which parts come out."""
 
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Literal, NamedTuple
 
-from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict
+from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict, ids_of
 from hapticdb.store.base import Object
 
 DisassemblyVerdict = Literal["comes out", "no order found"]
-
-
-def ids_of(parts: Sequence[Object]) -> tuple[int, ...]:
-    """Ids of parts, in their order."""
-    return tuple(obj.id for obj in parts)
 
 
 class Removal(NamedTuple):

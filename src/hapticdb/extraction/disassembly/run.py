@@ -15,8 +15,8 @@ from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
-from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Removal, ids_of
-from hapticdb.extraction.result import Extraction
+from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Removal
+from hapticdb.extraction.result import Extraction, ids_of
 from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object
@@ -150,18 +150,10 @@ class _Known(NamedTuple):
 class _OrderSearch:
     """One search for an order.
 
-    Attributes
-    ----------
-    steps : list of Removal
-        What was taken off so far.
-    failed : list of FailedSearch
-        Searches that proved no path.
-    motions_of_others : int
-        Motions of the planner for objects that block.
-    missing : MissingExtraError or None
-        The planner's, if it was wanted and is not installed: then there are straight pulls only.
-    is_spent : bool
-        Whether a search was left out because the time was over.
+    steps : what was taken off so far; failed : searches that proved no path; motions_of_others :
+    motions of the planner for objects that block; missing : the planner's, if it was wanted and is
+    not installed: then there are straight pulls only; is_spent : whether a search was left out
+    because the time was over.
     """
 
     def __init__(

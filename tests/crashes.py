@@ -164,7 +164,7 @@ def small(url: str, file: Path, layout: Layout = "brick") -> Environment:
 
 PLACE = placement(0.02, 0.01, -0.03)
 STEPS = ("_next_revision", "_take", "_put", "_log")
-"""Steps of a write, in their order: methods of `PostgresWriter`."""
+"""Steps of a write, in their order: methods of `ServerTables`."""
 Edit = Callable[[Environment], object]
 EDITS: list[tuple[str, Edit]] = [
     ("move", lambda env: env.move(7, PLACE)),

@@ -23,7 +23,7 @@ from command_line import (  # noqa: F401 - fixtures among them
 from hapticdb import Grid
 from hapticdb.cli.verbs import moving
 from hapticdb.store.base import Object, Rows
-from hapticdb.store.sqlite.tables.writing import SQLiteWriter
+from hapticdb.store.sqlite.tables.file_tables import FileTables
 from hapticdb.testing import write_voxels
 
 # -- copy -----------------------------------------------------------------------------------------
@@ -133,16 +133,16 @@ def test_a_diff_with_nothing_is_an_error(run: Run, args: list[str]) -> None:
 def test_a_copy_that_is_interrupted_says_that_it_goes_on(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    add, left = SQLiteWriter.add, [1]
+    add, left = FileTables.add, [1]
 
-    def interrupted(writer: SQLiteWriter, record: Object, rows: Rows, surface: bytes) -> int:
+    def interrupted(writer: FileTables, record: Object, rows: Rows, surface: bytes) -> int:
         if not left:
             raise KeyboardInterrupt
         left.pop()
         return add(writer, record, rows, surface)
 
     with monkeypatch.context() as patched:
-        patched.setattr(SQLiteWriter, "add", interrupted)
+        patched.setattr(FileTables, "add", interrupted)
         code, _, err = run("copy", scene, "b.db")
     assert code == 130
     assert "the same command goes on from there" in err

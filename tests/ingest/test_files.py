@@ -36,7 +36,7 @@ from hapticdb.mesh import MeshFile, Part, parse_in_process, read_file
 from hapticdb.store import base
 from hapticdb.store.base import Layout, Object
 from hapticdb.store.refusals import present_already
-from hapticdb.store.sqlite.tables.writing import SQLiteWriter
+from hapticdb.store.sqlite.tables.file_tables import FileTables
 from hapticdb.testing import KINDS
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
@@ -370,15 +370,15 @@ def test_a_part_that_another_adds_and_a_third_removes_meanwhile_goes_in(
 ) -> None:
     """Another process removes the part after the engine has refused to add it again."""
     calls: list[str] = []
-    add = SQLiteWriter.add
+    add = FileTables.add
 
-    def overtaken(writer: SQLiteWriter, record: Object, rows: base.Rows, surface: bytes) -> int:
+    def overtaken(writer: FileTables, record: Object, rows: base.Rows, surface: bytes) -> int:
         calls.append(record.name)
         if len(calls) == 2:
             raise present_already(record, "a.db")
         return add(writer, record, rows, surface)
 
-    monkeypatch.setattr(SQLiteWriter, "add", overtaken)
+    monkeypatch.setattr(FileTables, "add", overtaken)
     report = import_one(tmp_path / "a.db", file)
     names = [part.name for part in parts]
     assert calls == [names[0], names[1], *names[1:]]

@@ -23,7 +23,7 @@ from draws import drawn
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
-from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
+from hapticdb.store.sqlite.tables.file_tables import FileTables
 
 N_PARTS = 60
 
@@ -262,7 +262,7 @@ def test_statistics_missed_by_an_interruption_are_kept_by_the_next_import(
         raise KeyboardInterrupt
 
     with monkeypatch.context() as patch:
-        patch.setattr(SQLiteStatistics, "analyze", interrupted)
+        patch.setattr(FileTables, "analyze", interrupted)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(tmp_path / "e.db", [file], small_options())
     (report,) = hapticdb.import_files(tmp_path / "e.db", [file], small_options())

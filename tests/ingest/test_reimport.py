@@ -12,7 +12,7 @@ import trimesh
 
 import hapticdb
 from command_line import Run, boxes, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
-from hapticdb.store.sqlite.tables.writing import SQLiteWriter
+from hapticdb.store.sqlite.tables.file_tables import FileTables
 
 
 def names(url: Path) -> list[str]:
@@ -127,10 +127,10 @@ def test_an_interrupted_replacement_goes_on(
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6, extent=3))
     hapticdb.import_files(url, [file], options)
     boxes(file, side=0.12)
-    replace = SQLiteWriter.replace
+    replace = FileTables.replace
     calls: list[int] = []
 
-    def twice(writer: SQLiteWriter, *words: Any) -> None:  # noqa: ANN401 - handed on
+    def twice(writer: FileTables, *words: Any) -> None:  # noqa: ANN401 - handed on
         calls.append(1)
         if len(calls) == 2:
             raise KeyboardInterrupt
@@ -138,7 +138,7 @@ def test_an_interrupted_replacement_goes_on(
 
     again = hapticdb.ImportOptions(replace=True)
     with monkeypatch.context() as patched:
-        patched.setattr(SQLiteWriter, "replace", twice)
+        patched.setattr(FileTables, "replace", twice)
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(url, [file], again)
     assert names(url) == ["box0", "box1", "box2"]

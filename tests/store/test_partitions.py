@@ -45,7 +45,7 @@ from hapticdb.store.postgres.partitions import ends
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.writing import PostgresWriter
+from hapticdb.store.postgres.tables.server_tables import ServerTables
 from hapticdb.store.urls import redact, with_partitions
 from hapticdb.testing import StoreContract
 from servers import SETTINGS, kill
@@ -200,7 +200,7 @@ def test_a_partition_that_dies_in_a_write_leaves_the_environment_as_it_was(
     with hapticdb.open(made) as env:
         before = contents(env)
         with monkeypatch.context() as patch:
-            After(patch, PostgresWriter, step, lambda: kill(dying))
+            After(patch, ServerTables, step, lambda: kill(dying))
             with pytest.raises(
                 ConnectionLostError, match="one of its partitions cannot be reached"
             ):

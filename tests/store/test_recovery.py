@@ -42,7 +42,7 @@ from hapticdb.ingest.files import ImportProgress
 from hapticdb.query.frame import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.private_server import PrivateServer
-from hapticdb.store.postgres.tables.writing import PostgresWriter
+from hapticdb.store.postgres.tables.server_tables import ServerTables
 from servers import kill
 from validity import Contents, assert_valid, contents, valid_contents
 
@@ -107,7 +107,7 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
         for (name, edit), after in zip(EDITS, edited, strict=True):
             for step in steps_of(name):
                 with pytest.MonkeyPatch.context() as patch:
-                    After(patch, PostgresWriter, step, lambda: kill(server))
+                    After(patch, ServerTables, step, lambda: kill(server))
                     with pytest.raises(
                         hapticdb.errors.ConnectionLostError, match="cannot be reached"
                     ):
@@ -128,7 +128,7 @@ def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
     before = env.store.revision()
     first = env.objects()[0].id
     with pytest.MonkeyPatch.context() as patch:
-        After(patch, PostgresWriter, step, lambda: crash(server))
+        After(patch, ServerTables, step, lambda: crash(server))
         if name == "move":
             env.move(first, PLACE)
         else:

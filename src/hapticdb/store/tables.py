@@ -8,7 +8,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
 from functools import partial
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,6 +25,8 @@ from hapticdb.store.base import (
     Layout,
     Object,
     Rows,
+    Table,
+    no_rows,
     touched_ranges,
 )
 from hapticdb.store.pairs import (
@@ -48,6 +50,8 @@ from hapticdb.store.refusals import (
 )
 
 Result = TypeVar("Result")
+Form = Literal["lookup", "lookup_one", "scan", "rows_of", "after"]
+"""Ways to ask for rows: as the methods of `Tables`; `lookup_one`, a statement a key."""
 
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
@@ -116,6 +120,10 @@ class Tables(ABC):
         self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
     ) -> list[Any]:
         """Rows of a statement that reads; binary : whether as the engine holds them, if faster."""
+
+    @abstractmethod
+    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
+        """Rows of a table, as a form of question finds them; what is asked is not empty."""
 
     @abstractmethod
     def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:
@@ -190,6 +198,34 @@ class Tables(ABC):
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision. May be nested."""
         return self._connection.snapshot()
+
+    # -- reads of rows ---------------------------------------------------------------------------
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,), in one statement."""
+        return self._found_rows("lookup", keys, distances=distances)
+
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,), one statement a key."""
+        return self._found_rows("lookup_one", keys, distances=distances)
+
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows with a key in any of the closed ranges, ascending and disjoint."""
+        return self._found_rows("scan", lows, highs, distances=distances)
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
+        return self._found_rows("rows_of", lows, highs, object_id, distances=distances)
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most that many rows after (key, id), ascending by both."""
+        return self._found_rows("after", key, object_id, limit, distances=distances)
+
+    def _found_rows(self, form: Form, first: Keys | int, *more: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
+        is_nothing = not isinstance(first, int) and not first.size
+        if is_nothing or (distances and not self.has_table(parsing.BAND)):
+            return no_rows(distances=distances)
+        return self._read("band" if distances else self.layout, form, (first, *more))
 
     # -- reads -----------------------------------------------------------------------------------
 

@@ -9,8 +9,7 @@ from hapticdb.store.engines import Lag
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables.reading import PostgresReader
-from hapticdb.store.postgres.tables.statistics import SIZE_OF_PARTITIONS, PostgresStatistics
-from hapticdb.store.postgres.tables.writing import PostgresWriter
+from hapticdb.store.postgres.tables.server_tables import SIZE_OF_PARTITIONS
 from hapticdb.store.postgres.watching import Watch
 
 GROUPS_KEYS_ITSELF = 170_000
@@ -25,7 +24,7 @@ SELECT pg_last_wal_replay_lsn()::text,
  WHERE pg_is_in_recovery()"""
 
 
-class PostgresStore(PostgresReader, PostgresWriter, PostgresStatistics):
+class PostgresStore(PostgresReader):
     """An environment on a PostgreSQL server. Open with `open`, make with `create`."""
 
     def __init__(self, connection: ServerConnection) -> None:

@@ -13,11 +13,9 @@ from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
-from hapticdb.store.sqlite.tables.statistics import SQLiteStatistics
-from hapticdb.store.sqlite.tables.writing import SQLiteWriter
 
 
-class SQLiteStore(SQLiteReader, SQLiteWriter, SQLiteStatistics):
+class SQLiteStore(SQLiteReader):
     """An environment in one SQLite file. Open with `open`, make with `create`."""
 
     def __init__(self, connection: FileConnection) -> None:

@@ -1,6 +1,7 @@
 """Reads on a server: rows by key and by range, the paper's Figure 3, surfaces."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,8 @@ from hapticdb.store.base import (
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.asking import ServerTables
+from hapticdb.store.postgres.tables.server_tables import ServerTables
+from hapticdb.store.tables import Form
 
 MOST_BITS = 1 << 20
 """Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
@@ -51,46 +53,14 @@ class PostgresReader(ServerTables):
             rows = rows.having(parsing.band_of(self.url, found[3] or b"", lengths))
         return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
-    def _read(
-        self,
-        texts: dict[Table, str],
-        *parameters: wire.Parameter,
-        distances: bool,
-        is_nothing: bool = False,
-    ) -> Rows:
-        """Rows by the statement of the table that answers; none if that table is not there."""
-        if is_nothing or (distances and not self.has_table(parsing.BAND)):
-            return no_rows(distances=distances)
-        text = texts["band" if distances else self.layout]
+    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
+        text, distances = getattr(self._sql, form)[table], table == "band"
+        if form == "lookup_one":
+            each = (self._connection.fetch(text, wire.int8(key)) for key in asked[0].tolist())
+            parts = [self._unpacked(found, distances=distances) for found in each]
+            return joined([part for part in parts if len(part)], distances=distances)
+        parameters = (wire.int8(one) if isinstance(one, int) else wire.int8s(one) for one in asked)
         return self._unpacked(self._connection.fetch(text, *parameters), distances=distances)
-
-    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), in one statement."""
-        asked = wire.int8s(keys)
-        return self._read(self._sql.lookup, asked, distances=distances, is_nothing=not keys.size)
-
-    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), one statement a key."""
-        parts = [
-            self._read(self._sql.lookup_one, wire.int8(key), distances=distances)
-            for key in keys.tolist()
-        ]
-        return joined([part for part in parts if len(part)], distances=distances)
-
-    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        ends = wire.int8s(lows), wire.int8s(highs)
-        return self._read(self._sql.scan, *ends, distances=distances, is_nothing=not lows.size)
-
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(object_id)
-        return self._read(self._sql.rows_of, *chosen, distances=distances, is_nothing=not lows.size)
-
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most that many rows after (key, id), ascending by both."""
-        place = wire.int8(key), wire.int8(object_id), wire.int8(limit)
-        return self._read(self._sql.after, *place, distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""

@@ -15,12 +15,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.store import parsing
-from hapticdb.store.base import LAYOUTS, Keys, LocatedShell, Rows, Table, no_rows, row_shift
+from hapticdb.store.base import LAYOUTS, Keys, LocatedShell, Rows, Table
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import rows as sqlite_rows
-from hapticdb.store.sqlite.tables.asking import FileTables
+from hapticdb.store.sqlite.tables.file_tables import FileTables
 from hapticdb.store.sqlite.tables.ranges import COLUMNS, TABLES, RangeStatements
+from hapticdb.store.tables import Form
 
 LOOKUP: dict[Table, str] = {
     table: f"""
@@ -50,73 +51,32 @@ class SQLiteReader(FileTables):
 
     def __init__(self, connection: FileConnection) -> None:
         super().__init__(connection)
-        self._has_bricks = row_shift(self.layout) > 0
         self._ranges = RangeStatements(connection.driver, self.layout, self.grid.bits)
         sqlite_force.register(connection.driver, self.grid, self.layout)
 
-    def _unpacked(self, found: list[Any], *, distances: bool = False) -> Rows:
-        """Rows as arrays, from the tuples of a statement."""
-        if distances:
+    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
+        fetch = self._connection.fetch
+        if form == "lookup_one":
+            one = LOOKUP_ONE[table]
+            found = [row for key in asked[0].tolist() for row in fetch(one, (key,))]
+        elif form == "lookup":
+            found = fetch(LOOKUP[table], (apsw.carray(asked[0]),))
+        elif form == "after":
+            found = fetch(AFTER[table], asked)
+        else:
+            sql, bindings = self._ranges.scan(table, *asked[:2])
+            if form == "rows_of":
+                sql, bindings = f"{sql} AND {table}.id = ?4", (*bindings, asked[2])
+            found = fetch(sql, bindings)
+        if table == "band":
             return sqlite_rows.rows_with_distances(self.url, found)
-        return sqlite_rows.rows_of(self.url, found, has_bricks=self._has_bricks)
-
-    def _table(self, *, distances: bool, is_nothing: bool = False) -> Table | None:
-        """Table that answers a read; None if it is not there, or nothing is asked for."""
-        if is_nothing or (distances and not self.has_table(parsing.BAND)):
-            return None
-        return "band" if distances else self.layout
-
-    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), in one statement."""
-        table = self._table(distances=distances, is_nothing=not keys.size)
-        if table is None:
-            return no_rows(distances=distances)
-        found = self._connection.fetch(LOOKUP[table], (apsw.carray(keys),))
-        return self._unpacked(found, distances=distances)
-
-    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), one statement a key."""
-        table = self._table(distances=distances)
-        if table is None:
-            return no_rows(distances=distances)
-        sql = LOOKUP_ONE[table]
-        found: list[Any] = []
-        for key in keys.tolist():
-            found += self._connection.fetch(sql, (key,))
-        return self._unpacked(found, distances=distances)
-
-    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        return self._in_ranges(lows, highs, distances=distances)
-
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        return self._in_ranges(lows, highs, object_id, distances=distances)
-
-    def _in_ranges(
-        self, lows: Keys, highs: Keys, object_id: int | None = None, *, distances: bool
-    ) -> Rows:
-        table = self._table(distances=distances, is_nothing=not lows.size)
-        if table is None:
-            return no_rows(distances=distances)
-        sql, bindings = self._ranges.scan(table, lows, highs)
-        if object_id is not None:
-            sql, bindings = f"{sql} AND {table}.id = ?4", (*bindings, object_id)
-        return self._unpacked(self._connection.fetch(sql, bindings), distances=distances)
+        return sqlite_rows.rows_of(self.url, found, has_bricks=table == "brick")
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
         return int(self._connection.fetch(*self._ranges.count(lows, highs))[0][0])
-
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most that many rows after (key, id), ascending by both."""
-        table = self._table(distances=distances)
-        if table is None:
-            return no_rows(distances=distances)
-        found = self._connection.fetch(AFTER[table], (key, object_id, limit))
-        return self._unpacked(found, distances=distances)
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""

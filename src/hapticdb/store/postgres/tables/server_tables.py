@@ -1,0 +1,265 @@
+"""The tables on a server: how statements run, what is written, sizes and quantiles of the keys."""
+
+from collections.abc import Callable, Sequence
+from typing import Any, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+from psycopg import errors
+
+from hapticdb.store import parsing
+from hapticdb.store.base import (
+    NO_KEYS,
+    Covering,
+    Histogram,
+    Keys,
+    Object,
+    Rows,
+    Size,
+    Table,
+)
+from hapticdb.store.pairs import PUT, Ids, PairRow
+from hapticdb.store.postgres import schema_of
+from hapticdb.store.postgres.connecting import failures, wire
+from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.tables import statements
+from hapticdb.store.postgres.tables.histogram import (
+    ENOUGH_ROWS,
+    SERVER_RESOLUTION,
+    exact_histogram,
+    server_histogram,
+)
+from hapticdb.store.postgres.tables.loading import TABLES, Loading
+from hapticdb.store.postgres.watching import channel_of
+from hapticdb.store.tables import Tables
+
+Result = TypeVar("Result")
+
+WRITE_LOCK = "SELECT 1 FROM environment WHERE id = 1 FOR UPDATE"
+# writers take revisions one after the other, and no reader waits for this lock
+NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
+COPY_CHUNK = 1 << 17
+"""Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
+COLUMNS: dict[Table, str] = {
+    "voxel": "z_val, id",
+    "brick": "z_val, id, occupancy",
+    "band": "z_val, id, distances",
+}
+# not from a sequence, which also counts rolled-back writes: an import that is run again would
+# give other ids
+HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
+NEXT_ID = "SELECT setval('object_id_seq', greatest(nextval('object_id_seq'), %s))"
+# of the table `pair`, a column each
+PAIR_TYPES = (
+    "bigint[]", "bigint[]", "text[]", *["double precision[]"] * 8, "text[]", "bigint[]", "text[]",
+)  # fmt: skip
+PUT_PAIRS = PUT.format(
+    values=f"SELECT * FROM unnest({', '.join(f'%s::{kind}' for kind in PAIR_TYPES)})"
+)
+DELETE_PAIRS = """
+DELETE FROM pair USING unnest(%s::bigint[], %s::bigint[]) AS gone (a, b)
+ WHERE (pair.a, pair.b) = (gone.a, gone.b)"""
+SIZE_OF_BAND = "SELECT count(*), pg_total_relation_size('band') FROM band"
+SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages), sum(band) FROM size"
+SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
+
+
+class ServerTables(Tables):
+    """The tables on a server. They remember the revision that the last read has seen."""
+
+    HAS_TABLE = "SELECT 1 WHERE to_regclass(%s) IS NOT NULL"
+    AMONG = "id = ANY (ARRAY(SELECT json_array_elements_text(%s::json)::bigint))"
+    AS_TEXT = "::text"
+    TAKEN = errors.UniqueViolation
+    _connection: ServerConnection
+
+    def __init__(self, connection: ServerConnection) -> None:
+        super().__init__(connection)
+        self.url = connection.shown
+        made = schema_of.read_environment(connection)
+        self.grid, self.layout, self.wants_distances, self.identity, self._is_spread = made
+        self._seen = -1
+        self._loading = Loading(connection, self.layout, is_spread=self._is_spread)
+        self._written: tuple[Any, ...] = ()
+        self._highest_id = (0, 0)  # at which revision
+
+    def _rows(
+        self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
+    ) -> list[Any]:
+        return self._connection.rows(text, parameters, binary=binary)
+
+    def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:
+        cursor = self._connection.execute(text, parameters)
+        return cursor.fetchall() if cursor.description else []
+
+    def _save(self, text: str, parameters: Sequence[Any] = ()) -> None:
+        self._connection.write(lambda: self._do(text, parameters))
+
+    def _alone(self, work: Callable[[], Result]) -> Result:
+        def locked() -> Result:
+            self._do(WRITE_LOCK)
+            return work()
+
+        return self._connection.write(locked)
+
+    def _next_revision(self) -> int:
+        return int(self._do(NEXT_REVISION)[0][0])
+
+    def _packed(self, values: NDArray[Any]) -> list[Any]:
+        return values.reshape(-1).tolist()
+
+    def version(self) -> int:
+        """The revision that the last read has seen."""
+        return self._seen
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+        text = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
+        ((self._seen, identity),) = self._rows(text)
+        if identity != self.identity:
+            raise failures.remade(self.url)
+        return self._seen
+
+    # -- writes ----------------------------------------------------------------------------------
+
+    def _exchange_pairs(self, gone: Ids, rows: Sequence[PairRow]) -> None:
+        self._do(DELETE_PAIRS, [list(column) for column in zip(*gone, strict=True)])
+        columns = zip(*(row.columns for row in rows), strict=True)
+        self._do(PUT_PAIRS, [list(column) for column in columns])
+
+    def drop_rows(self, object_id: int) -> None:
+        """Delete the rows that a crash has left of an object that is not there."""
+
+        def work() -> None:
+            if not self._do("SELECT 1 FROM object WHERE id = %s", (object_id,)):
+                for table in TABLES[self.layout]:
+                    self._do(f"DELETE FROM {table} WHERE id = %s", (object_id,))
+
+        self._alone(work)
+
+    def _new_id(self, revision: int) -> int:
+        """One above all ids ever given. The write lock is held, so nobody else adds an object.
+
+        On partitions an id of an add that failed is never given again: rows of it may be there.
+        """
+        since, highest = self._highest_id
+        found = self._do(HIGHEST_ID, (since,))
+        self._highest_id = revision - 1, max(highest, int(found[0][0]))
+        if self._is_spread:
+            return int(self._do(NEXT_ID, (self._highest_id[1] + 1,))[0][0])
+        return self._highest_id[1] + 1
+
+    def _commit(self, work: Callable[[], Result]) -> Result:
+        result = self._connection.write(work, self._is_written)
+        self._loading.note()
+        return result
+
+    def _note(self, change: tuple[Any, ...]) -> None:
+        """Write the row of `change`, and notify those who watch when it is committed."""
+        ((transaction, _),) = self._do(
+            "INSERT INTO change VALUES (%s, %s, %s, %s)"
+            " RETURNING xmin::text, pg_notify(%s, revision::text)",
+            (*change, channel_of(self._connection.address.environment)),
+        )
+        self._written = (*change[:3], transaction)
+
+    def _is_written(self) -> bool:
+        """Whether a write was committed although the connection broke during its commit."""
+        # the commit may still be under way: wait for its lock before looking
+        self._rows(WRITE_LOCK)
+        found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
+        return bool(self._rows(found, self._written))
+
+    def _put(self, rows: Rows, object_id: int) -> None:
+        """Write the rows of an object that has none."""
+        self._copy_into(self.layout, rows.occupied(), object_id)
+        if rows.distances is not None:
+            self._copy_into("band", rows, object_id)
+
+    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
+        """Delete the rows of an object as it is now, from both tables; returns their keys.
+
+        keys : of its new rows; on partitions a try that failed may have left such rows.
+        """
+        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        if self._is_spread and keys.size:
+            ends = np.concatenate([ends, [[keys.min(), keys.max()]]])
+        chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
+        tables: list[Table] = [self.layout]
+        if known.has_distances:
+            tables.append("band")
+        gone = []
+        for table in tables:
+            (found,) = self._connection.fetch(statements.DELETE_ROWS[table], *chosen)
+            gone.append(wire.read_int8s(found))
+        return np.concatenate(gone)
+
+    def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
+        target = f"{table} ({COLUMNS[table]})"
+        with self._connection.driver.cursor().copy(
+            f"COPY {target} FROM STDIN (FORMAT binary)"
+        ) as copy:
+            copy.write(wire.COPY_HEADER)
+            for at in range(0, len(rows), COPY_CHUNK):
+                copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
+            copy.write(wire.COPY_TRAILER)
+
+    # -- statistics ------------------------------------------------------------------------------
+
+    def size(self) -> Size:
+        """Rows, bytes of all tables and indexes, leaf blocks; rows of distances; surfaces."""
+        with self._connection.snapshot(), self._connection.without_limit():
+            self.revision()
+            band = surfaces = (0, 0)
+            counted = (
+                "SELECT count(*) FROM brick"
+                if self.layout == "brick"
+                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
+            )
+            ((rows,),) = self._connection.execute(counted).fetchall()
+            total, index = self._bytes()
+            if self.has_table(parsing.BAND):
+                (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
+            if self._is_spread:
+                ((more, index, of_band),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
+                total, index, band = total + int(more), int(index), (band[0], of_band)
+            if self.has_table(parsing.SURFACE):
+                (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
+            return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets.
+
+        At 10,000 from the server's statistics once there are enough rows; else the kept one while
+        no object was written since, else computed exactly.
+        """
+        if resolution == SERVER_RESOLUTION:
+            found = server_histogram(self._connection, self.layout)
+            if found is not None and found[1] >= ENOUGH_ROWS:
+                return Histogram(*found, "server statistics")
+        return super().quantiles(resolution)
+
+    def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
+        """The server's own statistics once there are enough rows."""
+        if resolution == SERVER_RESOLUTION:
+            revision, n_rows = self.revision(), self.size().rows
+            if n_rows >= ENOUGH_ROWS:
+                with self._connection.without_limit("statement_timeout", "lock_timeout"):
+                    self._connection.execute("SELECT refresh_statistics()")
+                return revision, n_rows, None
+        return super()._measured(resolution)
+
+    def _exact(self, resolution: int) -> tuple[Keys, int]:
+        return exact_histogram(self._connection, self.layout, resolution)
+
+    def _bytes(self) -> tuple[int, int]:
+        """Bytes of all tables and indexes of the schema, and pages of the index of its rows."""
+        ((total, pages),) = self._connection.execute(
+            "SELECT (SELECT coalesce(sum(pg_total_relation_size(oid)), 0) FROM pg_class"
+            "         WHERE relkind = 'r'"
+            "           AND relnamespace = quote_ident(current_schema())::regnamespace),"
+            "       coalesce(pg_relation_size(to_regclass(%s)), 0)"
+            "         / current_setting('block_size')::int",
+            (f"{self.layout}_key",),
+        ).fetchall()
+        return int(total), int(pages)

@@ -4,6 +4,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pytest
 import trimesh
 from numpy.typing import NDArray
 
@@ -287,3 +288,11 @@ def grounded(folder: Path) -> Path:
         cage=walls((0.0, 0.0, 0.0), (0.08, 0.08, 0.06), 0.02),
         block=box((0.03, 0.03, 0.0), (0.05, 0.05, 0.02)),
     )
+
+
+def shadow_planner(folder: Path, monkeypatch: pytest.MonkeyPatch, code: str) -> None:
+    """Put a planner that runs `code` when it is imported before the installed one."""
+    shadow = folder / "shadow" / "ompl"
+    shadow.mkdir(parents=True)
+    (shadow / "__init__.py").write_text(code)
+    monkeypatch.syspath_prepend(str(shadow.parent))  # a child has the path of its parent

@@ -16,7 +16,7 @@ from disassembly_scenes import (
     least_gap,
     made,
 )
-from extraction_scenes import corner, lid
+from extraction_scenes import corner, lid, shadow_planner
 from hapticdb import Disassembly, disassemble
 from hapticdb.errors import MissingExtraError
 from hapticdb.extraction.verdict import disassembly_line, failed_line
@@ -118,10 +118,7 @@ def test_the_last_object_that_stands_is_not_taken_off(tmp_path: Path) -> None:
 def test_without_a_planner_straight_orders_are_found(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shadow = tmp_path / "shadow" / "ompl"
-    shadow.mkdir(parents=True)
-    (shadow / "__init__.py").write_text("raise ImportError('no planner')")
-    monkeypatch.syspath_prepend(str(shadow.parent))  # the child has the path of its parent
+    shadow_planner(tmp_path, monkeypatch, "raise ImportError('no planner')")
     url = made(tmp_path, STACK)
     assert order(found_in(url, "lid", motions=100, keep=["pot"])) == ["weight", "lid"]
     (tmp_path / "chain").mkdir()

@@ -25,6 +25,7 @@ from extraction_scenes import (
     lid,
     recessed,
     room_with_a_door,
+    shadow_planner,
     studded,
     threaded,
     walls,
@@ -209,10 +210,7 @@ def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.Monk
 def test_a_missing_planner_is_said_with_what_is_in_the_way(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shadow = tmp_path / "shadow" / "ompl"
-    shadow.mkdir(parents=True)
-    (shadow / "__init__.py").write_text("raise ImportError('no planner')")
-    monkeypatch.syspath_prepend(str(shadow.parent))  # the child has the path of its parent
+    shadow_planner(tmp_path, monkeypatch, "raise ImportError('no planner')")
     url = enclosed(tmp_path)
     with pytest.raises(MissingExtraError, match=r"cage is in the way.*pip install .*ompl"):
         found_in(url, "block")
@@ -222,10 +220,7 @@ def test_a_missing_planner_is_said_with_what_is_in_the_way(
 def test_a_planner_that_dies_is_an_error_and_no_wait(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    shadow = tmp_path / "shadow" / "ompl"
-    shadow.mkdir(parents=True)
-    (shadow / "__init__.py").write_text("import os\nos.kill(os.getpid(), 9)")
-    monkeypatch.syspath_prepend(str(shadow.parent))
+    shadow_planner(tmp_path, monkeypatch, "import os\nos.kill(os.getpid(), 9)")
     with pytest.raises(hapticdb.errors.HapticDBError, match="planner's process has ended"):
         found_in(enclosed(tmp_path), "block")
 

@@ -7,11 +7,20 @@ from hapticdb.store.base import Layout, Store, row_shift
 from hapticdb.testing.scenes import KINDS, blob, write_voxels
 
 
-class StoreCase:
-    """A store of one engine with two objects in it, over every layout and curve."""
+class Case:
+    """Tests of one engine, which may lack capabilities."""
 
     lacks: frozenset[str] = frozenset()
-    """Keys of `hapticdb.testing.STORE_CAPABILITIES`; tests of these capabilities are skipped."""
+    """Keys of `STORE_CAPABILITIES` or `ENGINE_CAPABILITIES`, whose tests are skipped."""
+
+    def need(self, capability: str) -> None:
+        """Skip a test where the engine says that it lacks a capability."""
+        if capability in self.lacks:
+            pytest.skip(f"{type(self).__name__}: the engine lacks the capability {capability!r}")
+
+
+class StoreCase(Case):
+    """A store of one engine with two objects in it, over every layout and curve."""
 
     def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
         """Make a new store; each name gives another store in the same place."""
@@ -20,11 +29,6 @@ class StoreCase:
     def reopen(self, store: Store) -> Store:
         """Open the same environment by a second connection."""
         raise NotImplementedError
-
-    def need(self, capability: str) -> None:
-        """Skip a test where the engine says that it lacks a capability."""
-        if capability in self.lacks:
-            pytest.skip(f"{type(self).__name__}: the engine lacks the capability {capability!r}")
 
     @pytest.fixture(params=KINDS, ids="-".join)
     def store(self, request: pytest.FixtureRequest) -> Store:

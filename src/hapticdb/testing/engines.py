@@ -19,6 +19,7 @@ from hapticdb.store.engines import (
     SupportsGrant,
     engine_of,
 )
+from hapticdb.testing.case import Case
 from hapticdb.testing.scenes import (
     blob,
     everything,
@@ -33,21 +34,14 @@ ENGINE_CAPABILITIES: dict[str, Any] = {
 """Capabilities that only some engines have, by their names in `EngineContract.lacks`."""
 
 
-class EngineContract:
+class EngineContract(Case):
     """Tests of what one engine does with URLs. Subclass and override `url`."""
 
-    lacks: frozenset[str] = frozenset()
-    """Keys of `ENGINE_CAPABILITIES`; tests of these capabilities are skipped."""
     grid = Grid(0.01, (0, 0, 0), 6)
 
     def url(self) -> str:
         """URL of an environment that does not exist yet; another one at each call."""
         raise NotImplementedError
-
-    def need(self, capability: str) -> None:
-        """Skip a test where the engine says that it lacks a capability."""
-        if capability in self.lacks:
-            pytest.skip(f"{type(self).__name__}: the engine lacks the capability {capability!r}")
 
     def make(self) -> str:
         """URL of a small environment, which is closed."""

@@ -227,6 +227,12 @@ class GridOptions:
             )
 
 
+def corners_of(boxes: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Corners (..., 8, 3) of boxes (..., 2, 3), lower and upper corner of each."""
+    which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
+    return np.asarray(boxes[..., which, np.arange(3)])
+
+
 def _is_close(a: float, b: float) -> bool:
     return math.isclose(a, b, rel_tol=1e-9)
 

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from hapticdb.extraction.directions import AXES, likely_directions
 from hapticdb.extraction.free_space import FreeSpace, Room
 from hapticdb.extraction.judge import passed
-from hapticdb.extraction.problem import Exit, Problem, corners_of
+from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.pulls import Pulls, first_run, shifted
+from hapticdb.grid import corners_of
 
 Floats = NDArray[np.float64]
 
@@ -136,7 +137,7 @@ class GoalsOutside:
             if obj.id in first
         ]
         boxes.append(np.stack([problem.center, problem.center]))
-        return np.concatenate([corners_of(box) for box in boxes])
+        return corners_of(np.stack(boxes)).reshape(-1, 3)
 
 
 class GoalPose:

@@ -9,6 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
+from hapticdb.grid import corners_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, scene_bounds
 from hapticdb.store.finding import Words
@@ -92,12 +93,6 @@ def problem_of(
         env, tuple(parts), tuple(where), left_out, contact, tuple(standing),
         _box_of(standing), shell, corners_of(box), center, radius,
     )  # fmt: skip
-
-
-def corners_of(box: Floats) -> Floats:
-    """Corners (8, 3) of a box (2, 3)."""
-    which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
-    return np.asarray(box[which, np.arange(3)])
 
 
 def _box_of(standing: Sequence[Object]) -> Floats:

@@ -7,8 +7,9 @@ import numpy as np
 from hapticdb.extraction.directions import AXES, distinct
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.loosening import Twist
-from hapticdb.extraction.problem import Exit, Problem, corners_of
+from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.result import WayOut
+from hapticdb.grid import corners_of
 
 
 def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> WayOut | None:

@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError, pip_line
-from hapticdb.extraction.problem import corners_of
 from hapticdb.extraction.result import Extraction
+from hapticdb.grid import corners_of
 from hapticdb.ingest.geometry import found_parts
 from hapticdb.page import colours
 from hapticdb.page.drawing import put_at

@@ -6,6 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from hapticdb.grid import corners_of
+
 Floats = NDArray[np.float64]
 Image = NDArray[np.float32]
 
@@ -48,8 +50,7 @@ class Camera:
         right /= np.linalg.norm(right)
         axes = np.stack([right, np.cross(ahead, right), ahead])
         eye = center - 5.5 * radius * ahead
-        which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
-        corners = boxes[:, which, np.arange(3)].reshape(-1, 3)
+        corners = corners_of(boxes).reshape(-1, 3)
         seen = (corners - eye) @ axes.T
         flat = seen[:, :2] / seen[:, 2:]
         left, right_most = flat.min(axis=0), flat.max(axis=0)

@@ -14,6 +14,7 @@ from matplotlib.transforms import Bbox
 from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
+from hapticdb.grid import corners_of
 from hapticdb.pictures.demo import (
     BODY,
     COLORS,
@@ -151,8 +152,7 @@ def _camera(
 ) -> Camera:
     """Camera that has the tool's way in view, left of the legend, and the scene or some of it."""
     low, high = shell.points.min(axis=0), shell.points.max(axis=0)
-    which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
-    corners = np.stack([low, high])[which, np.arange(3)]
+    corners = corners_of(np.stack([low, high]))
     swept = np.stack([_placed(corners, pose) for pose in _along(found, WAY)[1]])
     low, high = swept.min(axis=1), swept.max(axis=1)
     length = float((high.max(axis=0) - low.min(axis=0)).max())
@@ -194,9 +194,8 @@ def _in_view(env: Environment, camera: Camera, exclude: set[int]) -> list[Object
     """Objects whose bounds may be seen, the smallest first, while they are not too many voxels."""
     chosen: list[Object] = []
     total = 0
-    which = np.stack(np.meshgrid([0, 1], [0, 1], [0, 1]), axis=-1).reshape(-1, 3)
     for obj in sorted(env.objects(), key=lambda obj: (obj.voxels, obj.id)):
-        seen = camera.project(obj.bounds[which, np.arange(3)])
+        seen = camera.project(corners_of(obj.bounds))
         is_begun = (seen.max(axis=0) > (0, 0, camera.near)).all()
         is_ended = (seen.min(axis=0) >= (*camera.size, camera.far)).any()
         if obj.id not in exclude and is_begun and not is_ended:

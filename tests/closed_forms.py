@@ -240,7 +240,7 @@ class Hand:
 
     def advance(self, dt: float = 1e-3) -> Floats:
         """Run one period; returns the force at the device (3,), a copy."""
-        self._periods.step(0, 0, dt)
+        self._periods.step(dt, 0)
         force: Floats = self.sent.wrench[:3].copy()
         return force
 

@@ -97,7 +97,7 @@ class SmoothHand:
         returned is the caller's own.
         """
         self._handle.follow(Reading(pose, velocity, 0), self._hand)
-        self._periods.step(0, 0, self._period)
+        self._periods.step(self._period, 0)
         return np.array(self._sent["wrench"][:3])
 
 

@@ -220,9 +220,9 @@ def test_no_text_names_this_machine_or_a_package_index() -> None:
 
 # --- waits in tests ------------------------------------------------------------------------------
 
-# methods that may wait for ever without arguments; deadlines and tables have the same names
+# methods that may wait for ever without arguments; tables have the same name
 WAITS = {"acquire", "communicate", "get", "join", "recv", "result", "wait"}
-WAITS_OF_OTHERS = {("table", "join"), ("deadlines", "wait")}
+WAITS_OF_OTHERS = {("table", "join")}
 RUNS = {"run", "call", "check_call", "check_output"}
 
 

@@ -1,4 +1,4 @@
-"""Deadlines on a clock that the test moves, and the settings that `undisturbed` restores."""
+"""Times of a loop, and the settings that `undisturbed` restores."""
 
 import ctypes
 import gc
@@ -6,99 +6,35 @@ import math
 import os
 import sys
 
+import numpy as np
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hapticdb.errors import UsageError
-from hapticdb.realtime.deadlines import (
-    SWITCH_INTERVAL,
-    Deadlines,
-    Timing,
-    empty_loop,
-    undisturbed,
-)
-from hapticdb.realtime.report import Times
+from hapticdb.kernels.records import TIME_BINS
+from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
+from hapticdb.realtime.deadlines import SWITCH_INTERVAL, Timing, undisturbed
+from hapticdb.realtime.loop import empty_loop
+from hapticdb.realtime.report import spread_of
 
-PERIOD = 1_000_000
 GET_TIMERSLACK = 30
 
 
-class Clock:
-    """A clock in nanoseconds: reading it takes 50 ns, a sleep ends `late` ns too late."""
-
-    def __init__(self, start: int = 12_345) -> None:
-        self.now = start
-        self.late = 0
-
-    def __call__(self) -> int:
-        self.now += 50
-        return self.now
-
-    def sleep(self, seconds: float) -> None:
-        self.now += round(seconds * 1e9) + self.late
-
-
-def ticking() -> tuple[Clock, Deadlines]:
-    clock = Clock()
-    return clock, Deadlines(PERIOD, Times(), Times(), clock=clock, sleep=clock.sleep)
-
-
-@given(st.lists(st.integers(0, 5 * PERIOD), min_size=1, max_size=50))
-def test_every_frame_begins_at_a_deadline_and_all_others_are_missed(works: list[int]) -> None:
-    clock, deadlines = ticking()
-    for work in works:
-        begun = deadlines.wait()
-        assert 0 <= begun - deadlines.due < 200
-        assert (deadlines.due - deadlines.started) % PERIOD == 0
-        clock.now += work
-        deadlines.done()
-    figures = deadlines.figures()
-    assert figures.frames == len(works)
-    assert deadlines.passed == figures.frames + figures.missed
-    assert deadlines.passed * PERIOD == deadlines.due - PERIOD - deadlines.started
-    assert (deadlines.passed - 1) * PERIOD <= figures.seconds * 1e9 + 1
-    assert figures.seconds * 1e9 <= (deadlines.passed + 1) * PERIOD
-
-
-def test_a_frame_of_two_and_a_half_periods_misses_two_deadlines() -> None:
-    clock, deadlines = ticking()
-    deadlines.wait()
-    clock.now += 5 * PERIOD // 2
-    deadlines.done()
-    deadlines.wait()
-    assert deadlines.missed == 2
-    assert deadlines.dt == pytest.approx(3e-3, abs=1e-6)
-    assert deadlines.figures().elapsed.worst == pytest.approx(2.5e-3, abs=1e-6)
-
-
-def test_a_late_wake_up_is_lateness_and_no_drift() -> None:
-    clock, deadlines = ticking()
-    clock.late = 300_000
-    for _ in range(100):
-        begun = deadlines.wait()
-        assert (begun - deadlines.due) == pytest.approx(240_000, abs=200)  # 60 us were to spin
-        deadlines.done()
-    assert deadlines.missed == 0
-    assert deadlines.due - deadlines.started == 101 * PERIOD
-    assert deadlines.figures().lateness.p50 == pytest.approx(240e-6, abs=1e-6)
-
-
 def test_percentiles_are_of_all_that_was_counted() -> None:
-    times = Times()
-    assert times.spread() == (0.0, 0.0, 0.0, 0.0)
-    for n in range(1, 1001):
-        times.add(n * 1e-6)
-    times.add(1.0)  # beyond the histogram's last bin
-    spread = times.spread()
+    counts = np.zeros(TIME_BINS + 1, np.int64)
+    assert spread_of(counts, 0.0) == (0.0, 0.0, 0.0, 0.0)
+    counts[1:1001] = 1
+    counts[-1] = 1  # longer than the histogram's bins
+    spread = spread_of(counts, 1.0)
     assert spread.p50 == pytest.approx(501e-6, abs=1e-6)
     assert spread.p99 == pytest.approx(991e-6, abs=1e-6)
     assert spread.worst == 1.0
 
 
-def test_an_empty_loop_lasts_as_many_deadlines_as_asked() -> None:
-    figures = empty_loop(500.0, 0.1)
+@pytest.mark.parametrize("law", [PLANE, SMOOTH])
+def test_an_empty_loop_lasts_as_many_deadlines_as_asked(law: ForceLaw) -> None:
+    figures = empty_loop(law, 500.0, 0.1)
     assert 50 <= figures.frames + figures.missed < 60 + figures.missed
+    assert figures.seconds >= 0.1
     assert all(map(math.isfinite, (*figures.lateness, *figures.elapsed)))
 
 

@@ -141,23 +141,41 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     hand.z = 0.02
     loop._place()
     loop.station.row["staleness"] = -(10**18)
-    loop._step(1e-3, is_frame=True)
+    loop.station.row["is_frame"] = True
+    loop._step(1e-3)
     noted = loop.board.rings[0, 0]
     assert noted["hits"] == loop.board.seats["hit_frames"][0] == 0
     assert not noted["wrench"].any()
+
+
+class Ended(SystemExit):
+    """Raised by the signal handler of these tests."""
+
+
+def _end(number: int, _: object) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise Ended
+
+
+def test_a_loop_told_to_end_while_it_runs_lets_its_device_go(world: World) -> None:
+    class Told(Pressing):
+        def apply(self, wrench: Floats) -> None:
+            super().apply(wrench)
+            if len(self.sent) == 20:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    signal.signal(signal.SIGTERM, _end)
+    hand = Told(-0.004)
+    with pytest.raises(Ended):
+        work(requested(world, hand, seconds=60.0), Heard())
+    assert len(hand.sent) < 30
+    assert not hand.sent[-1].any()
 
 
 @pytest.mark.parametrize("when", ["apply", "close"])
 def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
     world: World, when: str
 ) -> None:
-    class Ended(SystemExit):
-        pass
-
-    def end(number: int, _: object) -> None:
-        signal.signal(number, signal.SIG_IGN)
-        raise Ended
-
     class Told(Pressing):
         is_failing = is_closed = False
 
@@ -180,7 +198,7 @@ def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
             self.tell("close")
             self.is_closed = True
 
-    signal.signal(signal.SIGTERM, end)
+    signal.signal(signal.SIGTERM, _end)
     hand = Told(0.02)
     with pytest.raises(DeviceError, match="unplugged"):
         work(requested(world, hand), Heard())

@@ -59,7 +59,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         seats["is_recorded"] = True
         for revision in (7, 8, 9):
             publish(table.cells.control, revision - 6, revision)
-            periods.step(0, 0, 1e-3)
+            periods.step(1e-3, 0)
         assert rings["revision"][0].tolist() == [7, 8, 9, 0]
 
 

@@ -170,7 +170,7 @@ class ContactSource:
             quaternion = last[3:] + share * (turned - last[3:])
             hand["position"] = last[:3] + share * (at[:3] - last[:3])
             hand["quaternion"] = quaternion / np.linalg.norm(quaternion)
-            self._stations.step(0, time.monotonic_ns(), period)
+            self._stations.step(period, time.monotonic_ns())
         self._last = at.copy()
 
     def _state(self, hand: HandState, kept: float) -> ProxyState:

@@ -10,10 +10,9 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import FARTHEST
-from hapticdb.kernels.records import TIME_BIN
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.report import Spread, spread_of
+from hapticdb.realtime.report import LoopFigures, Spread
 from hapticdb.recording.frame import Frames, State
 
 
@@ -150,13 +149,13 @@ class HostedSession:
         """Figures of the session so far."""
         seat = self._open_seat()
         row = self._board.seats[seat]
-        frames, missed = int(row["n_frames"]), int(row["missed"])
+        loop = LoopFigures.of_seat(row, 0.0)
         return HostedFigures(
-            frames=frames,
-            missed=missed,
-            in_time=int(row["in_time"]) / max(frames + missed, 1),
-            lateness=spread_of(row["lateness"], TIME_BIN, float(row["worst_lateness"])),
-            elapsed=spread_of(row["elapsed"], TIME_BIN, float(row["worst_elapsed"])),
+            frames=loop.frames,
+            missed=loop.missed,
+            in_time=int(row["in_time"]) / max(loop.frames + loop.missed, 1),
+            lateness=loop.lateness,
+            elapsed=loop.elapsed,
             unknown=int(row["unknown_frames"]),
             held=int(row["held_frames"]),
             stale=int(row["stale_frames"]),

@@ -22,7 +22,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import SettledCoupling
-from hapticdb.realtime.deadlines import SPIN, undisturbed
+from hapticdb.realtime.deadlines import undisturbed
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
@@ -76,10 +76,7 @@ class Worker:
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         seats = self._board.seats
-        self._stations = Stations(
-            len(seats), seats, self._board.rings, SMOOTH, period=round(1e9 / request.rate),
-            spin=round(1e9 * SPIN),
-        )  # fmt: skip
+        self._stations = Stations(len(seats), seats, self._board.rings, SMOOTH)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------
@@ -144,7 +141,7 @@ class Worker:
     def run(self) -> None:
         """Run periods until the host ends; the work of the loop's thread."""
         with undisturbed():
-            self._stations.run()
+            self._stations.run(self._rate)
 
 
 def work(request: WorkerRequest, sender: MessageSender) -> None:

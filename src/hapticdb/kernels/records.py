@@ -320,7 +320,7 @@ FIGURES: Layout = _record(
 MOST_SHOWN = 64
 """Most contacts of a hosted session that others see. Larger: broad contacts are drawn more
 densely."""
-TIME_BINS, TIME_BIN = 1000, 5e-6
+TIME_BINS, TIME_BIN = 5000, 1e-6
 """Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
 bins: less exact percentiles. The worst time is kept exactly."""
 
@@ -424,6 +424,9 @@ STATION: Layout = _record(
         # of a device's hand
         ("handle", HANDLE),
         ("reading", READING),
+        # addresses of what reads the device and what pushes it; 0: the caller does
+        ("reads", "<i8"),
+        ("pushes", "<i8"),
         # of a hosted hand, between arrivals
         ("seen", "<i8"),  # sequence number of the last arrival
         ("arrived", "<i8"),  # ns
@@ -450,7 +453,8 @@ PACE: Layout = _record(
         ("is_over", "<i8"),
         ("periods", "<i8"),  # done so far
         ("period", "<i8"),  # ns; 0: one period, whose times the caller has written
-        ("spin", "<i8"),  # ns before a deadline at which the loop watches the clock
+        ("passed", "<i8"),  # deadlines so far, kept and missed
+        ("most", "<i8"),  # deadlines after which the loop ends
         ("due", "<i8"),  # ns, the deadline of the period
         ("begun", "<i8"),  # ns, when it began
         ("dt", "<f8"),  # s since the one before

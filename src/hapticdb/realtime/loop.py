@@ -1,15 +1,16 @@
 """The servo loop, in a process of its own: every frame on time, no frame queries the database.
 
-Deadlines are absolute: the loop sleeps until shortly before each one, and then watches the clock.
-While the loop runs, no kernel is compiled and no garbage is collected.
+The loop is one kernel, which calls this module to read the device and to push it. While it runs, no
+kernel is compiled and no garbage is collected.
 """
 
 import contextlib
 import math
 import signal
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
@@ -25,17 +26,18 @@ from hapticdb.devices.protocol import (
 from hapticdb.errors import DeviceError, HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
+from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.handle import is_somewhere
-from hapticdb.kernels.period.loop import DEVICE
-from hapticdb.kernels.records import pose_numbers, views_of
+from hapticdb.kernels.period.loop import DEVICE, NOBODY
+from hapticdb.kernels.records import FRAME, SEAT, pose_numbers, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
-from hapticdb.realtime.deadlines import Deadlines, Timing, empty_loop, undisturbed
+from hapticdb.realtime.deadlines import Timing, undisturbed
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
-from hapticdb.realtime.report import LoopAnswer, LoopFigures, Times
+from hapticdb.realtime.report import LoopAnswer, LoopFigures
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import LOST, STOP, CellTable
@@ -112,11 +114,11 @@ class Loop:
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])
-        self._is_frame = self.station.record["is_frame"]
         self._is_asked_to_end = seats[0, ...]["is_asked_to_end"]
         self.bad_reading: str | None = None
         self.is_warm = False
-        self.lateness, self.elapsed = Times(), Times()
+        self._error: BaseException | None = None
+        self._signal = 0
 
     # -- before the first frame --------------------------------------------------------------
 
@@ -187,16 +189,9 @@ class Loop:
         taken = self._reading
         taken.pose[:], taken.velocity[:], taken.buttons[()] = reading
 
-    def _step(
-        self, dt: float, due: int = 0, begun: int | None = None, *, is_frame: bool = False
-    ) -> None:
-        """Run a period of `dt` s; `sent` then has the wrench for the device.
-
-        is_frame : whether it is noted and counted; due, begun : ns.
-        """
-        self._is_frame[()] = is_frame
-        now = time.perf_counter_ns() if begun is None else begun
-        self.stations.step(due, now, dt)
+    def _step(self, dt: float) -> None:
+        """Run a period of `dt` s; `sent` then has the wrench for the device."""
+        self.stations.step(dt, time.monotonic_ns())
         if self.gpu is not None:
             self.gpu.check()
 
@@ -210,29 +205,61 @@ class Loop:
 
     def run(self) -> LoopFigures:
         """Run frames until the time is over, the device's script ends, or a stop is requested."""
-        request, device, reader = self.request, self.device, self.reader
-        rate = request.timing.rate
-        n_deadlines = max(round(request.seconds * rate), 1)
-        look_every = max(round(LOOK_EVERY * rate), 1)
+        timing, row = self.request.timing, self.station.row
+        called = self._called(self._read_hand), self._called(self._pusher())
+        row["reads"], row["pushes"] = map(address_of, called)
+        row["is_frame"] = True
+        # an error that a signal raises where a kernel calls could be lost: it is raised below
+        before = signal.signal(signal.SIGTERM, self._end)
+        try:
+            seconds = self.stations.run(timing.rate, self.request.seconds)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        if self._signal:
+            signal.raise_signal(self._signal)
+        if self._error is not None:
+            raise self._error
+        self.device.apply(np.zeros(6))
+        return LoopFigures.of_seat(self.board.seats[0], seconds)
+
+    def _end(self, number: int, _: object) -> None:
+        self._signal = number
+        self.stations.stop()
+
+    def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
+        """Return what a kernel calls for `work`: whether the loop ends, as it does with an error."""
+
+        def answer() -> bool:
+            try:
+                return work()
+            except BaseException as error:  # noqa: BLE001 - `run` raises it
+                self._error = error
+                return True
+
+        return FUNCTION(answer)
+
+    def _read_hand(self) -> bool:
+        self._take(self.reader.read())
+        return False
+
+    def _pusher(self) -> Callable[[], bool]:
+        """Return what pushes the device and looks whether the loop ends."""
+        device, seat = self.device, self.board.seats[0, ...]
         ends = device if isinstance(device, SupportsEnd) else None
-        deadlines = Deadlines(round(1e9 / rate), self.lateness, self.elapsed)
-        self.station.row["began"] = deadlines.started
-        applied, x = self.sent.wrench, self.hand["position"][:1]
-        while deadlines.passed < n_deadlines:
-            at = deadlines.frames
-            begun = deadlines.wait()
-            self._take(reader.read())
-            self._step(deadlines.dt, deadlines.due, begun, is_frame=True)
+        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], seat["n_frames"]
+        look_every = max(round(LOOK_EVERY * self.request.timing.rate), 1)
+
+        def push() -> bool:
+            if self.gpu is not None:
+                self.gpu.check()
             device.apply(applied)
             if math.isnan(x.item()) and self.bad_reading is None:
-                self.bad_reading = reader.complaint() or None
-            deadlines.done()
+                self.bad_reading = self.reader.complaint() or None
             if self._is_stopped() or (ends is not None and ends.is_over):
-                break
-            if at % look_every == 0 and parent_is_gone():
-                break
-        device.apply(np.zeros(6))
-        return deadlines.figures()
+                return True
+            return n_frames.item() % look_every == 0 and parent_is_gone()
+
+        return push
 
     def close(self) -> None:
         """Set the force to zero, however the loop ended, and close the device."""
@@ -240,6 +267,14 @@ class Loop:
             self.device.apply(np.zeros(6))
         if isinstance(self.device, SupportsClose):
             self.device.close()
+
+
+def empty_loop(law: ForceLaw, rate: float, seconds: float) -> LoopFigures:
+    """Run a loop that does nothing at that rate, to measure the machine's lateness."""
+    seats = np.zeros(1, SEAT)
+    stations = Stations(1, seats, np.zeros((1, 1), FRAME), law)
+    stations.rows["source"], stations.rows["is_running"] = NOBODY, True
+    return LoopFigures.of_seat(seats[0], stations.run(rate, seconds))
 
 
 def n_compiled() -> int:
@@ -255,7 +290,8 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
         with undisturbed(request.timing.processor):
             empty = None
             if request.has_baseline:
-                empty = empty_loop(request.timing.rate, min(EMPTY_SECONDS, request.seconds))
+                seconds = min(EMPTY_SECONDS, request.seconds)
+                empty = empty_loop(request.law, request.timing.rate, seconds)
             warm_up = loop.prepare()
             compiled = n_compiled()
             sender.send("running")

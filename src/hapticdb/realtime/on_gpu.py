@@ -1,6 +1,5 @@
 """Looks of a session's coupling on a graphics processor, which the kernel of its periods calls."""
 
-import ctypes
 from collections.abc import Callable
 from typing import Any
 
@@ -11,7 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.batches.on_gpu import check_gpu
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.gpu import looks as kernels
-from hapticdb.kernels.hand.calling import FUNCTION
+from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.near_points import (
     BOUND,
     FAR,
@@ -137,8 +136,8 @@ class GpuLooks:
         self._launch_put_back()
         self._stream.synchronize()
         self._repeat()
-        self._called = FUNCTION(self._answer)  # kept as long as its address is used
-        station.follower["looker"] = ctypes.cast(self._called, ctypes.c_void_p).value
+        self._called = FUNCTION(self._answer)
+        station.follower["looker"] = address_of(self._called)
 
     def _sight_of(self, station: Station) -> kernels.Sight:
         """Memory of the GPU for a tool."""

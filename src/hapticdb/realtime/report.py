@@ -1,23 +1,19 @@
 """Report of a session: its rate, lateness and computing time, and those of an empty loop."""
 
 from dataclasses import asdict, dataclass, fields
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, Self
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.kernels.records import TIME_BIN, TIME_BINS
 from hapticdb.proportions import Proportions
 from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.resident_cells import CacheFigures
 
-BINS = 200_000
-BIN = 1e-7
-"""Width of a bin of the histogram of times, seconds; the bins cover 0 to 20 ms. Larger: less exact
-percentiles. The worst time is kept exactly."""
-
 
 class Spread(NamedTuple):
-    """Distribution of a time over frames, seconds: percentiles exact to 0.1 us, and the worst."""
+    """Distribution of a time over frames, seconds: percentiles exact to 1 us, and the worst."""
 
     p50: float
     p99: float
@@ -25,36 +21,17 @@ class Spread(NamedTuple):
     worst: float
 
 
-class Times:
-    """Histogram of the times of many frames; its memory does not grow with their number."""
+def spread_of(counts: NDArray[np.int64], worst: float) -> Spread:
+    """Percentiles of a seat's histogram; zeros if it is empty.
 
-    def __init__(self) -> None:
-        self.counts: NDArray[np.int64] = np.zeros(BINS + 1, dtype=np.int64)
-        self.worst = 0.0
-
-    def add(self, seconds: float) -> None:
-        """Add one time (s)."""
-        at = int(seconds / BIN)
-        self.counts[at if at < BINS else BINS] += 1  # noqa: FURB136 - min() costs 0.2 us
-        if seconds > self.worst:  # noqa: PLR1730 - likewise
-            self.worst = seconds
-
-    def spread(self) -> Spread:
-        """Percentiles of the times added; zeros if there are none."""
-        return spread_of(self.counts, BIN, self.worst)
-
-
-def spread_of(counts: NDArray[np.int64], width: float, worst: float) -> Spread:
-    """Percentiles of a histogram whose bins have that width (s); the last bin has all above.
-
-    Zeros if it is empty.
+    counts (TIME_BINS + 1,): the last bin has all longer times; worst : the longest one, s.
     """
     total = int(counts.sum())
     if not total:
         return Spread(0.0, 0.0, 0.0, 0.0)
     at = np.searchsorted(np.cumsum(counts), np.ceil([0.5 * total, 0.99 * total, 0.999 * total]))
     p50, p99, p999 = np.where(
-        at == len(counts) - 1, worst, np.minimum((at + 0.5) * width, worst)
+        at == TIME_BINS, worst, np.minimum((at + 0.5) * TIME_BIN, worst)
     ).tolist()
     return Spread(p50, p99, p999, worst)
 
@@ -79,6 +56,14 @@ class LoopFigures:
     def rate(self) -> float:
         """Frames a second."""
         return self.frames / self.seconds if self.seconds else 0.0
+
+    @classmethod
+    def of_seat(cls, seat: NDArray[np.void], seconds: float) -> Self:
+        """Timing of a session that ran for so long; seat : its row of `SEAT`."""
+        spreads = [
+            spread_of(seat[name], float(seat[f"worst_{name}"])) for name in ("lateness", "elapsed")
+        ]
+        return cls(int(seat["n_frames"]), seconds, int(seat["missed"]), *spreads)
 
 
 class LoopAnswer(NamedTuple):

@@ -24,7 +24,7 @@ from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
-from hapticdb.realtime.stations import without_surface
+from hapticdb.realtime.stations import FOREVER, without_surface
 from hapticdb.recording.file import DEFAULT_LIMIT, Header
 from hapticdb.recording.frame import Frames, State
 from hapticdb.recording.ring import SessionRecording
@@ -43,8 +43,6 @@ START_PATIENCE = 120.0
 """Seconds in which the loop's process must be ready. A device may take long to open."""
 END_PATIENCE = 10.0
 """Seconds in which the loop must end after a request to end; normally it ends after a frame."""
-FOREVER = 1e9
-"""Seconds that mean "no limit": thirty years."""
 DEFAULT_STALENESS = 1.0
 """Default of `staleness`, seconds without an answer of the database."""
 

@@ -1,5 +1,6 @@
 """Stations: sessions in the form that the kernel of their periods reads (`kernels.period.loop`)."""
 
+import time
 from dataclasses import replace
 
 import numpy as np
@@ -28,6 +29,8 @@ results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
 """Nanoseconds without an answer of the database after which hosted hands and contact proxies take
 all cells for unknown."""
+FOREVER = 1e9
+"""Seconds that mean "no limit": thirty years."""
 
 Record = NDArray[np.void]
 
@@ -133,33 +136,32 @@ class Stations:
     """Stations of a process, and the call of their periods.
 
     most : stations; seats, rings : of the board (`realtime.board.Board`); law : that all sessions
-    feel; period, spin : ns, of periods that `run` keeps; a period of 0 runs one period a call.
+    feel.
     """
 
-    def __init__(
-        self,
-        most: int,
-        seats: Record,
-        rings: Frames,
-        law: ForceLaw,
-        *,
-        period: int = 0,
-        spin: int = 0,
-    ) -> None:
+    def __init__(self, most: int, seats: Record, rings: Frames, law: ForceLaw) -> None:
         self.rows, self.pace = np.zeros(most, STATION), np.zeros((), PACE)
-        self.pace["period"], self.pace["spin"] = period, spin
         self._run = loop.run if is_smooth(law) else direct.run_directly
         self._arguments = (self.rows, seats, rings, self.pace, law.for_kernels)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
 
-    def run(self) -> None:
-        """Run periods until `stop`, or one; without the interpreter lock."""
-        self._run(*self._arguments)
+    def run(self, rate: float, seconds: float = FOREVER) -> float:
+        """Run periods at a rate until `stop` or for so long -> seconds that they took.
 
-    def step(self, due: int, begun: int, dt: float) -> None:
-        """Run one period that was due at a time and has begun, ns, `dt` s after the last one."""
+        A period that takes longer than its time misses the deadlines within it; the next one is due
+        at the next deadline of the grid. It holds no interpreter lock.
+        """
+        begun, pace = time.monotonic_ns(), self.pace
+        self.rows["began"] = self.rows["last"] = begun
+        pace["period"], pace["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
+        pace["due"] = begun + pace["period"]
+        self._run(*self._arguments)
+        return 1e-9 * (time.monotonic_ns() - begun)
+
+    def step(self, dt: float, begun: int) -> None:
+        """Run one period that has begun at a time, ns, `dt` s after the last one."""
         times = self._times
-        times[0][()], times[1][()], times[2][()] = due, begun, dt
+        times[0][()], times[1][()], times[2][()] = begun, begun, dt
         self._run(*self._arguments)
 
     def stop(self) -> None:

@@ -10,6 +10,9 @@ MONOTONIC = int(time.CLOCK_MONOTONIC)
 """The system's number of the clock that `time.monotonic_ns` reads."""
 SECOND = 1_000_000_000
 """Nanoseconds."""
+SPIN = 60_000
+"""Nanoseconds before a deadline at which a loop stops sleeping and watches the clock. A larger
+value hides a later wake-up by the system, and takes more of the processor."""
 
 if config.DISABLE_JIT:
 
@@ -40,9 +43,9 @@ else:
 
 
 @leaf
-def wait_until(moment, due, spin):
-    """Sleep until `spin` ns before a time, then watch the clock until then."""
-    left = due - now_ns(moment) - spin
+def wait_until(moment, due):
+    """Sleep until shortly before a time, ns, then watch the clock until then."""
+    left = due - now_ns(moment) - SPIN
     if left > 0:
         sleep_ns(moment, left)
     while now_ns(moment) < due:

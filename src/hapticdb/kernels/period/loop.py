@@ -1,9 +1,9 @@
 """The loop of sessions: their periods, one call each or period by period, in this one kernel.
 
-A period of a session reads its hand, moves the tool, tells others of it, and notes the frame. A
-session's loop has a device, which Python reads and drives: it calls the kernel once a period. A
-worker of a host has many sessions and no device: there the kernel is one call that ends when the
-worker ends. It allocates nothing, compiles nothing, holds no interpreter lock and asks no database.
+A period of a session reads its hand, moves the tool, pushes the hand, tells others of it, and notes
+the frame. The kernel is one call that ends with the loop: of a session, whose device it reads and
+pushes by functions of Python, or of a worker of a host, which has many sessions and no device. It
+allocates nothing, compiles nothing, holds no interpreter lock and asks no database.
 Another thread makes sessions and withdraws them: it sets `is_running` of a station whose other
 fields are complete, and may free a station two periods after it was withdrawn.
 """
@@ -14,6 +14,7 @@ import numpy as np
 
 from hapticdb.kernels._jit import chosen_by_type, entry, leaf, record_of
 from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
+from hapticdb.kernels.hand.calling import call
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.handle import follow_reading
 from hapticdb.kernels.hand.holding import IS_HELD
@@ -54,9 +55,9 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
-GIVEN, BOARD, DEVICE = 0, 1, 2
+GIVEN, BOARD, DEVICE, NOBODY = 0, 1, 2, 3
 """Sources of a session's hand: the caller has written it; it arrives on the board; a device's
-reading is beside."""
+reading is beside; there is none, and only the times of its periods are counted."""
 TELL_EVERY_NS = 900_000
 """Nanoseconds between two reports of the tool's place. Larger: cells are requested later. Smaller:
 the loop computes more."""
@@ -154,6 +155,11 @@ def _ask_objects(station, seat, session, shell, place, pose, touching, n_touchin
 def _run_period(law, station, seat, ring, pace):
     """Run one period of a session, which was due and has begun as `pace` says."""
     servo, begun = station.servo, pace.begun
+    lateness = 1e-9 * (begun - pace.due)
+    if station.source == NOBODY:
+        count_times(seat, lateness, 1e-9 * (now_ns(pace.moment) - begun))
+        seat.n_frames += 1
+        return
     hand, sent = servo.hand, servo.sent
     shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
     session = array_at(station.session, (), SESSION)[()]
@@ -162,9 +168,14 @@ def _run_period(law, station, seat, ring, pace):
     if station.source == BOARD:
         follow_arrivals(station, seat, hand, begun)
     elif station.source == DEVICE:
+        if station.reads != 0 and call(station.reads) != 0:
+            pace.is_over = 1
+            return
         follow_reading(station.handle, reading.pose, reading.velocity, reading.buttons, hand)
     hand.is_stale = begun - heartbeat > station.staleness
     row, n_touching = _move(law, station, seat, shell, place, pace.dt, memory)
+    if station.pushes != 0 and call(station.pushes) != 0:
+        pace.is_over = 1
     if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not station.is_frame:
         station.told_at = begun
         tell(
@@ -180,7 +191,7 @@ def _run_period(law, station, seat, ring, pace):
             heartbeat,
         )  # fmt: skip
     station.last = begun
-    lateness, elapsed = 1e-9 * (begun - pace.due), 1e-9 * (now_ns(pace.moment) - begun)
+    elapsed = 1e-9 * (now_ns(pace.moment) - begun)
     note(
         ring, seat.n_frames, 1e-9 * (begun - station.began), pace.dt, lateness, elapsed, servo,
         reading.buttons,
@@ -203,11 +214,12 @@ def _count_missed(stations, seats, pace):
             seat.in_time += behind == 0
             seat.missed += behind
     pace.due += behind * pace.period
+    pace.passed += 1 + behind
 
 
 @leaf
 def run_periods(stations, seats, rings, pace_record, law):
-    """Run one period of all sessions, or periods until `pace.is_over`.
+    """Run one period of all sessions, or periods until `pace.is_over` or `pace.most` deadlines.
 
     stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the board; pace_record ()
     of PACE; law: of all sessions. The distance law moves tools by the quasi-static coupling, every
@@ -216,11 +228,9 @@ def run_periods(stations, seats, rings, pace_record, law):
     """
     pace = pace_record[()]
     is_alone = pace.period > 0
-    if is_alone:
-        pace.due = now_ns(pace.moment) + pace.period
     while True:
         if is_alone:
-            wait_until(pace.moment, pace.due, pace.spin)
+            wait_until(pace.moment, pace.due)
         for n in range(stations.shape[0]):
             station = stations[n]
             if station.is_running:
@@ -233,7 +243,7 @@ def run_periods(stations, seats, rings, pace_record, law):
         _count_missed(stations, seats, pace)
         fence()
         pace.periods += 1
-        if pace.is_over:
+        if pace.is_over or pace.passed >= pace.most:
             return
 
 

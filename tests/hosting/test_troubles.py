@@ -16,10 +16,10 @@ from children import joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.attached import serve_attached
-from hapticdb.hosting.channel import AskingChannel
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.realtime.board import Board
+from hapticdb.realtime.channel import Channel
 from hapticdb.recording.ring import SessionRecording
 from realtime.hands import at
 
@@ -81,7 +81,7 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     board = Board.create(1)
     thread = threading.Thread(target=serve_attached, args=(ours, board, begin, call))
     thread.start()
-    channel = AskingChannel(theirs)
+    channel = Channel(theirs)
     try:
         channel.receive()
         with pytest.raises(HapticDBError, match="its log says why") as found:

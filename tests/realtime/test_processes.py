@@ -16,7 +16,8 @@ import pytest
 from children import PATIENCE, child, finished
 from hapticdb.errors import DatabaseError, HapticDBError, UsageError
 from hapticdb.realtime import processes as module
-from hapticdb.realtime.processes import Message, Process
+from hapticdb.realtime.channel import Message
+from hapticdb.realtime.processes import Process
 from hapticdb.resident.table import is_alive
 from realtime.sessions import until
 

@@ -9,11 +9,11 @@ from numpy.typing import ArrayLike
 
 from hapticdb.closing import Closes
 from hapticdb.errors import HapticDBError
-from hapticdb.hosting.channel import Ask, AskingChannel
 from hapticdb.hosting.hosted import Calls, HostedSession
 from hapticdb.hosting.tables import Words
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.board import Board
+from hapticdb.realtime.channel import Channel, Message
 from hapticdb.realtime.coupling import Coupling
 
 LOG = logging.getLogger("hapticdb.hosting")
@@ -34,7 +34,7 @@ class AttachedHost(Closes):
 
     def __init__(self, sock: socket.socket) -> None:
         sock.settimeout(None)
-        self._channel = AskingChannel(sock)
+        self._channel = Channel(sock)
         try:
             _, (descriptor,) = self._channel.receive()
         except (EOFError, OSError, ValueError) as error:
@@ -70,10 +70,10 @@ def serve_attached(
     sock: socket.socket, board: Board, begin: Callable[..., HostedSession], call: Calls
 ) -> None:
     """Serve an `AttachedHost` until it leaves, by a host's methods; then end its sessions."""
-    channel = AskingChannel(sock)
+    channel = Channel(sock)
     begun: set[int] = set()
 
-    def do(ask: Ask, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
+    def do(ask: Message, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
         if ask.word == "begin":
             shell, start, options = ask.content
             session = begin(shell, start, **options)

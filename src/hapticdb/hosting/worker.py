@@ -1,13 +1,11 @@
 """A worker process of the host: one loop that runs the frames of many sessions, period by period.
 
 The loop is one kernel in a thread of its own, which needs no interpreter. Commands of the host come
-over a channel and are done beside it: a session is made there, and enters the loop between two
+over its channel and are done beside it: a session is made there, and enters the loop between two
 periods.
 """
 
 import os
-import select
-import socket
 import threading
 import time
 from dataclasses import dataclass
@@ -16,14 +14,14 @@ import numpy as np
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.hosting.channel import Ask, AskingChannel
 from hapticdb.kernels.compiling import load
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
+from hapticdb.realtime.channel import Message
 from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.deadlines import undisturbed
-from hapticdb.realtime.processes import MessageSender, parent_is_gone
+from hapticdb.realtime.processes import MessageSender, parent_is_gone, reply_to_parent
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
@@ -38,10 +36,9 @@ LEAVE_PATIENCE = 5.0
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """board, sock : descriptors of the board's memory and of the channel; rate : frames/s."""
+    """board : of the host; rate : frames/s."""
 
-    board: int
-    sock: int
+    board: Board
     rate: float
 
 
@@ -71,12 +68,10 @@ class Worker:
     """
 
     def __init__(self, request: WorkerRequest) -> None:
-        self._board = Board(request.board)
-        self._channel = AskingChannel(socket.socket(fileno=request.sock))
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
-        seats = self._board.seats
-        self._stations = Stations(len(seats), seats, self._board.rings, SMOOTH)
+        self._board = board = request.board
+        self._stations = Stations(len(board.seats), board.seats, board.rings, SMOOTH)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------
@@ -85,14 +80,13 @@ class Worker:
         """Do what the host says until it ends; the work of the thread beside the loop's."""
         try:
             while not parent_is_gone():
-                if select.select([self._channel.sock], [], [], LOOK_EVERY)[0]:
-                    self._channel.reply(self._do)
+                reply_to_parent(self._do, LOOK_EVERY)
         except (EOFError, OSError):
             pass
         finally:
             self._stations.stop()
 
-    def _do(self, ask: Ask, descriptors: list[int]) -> None:
+    def _do(self, ask: Message, descriptors: list[int]) -> None:
         word, content = ask
         if word == "begin":
             self._begin(content[0], descriptors[0])

@@ -1,12 +1,9 @@
 """The worker processes of a host, started when sessions need them."""
 
-import socket
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
-from hapticdb.hosting.channel import AskingChannel
 from hapticdb.hosting.worker import WorkerRequest
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.processes import Process
@@ -20,46 +17,19 @@ FILLED = 8
 fewer processes and less memory, and later frames."""
 
 
-class WorkerProcess:
+class WorkerProcess(Process):
     """A worker process, from the host; `number` counts from 0, `rate` is in frames a second."""
 
     def __init__(self, number: int, board: Board, rate: float) -> None:
         self.number = number
-        ours, theirs = socket.socketpair()
-        with theirs:
-            request = WorkerRequest(board.descriptor, theirs.fileno(), rate)
-            self._process = Process(
-                "hapticdb.hosting.worker:work",
-                request,
-                [board.descriptor, theirs.fileno()],
-                ["host"],
-            )
-        ours.settimeout(ANSWER_PATIENCE)
-        self._channel = AskingChannel(ours)
-        try:
-            self._process.await_ready("worker's", START_PATIENCE)
-        except BaseException:
-            self._channel.close()
-            raise
+        request = WorkerRequest(board, rate)
+        super().__init__("hapticdb.hosting.worker:work", request, [board.descriptor], ["host"])
+        self.await_ready("worker's", START_PATIENCE)
+        self._channel.sock.settimeout(ANSWER_PATIENCE)
 
-    @property
-    def pid(self) -> int:
-        """Process id."""
-        return self._process.pid
-
-    @property
-    def is_alive(self) -> bool:
-        """Whether the process runs."""
-        return self._process.is_alive
-
-    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
-        """Tell the worker to do something, and return its answer; see `Channel.ask`."""
-        return self._channel.ask(word, *content, descriptors=descriptors)
-
-    def close(self) -> None:
-        """End the process."""
-        self._channel.close()
-        self._process.end()
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> None:
+        """Tell the worker to do something, and wait until it is done; see `Channel.ask`."""
+        self._channel.ask(word, *content, descriptors=descriptors)
 
 
 class Workers:
@@ -79,7 +49,7 @@ class Workers:
         """Worker for one more session: the one with the fewest, or a new one if all are filled."""
         for process in [process for process in self._processes if not process.is_alive]:
             self._processes.remove(process)
-            process.close()
+            process.end()
         seats = self._board.seats
         counts = [
             int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == process.number)))
@@ -94,5 +64,5 @@ class Workers:
     def close(self) -> None:
         """End all workers."""
         for process in self._processes:
-            process.close()
+            process.end()
         self._processes.clear()

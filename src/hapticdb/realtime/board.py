@@ -62,6 +62,10 @@ class Board:
         """Make a board with free seats, and that many frames for each."""
         return cls(anonymous_memory("hapticdb-board", n_seats * _bytes_a_seat(ring)), ring)
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle it for a process that inherits its descriptor."""
+        return Board, (self.descriptor, self.rings.shape[1])
+
     def close(self) -> None:
         """Free the memory in this process; the mapping goes with the last array."""
         if self.descriptor >= 0:

@@ -14,10 +14,10 @@ import sys
 import weakref
 from collections.abc import Callable, Sequence
 from importlib import import_module
-from typing import Any, NamedTuple, Self
+from typing import Any, Self
 
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.realtime.channel import Channel
+from hapticdb.realtime.channel import Channel, Message
 from hapticdb.realtime.fork_server import start
 
 END_PATIENCE = 5.0
@@ -27,13 +27,6 @@ _ends = select.poll()
 """Tells that the process that started this one has ended, or has closed its channel."""
 _parent: Channel | None = None
 """Of a process that was started: to the one that started it."""
-
-
-class Message(NamedTuple):
-    """A message of a process: a word for its kind, and its content."""
-
-    word: str
-    content: Any = None
 
 
 class Process:
@@ -212,6 +205,13 @@ def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
         return _parent.receive()[0]
     except (EOFError, OSError):  # it may have ended while it was sending
         raise _EndQuietly(0) from None
+
+
+def reply_to_parent(do: Callable[[Message, list[int]], Any], seconds: float) -> None:
+    """Do what the parent asks by its channel, if that comes in `seconds`; see `Channel.reply`."""
+    assert _parent is not None  # noqa: S101 - `run` was called
+    if select.select([_parent.sock], [], [], seconds)[0]:
+        _parent.reply(do)
 
 
 def _request() -> object:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 import children
 import hapticdb
@@ -20,6 +20,7 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.scripted import RandomHand
 from hapticdb.errors import DatabaseError, HapticDBError
 from hapticdb.kernels.period.telling import name_voxels
+from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import LISTED, cell_key
 from hapticdb.realtime.fetching import (
     CONFIRM_EVERY,
@@ -27,7 +28,7 @@ from hapticdb.realtime.fetching import (
     FetchRequest,
 )
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.realtime.tracking import Motion, Wish
+from hapticdb.realtime.tracking import Wish
 from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
 from hapticdb.testing import write_voxels
 from naive_frame import touch_of_shell
@@ -107,7 +108,7 @@ class LockStep:
         self.pose[:3, 3] = np.array(env.grid.origin) + env.grid.edge / 2
         self.side = Side(self.table, env.grid, shell)
         self.fetcher = Fetcher(
-            FetchRequest(env.url, self.table.descriptor, self.table.n_slots, env.grid, wrap=wrap),
+            FetchRequest(env.url, self.table, env.grid, wrap=wrap),
             clock=lambda: self.now,
         )
 
@@ -159,6 +160,11 @@ def world(tmp_path: Path) -> Environment:
     return env
 
 
+def told(*numbers: ArrayLike) -> NDArray[np.void]:
+    """What a loop tells of its tool: places of tool and handle, the handle's velocity, radius."""
+    return np.array((True, *numbers), TOLD)
+
+
 # --- wanted cells -------------------------------------------------------------------------------
 
 
@@ -172,8 +178,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
     handle = tool + rng.normal(0, 0.02, 3)
     velocity = rng.normal(0, 0.5, 3)
     lookahead, radius = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 0.05))
-    motion = Motion(tool, handle, velocity, radius)
-    wish = Wish.of_motion(grid, motion, lookahead, 1.0)
+    wish = Wish.of_told(grid, told(tool, handle, velocity, radius), lookahead, 1.0)
     assert wish is not None
     cells, urgency = wish.cells(grid)
     wanted = set(cells.tolist())
@@ -197,8 +202,7 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
 def test_a_wish_too_large_keeps_what_is_near() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
     tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
-    motion = Motion(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05)
-    wish = Wish.of_motion(grid, motion, 0.5, 40.0)
+    wish = Wish.of_told(grid, told(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05), 0.5, 40.0)
     assert wish is not None
     cells, _ = wish.cells(grid)
     assert 0 < len(cells) <= 1 << 15
@@ -207,11 +211,11 @@ def test_a_wish_too_large_keeps_what_is_near() -> None:
 
 def test_a_motion_that_is_none_wants_nothing() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 8)
-    still = Motion.at_rest(np.zeros(3))
+    rest = np.zeros(3)
     for broken in (np.nan, np.inf):
         nowhere = np.array([0.0, broken, 0.0])
-        for motion in (still._replace(velocity=nowhere), still._replace(radius=broken)):
-            assert Wish.of_motion(grid, motion, 0.1, 1.0) is None
+        for motion in (told(rest, rest, nowhere, 0.0), told(rest, rest, rest, broken)):
+            assert Wish.of_told(grid, motion, 0.1, 1.0) is None
 
 
 # --- in lock step -------------------------------------------------------------------------------
@@ -233,9 +237,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
     step = LockStep(world, sphere)
     step.warm_start()
     trouble = functools.partial(troubled, wait=step.wait, latency=0.002, errors=0.1, seed=3)
-    step.fetcher.request = FetchRequest(
-        world.url, step.table.descriptor, step.table.n_slots, world.grid, wrap=trouble
-    )
+    step.fetcher.request = FetchRequest(world.url, step.table, world.grid, wrap=trouble)
     step.hand = RandomHand(step.pose, 1, speed=0.6, clock=lambda: step.now)
     n_lost, is_lost = 0, True
     while step.now < 4.0:
@@ -253,9 +255,7 @@ def test_errors_are_got_over(world: Environment, sphere: PointShell) -> None:
             assert step.table.cells.control[HEARTBEAT] == before
     assert n_lost > 3
     step.hand = None
-    step.fetcher.request = FetchRequest(
-        world.url, step.table.descriptor, step.table.n_slots, world.grid
-    )
+    step.fetcher.request = FetchRequest(world.url, step.table, world.grid)
     step.fetcher.reopen()
     step.warm_start()
     naive = touch_of_shell(ids_by_voxel(world), world.grid, sphere, step.pose)

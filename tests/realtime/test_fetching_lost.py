@@ -104,7 +104,7 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
     pose = np.eye(4)
     with CellTable.create(LEAST_BUDGET) as table:
         side = Side(table, env.grid, sphere)
-        fetching = Fetcher(FetchRequest(env.url, table.descriptor, table.n_slots, env.grid))
+        fetching = Fetcher(FetchRequest(env.url, table, env.grid))
         side.be_at(pose)
         until(lambda: side.is_served, fetching.round)
         before, grid = side.reader.feel(pose)[0], env.grid

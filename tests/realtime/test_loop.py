@@ -56,12 +56,12 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
 
         def ran(device: Device, **options: object) -> Ran:
             board = Board.create(1, N_RING)
+            board.seats["is_recorded"] = True
             rate = float(str(options.pop("rate", 500.0)))
             request = LoopRequest(
-                descriptor=cells.table.descriptor, n_slots=cells.table.n_slots, row=row,
-                board=board.descriptor, n_ring=N_RING, grid=cells.grid, shell=sphere, device=device,
-                law=TangentPlane(), coupling=DIRECT, handle=Handle(), timing=Timing(rate),
-                seconds=0.3, staleness=60.0,
+                table=cells.table, row=row, board=board, grid=cells.grid, shell=sphere,
+                device=device, law=TangentPlane(), coupling=DIRECT, handle=Handle(),
+                timing=Timing(rate), seconds=0.3, staleness=60.0,
             )  # fmt: skip
             heard = Heard()
             work(dataclasses.replace(request, **options), heard)  # type: ignore[arg-type]

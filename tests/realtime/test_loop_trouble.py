@@ -22,7 +22,7 @@ from hapticdb.kernels.period.loop import WITHDRAWN_NS
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling
+from hapticdb.realtime.coupling import Coupling, DirectRendering
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, work
@@ -89,16 +89,16 @@ def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
 
 def requested(world: World, hand: Pressing, seconds: float = 1.0) -> LoopRequest:
     law: ForceLaw = TangentPlane()
-    coupling: DirectRendering | SettledCoupling = Coupling().direct(SCRIPTED, 1.0, 0.01)
+    coupling: DirectRendering = Coupling().direct(SCRIPTED, 1.0, 0.01)
     if world.table.has_distances:
         law = DistanceField()
         coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
+    board = Board.create(1, N_RING)
+    board.seats["is_recorded"] = True
     return LoopRequest(
-        descriptor=world.table.descriptor,
-        n_slots=world.table.n_slots,
+        table=world.table,
         row=world.table.join(),
-        board=Board.create(1, N_RING).descriptor,
-        n_ring=N_RING,
+        board=board,
         grid=world.grid,
         shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
         device=hand,

@@ -116,7 +116,6 @@ def test_the_figures_are_those_of_the_frames(played: Played) -> None:
     assert report.hit_frames == np.count_nonzero(frames["hits"]) > 0
     assert report.contact_frames == np.count_nonzero(frames["contacts"])
     assert report.unknown_frames == np.count_nonzero(frames["unknown"])
-    assert report.unknown_points == frames["unknown"].sum()
     assert report.held_frames == np.count_nonzero(frames["state"] & State.HELD)
     assert report.loop.lateness.worst == pytest.approx(frames["lateness"].max(), rel=1e-6)
     forces = np.linalg.norm(frames["applied"][:, :3], axis=1)

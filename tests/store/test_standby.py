@@ -121,7 +121,7 @@ def test_a_session_reads_its_cells_and_its_lag_from_it(pair: Pair, *, is_standby
     url = pair.both if is_standby else pair.primary
     table = CellTable.create(LEAST_BUDGET)
     with hapticdb.open(url, read_only=True) as env:
-        fetcher = Fetcher(FetchRequest(url, table.descriptor, table.n_slots, env.grid))
+        fetcher = Fetcher(FetchRequest(url, table, env.grid))
     try:
         assert isinstance(fetcher.store, MayLag)
         fetcher.warm_up()

@@ -7,7 +7,6 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -32,7 +31,6 @@ from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
-from hapticdb.recording.header import Header
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.filtering import Filter
 
@@ -215,17 +213,7 @@ class SessionHost(Closes):
 
     def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
         asked = running.request
-        header = Header(
-            environment=self.url,
-            grid=asked.grid,
-            revision=running.cells.table.revision,
-            shell=asked.shell,
-            rate=self.rate,
-            law=SMOOTH,
-            where=running.cells.filter.where,
-            exclude=running.cells.filter.exclude,
-            coupling=asdict(asked.coupling),
-        )
+        header = running.cells.header(asked.shell, self.rate, SMOOTH, asked.coupling)
         running.record(path, header, self._board, replace=replace)
 
     def _end(self, running: Running) -> Recorded:

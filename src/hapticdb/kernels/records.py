@@ -300,13 +300,13 @@ SESSION: Layout = _record_in_lines(
 
 FIGURES: Layout = _record(
     [
-        ("cells", "<i8"),  # fetched so far
+        ("loaded", "<i8"),  # cells, so far
         ("rows", "<i8"),  # read for them
         ("ranges", "<i8"),  # scanned for them
-        ("batches", "<i8"),  # statements
+        ("statements", "<i8"),  # one a batch
         ("evicted", "<i8"),  # cells
-        ("median_latency", "<f8"),  # s, of the last 32 batches
-        ("worst_latency", "<f8"),  # s, of all batches
+        ("latency", "<f8"),  # s, median of the last 32 batches
+        ("worst", "<f8"),  # s, of all batches
         ("resident", "<i8"),  # cells in memory now
         ("empty", "<i8"),  # cells known to be empty now
         ("wanted", "<i8"),  # cells wanted, summed over all looks
@@ -315,7 +315,7 @@ FIGURES: Layout = _record(
         ("lag", "<f8"),  # s since the commit that a standby replayed last; NaN: none answers
     ]
 )
-"""Counts and latencies of the fetching process."""
+"""Counts and latencies of the fetching process: a `CacheFigures` has them by these names."""
 
 MOST_SHOWN = 64
 """Most contacts of a hosted session that others see. Larger: broad contacts are drawn more
@@ -345,15 +345,12 @@ SEAT: Layout = _record(
         ("hit_frames", "<i8"),
         ("contact_frames", "<i8"),
         ("unknown_frames", "<i8"),
-        ("unknown_points", "<i8"),
         ("held_frames", "<i8"),
         ("stale_frames", "<i8"),
-        ("cut_frames", "<i8"),
         ("nowhere_frames", "<i8"),
         ("loose_frames", "<i8"),
         ("first_loose_frame", "<i8"),
         ("ended_loose", "<i8"),
-        ("snapping_frames", "<i8"),
         ("guard_actions", "<i8"),
         ("left_out_frames", "<i8"),  # frames in which the budget left out points
         ("most_left_out", "<i8"),  # points that one frame left out

@@ -160,56 +160,8 @@ class Coupling:
         )
 
 
-class _Rendered:
-    """What a device renders of a session, for kernels."""
-
-    torque_cap: float
-
-    def spring(self) -> DeviceSpring:
-        """Return the numbers in the kernel's form; those of a spring that is not there are 0."""
-        numbers = {name: float(getattr(self, name, 0.0)) for name in DeviceSpring._fields}
-        return DeviceSpring(**numbers | {"turn_cap": float(self.torque_cap)})
-
-
-@dataclass(frozen=True)
-class SettledCoupling(_Rendered):
-    """A `Coupling` of one session: every number is settled. A recording has these.
-
-    Attributes
-    ----------
-    profile : str
-        Name of the device's profile.
-    stiffness, asked_stiffness : float
-        K, N/m at the device, and the one that was asked for.
-    lowered : str or None
-        One line: what lowered the stiffness; None if nothing did.
-    cap, turn_stiffness, torque_cap, damping, delay : float
-        As for `Coupling`.
-    scale : float
-        S, metres of the scene for one metre of the device.
-    radius : float
-        Distance of the tool's farthest point from its centre, metres of the scene.
-    hold, fade : float
-        See `HOLD`.
-    """
-
-    profile: str
-    stiffness: float
-    asked_stiffness: float
-    lowered: str | None
-    cap: float
-    turn_stiffness: float
-    torque_cap: float
-    damping: float
-    delay: float
-    scale: float
-    radius: float
-    hold: float = HOLD
-    fade: float = FADE
-
-
-@dataclass(frozen=True)
-class DirectRendering(_Rendered):
+@dataclass(frozen=True, kw_only=True)
+class DirectRendering:
     """Rendering without a coupling: the tool is at the hand, and feels what the device renders.
 
     This is the loop of the paper (section 4, Figure 4). The wrench of the tangent-plane law goes to
@@ -221,8 +173,12 @@ class DirectRendering(_Rendered):
         Name of the device's profile.
     cap, torque_cap : float
         Greatest force, N, and greatest torque about the tool's centre, N m, at the device.
-    scale, radius, hold, fade : float
-        As for `SettledCoupling`.
+    scale : float
+        S, metres of the scene for one metre of the device.
+    radius : float
+        Distance of the tool's farthest point from its centre, metres of the scene.
+    hold, fade : float
+        See `HOLD`.
     """
 
     profile: str
@@ -232,6 +188,33 @@ class DirectRendering(_Rendered):
     radius: float
     hold: float = HOLD
     fade: float = FADE
+
+    def spring(self) -> DeviceSpring:
+        """Return the numbers in the kernel's form; those of a spring that is not there are 0."""
+        numbers = {name: float(getattr(self, name, 0.0)) for name in DeviceSpring._fields}
+        return DeviceSpring(**numbers | {"turn_cap": float(self.torque_cap)})
+
+
+@dataclass(frozen=True, kw_only=True)
+class SettledCoupling(DirectRendering):
+    """A `Coupling` of one session: every number is settled. A recording has these.
+
+    Attributes
+    ----------
+    stiffness, asked_stiffness : float
+        K, N/m at the device, and the one that was asked for.
+    lowered : str or None
+        One line: what lowered the stiffness; None if nothing did.
+    turn_stiffness, damping, delay : float
+        As for `Coupling`.
+    """
+
+    stiffness: float
+    asked_stiffness: float
+    lowered: str | None
+    turn_stiffness: float
+    damping: float
+    delay: float
 
 
 def radius_of(shell: PointShell, voxel_size: float) -> float:

@@ -14,8 +14,9 @@ import numpy as np
 
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
+from hapticdb.kernels.records import TOLD
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
-from hapticdb.realtime.tracking import Motion, ObjectAnswers, SessionTracker, Wish
+from hapticdb.realtime.tracking import ObjectAnswers, SessionTracker, Wish
 from hapticdb.resident.residency import BATCH, Loaded, Residency
 from hapticdb.resident.table import (
     FIRST_VERSION,
@@ -69,14 +70,12 @@ Wrap = Callable[[Store], Store]
 class FetchRequest:
     """Request to a fetching process.
 
-    url, grid : of the environment, which must have that grid; descriptor, n_slots : file descriptor
-    and number of slots of the table's memory; filter : which objects are felt; wrap : a hook for
-    tests.
+    url, grid : of the environment, which must have that grid; filter : which objects are felt;
+    wrap : a hook for tests.
     """
 
     url: str
-    descriptor: int
-    n_slots: int
+    table: CellTable
     grid: Grid
     filter: Filter = ALL
     wrap: Wrap | None = None
@@ -104,7 +103,7 @@ class Fetcher:
         self, request: FetchRequest, *, clock: Callable[[], float] = time.monotonic
     ) -> None:
         self.request = request
-        self.table = CellTable(request.descriptor, request.n_slots)
+        self.table = request.table
         self.tracker = SessionTracker(self.table, request.grid)
         self._clock = clock
         self._figures = self.table.desk.figures
@@ -149,7 +148,9 @@ class Fetcher:
     def warm_up(self) -> None:
         """Run all steps of a round once, on one cell, so that no later round compiles a kernel."""
         grid = self.request.grid
-        wish = Wish.of_motion(grid, Motion.at_rest(np.array(grid.origin)), LOOKAHEAD, 0.0)
+        told = np.zeros((), TOLD)
+        told["tool"] = told["handle"] = grid.origin
+        wish = Wish.of_told(grid, told, LOOKAHEAD, 0.0)
         assert wish is not None  # noqa: S101 - the origin is finite
         self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
         self.residency.warm_up()
@@ -225,12 +226,12 @@ class Fetcher:
         """Write the figures so far to the desk."""
         self._latencies = [*self._latencies[1 - BATCHES_REMEMBERED :], loaded.elapsed]
         figures, writer = self._figures, self.residency.writer
-        figures["cells"] += loaded.cells
+        figures["loaded"] += loaded.cells
         figures["rows"] += loaded.rows
         figures["ranges"] += loaded.ranges
-        figures["batches"] += 1
-        figures["median_latency"] = np.median(self._latencies)
-        figures["worst_latency"] = max(float(figures["worst_latency"]), loaded.elapsed)
+        figures["statements"] += 1
+        figures["latency"] = np.median(self._latencies)
+        figures["worst"] = max(float(figures["worst"]), loaded.elapsed)
         figures["evicted"] = self._evicted_before + writer.n_evicted
         figures["resident"] = writer.n_resident
         figures["empty"] = writer.n_empty
@@ -264,7 +265,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
     UsageError
         If the table has distances and an object was written that has none.
     """
-    table = CellTable(request.descriptor, request.n_slots)
+    table = request.table
     is_first = table.version == FIRST_VERSION
     fetcher: Fetcher | None = None
     patience, at_most = RETRY

@@ -58,22 +58,19 @@ WARM_PATIENCE = 30.0
 class LoopRequest:
     """Request to a loop's process: see `hapticdb.realtime.session.Session`."""
 
-    descriptor: int
-    n_slots: int
+    table: CellTable
     row: int
-    board: int
-    n_ring: int
+    board: Board
     grid: Grid
     shell: PointShell
     device: Device
     law: ForceLaw
-    coupling: SettledCoupling | DirectRendering
+    coupling: DirectRendering
     handle: Handle
     timing: Timing
     seconds: float
     staleness: float
     has_baseline: bool = True
-    is_recorded: bool = True
     budget_points: int | None = None
     is_on_gpu: bool = False
 
@@ -91,8 +88,7 @@ class Loop:
         self.request = request
         self.device = request.device
         self.reader = Reader(request.device)
-        self.table = CellTable(request.descriptor, request.n_slots)
-        self.board = Board(request.board, request.n_ring)
+        self.table, self.board = request.table, request.board
         self.session = self.table.desk.sessions[request.row, ...]
         seats, law = self.board.seats, request.law
         self.stations = Stations(1, seats, self.board.rings, law)
@@ -110,7 +106,6 @@ class Loop:
             from hapticdb.realtime import on_gpu  # noqa: PLC0415 - loads numba.cuda
 
             self.gpu = on_gpu.GpuLooks(self.station, self.table)
-        seats["is_recorded"] = request.is_recorded
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])
@@ -122,8 +117,8 @@ class Loop:
 
     # -- before the first frame --------------------------------------------------------------
 
-    def prepare(self) -> float:
-        """Place the tool at the hand and wait for its cells; returns the seconds taken.
+    def prepare(self) -> None:
+        """Place the tool at the hand and wait for its cells.
 
         Without a database it does not wait: what supervises the session tells of that at once.
         """
@@ -145,7 +140,6 @@ class Loop:
                 asked = int(session["sequence"])
             time.sleep(1e-3)
         self._place()
-        return time.monotonic() - started
 
     def _place(self) -> None:
         """Put the tool where the hand is, at rest."""
@@ -227,7 +221,7 @@ class Loop:
         self.stations.stop()
 
     def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
-        """Return what a kernel calls for `work`: whether the loop ends, as it does with an error."""
+        """Return what a kernel calls for `work`, which says if the loop ends: an error ends it."""
 
         def answer() -> bool:
             try:
@@ -292,14 +286,14 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
             if request.has_baseline:
                 seconds = min(EMPTY_SECONDS, request.seconds)
                 empty = empty_loop(request.law, request.timing.rate, seconds)
-            warm_up = loop.prepare()
+            loop.prepare()
             compiled = n_compiled()
             sender.send("running")
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")
         card = None if loop.gpu is None else loop.gpu.card
-        answer = LoopAnswer(figures, empty, loop.bad_reading, warm_up, loop.is_warm, card)
+        answer = LoopAnswer(figures, empty, loop.bad_reading, loop.is_warm, card)
         sender.send("done", answer)
     finally:
         try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely

@@ -43,6 +43,8 @@ NOBODY = 1 << 62
 """In the place of a point's number: none."""
 NUMBER, RUN, LAST, N_DUE = map(kernels.Look._fields.index, ("number", "run", "last", "n_due"))
 """Of `Look`."""
+NOTHING = np.array([0.0, 0.0, 0.0, NEVER])
+"""What a look finds at first."""
 USED_EVERY = 16
 """Looks after which the table learns which cells were read. Larger: less copying; a cell may be
 evicted sooner after it was read."""
@@ -122,7 +124,7 @@ class GpuLooks:
         self._n_looks, self._epoch = 0, 0
         self._error: BaseException | None = None
         self._stream = cuda.stream()
-        self._nothing = cuda.to_device(np.array([0.0, 0.0, 0.0, NEVER]))
+        self._nothing = cuda.to_device(NOTHING)
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
         self._asked: NDArray[np.float64] = cuda.pinned_array(kernels.ASKED, np.float64)
         self._sight = self._sight_of(station)
@@ -160,7 +162,7 @@ class GpuLooks:
             asked=cuda.device_array(kernels.ASKED, np.float64),
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
-            found=cuda.to_device(np.array([0.0, 0.0, 0.0, NEVER])),
+            found=cuda.to_device(NOTHING),
             numbers=cuda.mapped_array(room, np.int64),
             rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
         )

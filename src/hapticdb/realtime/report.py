@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.records import TIME_BIN, TIME_BINS
 from hapticdb.proportions import Proportions
-from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
+from hapticdb.realtime.coupling import DirectRendering
 from hapticdb.realtime.resident_cells import CacheFigures
 
 
@@ -75,7 +75,6 @@ class LoopAnswer(NamedTuple):
     loop: LoopFigures
     empty: LoopFigures | None
     bad_reading: str | None
-    warm_up: float
     is_warm: bool
     card: str | None
 
@@ -98,11 +97,9 @@ class Report:
         what bounded the wrench, which went to the device directly.
     budget_points : int or None
         Most points near something that a frame looks at; None: all.
-    warm_up : float
-        Seconds until all wanted cells were resident, before the first frame; after
-        `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
     is_warm : bool
-        Whether all wanted cells were resident before the first frame.
+        Whether all wanted cells were resident before the first frame; after
+        `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
     cache : CacheFigures
         Figures of the fetching process.
     objects, loose_objects : tuple of int
@@ -120,10 +117,6 @@ class Report:
         a contact (a point below its tangent plane or, with distances, below the onset); with a
         point in a cell that was not resident; that kept an earlier wrench; in which the database
         had not answered for too long.
-    unknown_points : int
-        Points of all frames in cells that were not resident.
-    cut_frames : int
-        Frames in which a surface held the tool back: a step was shortened or left out.
     nowhere_frames : int
         Frames with an invalid reading: numbers not finite or too large, or no rotation.
     bad_reading : str or None
@@ -138,8 +131,6 @@ class Report:
         there or a part was put upon it; number of the first of them from 0, or -1 without any.
     ended_loose : bool
         Whether the tool still lay in something at the end.
-    snapping_frames : int
-        Frames in which the change of the force was softened, as when the tool snaps off an edge.
     guard_actions : int
         How often the guard lowered the stiffness because the force went back and forth.
     least_share : float
@@ -154,9 +145,8 @@ class Report:
     loop: LoopFigures
     empty: LoopFigures | None
     law: str
-    coupling: SettledCoupling | DirectRendering
+    coupling: DirectRendering
     budget_points: int | None
-    warm_up: float
     is_warm: bool
     cache: CacheFigures
     objects: tuple[int, ...]
@@ -171,8 +161,6 @@ class Report:
     unknown_frames: int
     held_frames: int
     stale_frames: int
-    unknown_points: int
-    cut_frames: int
     nowhere_frames: int
     bad_reading: str | None
     peak_force: float
@@ -181,7 +169,6 @@ class Report:
     loose_frames: int
     first_loose_frame: int
     ended_loose: bool
-    snapping_frames: int
     guard_actions: int
     least_share: float
     left_out_frames: int

@@ -5,15 +5,21 @@ import os
 import threading
 import time
 from contextlib import suppress
+from dataclasses import asdict
 from typing import NamedTuple
 
 from hapticdb.closing import Closes
 from hapticdb.errors import GridError, HapticDBError, UsageError
 from hapticdb.grid import Grid
+from hapticdb.kernels.records import FIGURES
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import ForceLaw
 from hapticdb.ready import make_ready
+from hapticdb.realtime.coupling import DirectRendering
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
+from hapticdb.recording.header import Header
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import DEFAULT_BUDGET, HEARTBEAT, LOST, STOP, CellTable
 from hapticdb.store.connect import open_store
@@ -126,9 +132,7 @@ class ResidentCells(Closes):
         make_ready(*PURPOSES)  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
-        self._request = FetchRequest(
-            url, self.table.descriptor, self.table.n_slots, self.grid, self.filter, wrap
-        )
+        self._request = FetchRequest(url, self.table, self.grid, self.filter, wrap)
         try:
             self._process = self._begun()
             self._process.await_ready("fetching", START_PATIENCE)
@@ -240,23 +244,30 @@ class ResidentCells(Closes):
     def figures(self) -> CacheFigures:
         """Figures of the fetching process so far."""
         counted = self.table.desk.figures
-        wanted = float(counted["wanted"])
-        return CacheFigures(
-            budget_bytes=self.table.size_bytes,
-            resident=int(counted["resident"]),
-            empty=int(counted["empty"]),
-            loaded=int(counted["cells"]),
-            evicted=int(counted["evicted"]),
-            rows=int(counted["rows"]),
-            ranges=int(counted["ranges"]),
-            statements=int(counted["batches"]),
-            latency=float(counted["median_latency"]),
-            worst=float(counted["worst_latency"]),
-            hit_rate=float(counted["granted"]) / wanted if wanted else 1.0,
-            losses=int(counted["losses"]),
-            restarts=self.restarts,
-            lag=None if math.isnan(counted["lag"]) else float(counted["lag"]),
-        )
+        told = {
+            name: counted[name].item() for name in CacheFigures._fields if name in FIGURES.names
+        }
+        wanted = counted["wanted"].item()
+        return CacheFigures(**told | {
+            "budget_bytes": self.table.size_bytes,
+            "hit_rate": counted["granted"].item() / wanted if wanted else 1.0,
+            "restarts": self.restarts,
+            "lag": None if math.isnan(told["lag"]) else told["lag"],
+        })  # fmt: skip
+
+    def header(
+        self,
+        shell: PointShell,
+        rate: float,
+        law: ForceLaw,
+        coupling: DirectRendering,
+        budget_points: int | None = None,
+    ) -> Header:
+        """Header of a recording of a session in these cells, at their revision now."""
+        return Header(
+            self.url, self.grid, self.table.revision, shell, rate, law, self.filter.exclude,
+            asdict(coupling), where=self.filter.where, budget_points=budget_points,
+        )  # fmt: skip
 
     def close(self) -> None:
         """End the fetching process and free the memory; does nothing in a forked copy."""

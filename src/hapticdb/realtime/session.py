@@ -3,7 +3,6 @@
 import os
 import time
 from contextlib import ExitStack, suppress
-from dataclasses import asdict
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -17,7 +16,7 @@ from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import Coupling, DirectRendering, SettledCoupling, radius_of
+from hapticdb.realtime.coupling import Coupling, DirectRendering, radius_of
 from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand
 from hapticdb.realtime.loop import LoopRequest
@@ -25,7 +24,7 @@ from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import FOREVER, without_surface
-from hapticdb.recording.file import DEFAULT_LIMIT, Header
+from hapticdb.recording.file import DEFAULT_LIMIT
 from hapticdb.recording.frame import Frames, State
 from hapticdb.recording.ring import SessionRecording
 
@@ -184,7 +183,7 @@ class Session(Closes):
             "ResidentCells(..., distances=True), or give law='plane'"
         )
 
-    def _settled(self, coupling: Coupling, device: Device) -> SettledCoupling | DirectRendering:
+    def _settled(self, coupling: Coupling, device: Device) -> DirectRendering:
         """Coupling or caps of the session, with all numbers."""
         profile, scale = profile_of(device), self.handle.scale
         radius = radius_of(self.shell, self.cells.grid.voxel_size)
@@ -210,16 +209,17 @@ class Session(Closes):
         make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
-            self._recording.begin(self._header())
+            law, budget = self.law, self.budget_points
+            header = self.cells.header(self.shell, self.timing.rate, law, self.coupling, budget)
+            self._recording.begin(header)
         n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
-        self._board = Board.create(1, n_ring)
+        self._board = board = Board.create(1, n_ring)
+        board.seats["is_recorded"] = self._recording is not None
         self._row = table.join()
         request = LoopRequest(
-            descriptor=table.descriptor,
-            n_slots=table.n_slots,
+            table=table,
             row=self._row,
-            board=self._board.descriptor,
-            n_ring=n_ring,
+            board=board,
             grid=self.cells.grid,
             shell=without_surface(self.shell),
             device=device,
@@ -230,32 +230,18 @@ class Session(Closes):
             seconds=FOREVER if seconds is None else seconds,
             staleness=staleness,
             has_baseline=self._has_baseline,
-            is_recorded=self._recording is not None,
             budget_points=self.budget_points,
             is_on_gpu=self.frames_on == "cuda",
         )
         self._process = Process(
             "hapticdb.realtime.loop:work",
             request,
-            [table.descriptor, self._board.descriptor],
+            [table.descriptor, board.descriptor],
             purposes,
         )
         table.desk.pids[self._row] = self._process.pid
         self._process.await_ready("loop's", START_PATIENCE)
 
-    def _header(self) -> Header:
-        return Header(
-            environment=self.cells.url,
-            grid=self.cells.grid,
-            revision=self.cells.table.revision,
-            shell=self.shell,
-            rate=self.timing.rate,
-            law=self.law,
-            where=self.cells.filter.where,
-            exclude=self.cells.filter.exclude,
-            coupling=asdict(self.coupling),
-            budget_points=self.budget_points,
-        )
 
     def __del__(self) -> None:
         with suppress(Exception):
@@ -380,7 +366,6 @@ class Session(Closes):
             empty=answer.empty,
             bad_reading=answer.bad_reading,
             conditions=self._conditions() | ({"frames on": answer.card} if answer.card else {}),
-            warm_up=answer.warm_up,
             is_warm=answer.is_warm,
             cache=self.cells.figures(),
             objects=self.objects,

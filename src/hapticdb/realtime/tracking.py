@@ -50,34 +50,6 @@ Ranked = tuple[Keys, NDArray[np.float64]]
 """Cells (n,) int64 and their urgency (n,), smallest first."""
 
 
-class Motion(NamedTuple):
-    """Place and motion of a loop's tool: metres and m/s, world frame.
-
-    tool (3,): the shell's centre; handle (3,): target of that centre, set by the hand; velocity
-    (3,): of the handle; radius: distance from the centre to the shell's farthest point.
-    """
-
-    tool: Floats
-    handle: Floats
-    velocity: Floats
-    radius: float
-
-    @classmethod
-    def of_told(cls, told: NDArray[np.void]) -> "Motion":
-        """Motion from a loop's report: told () of `kernels.records.TOLD`, which is not copied."""
-        return cls(told["tool"], told["handle"], told["velocity"], float(told["radius"]))
-
-    @classmethod
-    def at_rest(cls, position: Floats) -> "Motion":
-        """Motion of a single point that stays at a position (3,)."""
-        return cls(position, position, np.zeros(3), 0.0)
-
-    @property
-    def is_finite(self) -> bool:
-        """Whether all numbers are finite."""
-        return all(bool(np.isfinite(part).all()) for part in self)
-
-
 class Wish(NamedTuple):
     """Where a tool is and may soon be, in voxels of the grid.
 
@@ -91,19 +63,20 @@ class Wish(NamedTuple):
     margin: float
 
     @classmethod
-    def of_motion(
-        cls, grid: Grid, motion: Motion, lookahead: float, peak_speed: float
+    def of_told(
+        cls, grid: Grid, told: NDArray[np.void], lookahead: float, peak_speed: float
     ) -> "Wish | None":
-        """Wish for a session's motion, or None if not all of its numbers are finite.
+        """Wish for what a loop tells of its tool, or None if not all of its numbers are finite.
 
-        The bounding sphere moves from the tool to the hand, and on with the hand's velocity for
-        `lookahead` seconds. The margin is the greatest distance of the hand from this path after
-        that time, at 1.5 times its recent `peak_speed` (m/s), or at `REACH_VOXELS` if that is more.
+        told () : of `kernels.records.TOLD`. The bounding sphere moves from the tool to the hand,
+        and on with the hand's velocity for `lookahead` seconds. The margin is the greatest distance
+        of the hand from this path after that time, at 1.5 times its recent `peak_speed` (m/s), or
+        at `REACH_VOXELS` if that is more.
         """
-        if not motion.is_finite:
+        tool, handle, velocity = told["tool"], told["handle"], told["velocity"]
+        radius, size = float(told["radius"]), grid.voxel_size
+        if not np.isfinite([*tool, *handle, *velocity, radius]).all():
             return None
-        size = grid.voxel_size
-        tool, handle, velocity, radius = motion
         margin = max(1.5 * peak_speed / size, REACH_VOXELS) * lookahead
         return cls(
             (tool - np.array(grid.origin)) / size,
@@ -205,13 +178,13 @@ class SessionTracker:
         has_moved = active != set(self.sessions)
         self.sessions = {row: self.sessions.get(row, _TrackedSession()) for row in sorted(active)}
         for row, session in self.sessions.items():
-            motion = self._read_motion(row, session)
-            if motion is None:
+            told = self._read_told(row, session)
+            if told is None:
                 continue
-            speed = float(np.linalg.norm(motion.velocity))
+            speed = float(np.linalg.norm(told["velocity"]))
             if np.isfinite(speed):
                 session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
-            wish = Wish.of_motion(self._grid, motion, lookahead, session.speed)
+            wish = Wish.of_told(self._grid, told, lookahead, session.speed)
             if wish is None or (session.wish is not None and wish.is_near(session.wish)):
                 continue
             session.wish = wish
@@ -219,14 +192,14 @@ class SessionTracker:
             has_moved = True
         return has_moved
 
-    def _read_motion(self, row: int, session: _TrackedSession) -> Motion | None:
+    def _read_told(self, row: int, session: _TrackedSession) -> NDArray[np.void] | None:
         """Read a row of the desk completely; None if its loop died while it wrote the row."""
         desk = self._table.desk.sessions
         for _ in range(READ_ATTEMPTS):
             session.sequence = int(desk["sequence"][row])
-            motion = Motion.of_told(desk["told"][row, ...].copy())
+            told: NDArray[np.void] = desk["told"][row, ...].copy()
             if session.sequence % 2 == 0 and session.sequence == desk["sequence"][row]:
-                return motion
+                return told
         return None
 
     def has_met_unknown_cells(self) -> bool:

@@ -185,6 +185,10 @@ class CellTable(Closes):
             table.cells.payload[kernels.EMPTY_SLOT] = BEYOND
         return table
 
+    def __reduce__(self) -> tuple[object, ...]:
+        """Pickle it for a process that inherits its descriptor."""
+        return CellTable, (self.descriptor, self.n_slots)
+
     def close(self) -> None:
         """Free the memory in this process; other processes keep their mappings."""
         if self.descriptor >= 0:

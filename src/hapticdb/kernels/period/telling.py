@@ -7,7 +7,7 @@ import numpy as np
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.hand.device_spring import contact_stiffness
-from hapticdb.kernels.hand.holding import IS_CUT, IS_FADING, IS_HELD
+from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD
 from hapticdb.kernels.hand.near_points import (
     ALONG,
     FELT_POINTS,
@@ -18,7 +18,7 @@ from hapticdb.kernels.hand.near_points import (
     ONSETS,
     U,
 )
-from hapticdb.kernels.hand.quasistatic import IS_LOOSE, IS_SNAPPING, IS_SOFTER
+from hapticdb.kernels.hand.quasistatic import IS_LOOSE, IS_SOFTER
 from hapticdb.kernels.period.memory import TOUCHING
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH, in_voxels
@@ -138,16 +138,13 @@ def count(seat, servo, follower):
         seat.contact_frames += 1
         seat.deepest = max(seat.deepest, sent.deepest)
     seat.unknown_frames += sent.unknown > 0
-    seat.unknown_points += sent.unknown
     seat.held_frames += (marks & IS_HELD) != 0
     seat.stale_frames += hand.is_stale
-    seat.cut_frames += (marks & IS_CUT) != 0
     seat.nowhere_frames += math.isnan(hand.position[0])
     seat.ended_loose = (marks & IS_LOOSE) != 0
     if seat.ended_loose and seat.loose_frames == 0:
         seat.first_loose_frame = seat.n_frames
     seat.loose_frames += seat.ended_loose
-    seat.snapping_frames += (marks & IS_SNAPPING) != 0
     seat.guard_actions += (marks & IS_SOFTER) != 0
     seat.left_out_frames += sent.left_out > 0
     seat.most_left_out = max(seat.most_left_out, sent.left_out)

@@ -15,7 +15,7 @@ from hapticdb.kernels.field.lattice import (
     STEPS,
 )
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.records import FRAME, SEAT, SESSION, pose_numbers, views_of
+from hapticdb.kernels.records import SESSION, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (
     READER_STRIDE,
     SCRATCH_ROWS,
@@ -224,7 +224,7 @@ class Hand:
         reach = np.linalg.norm(self.shell.points[:, :3] - self.shell.center, axis=1).max()
         radius = max(float(reach), field.place.size)
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
-        self._periods = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._periods = Stations(SMOOTH)
         self._station = Station(
             self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
         )

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from feel.ground import Ground
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.records import FRAME, SEAT, pose_numbers
+from hapticdb.kernels.records import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.handle import Handle
@@ -54,7 +54,7 @@ class SmoothHand:
     """
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._periods = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._periods = Stations(SMOOTH)
         self._station = Station(
             self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
             ground.residency.grid, held_tool(shell, ground.size),

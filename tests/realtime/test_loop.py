@@ -15,11 +15,11 @@ from hapticdb.errors import DeviceError
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, work
 from hapticdb.realtime.report import LoopAnswer, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells
+from hapticdb.realtime.timing import Timing
 from hapticdb.recording.frame import State
 from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, still, stroking

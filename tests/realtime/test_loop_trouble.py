@@ -23,9 +23,9 @@ from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering
-from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, work
+from hapticdb.realtime.timing import Timing
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable
 from hapticdb.testing import write_voxels

@@ -20,7 +20,7 @@ from hapticdb.kernels.hand.device_spring import DeviceSpring, contact_stiffness
 from hapticdb.kernels.hand.holding import IS_HELD
 from hapticdb.kernels.proxy.linearize import linearize
 from hapticdb.kernels.proxy.planes import ROW_COLUMNS
-from hapticdb.kernels.records import CONTACT_MODEL, FRAME, SEAT
+from hapticdb.kernels.records import CONTACT_MODEL
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.protocol.contacts import (
     FINE,
@@ -86,7 +86,7 @@ class ContactSource:
         )  # the client damps at its own rate
         self._cells = cells
         self._row = cells.table.join()
-        self._stations = Stations(1, np.zeros(1, SEAT), np.zeros((1, 1), FRAME), SMOOTH)
+        self._stations = Stations(SMOOTH)
         self._station = Station(
             self._stations.rows, cells.table.cells, self._row,
             cells.table.desk.sessions[self._row, ...], cells.grid, held_tool(shell, size),

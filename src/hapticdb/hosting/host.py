@@ -29,8 +29,10 @@ from hapticdb.query.law import SMOOTH
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
+from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
+from hapticdb.realtime.timing import Timing
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.filtering import Filter
 
@@ -40,8 +42,6 @@ MOST_SESSIONS = 64
 TEND_EVERY = 0.05
 """Seconds between two looks after recordings and processes. Larger: less work, and what has died is
 noticed later. A recording loses frames from 2 s on."""
-LARGEST_SCALE = 1e6
-"""Greatest scale of a session, as of `hapticdb.realtime.handle`."""
 
 
 class SessionHost(Closes):
@@ -65,8 +65,7 @@ class SessionHost(Closes):
         budget_bytes: int = DEFAULT_BUDGET,
         processes: int | None = None,
     ) -> None:
-        if not 10.0 <= rate <= 20_000.0:
-            raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
+        Timing(rate)  # checks it
         if processes is not None and processes < 1:
             raise UsageError(f"{processes} worker processes: give 1 or more")
         self.url, self.rate = url, rate
@@ -126,10 +125,7 @@ class SessionHost(Closes):
         pose = pose_at(start)
         if not is_rigid(pose):
             raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
-        if not 0.0 < scale <= LARGEST_SCALE:
-            raise UsageError(
-                f"a scale of {scale}: give a number above 0, {LARGEST_SCALE:g} at most"
-            )
+        Handle(scale=scale)  # checks it
         make_ready("host")  # here, so that no worker compiles
         felt = self._tables.checked(where, exclude)
         with self._changing:

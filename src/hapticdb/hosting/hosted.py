@@ -3,7 +3,8 @@
 import math
 import os
 import time
-from typing import NamedTuple, Protocol
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -43,11 +44,8 @@ class Recorded(NamedTuple):
     lost: int
 
 
-class Calls(Protocol):
-    """What a hosted session asks of the host: a word, the session's id, what goes with it."""
-
-    def __call__(self, word: str, session: int, /, *content: object) -> object:
-        """Do what the word says and return its result."""
+Calls = Callable[..., object]
+"""What a hosted session asks of the host: a word, the session's id, what goes with it -> result."""
 
 
 class HostedSession:

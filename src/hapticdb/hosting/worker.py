@@ -20,9 +20,9 @@ from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.channel import Message
 from hapticdb.realtime.coupling import SettledCoupling
-from hapticdb.realtime.deadlines import undisturbed
 from hapticdb.realtime.processes import MessageSender, parent_is_gone, reply_to_parent
 from hapticdb.realtime.stations import Station, Stations
+from hapticdb.realtime.timing import undisturbed
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 
@@ -71,7 +71,7 @@ class Worker:
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         self._board = board = request.board
-        self._stations = Stations(len(board.seats), board.seats, board.rings, SMOOTH)
+        self._stations = Stations(SMOOTH, board.seats, board.rings)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------

@@ -29,16 +29,16 @@ from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.period.loop import DEVICE, NOBODY
-from hapticdb.kernels.records import FRAME, SEAT, pose_numbers, views_of
+from hapticdb.kernels.records import pose_numbers, views_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
-from hapticdb.realtime.deadlines import Timing, undisturbed
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import LoopAnswer, LoopFigures
 from hapticdb.realtime.stations import Station, Stations
+from hapticdb.realtime.timing import Timing, undisturbed
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import LOST, STOP, CellTable
 
@@ -90,8 +90,7 @@ class Loop:
         self.reader = Reader(request.device)
         self.table, self.board = request.table, request.board
         self.session = self.table.desk.sessions[request.row, ...]
-        seats, law = self.board.seats, request.law
-        self.stations = Stations(1, seats, self.board.rings, law)
+        self.stations = Stations(request.law, self.board.seats, self.board.rings)
         has_distances = isinstance(request.coupling, SettledCoupling)
         cells = self.table.cells if has_distances else self.table.cells.without_distances()
         tool = held_tool(request.shell, request.grid.voxel_size, request.budget_points)
@@ -109,7 +108,7 @@ class Loop:
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])
-        self._is_asked_to_end = seats[0, ...]["is_asked_to_end"]
+        self._is_asked_to_end = self.board.seats[0, ...]["is_asked_to_end"]
         self.bad_reading: str | None = None
         self.is_warm = False
         self._error: BaseException | None = None
@@ -265,10 +264,9 @@ class Loop:
 
 def empty_loop(law: ForceLaw, rate: float, seconds: float) -> LoopFigures:
     """Run a loop that does nothing at that rate, to measure the machine's lateness."""
-    seats = np.zeros(1, SEAT)
-    stations = Stations(1, seats, np.zeros((1, 1), FRAME), law)
+    stations = Stations(law)
     stations.rows["source"], stations.rows["is_running"] = NOBODY, True
-    return LoopFigures.of_seat(seats[0], stations.run(rate, seconds))
+    return LoopFigures.of_seat(stations.seats[0], stations.run(rate, seconds))
 
 
 def n_compiled() -> int:

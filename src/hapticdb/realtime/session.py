@@ -17,13 +17,13 @@ from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, radius_of
-from hapticdb.realtime.deadlines import Timing
 from hapticdb.realtime.handle import Handle, path_of_hand
 from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import FOREVER, without_surface
+from hapticdb.realtime.timing import Timing
 from hapticdb.recording.file import DEFAULT_LIMIT
 from hapticdb.recording.frame import Frames, State
 from hapticdb.recording.ring import SessionRecording
@@ -135,7 +135,7 @@ class Session(Closes):
         has_baseline: bool = True,
     ) -> None:
         check_device(device)
-        _check_choices(rate, seconds, staleness)
+        _check_choices(seconds, staleness)
         self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
         self.shell, self.handle = shell, handle or Handle()
         self.frames_on = _checked_frames(frames_on, law, budget_points)
@@ -418,9 +418,7 @@ class Session(Closes):
             self._board = None
 
 
-def _check_choices(rate: float, seconds: float | None, staleness: float) -> None:
-    if not 10.0 <= rate <= 20_000.0:
-        raise UsageError(f"a rate of {rate} Hz: give 10 to 20,000")
+def _check_choices(seconds: float | None, staleness: float) -> None:
     if seconds is not None and not 0.0 < seconds <= 1e6:
         raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
     if not staleness > 0.0:

@@ -12,7 +12,7 @@ from hapticdb.kernels.hand.near_points import FIELD_ROWS
 from hapticdb.kernels.period import direct, loop
 from hapticdb.kernels.period.following import USUAL_GAP_NS
 from hapticdb.kernels.period.memory import PERIOD_ROWS
-from hapticdb.kernels.records import MOST_MISSED, PACE, RESULTS, STATION, pose_numbers
+from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
 from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, is_smooth
@@ -135,12 +135,16 @@ class Station:
 class Stations:
     """Stations of a process, and the call of their periods.
 
-    most : stations; seats, rings : of the board (`realtime.board.Board`); law : that all sessions
-    feel.
+    law : that all sessions feel; seats, rings : of the board (`realtime.board.Board`), and for each
+    seat a station; unless given, of one session alone.
     """
 
-    def __init__(self, most: int, seats: Record, rings: Frames, law: ForceLaw) -> None:
-        self.rows, self.pace = np.zeros(most, STATION), np.zeros((), PACE)
+    def __init__(
+        self, law: ForceLaw, seats: Record | None = None, rings: Frames | None = None
+    ) -> None:
+        self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
+        rings = np.zeros((1, 1), FRAME) if rings is None else rings
+        self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
         self._run = loop.run if is_smooth(law) else direct.run_directly
         self._arguments = (self.rows, seats, rings, self.pace, law.for_kernels)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]

@@ -254,7 +254,7 @@ def _begin_loop(
     prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
 
     from hapticdb.pointshell.shell import checked_budget
-    from hapticdb.realtime.deadlines import Timing
+    from hapticdb.realtime.timing import Timing
 
     checked_budget(budget_points)
     Timing(processor=processor)

@@ -25,20 +25,22 @@ class Timing:
     Attributes
     ----------
     rate : float
-        Frames a second.
+        Frames a second, 10 to 20,000.
     processor : int or None
         Number of the processor that the loop is bound to.
 
     Raises
     ------
     UsageError
-        If this process may not run on that processor.
+        If the rate is out of its range, or this process may not run on that processor.
     """
 
     rate: float = 1000.0
     processor: int | None = None
 
     def __post_init__(self) -> None:
+        if not 10.0 <= self.rate <= 20_000.0:
+            raise UsageError(f"a rate of {self.rate} Hz: give 10 to 20,000")
         granted = os.sched_getaffinity(0)
         if self.processor is not None and self.processor not in granted:
             shown = ", ".join(map(str, sorted(granted)))

@@ -12,9 +12,9 @@ import pytest
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import TIME_BINS
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
-from hapticdb.realtime.deadlines import SWITCH_INTERVAL, Timing, undisturbed
 from hapticdb.realtime.loop import empty_loop
 from hapticdb.realtime.report import spread_of
+from hapticdb.realtime.timing import SWITCH_INTERVAL, Timing, undisturbed
 
 GET_TIMERSLACK = 30
 

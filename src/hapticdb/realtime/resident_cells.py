@@ -244,9 +244,8 @@ class ResidentCells(Closes):
     def figures(self) -> CacheFigures:
         """Figures of the fetching process so far."""
         counted = self.table.desk.figures
-        told = {
-            name: counted[name].item() for name in CacheFigures._fields if name in FIGURES.names
-        }
+        shared = set(CacheFigures._fields) & set(FIGURES.names or ())
+        told = {name: counted[name].item() for name in shared}
         wanted = counted["wanted"].item()
         return CacheFigures(**told | {
             "budget_bytes": self.table.size_bytes,

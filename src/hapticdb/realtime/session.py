@@ -255,13 +255,13 @@ class Session(Closes):
     @property
     def pid(self) -> int:
         """Process id of the loop."""
-        return int(self.cells.table.desk.pids[self._open_row])
+        return self._open_process.pid
 
     @property
-    def _open_row(self) -> int:
-        if self._row < 0:
+    def _open_process(self) -> Process:
+        if self._process is None:
             raise UsageError("the session is closed: begin another")
-        return self._row
+        return self._process
 
     @property
     def _open_board(self) -> Board:
@@ -305,9 +305,7 @@ class Session(Closes):
         Call this again and again, or without a time: only during the call frames are recorded, and
         a fetching process that has died is started again.
         """
-        process = self._process
-        if process is None:
-            raise UsageError("the session is closed: begin another")
+        process = self._open_process
         until = time.monotonic() + (FOREVER if seconds is None else seconds)
         while self._answer is None and time.monotonic() < until:
             is_alive = process.is_alive  # read first: the last message may come with the end

@@ -113,3 +113,15 @@ def cause(path: Path, read: Callable[..., MeshFile] = parse_in_process, **option
     assert "\n" not in line
     assert line.isprintable()
     return line
+
+
+def area_and_volume(file: MeshFile) -> tuple[float, float]:
+    """Area and enclosed volume of all triangles."""
+    area = volume = 0.0
+    for part in file.parts:
+        corners = part.triangles()
+        corners = corners - part.bounds[0]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+        area += float(np.linalg.norm(normals, axis=1).sum()) / 2
+        volume += float(np.einsum("ij,ij", corners[:, 0], normals)) / 6
+    return area, volume

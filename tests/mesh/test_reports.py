@@ -14,8 +14,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticdb.mesh import MeshFile, parse_in_process
-from mesh_files import COLLADA, MESH_3MF, TRIANGLE, cause, gltf, names, text, threemf
+from hapticdb.mesh import parse_in_process
+from mesh_files import MESH_3MF, TRIANGLE, area_and_volume, cause, gltf, names, text, threemf
 
 
 class Reads(NamedTuple):
@@ -120,18 +120,6 @@ EXPECTED: dict[str, Reads | str] = {
     "t01_bom.stl": Reads(["box"], 6, 1, *HALF),
     "t08_count0.stl": Reads(["t08_count0"], 6, 1, *HALF, "counts 0 triangles, and 12 follow"),
 }
-
-
-def area_and_volume(file: MeshFile) -> tuple[float, float]:
-    """Area and enclosed volume of all triangles."""
-    area = volume = 0.0
-    for part in file.parts:
-        corners = part.triangles()
-        corners = corners - part.bounds[0]
-        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
-        area += float(np.linalg.norm(normals, axis=1).sum()) / 2
-        volume += float(np.einsum("ij,ij", corners[:, 0], normals)) / 6
-    return area, volume
 
 
 @pytest.mark.parametrize("name", EXPECTED)
@@ -264,56 +252,6 @@ def test_coordinates_too_far_away_for_their_numbers_are_told(tmp_path: Path) -> 
         file = parse_in_process(tmp_path / "far.ply")
         assert len(file.notes) == n_told
         assert area_and_volume(file)[0] == pytest.approx(7)
-
-
-def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
-    far = COLLADA.replace("0 0 0 1 0 0 1 1 0\n0 1 0", "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0")
-    far = far.replace("<translate>100 0 0", "<translate>400000000.25 0 0")
-    file = parse_in_process(text(tmp_path / "far.dae", far))
-    np.testing.assert_allclose(file.bounds[:, 0], [14000000.0025, 14000000.0225], rtol=1e-15)
-    assert not file.notes
-
-
-@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-32", "iso-8859-1"])
-def test_a_collada_file_is_read_in_the_encoding_that_it_declares(
-    tmp_path: Path, encoding: str
-) -> None:
-    path = tmp_path / "a.dae"
-    declared = encoding.removesuffix("-be")
-    content = COLLADA.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
-    path.write_bytes(content.encode(encoding))
-    assert len(parse_in_process(path).parts[0].triangles()) == 4
-
-
-def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path) -> None:
-    path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', 'meter="0,01"'))
-    assert not parse_in_process(path).names_unit
-    path = text(tmp_path / "b.dae", COLLADA.replace('<unit meter="0.01"/>', '<unit name="m"/>'))
-    assert parse_in_process(path).names_unit
-
-
-def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
-    strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
-    spline = "<geometry id='s'><spline/></geometry></library_geometries>"
-    gone = "<instance_geometry url='#gone'/><instance_light url='#sun'/></node></node>"
-    content = COLLADA.replace("</mesh>", strange).replace("</library_geometries>", spline)
-    path = text(tmp_path / "odd.dae", content.replace("</node></node>", gone))
-    file = parse_in_process(path)
-    assert len(file.parts[0].triangles()) == 4
-    assert file.notes == (
-        "1 pieces of the kind 'linestrips' are not read",
-        "1 of its 2 geometries cannot be read",
-        "1 of its 2 placements refer to what is not there",
-    )
-
-
-def test_strips_and_fans_of_a_collada_file_are_read(tmp_path: Path) -> None:
-    for kind in ("tristrips", "trifans"):
-        corners = "0 1 3 2" if kind == "tristrips" else "0 1 2 3"
-        content = COLLADA.replace("<triangles", f"<{kind}").replace("</triangles", f"</{kind}")
-        content = content.replace("<p>0 1 2</p></tri", f"<p>{corners}</p></tri")
-        file = parse_in_process(text(tmp_path / f"{kind}.dae", content))
-        assert area_and_volume(file)[0] == pytest.approx(4 * 2.5e-4)
 
 
 def with_arrays(path: Path, tree: dict[str, Any], *arrays: NDArray[Any], **extra: object) -> Path:

@@ -2,6 +2,7 @@
 
 import codecs
 import re
+from contextlib import suppress
 
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
@@ -10,6 +11,7 @@ _MARKS = (
     (codecs.BOM_UTF16_LE, "utf-16"),
     (codecs.BOM_UTF16_BE, "utf-16"),
 )
+_DECLARED = re.compile(rb"<\?xml[^>]*encoding=[\"']([\w.-]+)")
 _SAMPLE = 64
 """Bytes that tell UTF-16 without a mark."""
 _NOT_ASCII = re.compile(rb"[\x80-\xff]+")
@@ -28,6 +30,18 @@ def recoded(content: bytes) -> bytes:
         if len(head) > 3 and not any(zeros) and all(letters):
             return content.decode(name, "replace").encode()
     return content
+
+
+def xml_of(content: bytes) -> bytes:
+    """XML in UTF-8, by the encoding that it declares; if that is wrong, as `text_of` has it."""
+    plain = recoded(content)
+    declared = _DECLARED.match(plain)
+    if plain is content and declared is not None:
+        with suppress(LookupError, UnicodeDecodeError):
+            text = plain.decode(declared[1].decode())
+            if text.startswith("<"):
+                return text.encode()
+    return text_of(plain).encode()
 
 
 def text_of(content: bytes) -> str:

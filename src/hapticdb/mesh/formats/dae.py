@@ -1,281 +1,341 @@
-"""COLLADA through pycollada: one part for each placed geometry, named along its nodes.
+"""COLLADA: one part for each placed geometry, named along its nodes.
 
-This module walks the nodes itself: trimesh's loader loses their names and copies the geometry for
-every placement. pycollada rounds positions to float32 and makes 0 of those that are NaN, loses a
-geometry with holes or for one piece of an unknown kind, and stops at a damaged light. So the text
-is prepared for it, and positions are read from the text.
+This module does not use pycollada, which rounds positions and turns to 32 bits, makes 0 of NaN,
+passes over skews and the matrices of skins, loses a geometry for one index out of range or one
+empty piece, and a placement for a damaged material; nor trimesh, which loses the nodes' names.
 """
 
-import io
 from collections import Counter
+from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
-from typing import Any
 from xml.etree import ElementTree as ET
 
-import collada
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
-from hapticdb.mesh.polygons import triangulated
+from hapticdb.mesh.polygons import fan, strip, triangulated
 from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
-from hapticdb.mesh.text import recoded
+from hapticdb.mesh.text import xml_of
+from hapticdb.poses import rotation_of
 
+Floats = NDArray[np.float64]
 _Palette = dict[str, tuple[float, ...]]
 """Colours and opacity, 0 to 1, by the symbol that triangles name."""
+_Geometry = tuple[ET.Element, _Palette]
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
-
-
-_NO_SHAPE = ("library_lights", "library_cameras", "library_animations", "library_physics_models")
-_PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons", "lines"}
-_OF_A_MESH = _PIECES | {"source", "vertices", "extra"}
-_INSTANCES = ("instance_geometry", "instance_controller", "instance_node")
+_PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
+_OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
+_INSTANCES = {
+    "instance_geometry": ("geometry",),
+    "instance_controller": ("controller",),
+    "instance_node": ("node",),
+}
 
 
 def read(path: Path) -> Parsed:
     """Parts of the document's scene, in its unit and with its axes."""
-    content = path.read_bytes()
-    plain = recoded(content)
-    # What was recoded still declares the encoding that it had.
-    parser = ET.XMLParser(encoding=None if plain is content else "utf-8")  # noqa: S314 - expat stops entities that multiply
+    parser = ET.XMLParser(encoding="utf-8")  # noqa: S314 - expat stops entities that multiply
     try:
-        root = ET.fromstring(plain, parser)  # noqa: S314
+        root = ET.fromstring(xml_of(path.read_bytes()), parser)  # noqa: S314
     except ET.ParseError as error:
         raise UnreadableError(f"its XML is damaged or cut short: {error}") from None
-    if not root.tag.endswith("COLLADA"):
+    document = _Document(root)
+    if root.tag != "COLLADA":
         raise UnreadableError("it is no COLLADA file: its first element is not 'COLLADA'")
-    left_out = _prepare(root)
-    document = collada.Collada(io.BytesIO(ET.tostring(root)), ignore=[collada.common.DaeError])
-    if document.scene is None:
+    scene = document.referred(root.find("scene/instance_visual_scene"), "visual_scene")
+    if scene is None:
         raise UnreadableError("it has no scene")
-    shapes: dict[tuple[str, ...], int] = {}
-    geometries: list[tuple[Any, _Palette]] = []
+    shapes: dict[tuple[object, ...], int] = {}
+    geometries: list[_Geometry] = []
     placements: list[Placement] = []
-    for nodes, world_from_node in walk(_links(document.scene.nodes), _children):
-        for geometry, palette in _geometries(nodes[-1]):
-            key = (str(geometry.id), *(f"{name} {palette[name]}" for name in sorted(palette)))
+    for nodes, world_from_node in walk(document.links(scene), document.links):
+        for geometry, palette, bound in document.geometries(nodes[-1]):
+            key = (geometry, *(f"{name} {palette[name]}" for name in sorted(palette)))
             if key not in shapes:
                 shapes[key] = len(geometries)
                 geometries.append((geometry, palette))
-            name = "/".join(filter(None, (node.name for node in nodes)))
-            name = name or str(geometry.name or geometry.id)
-            placements.append(Placement(name, shapes[key], world_from_node))
+            names = [node.get("name") or node.get("id", "") for node in nodes]
+            name = "/".join(filter(None, names)) or geometry.get("name", geometry.get("id", ""))
+            # A skin is where it is bound, whatever its node says.
+            world = world_from_node if bound is None else bound
+            placements.append(Placement(name, shapes[key], world))
+    read_shapes, lost = _shapes(geometries)
     return Parsed(
-        [_shape(geometry, palette) for geometry, palette in geometries],
+        read_shapes,
         placements,
         metres=_metres(root),
-        up=_UP_AXES.get(str(getattr(document.assetInfo, "upaxis", None))),
-        notes=[*left_out, *_notes(root, document)],
+        up=_UP_AXES.get((root.findtext("asset/up_axis") or "").strip()),
+        notes=[*lost, *document.notes({id(geometry) for geometry, _ in geometries})],
     )
 
 
 def _metres(root: ET.Element) -> float | None:
     """Length of the document's unit, 1 m if it names none; None if what it names is no number."""
-    asset = next((child for child in root if _tag(child) == "asset"), ())
-    unit = next((child.get("meter", "1") for child in asset if _tag(child) == "unit"), "1")
+    unit = root.find("asset/unit")
     try:
-        return float(unit)
+        return 1.0 if unit is None else float(unit.get("meter", "1"))
     except ValueError:
         return None
 
 
-def _tag(element: ET.Element) -> str:
-    """Name of an element without its namespace."""
-    return element.tag.rpartition("}")[2]
+class _Document:
+    """Elements by kind and id; ids of different kinds may be equal."""
 
+    def __init__(self, root: ET.Element) -> None:
+        self._root = root
+        self._known: dict[tuple[str, str | None], ET.Element] = {}
+        for element in root.iter():
+            element.tag = element.tag.rpartition("}")[2]  # without its namespace
+            self._known.setdefault((element.tag, element.get("id")), element)
 
-def _prepare(root: ET.Element) -> list[str]:
-    """Take out what pycollada fails at and no surface needs; returns what is told about that."""
-    for library in [child for child in root if _tag(child) in _NO_SHAPE]:
-        root.remove(library)
-    strange: Counter[str] = Counter()
-    for mesh in root.iter():
-        if _tag(mesh) == "node":
-            for child in [c for c in mesh if _tag(c) in {"instance_light", "instance_camera"}]:
-                mesh.remove(child)
-        if _tag(mesh) != "mesh":
-            continue
-        for piece in list(mesh):
-            if _tag(piece) not in _OF_A_MESH:
-                strange[_tag(piece)] += 1
-                mesh.remove(piece)
-            elif _tag(piece) == "polygons":
-                _join_holes(piece)
-    return [f"{n} pieces of the kind '{kind}' are not read" for kind, n in strange.items()]
+    def referred(self, one: ET.Element | None, *kinds: str, key: str = "url") -> ET.Element | None:
+        """Element of a kind that the attribute `key` of an element refers to."""
+        name = "" if one is None else one.get(key, "").removeprefix("#")
+        found = (self._known.get((kind, name)) for kind in kinds)
+        return next((element for element in found if element is not None), None)
 
+    def links(self, node: ET.Element) -> list[tuple[ET.Element, Floats]]:
+        """Nodes below a node, with their transforms; an instance of a node counts as that node."""
+        below = [
+            child if child.tag == "node" else self.referred(child, "node")
+            for child in node
+            if child.tag in {"node", "instance_node"}
+        ]
+        return [(one, _parent_from_node(one)) for one in below if one is not None]
 
-def _join_holes(polygons: ET.Element) -> None:
-    """Write a polygon and its holes as one row of corners, with the lengths of the rows."""
-    for holed in [child for child in polygons if _tag(child) == "ph"]:
-        rows = [(row.text or "").split() for row in holed if _tag(row) in "ph"]
-        joined = ET.SubElement(
-            polygons, holed.tag[:-2] + "p", rows=" ".join(str(len(r)) for r in rows)
+    def geometries(self, node: ET.Element) -> list[tuple[ET.Element, _Palette, Floats | None]]:
+        """Geometries of a node itself, colours, and where the skin of one is bound."""
+        found = []
+        for child in node:
+            bound, key, one = None, "url", child
+            kinds = _INSTANCES.get(child.tag, ())
+            while (target := self.referred(one, *kinds, key=key)) is not None:
+                if target.tag == "geometry":
+                    found.append((target, self._palette(child), bound))
+                inner = [part for part in target if part.tag in {"skin", "morph"}]
+                if not inner or one is inner[0]:
+                    break
+                one, key, kinds = inner[0], "source", ("geometry", "controller")
+                if one.tag == "skin":
+                    text = one.findtext("bind_shape_matrix") or ""
+                    bound = np.asarray(numbers(text, np.float64), dtype=np.float64).reshape(-1)
+                    bound = bound.reshape(4, 4) if bound.size else np.eye(4)
+        return found
+
+    def _palette(self, instance: ET.Element) -> _Palette:
+        """Colours of the materials that a placement binds to the symbols of its triangles."""
+        found: _Palette = {}
+        for binding in instance.iter("instance_material"):
+            material = self.referred(binding, "material", key="target")
+            used = None if material is None else material.find("instance_effect")
+            effect = self.referred(used, "effect")
+            if effect is None:
+                continue
+            with suppress(UnreadableError, ValueError):
+                diffuse = numbers(effect.findtext(".//diffuse/color") or "", np.float64)
+                clear = float(effect.findtext(".//transparency/float") or 1)
+                if len(diffuse) in (3, 4):
+                    opacity = clear if 0 < clear < 1 else 1.0
+                    found[binding.get("symbol", "")] = (*diffuse[:3].tolist(), opacity)
+        return found
+
+    def notes(self, placed: set[int]) -> list[str]:
+        """Say what of the file did not become parts, or not in the place that it has when it moves.
+
+        placed : `id` of the geometries that are.
+        """
+        root = self._root
+        strange = Counter(
+            piece.tag for mesh in root.iter("mesh") for piece in mesh if piece.tag not in _OF_A_MESH
         )
-        joined.text = " ".join(word for row in rows for word in row)
-        polygons.remove(holed)
+        strange += Counter(
+            step.tag for node in root.iter("node") for step in node if step.tag == "skew"
+        )
+        wanted = [one for one in root.iter() if one.tag in _INSTANCES]
+        missing = sum(self.referred(one, *_INSTANCES[one.tag]) is None for one in wanted)
+        posed = Counter(one.tag for kind in ("skin", "morph") for one in root.iter(kind))
+        targets = {name for one in root.iter("IDREF_array") for name in (one.text or "").split()}
+        outside = sum(
+            one.get("id") not in targets and id(one) not in placed for one in root.iter("geometry")
+        )
+        others = sum(1 for _ in root.iter("visual_scene")) - 1
+        return [
+            *(f"{n} pieces of the kind '{kind}' are not read" for kind, n in strange.items()),
+            *([f"{outside} geometries are not in its scene and are left out"] if outside else []),
+            *(
+                [f"{missing} of its {len(wanted)} placements refer to what is not there"]
+                if missing
+                else []
+            ),
+            *(
+                f"{n} geometries have a {kind}: they are read in their rest pose"
+                for kind, n in posed.items()
+            ),
+            *([f"{others} more scenes are not read"] if others > 0 else []),
+        ]
 
 
-def _notes(root: ET.Element, document: Any) -> list[str]:  # noqa: ANN401 - untyped library
-    """Say what of the file did not become parts, or not in the place that it has when it moves."""
-    meshes = [one for one in root.iter() if _tag(one) == "geometry"]
-    lost = [one for one in meshes if one.get("id") not in document.geometries]
-    wanted = [one for one in root.iter() if _tag(one) in _INSTANCES]
-    missing = sum(one.get("url", "")[1:] not in _known(document) for one in wanted)
-    posed = Counter(type(one).__name__.lower() for one in document.controllers)
-    others = len(document.scenes) - 1
-    return [
-        *([f"{len(lost)} of its {len(meshes)} geometries cannot be read"] if lost else []),
-        *(
-            [f"{missing} of its {len(wanted)} placements refer to what is not there"]
-            if missing
-            else []
-        ),
-        *(
-            f"{n} geometries have a {kind}: they are read in their rest pose"
-            for kind, n in posed.items()
-        ),
-        *([f"{others} more scenes are not read"] if others > 0 else []),
-    ]
+def _turn(values: Floats) -> Floats:
+    """Rotation by an axis and degrees."""
+    half = np.radians(values[3]) / 2
+    length = np.linalg.norm(values[:3])
+    axis = np.sin(half) * values[:3] / (length or 1.0)
+    return rotation_of(np.array([np.cos(half), *axis]))[0]
 
 
-def _known(document: Any) -> set[str]:  # noqa: ANN401 - untyped library
-    """Ids that a node can refer to."""
-    nodes = [one.get("id", "") for one in document.xmlnode.getroot().iter() if _tag(one) == "node"]
-    read_things = [*document.geometries, *document.controllers]
-    return {str(one.id) for one in read_things} | set(nodes)
+def _look(values: Floats) -> Floats:
+    """Frame at a point that looks along -z at another, with y up."""
+    eye, interest, up = values.reshape(3, 3)
+    x = np.cross(interest - eye, up)
+    y = np.cross(x, interest - eye)
+    axes = np.stack([x, y, eye - interest], axis=1)
+    return np.column_stack([axes / np.linalg.norm(axes, axis=0), eye])
 
 
-def _links(nodes: list[Any]) -> list[tuple[Any, NDArray[np.float64]]]:
-    """Nodes with their transforms; an instance of a library node counts as that node."""
-    found = []
-    for node in nodes:
-        if isinstance(node, collada.scene.NodeNode):
-            found.append((node.node, _placed(node.node)))
-        elif isinstance(node, collada.scene.Node):
-            found.append((node, _placed(node)))
-    return found
+_STEPS: dict[str, Callable[[Floats], Floats]] = {
+    "matrix": lambda values: values.reshape(4, 4),
+    "translate": lambda values: np.column_stack([np.eye(3), values]),
+    "scale": lambda values: np.diag(values.reshape(3)),
+    "rotate": _turn,
+    "lookat": _look,
+}
+"""Upper left (n, m) of a transform (4, 4), by the numbers of a step."""
 
 
-def _placed(node: Any) -> NDArray[np.float64]:  # noqa: ANN401 - untyped library
-    """Transform (4, 4) of a node; pycollada rounds where it is far away."""
+def _parent_from_node(node: ET.Element) -> Floats:
+    """Transform (4, 4) of a node: its steps, one behind the other."""
     whole = np.eye(4)
-    for step in node.transforms:
-        one = np.asarray(step.matrix, dtype=np.float64).copy()
-        values = numbers(step.xmlnode.text or "", np.float64)
-        if isinstance(step, collada.scene.MatrixTransform):
-            one = values.reshape(4, 4).astype(np.float64)
-        elif isinstance(step, collada.scene.TranslateTransform):
-            one[:3, 3] = values
-        whole @= one
+    for step in node:
+        if step.tag in _STEPS:
+            one = np.eye(4)
+            values = np.asarray(numbers(step.text or "", np.float64), dtype=np.float64)
+            found = _STEPS[step.tag](values)
+            one[: found.shape[0], : found.shape[1]] = found
+            whole = whole @ one
     return whole
 
 
-def _children(node: Any) -> list[tuple[Any, NDArray[np.float64]]]:  # noqa: ANN401 - untyped library
-    """Nodes below a node."""
-    return _links(node.children)
+def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
+    """Shapes of geometries, those that cannot be read without triangles, and what is told then."""
+    found, lost = [], {}
+    for geometry, palette in geometries:
+        try:
+            found.append(_shape(geometry, palette))
+        except (UnreadableError, ValueError, LookupError, TypeError, AttributeError) as error:
+            lost[id(geometry)] = error
+            found.append(Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)))
+    if not lost:
+        return found, []
+    first = next(iter(lost.values()))
+    why = str(first) if isinstance(first, UnreadableError) else "it is damaged"
+    return found, [f"{len(lost)} of its geometries cannot be read: {why}"]
 
 
-def _geometries(node: Any) -> list[tuple[Any, _Palette]]:  # noqa: ANN401 - untyped library
-    """Geometries of a node itself, and colours; skinned geometries are in their rest pose."""
-    found = []
-    for child in node.children:
-        if isinstance(child, collada.scene.GeometryNode):
-            found.append((child.geometry, _palette(child.materials)))
-        elif isinstance(child, collada.scene.ControllerNode):
-            found.append((child.controller.geometry, _palette(child.materials)))
-    return found
-
-
-def _palette(bindings: list[Any]) -> _Palette:
-    """Colours of the materials that a placement binds to the symbols of its triangles."""
-    found = {}
-    for binding in bindings:
-        effect = getattr(binding.target, "effect", None)
-        diffuse = getattr(effect, "diffuse", None)
-        if isinstance(diffuse, tuple) and len(diffuse) in (3, 4):
-            clear = getattr(effect, "transparency", None)
-            opacity = clear if isinstance(clear, float) and 0 < clear < 1 else 1.0
-            found[str(binding.symbol)] = (*map(float, diffuse[:3]), opacity)
-    return found
-
-
-def _shape(geometry: Any, palette: _Palette) -> Shape:  # noqa: ANN401 - untyped library
-    """Triangles of a geometry's primitives; lines have no surface."""
-    vertices: dict[str, tuple[int, NDArray[np.float64]]] = {}
+def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
+    """Triangles of a geometry's pieces; lines have no surface."""
+    mesh = geometry.find("mesh")
+    if mesh is None:
+        raise UnreadableError("one has no mesh")
+    sources = {f"#{one.get('id')}": one for one in reversed(mesh) if one.tag not in _PIECES}
+    vertices: dict[str, tuple[int, Floats]] = {}
     faces: list[NDArray[np.int64]] = []
     painted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = incomplete = 0
-    for primitive in geometry.primitives:
-        if isinstance(primitive, collada.lineset.LineSet) or primitive.vertex is None:
-            unsupported += 1
+    for piece in mesh:
+        unsupported += piece.tag == "lines"
+        if piece.tag not in _PIECES or (piece.find("p") is None and piece.find("ph") is None):
             continue
-        source = primitive.sources["VERTEX"][0][4]
-        if source.id not in vertices:
-            vertices[source.id] = n_vertices, _positions(source)
-            n_vertices += len(vertices[source.id][1])
-        offset, corners = vertices[source.id]
-        index = np.asarray(primitive.vertex_index, dtype=np.int64).reshape(-1)
-        found, n_short = _faces(primitive, corners, index)
+        inputs = _inputs(piece)
+        at, name = inputs["VERTEX"]
+        of_vertex = _inputs(sources[name])
+        place = of_vertex["POSITION"][1]
+        if place not in vertices:
+            vertices[place] = n_vertices, _values(sources[place], 3)
+            n_vertices += len(vertices[place][1])
+        offset, corners = vertices[place]
+        width = 1 + max(int(one.get("offset", 0)) for one in piece.iter("input"))
+        index, found, n_short = _faces(piece, width, at, corners)
         incomplete += n_short
-        vertex = index[found]
+        vertex = index[:, at][found]
         inside = (vertex >= 0) & (vertex < len(corners))
         faces.append(np.where(inside, vertex + offset, -1))
-        colour = palette.get(str(primitive.material))
-        colours = None if colour is None else rgba(colour)
-        painted.append((_corner_colours(primitive, found, colours), len(found)))
+        colours = rgba(palette[symbol]) if (symbol := piece.get("material")) in palette else None
+        inputs = {kind: (at, name) for kind, (_, name) in of_vertex.items()} | inputs
+        with suppress(UnreadableError, LookupError, ValueError):
+            beside, shade = inputs["COLOR"]
+            values = _values(sources[shade], 3)
+            colours = rgba(mean_of_corners(values, index[:, beside][found]))
+        painted.append((colours, len(found)))
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
     if not faces:
         return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)
-    whole = np.concatenate([piece for _, piece in vertices.values()])
+    whole = np.concatenate([found for _, found in vertices.values()])
     return Shape(whole, np.concatenate(faces), defects, joined(painted))
 
 
-def _positions(source: Any) -> NDArray[np.float64]:  # noqa: ANN401 - untyped library
-    """Positions (V, 3) as the file's text has them."""
-    text = next(child.text or "" for child in source.xmlnode if _tag(child) == "float_array")
-    found = np.asarray(numbers(text, np.float64), dtype=np.float64)
-    return found.reshape(-1, len(source.components))[:, :3]
+def _inputs(holder: ET.Element) -> dict[str, tuple[int, str]]:
+    """Offset and source of the first input of each kind."""
+    found = reversed(holder.findall("input"))
+    return {i.get("semantic", ""): (int(i.get("offset", 0)), i.get("source", "")) for i in found}
 
 
-def _corner_colours(
-    primitive: Any,  # noqa: ANN401 - untyped library
-    faces: NDArray[np.int64],
-    otherwise: Colours | None,
-) -> Colours | None:
-    """Colours (F, 4) by the primitive's own corners, or else the material's."""
-    inputs = primitive.sources.get("COLOR")
-    if not inputs or not len(faces):
-        return otherwise
-    offset, source = inputs[0][0], inputs[0][4]
-    values = np.asarray(source.data, dtype=np.float64)
-    if not len(values) or values.shape[1] not in (3, 4):
-        return otherwise
-    of_corner = np.asarray(primitive.index, dtype=np.int64).reshape(-1, primitive.nindices)
-    return rgba(mean_of_corners(values, of_corner[:, offset][faces]))
+def _values(source: ET.Element, least: int) -> Floats:
+    """Numbers of a source, row by row: those that its accessor names, at least so many."""
+    found = np.asarray(numbers(source.findtext("float_array") or "", np.float64), dtype=np.float64)
+    accessor = source.find("technique_common/accessor")
+    named: list[int] = []
+    stride, start = least, 0
+    if accessor is not None:
+        stride, start = int(accessor.get("stride", 1)), int(accessor.get("offset", 0))
+        named = [n for n, one in enumerate(accessor.findall("param")) if one.get("name")]
+    rows = found[start : start + len(found[start:]) // stride * stride].reshape(-1, stride)
+    rows = rows[:, named] if named else rows
+    if rows.shape[1] < least:
+        raise UnreadableError(f"a source has rows of {rows.shape[1]} numbers, not {least}")
+    return rows[:, :4] if least < rows.shape[1] else rows
 
 
 def _faces(
-    primitive: Any,  # noqa: ANN401 - untyped library
-    vertices: NDArray[np.float64],
-    index: NDArray[np.int64],
-) -> tuple[NDArray[np.int64], int]:
-    """Triangles (F, 3) of a primitive, and how many polygons had fewer than three corners.
+    piece: ET.Element, width: int, at: int, vertices: Floats
+) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
+    """Indices of a piece's corners, its triangles, and how many polygons are too small.
 
-    They name corners of the primitive; `index` has the vertex of each corner.
+    at : the column of the indices (C, width) that has the vertex of a corner. The triangles (F, 3)
+    name corners. A polygon of fewer than three corners has none.
     """
+
+    def row(text: ET.Element) -> NDArray[np.int64]:
+        return np.asarray(numbers(text.text or "", np.int64), dtype=np.int64).reshape(-1, width)
+
+    rows: list[NDArray[np.int64]] = []
+    holes: dict[int, list[int]] = {}
+    for child in piece:
+        if child.tag == "p":
+            rows.append(row(child))
+        elif child.tag == "ph":
+            loops = [row(one) for one in child if one.tag in {"p", "h"}]
+            holes[len(rows)] = np.cumsum([len(loop) for loop in loops[:-1]]).tolist()
+            rows.append(np.concatenate(loops))
+    index = np.concatenate(rows)
     corners = np.arange(len(index))
-    if isinstance(primitive, collada.triangleset.TriangleSet):
-        return corners.reshape(-1, 3), 0
-    ends = np.cumsum(np.asarray(primitive.vcounts, dtype=np.int64))
-    polygons = [polygon.tolist() for polygon in np.split(corners, ends[:-1])]
-    holes = {}
-    rows = [one for one in primitive.xmlnode if _tag(one) == "p"]
-    for number, row in enumerate(rows):
-        if "rows" in row.attrib:
-            lengths = np.array(row.get("rows").split(), dtype=np.int64)
-            per_corner = max(int(lengths.sum()) // max(len(polygons[number]), 1), 1)
-            holes[number] = (np.cumsum(lengths[:-1]) // per_corner).tolist()
-    known = (index >= 0) & (index < len(vertices))
-    places = np.where(known[:, None], vertices[np.where(known, index, 0)], np.nan)
-    return triangulated(places, polygons, holes)
+    sizes = np.array([len(one) for one in rows])
+    if piece.tag == "triangles":
+        return index, corners[: len(corners) // 3 * 3].reshape(-1, 3), int(len(corners) % 3 > 0)
+    if piece.tag == "polylist":
+        sizes = np.asarray(numbers(piece.findtext("vcount") or "", np.int64))
+        if sizes.sum() != len(corners) or (sizes < 0).any():
+            raise UnreadableError("the corners of its polygons are not as many as it says")
+    split = np.split(corners, np.cumsum(sizes))[:-1]
+    if piece.tag in {"tristrips", "trifans"}:
+        cut = strip if piece.tag == "tristrips" else fan
+        long = [cut(one) for one in split if len(one) >= 3]
+        found = np.concatenate([np.empty((0, 3), dtype=np.int64), *long])
+        return index, found, len(split) - len(long)
+    vertex = index[:, at]
+    known = (vertex >= 0) & (vertex < len(vertices))
+    places = np.full((len(vertex), 3), np.nan)
+    places[known] = vertices[vertex[known]]
+    return index, *triangulated(places, [one.tolist() for one in split], holes)

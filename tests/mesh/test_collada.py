@@ -1,0 +1,161 @@
+"""COLLADA files as programs write them: read rightly, or told what is lost."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hapticdb.mesh import parse_in_process
+from mesh_files import COLLADA, area_and_volume, names, text
+
+
+def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
+    far = COLLADA.replace("0 0 0 1 0 0 1 1 0\n0 1 0", "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0")
+    far = far.replace("<translate>100 0 0", "<translate>400000000.25 0 0")
+    file = parse_in_process(text(tmp_path / "far.dae", far))
+    np.testing.assert_allclose(file.bounds[:, 0], [14000000.0025, 14000000.0225], rtol=1e-15)
+    assert not file.notes
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-32", "iso-8859-1"])
+def test_a_collada_file_is_read_in_the_encoding_that_it_declares(
+    tmp_path: Path, encoding: str
+) -> None:
+    path = tmp_path / "a.dae"
+    declared = encoding.removesuffix("-be")
+    content = COLLADA.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
+    path.write_bytes(content.encode(encoding))
+    assert len(parse_in_process(path).parts[0].triangles()) == 4
+
+
+def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path) -> None:
+    path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', 'meter="0,01"'))
+    assert not parse_in_process(path).names_unit
+    path = text(tmp_path / "b.dae", COLLADA.replace('<unit meter="0.01"/>', '<unit name="m"/>'))
+    assert parse_in_process(path).names_unit
+
+
+def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
+    strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
+    spline = "<geometry id='s'><spline/></geometry></library_geometries>"
+    gone = "<instance_geometry url='#gone'/><instance_light url='#sun'/></node></node>"
+    content = COLLADA.replace("</mesh>", strange).replace("</library_geometries>", spline)
+    path = text(tmp_path / "odd.dae", content.replace("</node></node>", gone))
+    file = parse_in_process(path)
+    assert len(file.parts[0].triangles()) == 4
+    assert file.notes == (
+        "1 pieces of the kind 'linestrips' are not read",
+        "1 geometries are not in its scene and are left out",
+        "1 of its 2 placements refer to what is not there",
+    )
+
+
+def test_strips_and_fans_of_a_collada_file_are_read(tmp_path: Path) -> None:
+    for kind in ("tristrips", "trifans"):
+        corners = "0 1 3 2" if kind == "tristrips" else "0 1 2 3"
+        content = COLLADA.replace("<triangles", f"<{kind}").replace("</triangles", f"</{kind}")
+        content = content.replace("<p>0 1 2</p></tri", f"<p>{corners}</p></tri")
+        file = parse_in_process(text(tmp_path / f"{kind}.dae", content))
+        assert area_and_volume(file)[0] == pytest.approx(4 * 2.5e-4)
+
+
+def collada_source(name: str, floats: str, stride: int = 3, start: int = 0) -> str:
+    params = "<param name='A'/>" * 3 + "<param/>" * (stride - 3)
+    return (
+        f"<source id='{name}'><float_array>{floats}</float_array><technique_common><accessor "
+        f"offset='{start}' stride='{stride}'>{params}</accessor></technique_common></source>"
+    )
+
+
+def test_a_collada_accessor_says_where_positions_are(tmp_path: Path) -> None:
+    head, _, tail = COLLADA.partition('<source id="p">')
+    tail = tail.partition("</source>")[2]
+    places = ("7 0 0 0 7 1 0 0 7 1 1 0 7 0 1 0 7", 4, 1), ("9 9 9 0 0 0 1 0 0 1 1 0 0 1 0", 3, 3)
+    for floats, stride, start in places:
+        source = collada_source("p", floats, stride, start)
+        file = parse_in_process(text(tmp_path / "a.dae", head + source + tail))
+        assert area_and_volume(file)[0] == pytest.approx(4 * 2e-4)
+
+
+@pytest.mark.parametrize(
+    ("steps", "low", "high"),
+    [
+        ("<rotate>0 0 2 90</rotate>", (5e6 - 2, 0, 0), (5e6, 2, 0)),
+        # Along -z, which is the world's -y; x is then the world's -x.
+        ("<lookat>0 0 0 0 -1 0 0 0 1</lookat>", (5e6 - 2, 0, 0), (5e6, 0, 2)),
+        ("<rotate>0 0 0 90</rotate><skew>1</skew>", (5e6, 0, 0), (5e6 + 2, 2, 0)),
+    ],
+)
+def test_a_collada_node_far_away_is_turned_in_64_bits(
+    tmp_path: Path, steps: str, low: tuple[float, ...], high: tuple[float, ...]
+) -> None:
+    content = COLLADA.replace("0.01", "1").replace("100 0 0", "5e6 0 0")
+    file = parse_in_process(text(tmp_path / "a.dae", content.replace("<scale>", f"{steps}<scale>")))
+    np.testing.assert_allclose(file.bounds, [low, high], rtol=0, atol=2e-9)
+    assert bool(file.notes) == ("skew" in steps)
+
+
+def test_a_collada_skin_is_where_it_is_bound_and_a_morph_where_its_node_is(tmp_path: Path) -> None:
+    skin = (
+        "<skin source='#{}'><bind_shape_matrix>1 0 0 7 0 1 0 0 0 0 1 0 0 0 0 1"
+        "</bind_shape_matrix></skin>"
+    )
+    morph = "<morph source='#g' method='NORMALIZED'/>"
+    for inside, low in ((skin.format("g"), 0.07), (morph, 1.0), (morph + skin.format("c"), 0.07)):
+        content = COLLADA.replace("<instance_geometry url='#g'/>", "")
+        content = content.replace('instance_geometry url="#g"', 'instance_controller url="#d"')
+        first, _, second = inside.partition("/><skin")
+        pieces = [first + "/>", "<skin" + second] if second else [inside]
+        ids = ["c", "d"] if second else ["d"]
+        made = [f"<controller id='{i}'>{p}</controller>" for i, p in zip(ids, pieces, strict=True)]
+        library = f"<library_controllers>{''.join(made)}</library_controllers><library_geom"
+        file = parse_in_process(text(tmp_path / "a.dae", content.replace("<library_geom", library)))
+        assert file.bounds[0, 0] == pytest.approx(low)
+        assert "are read in their rest pose" in file.notes[0]
+
+
+def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path) -> None:
+    beside = {
+        "an index out of range": ("<p>0 1 2</p>", "<p>0 1 9 0 1 2</p>"),
+        "an empty piece": ("<triangles ", "<triangles count='0'/><triangles "),
+        "a material that is not there": (
+            '<instance_geometry url="#g"/>',
+            '<instance_geometry url="#g"><instance_material target="#no"/></instance_geometry>',
+        ),
+        "an accessory of another shape": (
+            "<vcount>",
+            '<input semantic="TEXCOORD" source="#p" offset="0" set="0"/><vcount>',
+        ),
+    }
+    for old, new in beside.values():
+        file = parse_in_process(text(tmp_path / "a.dae", COLLADA.replace(old, new)))
+        assert area_and_volume(file)[0] == pytest.approx(4 * 2e-4)
+    broken = COLLADA[COLLADA.index("<geometry") : COLLADA.index("</library_geometries")]
+    for old, new, why in (
+        ("<vcount>4 3", "<vcount>4 4", "are not as many as it says"),
+        ("0 0 0 1 0 0", "0 0 0 1,0 0 0", "where a number should be"),
+        ("<p>0 1 2</p>", "<p>0 1 x</p>", "where a number should be"),
+        ('stride="3"', 'stride="x"', "it is damaged"),
+    ):
+        second = broken.replace('id="g"', 'id="b"').replace(old, new)
+        content = COLLADA.replace("</library_geometries>", second + "</library_geometries>")
+        content = content.replace("</node></node>", '<instance_geometry url="#b"/></node></node>')
+        file = parse_in_process(text(tmp_path / "b.dae", content))
+        assert len(file.parts) == 1
+        assert "1 of its geometries cannot be read: " in file.notes[0]
+        assert why in file.notes[0]
+
+
+@pytest.mark.parametrize(
+    ("encoding", "declared"),
+    [(e, d) for e in ("latin-1", "gb18030") for d in ("", "utf-8")] + [("gb18030", "gb2312")],
+)
+def test_names_of_a_collada_file_are_read_in_the_encoding_that_they_have(
+    tmp_path: Path, encoding: str, declared: str
+) -> None:
+    name = {"latin-1": "Größe", "gb18030": "左前轮"}[encoding]
+    content = COLLADA.replace("branch", name)
+    if declared:
+        content = content.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
+    (tmp_path / "a.dae").write_bytes(content.encode(encoding))
+    assert names(parse_in_process(tmp_path / "a.dae")) == [f"tree/{name}"]

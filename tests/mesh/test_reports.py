@@ -3,19 +3,14 @@
 Areas, volumes and bounds follow from the shapes that the files were written to hold.
 """
 
-import base64
-import json
-import shutil
-import zipfile
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
-from numpy.typing import NDArray
 
 from hapticdb.mesh import parse_in_process
-from mesh_files import MESH_3MF, TRIANGLE, area_and_volume, cause, gltf, names, text, threemf
+from mesh_files import area_and_volume, cause, names, text
 
 
 class Reads(NamedTuple):
@@ -254,79 +249,46 @@ def test_coordinates_too_far_away_for_their_numbers_are_told(tmp_path: Path) -> 
         assert area_and_volume(file)[0] == pytest.approx(7)
 
 
-def with_arrays(path: Path, tree: dict[str, Any], *arrays: NDArray[Any], **extra: object) -> Path:
-    """A glTF file of one triangle with more accessors, from number 2 on; `extra` goes into each."""
-    whole = json.loads(gltf(tree, path).read_text())
-    kinds = {"f4": 5126, "u1": 5121, "i2": 5122, "u2": 5123}
-    shapes = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
-    for array in arrays:
-        n = len(whole["buffers"])
-        uri = "data:;base64," + base64.b64encode(array.tobytes()).decode()
-        whole["buffers"].append({"byteLength": array.nbytes, "uri": uri})
-        whole["bufferViews"].append({"buffer": n, "byteLength": array.nbytes})
-        kind, shape = kinds[array.dtype.str[1:]], shapes[array.shape[1]]
-        view = {"bufferView": len(whole["bufferViews"]) - 1, "componentType": kind, "type": shape}
-        whole["accessors"].append(view | {"count": len(array)} | extra)
-    path.write_text(json.dumps(whole))
-    return path
+def test_a_word_among_numbers_is_named(tmp_path: Path) -> None:
+    corners = "v 0 0 0\nv 1 0 0\nv 0 {} 0\nf 1 2 3\n"
+    path = text(tmp_path / "a.obj", corners.format("1,5"))
+    assert "it holds '1,5' where a number should be: write decimals with points" in cause(path)
+    path = text(tmp_path / "b.obj", corners.format("-1.#IND"))  # and no comment begins there
+    assert "it holds '-1.#IND' where a number should be" in cause(path)
 
 
-def test_a_skin_places_a_mesh_where_its_joints_are(tmp_path: Path) -> None:
-    joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype=np.uint8)
-    weights = np.array([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype="<f4")
-    bind = np.stack([np.eye(4), np.eye(4)])
-    bind[1, :3, 3] = [-5, 0, 0]
-    inverse = bind.transpose(0, 2, 1).reshape(2, 16).astype("<f4")
-    attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}
-    tree = {
-        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1}]}],
-        "nodes": [
-            {"mesh": 0, "skin": 0, "name": "arm", "translation": [9, 9, 9]},
-            {"name": "root", "translation": [0, 0, 2], "children": [2]},
-            {"name": "tip", "translation": [5, 4, 0]},
-        ],
-        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}],
-        "scenes": [{"nodes": [0, 1]}],
-    }
-    path = with_arrays(tmp_path / "skin.gltf", tree, joints, weights, inverse)
-    moved = TRIANGLE + np.array([[0, 2, 2], [0, 4, 2], [0, 4, 2]])
-    np.testing.assert_allclose(parse_in_process(path).parts[0].triangles()[0], moved, atol=1e-6)
-    outside = tree | {"scenes": [{"nodes": [0]}]}
-    path = with_arrays(tmp_path / "lost.gltf", outside, joints, weights, inverse)
-    assert "a joint of its skin 0 is not in its scene" in cause(path)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_lines_of_an_obj_file_are_continued_at_every_end(tmp_path: Path, end: str) -> None:
+    lines = ["v 0 0 0", "v 1 0 0", "v 0 1 0", "f 1 \\", "2 \\ ", "3", "\0\0"]
+    path = tmp_path / "a.obj"
+    path.write_bytes(end.join(lines).encode())
+    file = parse_in_process(path)
+    assert len(file.parts[0].triangles()) == 1
+    assert not file.notes
 
 
-def test_a_nodes_weights_replace_its_meshs(tmp_path: Path) -> None:
-    target = np.array([[0, 0, 1]] * 3, dtype="<f4")
-    piece = {"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 2}]}
-    nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "weights": [0.25]}]
-    tree = {"meshes": [{"primitives": [piece], "weights": [2]}], "nodes": nodes}
-    path = with_arrays(tmp_path / "a.gltf", tree | {"scenes": [{"nodes": [0, 1]}]}, target)
-    assert [part.bounds[0, 2] for part in parse_in_process(path).parts] == [2.0, 0.25]
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+def test_a_ply_header_has_any_ends_of_lines_and_space_may_follow(tmp_path: Path, end: str) -> None:
+    head = f"ply\nformat binary_little_endian 1.0\ncomment end_header soon\n{PLY_U}"
+    head = head.replace("element face 2", "element face 1").replace("\n", end)
+    corners = np.array([line.split() for line in FLAT_U.splitlines()], dtype="<f4")
+    corners += np.frombuffer(b"\n\r\n\r", dtype="<f4")  # the first byte may be one, too
+    content = head.encode() + corners.tobytes() + b"\x08" + np.arange(8, dtype="<i4").tobytes()
+    (tmp_path / "a.ply").write_bytes(content + b"\r\n")
+    assert area_and_volume(parse_in_process(tmp_path / "a.ply"))[0] == pytest.approx(7)
+    twice = f"ply\nformat ascii 1.0\n{PLY_U}".replace("element face 2", "element vertex 1")
+    assert "two elements of the kind 'vertex'" in cause(text(tmp_path / "b.ply", twice))
 
 
-def test_instances_turn_and_scale_within_their_node(tmp_path: Path) -> None:
-    turned = np.array([[0, 0, 23170, 23170]], dtype="<i2")  # a quarter turn about z, normalized
-    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"ROTATION": 2}}}
-    tree = {"nodes": [{"mesh": 0, "translation": [1, 0, 0], "extensions": extension}]}
-    path = with_arrays(tmp_path / "a.gltf", tree, turned, normalized=True)
-    corners = parse_in_process(path).parts[0].triangles()[0]
-    np.testing.assert_allclose(corners, [[1, 0, 0], [1, 1, 0], [0, 0, 0]], atol=1e-4)
+def test_facets_of_two_and_of_four_corners_are_refused(tmp_path: Path) -> None:
+    line = "vertex 1 0 0\n"
+    both = FACET.replace(line, "") + FACET.replace(line, line * 2)
+    path = text(tmp_path / "a.stl", f"solid a\n{both}endsolid a\n")
+    assert "other than three corners" in cause(path)
 
 
-def test_extensions_that_are_not_read_are_counted_or_refused(tmp_path: Path) -> None:
-    nodes = [{"mesh": 0, "extensions": {"KHR_implicit_shapes": {}, "KHR_xmp_json_ld": {}}}] * 2
-    tree: dict[str, Any] = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
-    file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
-    assert file.notes == ("its extension KHR_implicit_shapes, used 2 times, is not read",)
-    tree["extensionsRequired"] = ["KHR_implicit_shapes"]
-    assert "requires the glTF extension KHR_implicit" in cause(gltf(tree, tmp_path / "b.gltf"))
-
-
-def test_a_packed_mesh_with_a_plain_copy_is_read(tmp_path: Path) -> None:
-    piece = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {}}}
-    path = gltf({"meshes": [{"primitives": [piece]}]}, tmp_path / "a.gltf")
-    assert area_and_volume(parse_in_process(path))[0] == pytest.approx(0.5)
+def test_a_binary_off_file_is_refused_as_one(tmp_path: Path) -> None:
+    assert "it is a binary OFF file" in cause(text(tmp_path / "a.off", "OFF BINARY\n\0\0\0\3"))
 
 
 def test_every_reported_file_has_its_expectation(test_data: Path | None) -> None:
@@ -334,31 +296,6 @@ def test_every_reported_file_has_its_expectation(test_data: Path | None) -> None
         pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no reported files to read")
     there = {path.name for path in (test_data / "reports").iterdir()}
     assert there == {*EXPECTED, "README", "q01_semicolon_decimal_comma.csv"}
-
-
-def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path) -> None:
-    path = threemf(tmp_path / "a.3mf", f'<object id="1" name="new">{MESH_3MF}</object>', ITEM)
-    old = threemf(tmp_path / "b.3mf", f'<object id="1" name="old">{MESH_3MF}</object>', ITEM)
-    with zipfile.ZipFile(old) as archive:
-        other = archive.read("3D/3dmodel.model")
-    with zipfile.ZipFile(path, "a") as archive:
-        archive.writestr("3D/Other.model", other)
-        archive.writestr("3D/My%20Other.model", other)
-        archive.writestr("backup/3D/3dmodel.model", "no XML")
-    assert names(parse_in_process(path)) == ["new"]
-    for target in (
-        "/3D/Other.model",
-        "3D/%4Fther.model",
-        "./3D/Other.model",
-        "3D/My%20Other.model",
-    ):
-        named = tmp_path / "named.3mf"
-        shutil.copy(path, named)
-        with zipfile.ZipFile(named, "a") as archive:
-            kind = "http://schemas.microsoft.com/3dmanufacturing/2013/01/3dmodel"
-            link = f'<Relationship Target="{target}" Id="r" Type="{kind}"/>'
-            archive.writestr("_rels/.rels", f"<Relationships>{link}</Relationships>")
-        assert names(parse_in_process(named)) == ["old"]
 
 
 def test_a_step_file_in_gb18030_keeps_its_names(test_data: Path | None, tmp_path: Path) -> None:

@@ -1,5 +1,6 @@
 """Results of a format's reader: shapes as the file has them, and their placements."""
 
+import re
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -12,6 +13,7 @@ from hapticdb.mesh.part import Defects
 
 Node = TypeVar("Node", bound=Hashable)
 
+_COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 MAX_NODES = 2_000_000
 """Most placements in a file: placements of nested assemblies multiply. A larger value lets a small
 file take more memory and time."""
@@ -107,7 +109,19 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
         try:
             return np.fromstring(text, dtype=dtype, sep=" ")
         except (DeprecationWarning, ValueError):
-            raise UnreadableError("it holds a word where a number should be") from None
+            word = next(word for word in text.split() if not _is_number(word, dtype))
+            commas = ": write decimals with points" if _COMMA.fullmatch(word) else ""
+            raise UnreadableError(
+                f"it holds '{word[:40]}' where a number should be{commas}"
+            ) from None
+
+
+def _is_number(word: str, dtype: type[np.float64] | type[np.int64]) -> bool:
+    try:
+        dtype(word)
+    except (ValueError, OverflowError):
+        return False
+    return True
 
 
 def walk(

@@ -45,6 +45,13 @@ def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, An
     return items[n]
 
 
+def extension_of(owner: dict[str, Any], name: str) -> dict[str, Any] | None:
+    """Extension of an object; some programs write an empty list where none is."""
+    extensions = owner.get("extensions")
+    found = extensions.get(name) if isinstance(extensions, dict) else None
+    return found if isinstance(found, dict) else None
+
+
 def _external_name(buffer: dict[str, Any]) -> str | None:
     """File that holds a buffer; None if the glTF file itself holds it."""
     name = buffer.get("uri")

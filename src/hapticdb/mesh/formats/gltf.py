@@ -8,6 +8,7 @@ does not read the numbers, either.
 import json
 import struct
 from collections import Counter
+from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -18,6 +19,7 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.accessors import (
     Accessors,
     chunks_of,
+    extension_of,
     external_bytes,
     item,
     objects_of,
@@ -44,6 +46,7 @@ from hapticdb.mesh.raw import (
     slash_note,
     walk,
 )
+from hapticdb.mesh.text import text_of
 
 _MAGIC = b"glTF"
 _Materials = list[NDArray[np.float64] | None]
@@ -53,7 +56,7 @@ _HARMLESS = (
     "KHR_materials_", "KHR_texture_", "EXT_texture_", "MSFT_texture_", "KHR_lights_", "KHR_xmp",
     "KHR_animation_", "KHR_node_", "KHR_mesh_quantization", "AGI_", "CESIUM_", "EXT_mesh_features",
     "EXT_lights_", "EXT_instance_features", "EXT_structural_metadata", "EXT_mesh_manifold",
-    INSTANCING,
+    "ADOBE_materials_", "NV_materials_", "MSFT_packing_", "KHR_techniques_webgl", INSTANCING,
 )  # fmt: skip
 
 
@@ -95,17 +98,20 @@ def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]]) -> list
         one = waiting.pop()
         if isinstance(one, dict) and isinstance(extensions := one.get("extensions"), dict):
             found.update(extensions.keys())
-            hidden += (extensions.get("KHR_node_visibility") or {}).get("visible") is False
+            hidden += (extension_of(one, "KHR_node_visibility") or {}).get("visible") is False
         if isinstance(one, (dict, list)):
             waiting += one.values() if isinstance(one, dict) else one
     slashed = sum("/" in _name(nodes[n], n) for n in worlds)
     unread = {name: n for name, n in found.items() if not name.startswith(_HARMLESS)}
+    placed = {node["mesh"] for node in nodes if "mesh" in node}
+    unplaced = sum(n not in placed for n in range(len(objects_of(tree, "meshes"))))
     return [
         *(
             [f"{outside} nodes with a mesh are not in its scene and are left out"]
             if outside
             else []
         ),
+        *([f"{unplaced} meshes are in no node and are left out"] if unplaced else []),
         *([slash_note(slashed)] if slashed else []),
         *([f"{hidden} nodes are hidden in it, and come in like any other"] if hidden else []),
         *(f"its extension {name}, used {n} times, is not read" for name, n in unread.items()),
@@ -139,7 +145,7 @@ def _load_tree(content: bytes, suffix: str) -> dict[str, Any]:
     else:
         text = content
     try:
-        tree = json.loads(text.decode("utf-8-sig"))
+        tree = json.loads(text_of(text))
     except ValueError:
         raise UnreadableError("it is no glTF file, or damaged: its text is not JSON") from None
     if not isinstance(tree, dict) or not isinstance(tree.get("asset"), dict):
@@ -160,7 +166,9 @@ def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
     required = tree.get("extensionsRequired", [])
     for extension in required if isinstance(required, list) else [required]:
         if not str(extension).startswith(_HARMLESS):
-            raise UnreadableError(f"it requires the glTF extension {extension}, which is not read")
+            raise UnreadableError(
+                f"it requires the glTF extension {extension}, which is not read: save it without"
+            )
     for number, mesh in enumerate(objects_of(tree, "meshes")):
         pieces = mesh.get("primitives")
         if not isinstance(pieces, list) or not all(isinstance(piece, dict) for piece in pieces):
@@ -169,9 +177,8 @@ def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
             attributes = piece.get("attributes", {})
             if not isinstance(attributes, dict):
                 raise UnreadableError(f"it is damaged: its mesh {number} has no 'attributes'")
-            if attributes.get("POSITION") is None:
-                continue
-            accessors.entry(attributes["POSITION"])
+            if attributes.get("POSITION") is not None:
+                accessors.entry(attributes["POSITION"])
 
 
 def _shapes(
@@ -205,14 +212,10 @@ def _shape(
     n_vertices = unsupported = 0
     for number, piece in enumerate(mesh["primitives"]):
         mode = piece.get("mode", _TRIANGLES)
-        if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN):
+        position = piece.get("attributes", {}).get("POSITION")
+        if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or position is None:
             unsupported += 1
             continue
-        position = piece.get("attributes", {}).get("POSITION")
-        if position is None:
-            raise UnreadableError(
-                f"it is damaged: a piece of its mesh {pose.mesh} has no positions"
-            )
         corners = positions(piece, pose, joints, accessors)
         if "targets" in piece or joints is not None:
             position = f"piece {number}"
@@ -247,7 +250,7 @@ def _base_colours(tree: dict[str, Any]) -> _Materials:
         colour = None
         try:
             surface = material.get("pbrMetallicRoughness", {})
-            old = material.get("extensions", {}).get("KHR_materials_pbrSpecularGlossiness", {})
+            old = extension_of(material, "KHR_materials_pbrSpecularGlossiness") or {}
             values = surface.get("baseColorFactor", old.get("diffuseFactor"))
             if values is not None or "baseColorTexture" not in surface:
                 colour = np.array(values or (1, 1, 1, 1), dtype=np.float64).reshape(4)
@@ -341,10 +344,16 @@ def _placements(
 def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
     """Nodes without a parent, of the default scene or else of the file."""
     scenes = objects_of(tree, "scenes")
+    listed: Sequence[int] = range(len(nodes))
     if scenes:
-        return _numbers(item(scenes, tree.get("scene", 0), "scene"), "nodes", len(nodes))
-    below = {child for node in nodes for child in _numbers(node, "children", len(nodes))}
-    return [i for i in range(len(nodes)) if i not in below]
+        listed = _numbers(item(scenes, tree.get("scene", 0), "scene"), "nodes", len(nodes))
+    below: set[int] = set()  # some programs list those, too
+    waiting = [*listed]
+    while waiting:
+        found = set(_numbers(nodes[waiting.pop()], "children", len(nodes))) - below
+        below |= found
+        waiting += found
+    return [i for i in listed if i not in below] or [*listed]
 
 
 def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:

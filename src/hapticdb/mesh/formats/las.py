@@ -46,8 +46,12 @@ def read(path: Path) -> Parsed:
     _check_header(path)
     pieces: list[NDArray[np.float64]] = []
     painted: list[NDArray[np.uint16]] = []
+    n_withheld = 0
     with laspy.open(path) as reader:
         promised = reader.header.point_count
+        if not reader.header.are_points_compressed:
+            behind = path.stat().st_size - reader.header.offset_to_point_data
+            _refuse_cut(promised, behind // reader.header.point_format.size)
         _check_chunks(reader.header)
         _check_layers(path, reader.header)
         lengths = _lengths(reader.header)
@@ -57,21 +61,27 @@ def read(path: Path) -> Parsed:
                 break
             axes = [np.asarray(axis, dtype=np.float64) for axis in (points.x, points.y, points.z)]
             pieces.append(np.stack(axes, axis=1))
+            n_withheld += int(np.count_nonzero(points.withheld))
             if {*_COLOURS}.issubset(points.point_format.dimension_names):
                 channels = [np.asarray(points[name]) for name in _COLOURS]
                 painted.append(np.stack(channels, axis=1))
-    found = sum(map(len, pieces))
-    if found != promised:
-        raise UnreadableError(
-            f"it is cut short: its header promises {promised:,} points, {found:,} are there"
-        )
+    _refuse_cut(promised, sum(map(len, pieces)))
     whole = np.concatenate(pieces) if pieces else np.empty((0, 3))
     whole[:, 2] *= lengths.rise
     parsed = placed_once([(path.stem, Shape(whole, None, colours=_screen(painted)))])
+    told = f"{n_withheld:,} points are withheld (deleted) in it, and come in like any other"
     return replace(
-        parsed, likely_metres=lengths.metres, up="z", notes=[*lengths.notes],
-        not_lengths=lengths.not_lengths,
+        parsed, likely_metres=lengths.metres, up="z", not_lengths=lengths.not_lengths,
+        notes=[*lengths.notes, *([told] if n_withheld else [])],
     )  # fmt: skip
+
+
+def _refuse_cut(promised: int, found: int) -> None:
+    """Refuse a file with fewer points than its header promises."""
+    if found < promised:
+        raise UnreadableError(
+            f"it is cut short: its header promises {promised:,} points, {found:,} are there"
+        )
 
 
 def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:

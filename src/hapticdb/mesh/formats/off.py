@@ -24,6 +24,8 @@ def read(path: Path) -> Parsed:
     if keyword is None:
         raise UnreadableError("it is no OFF file: its first word is none of OFF, COFF, NOFF")
     counts = lines[0][keyword.end() :]
+    if counts.split() == ["BINARY"]:
+        raise UnreadableError("it is a binary OFF file, which is not read: save it as text")
     body = lines[1:] if counts.strip() else lines[2:]
     header = numbers(counts if counts.strip() else " ".join(lines[1:2]), np.int64)
     if header.size < 2 or int(header.min()) < 0:
@@ -31,7 +33,7 @@ def read(path: Path) -> Parsed:
     n_vertices, n_faces = int(header[0]), int(header[1])
     if n_vertices + n_faces > len(body):
         raise UnreadableError(
-            f"its header promises {n_vertices:,} vertices and {n_faces:,} faces, "
+            f"its header promises {n_vertices:,} vertices and {n_faces:,} faces, each a line, "
             f"and {len(body):,} lines follow"
         )
     # Coordinates come after the position: normals, colours, texture.

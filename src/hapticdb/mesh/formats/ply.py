@@ -22,7 +22,10 @@ from hapticdb.mesh.text import recoded
 Column = NDArray[Any] | list[NDArray[Any]]
 """Values (n,) of a property; for lists (n, k), or an array for each row if they differ in size."""
 
-_HEADER = re.compile(rb"ply\s*\n(.*?)\bend_header[^\n]*\n", re.DOTALL | re.IGNORECASE)
+_HEADER = re.compile(
+    rb"ply[^\r\n]*(\r\n?|\n)(.*?[\r\n])[ \t]*end_header[ \t]*(?:\1|\r?\n)",
+    re.DOTALL | re.IGNORECASE,
+)
 _CODES = {
     "char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4",
     "float": "f4", "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2",
@@ -77,7 +80,7 @@ def tables_of(content: bytes) -> dict[str, dict[str, Column]]:
     header = _HEADER.match(content)
     if header is None:
         raise UnreadableError("it is cut short or damaged: its header has no 'end_header'")
-    order, elements = _header(header[1].decode("utf-8", "replace"))
+    order, elements = _header(header[2].decode("utf-8", "replace"))
     at = header.end()
     if not order:  # as if it was binary, of numbers of one type
         found = numbers(content[at:].decode("utf-8", "replace"), np.float64)
@@ -90,8 +93,10 @@ def tables_of(content: bytes) -> dict[str, dict[str, Column]]:
                 prop.code, prop.count_code = "f8", prop.count_code and "f8"
     tables = {}
     for element in elements:
+        if element.name in tables:
+            raise UnreadableError(f"it has two elements of the kind '{element.name}'")
         tables[element.name], at = _rows(content, at, order, element)
-    if at != len(content):
+    if content[at:].strip():
         raise UnreadableError("it is damaged: it is longer than its header promises")
     return tables
 

@@ -6,7 +6,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.formats.accessors import Accessors, item, objects_of, whole
+from hapticdb.mesh.formats.accessors import Accessors, extension_of, item, objects_of, whole
 from hapticdb.mesh.raw import UnreadableError
 from hapticdb.poses import rotation_of
 
@@ -24,7 +24,7 @@ class Pose(NamedTuple):
 
 def pose_of(node: dict[str, Any], number: int, mesh: dict[str, Any]) -> Pose:
     """Pose of a node's mesh."""
-    weights = node.get("weights", mesh.get("weights", ()))
+    weights = node.get("weights") or mesh.get("weights") or ()
     skin = None if "skin" not in node else whole(node["skin"], "the 'skin' of a node")
     return Pose(number, tuple(float(weight) for weight in weights), skin)
 
@@ -48,15 +48,13 @@ def parent_from_node(node: dict[str, Any]) -> Floats:
 
 def instances(node: dict[str, Any], accessors: Accessors) -> list[Floats]:
     """Transforms (4, 4) of a node's instances in its frame; the identity alone if it has none."""
-    extension = node.get("extensions", {}).get(INSTANCING)
-    if extension is None:
+    attributes = (extension_of(node, INSTANCING) or {}).get("attributes")
+    if not attributes:
         return [np.eye(4)]
-    columns = {
-        name.lower(): accessors.array(number)
-        for name, number in extension["attributes"].items()
-        if name in {"TRANSLATION", "ROTATION", "SCALE"}
-    }
-    rows = zip(*columns.values(), strict=True)
+    columns = {name.lower(): accessors.array(number) for name, number in attributes.items()}
+    if len({len(column) for column in columns.values()}) > 1:
+        raise UnreadableError("the attributes of its instances are not of one length")
+    rows = zip(*columns.values(), strict=True)  # what is no place, such as _ID, changes nothing
     return [parent_from_node(dict(zip(columns, row, strict=True))) for row in rows]
 
 

@@ -14,6 +14,8 @@ from hapticdb.mesh.text import text_of
 from hapticdb.units import UNITS
 
 _POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
+_END = "END-ISO-10303-21"
+_NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
 """Steps between positions of 32 bits that do no harm, as a share of the extent."""
 _SAME = 1e-5
@@ -26,18 +28,19 @@ def read(path: Path) -> Parsed:
     The chord error is cascadio's default: 0.01 of the file's unit, or 0.5 rad between neighbouring
     triangles, whichever is coarser on that face.
     """
-    content = path.read_bytes()
-    if b"ISO-10303-21" not in content[:1024]:
+    text = text_of(path.read_bytes())
+    if "ISO-10303-21" not in text[:1024]:
         raise UnreadableError("it is no STEP file: 'ISO-10303-21' does not stand at its start")
-    text = text_of(content)
     found = _tessellated(text, path)
-    return _nearer(found, text, path) if _is_coarse(found) else found
+    found = _nearer(found, text, path) if _is_coarse(found) else found
+    return found if _END in text else replace(found, notes=[*found.notes, _NO_END])
 
 
 def _tessellated(text: str, path: Path) -> Parsed:
     glb = cascadio.load(text.encode(), "step")
     if not glb:
-        raise UnreadableError("OpenCASCADE finds nothing in it that it can tessellate")
+        cause = "OpenCASCADE finds nothing in it that it can tessellate"
+        raise UnreadableError(cause if _END in text else f"{cause}; {_NO_END}")
     # The solids keep their axes, whatever they mean.
     return replace(gltf.parsed(glb, path.with_suffix(".glb")), up=None)
 

@@ -23,6 +23,7 @@ _STRANGE = re.compile(
     re.MULTILINE | re.IGNORECASE,
 )
 _LOOP = re.compile(r"\bouter\s*loop\b", re.IGNORECASE)
+_CORNER = re.compile(r"\bvertex\b", re.IGNORECASE)
 _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
@@ -107,7 +108,8 @@ def _text(text: str, stem: str) -> Parsed:
 def _facets(chunk: str, name: str) -> Shape:
     """Triangles of one solid."""
     corners = numbers(" ".join(_VERTEX.findall(chunk)), np.float64)
-    if corners.size != 9 * len(_LOOP.findall(chunk)):
+    loops = _LOOP.split(chunk)[1:]
+    if corners.size != 9 * len(loops) or any(len(_CORNER.findall(one)) != 3 for one in loops):
         raise UnreadableError(f"a facet of solid '{name}' has other than three corners")
     faces = np.arange(corners.size // 3, dtype=np.int64).reshape(-1, 3)
     return Shape(corners.reshape(-1, 3), faces)

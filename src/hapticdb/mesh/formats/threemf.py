@@ -37,6 +37,11 @@ unpack to five to eight times their size. Larger values let a damaged file take 
 _MOST_KINDS = 3
 """Kinds of elements that are told of an extension."""
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
+_SETTINGS = ("metadata/slic3r_pe_model.config", "metadata/model_settings.config")
+_MODIFIER = re.compile(
+    rb'"(NegativeVolume|ParameterModifier|Support\w+|(?:negative|modifier)_part|support_\w+)"'
+)
+"""Kinds of volumes that are no models, in the settings that slicers write beside the model."""
 _EXTENSION = re.compile(r"/([^/]+)/\d{4}/\d{2}$")
 Key = tuple[str, str]
 """An object: the model file inside the archive, and its id there."""
@@ -63,6 +68,8 @@ class _Model:
 
     objects: dict[Key, _Object] = field(default_factory=dict)
     items: list[Link] = field(default_factory=list)
+    placed: set[Key] = field(default_factory=set)
+    """Objects that the build reaches."""
     metres: float = 1e-3
     colours: list[tuple[int, ...]] = field(default_factory=list)
     number_of: dict[tuple[str, str, str], int] = field(default_factory=dict)
@@ -80,7 +87,11 @@ class _Model:
 
     def notes(self) -> list[str]:
         """Say what is not read, or not as it is meant."""
-        told = [
+        outside = sum(
+            bool(thing.indices) and key not in self.placed for key, thing in self.objects.items()
+        )
+        told = [f"{outside} objects are not in its build and are left out"] if outside else []
+        told += [
             f"{n} objects are of the type {kind}, and come in like any other"
             for kind, n in self.types.items()
         ]
@@ -102,6 +113,7 @@ def read(path: Path) -> Parsed:
     budget = NameBudget()
     for keys, world_from_object in walk(model.items, lambda key: model.objects[key].components):
         thing = model.objects[keys[-1]]
+        model.placed.add(keys[-1])
         if thing.components:
             continue
         names = [model.objects[key].name for key in keys]
@@ -127,7 +139,7 @@ def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
 
 def _member(name: str) -> str:
     """One spelling of a member: programs escape names, and mix their letters, on either side."""
-    return posixpath.normpath(unquote(name)).lower().strip("/")
+    return posixpath.normpath(unquote(name).replace("\\", "/")).lower().strip("/")
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
@@ -135,8 +147,14 @@ def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
     members = {_member(name): name for name in archive.namelist()}
     root = _root(archive, members)
     if root not in members:
-        raise UnreadableError(f"it is no 3MF file: no {root} in it")
+        models = [name for name in archive.namelist() if name.lower().endswith(".model")]
+        if not models:
+            raise UnreadableError("it is no 3MF file: a ZIP archive without a model in it")
+        raise UnreadableError(f"its root model {root} is missing; {models[0]} is in it")
     model = _Model(packed=n_bytes)
+    for name in {members.get(settings) for settings in _SETTINGS} - {None}:
+        if archive.getinfo(str(name)).file_size <= _PIECE:
+            model.types.update(w.decode() for w in _MODIFIER.findall(archive.read(str(name))))
     waiting, seen = [root], {root}
     while waiting:
         member = waiting.pop()

@@ -21,8 +21,11 @@ from hapticdb.mesh.polygons import triangulated, triangulated_equal
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
 from hapticdb.mesh.text import text_of
 
+_COMMENT = re.compile(r"(?<!\.)#")  # 1.#IND is no comment
+_CONTINUED = re.compile(r"\\[ \t]*(?:\r\n|\n|\r)")
 _TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
 _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
+_BLANKS = " \t\0"
 _FACE = {"f", "fo"}
 _NUMBERS = {"v", *_FACE}
 # Lines that say how surfaces look, or belong to curves, which `_NO_SURFACE` counts.
@@ -36,8 +39,8 @@ _WITH_COLOUR = 6
 """Numbers of a vertex with a colour."""
 MOST_BYTES = 16 << 20
 """Of a file of materials. A larger value reads larger ones, and takes more memory."""
-_MOST_WORDS = 3
-"""Words of unknown lines that are told."""
+_MOST_WORDS, _LONGEST_WORD = 3, 20
+"""Words of unknown lines that are told, and their characters."""
 
 
 @dataclass
@@ -59,10 +62,10 @@ def read(path: Path) -> Parsed:
     libraries: list[str] = []
     strange: Counter[str] = Counter()
     key, material = ("", ""), ""
-    for line in text.replace("\\\r\n", " ").replace("\\\n", " ").splitlines():
-        word, _, rest = line.strip().replace("\t", " ").partition(" ")
+    for line in _CONTINUED.sub(" ", text).splitlines():
+        word, _, rest = line.strip(_BLANKS).replace("\t", " ").partition(" ")
         if word in _NUMBERS and "#" in rest:  # names may hold one
-            rest = rest.partition("#")[0]
+            rest = _COMMENT.split(rest)[0]
         if word == "v":
             vertex_lines.append(rest)
         elif word in _FACE:
@@ -81,7 +84,7 @@ def read(path: Path) -> Parsed:
         elif word in _NO_SURFACE:
             groups.setdefault(key, _Group()).unsupported += 1
         elif word not in _NO_SHAPE and word[0] != "#":
-            strange[word] += 1
+            strange[word[:_LONGEST_WORD]] += 1
     vertices = _vertices(vertex_lines)
     palette = {name: colour for file in libraries for name, colour in _materials(path, file)}
     painted = _painted(vertex_lines)

@@ -1,0 +1,134 @@
+"""glTF files as programs write them: read rightly, or told what is not read."""
+
+import base64
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from hapticdb.mesh import parse_in_process
+from mesh_files import TRIANGLE, area_and_volume, cause, gltf, names
+
+
+def with_arrays(path: Path, tree: dict[str, Any], *arrays: NDArray[Any], **extra: object) -> Path:
+    """A glTF file of one triangle with more accessors, from number 2 on; `extra` goes into each."""
+    whole = json.loads(gltf(tree, path).read_text())
+    kinds = {"f4": 5126, "u1": 5121, "i2": 5122, "u2": 5123}
+    shapes = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+    for array in arrays:
+        n = len(whole["buffers"])
+        uri = "data:;base64," + base64.b64encode(array.tobytes()).decode()
+        whole["buffers"].append({"byteLength": array.nbytes, "uri": uri})
+        whole["bufferViews"].append({"buffer": n, "byteLength": array.nbytes})
+        kind, shape = kinds[array.dtype.str[1:]], shapes[array.shape[1]]
+        view = {"bufferView": len(whole["bufferViews"]) - 1, "componentType": kind, "type": shape}
+        whole["accessors"].append(view | {"count": len(array)} | extra)
+    path.write_text(json.dumps(whole))
+    return path
+
+
+def test_a_skin_places_a_mesh_where_its_joints_are(tmp_path: Path) -> None:
+    joints = np.array([[0, 1, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype=np.uint8)
+    weights = np.array([[0.5, 0.5, 0, 0], [1, 0, 0, 0], [1, 0, 0, 0]], dtype="<f4")
+    bind = np.stack([np.eye(4), np.eye(4)])
+    bind[1, :3, 3] = [-5, 0, 0]
+    inverse = bind.transpose(0, 2, 1).reshape(2, 16).astype("<f4")
+    attributes = {"POSITION": 0, "JOINTS_0": 2, "WEIGHTS_0": 3}
+    tree = {
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": 1}]}],
+        "nodes": [
+            {"mesh": 0, "skin": 0, "name": "arm", "translation": [9, 9, 9]},
+            {"name": "root", "translation": [0, 0, 2], "children": [2]},
+            {"name": "tip", "translation": [5, 4, 0]},
+        ],
+        "skins": [{"joints": [1, 2], "inverseBindMatrices": 4}],
+        "scenes": [{"nodes": [0, 1]}],
+    }
+    path = with_arrays(tmp_path / "skin.gltf", tree, joints, weights, inverse)
+    moved = TRIANGLE + np.array([[0, 2, 2], [0, 4, 2], [0, 4, 2]])
+    np.testing.assert_allclose(parse_in_process(path).parts[0].triangles()[0], moved, atol=1e-6)
+    outside = tree | {"scenes": [{"nodes": [0]}]}
+    path = with_arrays(tmp_path / "lost.gltf", outside, joints, weights, inverse)
+    assert "a joint of its skin 0 is not in its scene" in cause(path)
+
+
+def test_a_nodes_weights_replace_its_meshs(tmp_path: Path) -> None:
+    target = np.array([[0, 0, 1]] * 3, dtype="<f4")
+    piece = {"attributes": {"POSITION": 0}, "indices": 1, "targets": [{"POSITION": 2}]}
+    nodes: list[dict[str, Any]] = [{"mesh": 0}, {"mesh": 0, "weights": [0.25]}]
+    tree = {"meshes": [{"primitives": [piece], "weights": [2]}], "nodes": nodes}
+    path = with_arrays(tmp_path / "a.gltf", tree | {"scenes": [{"nodes": [0, 1]}]}, target)
+    assert [part.bounds[0, 2] for part in parse_in_process(path).parts] == [2.0, 0.25]
+
+
+def test_instances_turn_and_scale_within_their_node(tmp_path: Path) -> None:
+    turned = np.array([[0, 0, 23170, 23170]], dtype="<i2")  # a quarter turn about z, normalized
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"ROTATION": 2}}}
+    tree = {"nodes": [{"mesh": 0, "translation": [1, 0, 0], "extensions": extension}]}
+    path = with_arrays(tmp_path / "a.gltf", tree, turned, normalized=True)
+    corners = parse_in_process(path).parts[0].triangles()[0]
+    np.testing.assert_allclose(corners, [[1, 0, 0], [1, 1, 0], [0, 0, 0]], atol=1e-4)
+
+
+def test_extensions_that_are_not_read_are_counted_or_refused(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0, "extensions": {"KHR_implicit_shapes": {}, "KHR_xmp_json_ld": {}}}] * 2
+    tree: dict[str, Any] = {"nodes": nodes, "scenes": [{"nodes": [0, 1]}]}
+    file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
+    assert file.notes == ("its extension KHR_implicit_shapes, used 2 times, is not read",)
+    tree["extensionsRequired"] = ["KHR_implicit_shapes"]
+    assert "requires the glTF extension KHR_implicit" in cause(gltf(tree, tmp_path / "b.gltf"))
+
+
+def test_a_packed_mesh_with_a_plain_copy_is_read(tmp_path: Path) -> None:
+    piece = {"attributes": {"POSITION": 0}, "extensions": {"KHR_draco_mesh_compression": {}}}
+    path = gltf({"meshes": [{"primitives": [piece]}]}, tmp_path / "a.gltf")
+    assert area_and_volume(parse_in_process(path))[0] == pytest.approx(0.5)
+
+
+def test_instances_without_places_are_where_their_node_is(tmp_path: Path) -> None:
+    numbers = np.array([[1], [2]], dtype="<f4")
+    extension = {"EXT_mesh_gpu_instancing": {"attributes": {"_ID": 2}}}
+    tree = {"nodes": [{"mesh": 0, "extensions": extension}]}
+    assert len(parse_in_process(with_arrays(tmp_path / "a.gltf", tree, numbers)).parts) == 2
+    extension["EXT_mesh_gpu_instancing"]["attributes"] = {"_ID": 2, "TRANSLATION": 0}
+    path = with_arrays(tmp_path / "b.gltf", tree, numbers)
+    assert "the attributes of its instances are not of one length" in cause(path)
+
+
+def test_damage_beside_a_glb_files_geometry_does_not_lose_it(tmp_path: Path) -> None:
+    plain: dict[str, Any] = {"attributes": {"POSITION": 0}, "indices": 1}
+    trees: list[dict[str, Any]] = [
+        {"meshes": [{"primitives": [plain, {"attributes": {"_X": 0}}, {"attributes": {}}]}]},
+        {"meshes": [{"primitives": [plain | {"material": 0}]}], "materials": [{"extensions": []}]},
+        {"nodes": [{"mesh": 0, "extensions": []}]},
+        {"nodes": [{"mesh": 0, "extensions": {"KHR_node_visibility": True}}]},
+        {"nodes": [{"mesh": 0, "weights": None}]},
+        {"extensionsRequired": ["ADOBE_materials_clearcoat_tint"]},
+    ]
+    for n, tree in enumerate(trees):
+        file = parse_in_process(gltf(tree, tmp_path / f"{n}.gltf"))
+        assert area_and_volume(file)[0] == pytest.approx(0.5)
+        assert file.defects.unsupported == (2 if n == 0 else 0)
+
+
+def test_a_mesh_without_a_node_is_told(tmp_path: Path) -> None:
+    mesh = {"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}
+    file = parse_in_process(gltf({"meshes": [mesh, mesh]}, tmp_path / "a.gltf"))
+    assert file.notes == ("1 meshes are in no node and are left out",)
+
+
+def test_a_node_that_a_scene_lists_beside_its_parent_is_placed_once(tmp_path: Path) -> None:
+    nodes = [{"mesh": 0}, {"children": [2], "translation": [1, 0, 0]}, {"children": [0]}]
+    tree = {"nodes": nodes, "scenes": [{"nodes": [0, 1, 2]}]}
+    file = parse_in_process(gltf(tree, tmp_path / "a.gltf"))
+    assert [part.bounds[0, 0] for part in file.parts] == [1.0]
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "latin-1"])
+def test_a_gltf_file_of_another_encoding_is_read(tmp_path: Path, encoding: str) -> None:
+    path = gltf({"nodes": [{"mesh": 0, "name": "NAME"}]}, tmp_path / "a.gltf")
+    path.write_bytes(path.read_text().replace("NAME", "Größe").encode(encoding))
+    assert names(parse_in_process(path)) == ["Größe"]

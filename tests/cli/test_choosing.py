@@ -76,6 +76,10 @@ def test_a_number_is_an_id_or_else_a_name_and_a_verb_says_which(run: Run, tmp_pa
     faces = "".join(f"o {name}\nf 1 2 3\n" for name in ("2", "4711", "body", "9"))
     (tmp_path / "numbers.obj").write_text(corners + faces)
     run("import", "n.db", "numbers.obj", "--bits", 4, "--no-distances")
+    for word, name, taken in (("9", "9", "a name"), ("2", "4711", "an id"), ("name=2", "2", "")):
+        out, err = run("objects", "n.db", "--name", word, "--json")[1:]
+        assert json.loads(out)["name"] == name
+        assert (f"--name: {word} is taken as {taken}" in err) if taken else not err
     out, err = run("remove", "n.db", "2")[1:]
     assert "removed 2 (4711)" in out
     assert "2 is taken as an id; 'name=2' is a name" in err

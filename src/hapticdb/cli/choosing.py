@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, NamedTuple
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.store.base import Object
+    from hapticdb.store.finding import HasObjects
 
 
 class Felt(NamedTuple):
@@ -46,18 +47,18 @@ def _found(env: "Environment", words: list[str], option: str) -> "list[Object]":
         raise ObjectNotFoundError(f"{option}: {error}") from None
 
 
-def as_named(env: "Environment", words: Iterable[str], option: str) -> list[str]:
+def as_named(env: "HasObjects", words: Iterable[str], option: str) -> list[str]:
     """Words with a number as a name where no object has that id; says how numbers are taken."""
     from hapticdb.cli import render
     from hapticdb.errors import ObjectNotFoundError
-    from hapticdb.store.finding import NAME, is_id
+    from hapticdb.store.finding import NAME, find_objects, is_id
 
     taken = []
     for word in words:
         named: set[int] = set()
         if is_id(word):
             with suppress(ObjectNotFoundError):
-                named = {obj.id for obj in env.find(NAME + word)} - {int(word)}
+                named = {obj.id for obj in find_objects(env, [NAME + word])} - {int(word)}
         is_name = named and all(obj.id != int(word) for obj in env.objects())
         if is_name:
             render.note(f"{option}: {word} is taken as a name: no object has this id")

@@ -45,7 +45,8 @@ def show(
     cache = report.cache
     resident = f"{render.counted(cache.resident, 'cell')} in {cache.budget_bytes / 2**20:.4g} MiB"
     facts.append(("resident", resident))
-    facts.append(("fetched", f"{cache.loaded:,} cells, {1e3 * cache.worst:.3g} ms at worst"))
+    loaded = render.counted(cache.loaded, "cell")
+    facts.append(("fetched", f"{loaded}, {1e3 * cache.worst:.3g} ms at worst"))
     if report.loose_frames:
         facts.append(("in something", loose_text(report, cells)))
     facts.append(("objects", f"{len(report.objects)} touched{_names_after(cells, report.objects)}"))
@@ -77,10 +78,10 @@ def _show_loops(report: "Report") -> None:
 
 def _frame_facts(report: "Report") -> Facts:
     """Frames that touched, that knew too little, and whose force was held."""
-    frames = report.unknown_frames, report.held_frames
-    unknown, held = (render.counted(n, "frame") for n in frames)
+    frames = report.unknown_frames, report.held_frames, report.hit_frames
+    unknown, held, hit = (render.counted(n, "frame") for n in frames)
     facts = [
-        ("touching", f"{report.hit_frames:,} frames hit, {report.contact_frames:,} in contact"),
+        ("touching", f"{hit} hit, {report.contact_frames:,} in contact"),
         ("not known", f"{unknown} with cells that were not in memory yet"),
         ("force held", f"{held}, {report.stale_frames:,} while the database was silent"),
     ]

@@ -311,8 +311,9 @@ def _show(found: "Clashes", told: "list[Clash]") -> None:
     facts = [(f"within {length_text(found.within)}", counts or "no pair")]
     if statuses:
         facts.append(("since the last call", statuses))
-    facts.append(("measured", f"{found.measured:,} pairs, {found.kept:,} known before"))
+    measured, left = (render.counted(n, "pair") for n in (found.measured, found.left))
+    facts.append(("measured", f"{measured}, {found.kept:,} known before"))
     if found.left:
-        facts.append(("not looked at", f"{found.left:,} pairs: call again to go on"))
+        facts.append(("not looked at", f"{left}: call again to go on"))
     facts.append(("took", f"{found.elapsed:.2f} s"))
     render.facts(facts)

@@ -323,9 +323,13 @@ def _show(found: "Extraction", asked: _Outputs) -> None:
             for one in found.blockers[:MOST_BLOCKERS]
         ]
         render.table(("id>", "in the way", "of pulls>"), rows)
+    pulls, motions, poses = (
+        render.counted(n, noun)
+        for n, noun in ((found.pulls, "pull"), (found.motions, "motion"), (found.poses, "pose"))
+    )
     facts = [
         ("near its start", names_of(found.near) or "nothing"),
-        ("searched", f"{found.pulls} pulls, {found.motions:,} motions, {found.poses:,} poses"),
+        ("searched", f"{pulls}, {motions}, {poses}"),
         ("took", f"{found.seconds:.1f} s"),
     ]
     if found.way is not None:

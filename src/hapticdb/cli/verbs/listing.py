@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import opened_to_keep
+from hapticdb.cli.choosing import as_named, opened_to_keep
 from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.units import length_text
 
@@ -128,7 +128,7 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
     }
     origin = ", ".join(f"{x:.6g}" for x in grid.origin)
     a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
-    distances = f"of {n_banded:,} objects, {render.bytes_text(size.band_bytes)}"
+    distances = f"of {render.counted(n_banded, 'object')}, {render.bytes_text(size.band_bytes)}"
     n_shapes = render.counted(size.surfaces, "shape")
     surfaces = f"{n_shapes}, {render.bytes_text(size.surface_bytes)}" if size.surfaces else "none"
     words = [
@@ -192,7 +192,8 @@ def objects(
     with closing(open_store(url, read_only=True)) as store:
         shown_url = store.url
         try:
-            found = find_objects(store, name) if name else store.objects()
+            words = as_named(store, name or (), "--name")
+            found = find_objects(store, words) if words else store.objects()
         except ObjectNotFoundError as error:
             raise ObjectNotFoundError(f"--name: {error}") from None
     if limit is None:

@@ -349,10 +349,12 @@ def _show(told: _Told) -> None:
         render.table(columns, rows[:MOST_OBJECTS])
         if len(rows) > MOST_OBJECTS:
             render.say(f"{len(rows)} rows, {MOST_OBJECTS} of them shown")
-    facts = [("path", f"{len(found.path.poses):,} poses, {length_text(found.path.length)}")]
+    poses = render.counted(len(found.path.poses), "pose")
+    facts = [("path", f"{poses}, {length_text(found.path.length)}")]
     if found.is_free:
         facts.append(("gap", _gap_range(found, gap_text(found))))
-    looked = f"{render.counted(found.objects, 'object')} near the path, {found.looks:,} looks"
+    near, looks = render.counted(found.objects, "object"), render.counted(found.looks, "look")
+    looked = f"{near} near the path, {looks}"
     facts += [("looked at", looked), ("took", f"{told.seconds:.2f} s")]
     render.facts(facts)
 

@@ -276,6 +276,12 @@ def _record(index: int, touched: "Touch") -> dict[str, object]:
     }
 
 
+def _mean_of(numbers: "NDArray[np.float64]", noun: str) -> str:
+    """Mean in words: ``1 statement``, ``3.2 ranges``."""
+    mean = f"{numbers.mean():.3g}"
+    return f"{mean} {noun}" if mean == "1" else f"{mean} {noun}s"
+
+
 @dataclass
 class _Summary:
     """What a path felt like, gathered frame by frame.
@@ -319,8 +325,8 @@ class _Summary:
             (
                 "a frame asks",
                 (
-                    f"{statements.mean():.3g} statements, {ranges.mean():.3g} ranges, "
-                    f"reads {rows.mean():.3g} rows"
+                    f"{_mean_of(statements, 'statement')}, {_mean_of(ranges, 'range')}, "
+                    f"reads {_mean_of(rows, 'row')}"
                 ),
             ),
             ("law", render.shares(self.laws)),

@@ -118,6 +118,17 @@ def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> N
     assert "which its numbers are not" in read_file(tmp_path / "b.las").notes[0]
 
 
+def test_withheld_points_are_counted_and_a_cut_file_is_told(tmp_path: Path) -> None:
+    las = laspy.read(cloud(tmp_path / "a.las"))
+    las.withheld[:7] = 1
+    las.write(tmp_path / "b.las")
+    assert "7 points are withheld (deleted)" in read_file(tmp_path / "b.las").notes[0]
+    content = (tmp_path / "b.las").read_bytes()
+    (tmp_path / "c.las").write_bytes(content[:-10])
+    with pytest.raises(hapticdb.errors.FileError, match="promises 500 points, 499 are there"):
+        read_file(tmp_path / "c.las")
+
+
 @pytest.mark.parametrize(
     ("keys", "rise"),
     [

@@ -2,6 +2,7 @@
 
 import itertools
 import os
+import resource
 import sys
 import threading
 from pathlib import Path
@@ -43,6 +44,16 @@ def test_the_budget_is_used_and_never_exceeded(budget: int, distances: bool) -> 
 def test_a_budget_beyond_the_machines_memory_is_refused() -> None:
     with pytest.raises(UsageError, match=r"^a budget of \d+ bytes .*: this machine has \d+$"):
         CellTable.create(1 << 50)
+
+
+def test_a_limit_of_file_size_is_named_where_it_limits_memory() -> None:
+    before = resource.getrlimit(resource.RLIMIT_FSIZE)
+    resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, before[1]))
+    try:
+        with pytest.raises(UsageError, match="ulimit -f"):
+            CellTable.create(1 << 26)
+    finally:
+        resource.setrlimit(resource.RLIMIT_FSIZE, before)
 
 
 def test_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:

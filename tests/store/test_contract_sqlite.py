@@ -24,6 +24,7 @@ from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import backup_environment
 from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite import place
+from hapticdb.store.sqlite.file import named_errors
 from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.sqlite.store import SQLiteStore
@@ -290,6 +291,18 @@ def test_a_limit_of_file_size_is_no_damage(tmp_path: Path) -> None:
     assert told.startswith("DatabaseError")
     assert "limits of file sizes" in told
     assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("free", [0, 1 << 40])
+def test_an_error_of_the_disk_says_whether_it_is_full(
+    path: Path, free: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    space = shutil.disk_usage(path.parent)._replace(free=free)
+    monkeypatch.setattr(shutil, "disk_usage", lambda _: space)
+    with pytest.raises(hapticdb.errors.DatabaseError) as raised, named_errors(str(path)):
+        raise apsw.IOError("not an error")
+    assert ("the disk is full" in str(raised.value)) == (free == 0)
+    assert "not an error" not in str(raised.value)
 
 
 def test_a_read_only_copy_with_an_empty_log_is_read_and_a_full_log_told(

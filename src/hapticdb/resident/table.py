@@ -288,5 +288,12 @@ def anonymous_memory(name: str, size: int) -> int:
     else:
         with tempfile.TemporaryFile() as file:
             descriptor = os.dup(file.fileno())
-    os.truncate(descriptor, size)
+    try:
+        os.truncate(descriptor, size)
+    except OSError as error:
+        os.close(descriptor)
+        raise UsageError(
+            f"this process may not have {size:,} bytes of shared memory ({error.strerror}): allow "
+            "larger files (ulimit -f unlimited), or give a smaller budget of cells"
+        ) from None
     return descriptor

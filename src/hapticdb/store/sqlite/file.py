@@ -3,6 +3,7 @@
 import contextlib
 import glob
 import os
+import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import cast
@@ -29,6 +30,8 @@ BUSY_TIMEOUT_MS = 10_000
 CACHE_KIB = 256 * 1024
 """KiB of one connection's page cache, enough for the bricks of a large car. Memory is taken as
 pages are read. A smaller cache reads pages again from the operating system."""
+SHARED_BYTES = 32 << 10
+"""Bytes of the file -shm, without which no connection reads an environment in WAL mode."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -47,12 +50,12 @@ def named_errors(path: str) -> Iterator[None]:
         ) from error
     except (apsw.BusyError, apsw.LockedError) as error:
         raise BusyError(f"{path} is being written by another process: try again later") from error
-    except apsw.FullError as error:
-        raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
-    except apsw.IOError as error:
+    except (apsw.FullError, apsw.IOError) as error:
+        if isinstance(error, apsw.FullError) or _is_full(path):
+            raise DatabaseError(f"{path}: the disk is full; what was committed is safe") from error
         raise DatabaseError(
-            f"{path} cannot be read or written ({error}): look at the disk, at quotas and at "
-            "limits of file sizes; what was committed is safe"
+            f"{path} cannot be read or written: look at the disk, at quotas and at limits of file "
+            "sizes (ulimit -f); what was committed is safe"
         ) from error
     except (apsw.ConnectionClosedError, apsw.CursorClosedError) as error:
         raise DatabaseError(f"{path} has been closed: open it again") from error
@@ -61,6 +64,13 @@ def named_errors(path: str) -> Iterator[None]:
     except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
         # the statements are right for an environment's tables, so these are other tables
         raise damaged(path, str(error)) from error
+
+
+def _is_full(path: str) -> bool:
+    """Whether no file can grow beside this one, such as the index of what a reader may read."""
+    with contextlib.suppress(OSError):
+        return shutil.disk_usage(Path(path).parent).free < SHARED_BYTES
+    return False
 
 
 def damaged(path: str, cause: str) -> DamagedError:

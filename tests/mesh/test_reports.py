@@ -60,7 +60,7 @@ EXPECTED: dict[str, Reads | str] = {
         "2 names hold '/'",
     ),
     "g26_hidden.glb": Reads(
-        ["shown", "hidden"], 0.48, 0.016, TENTH[0], (1.1, 0.1, 0.1), "1 nodes are hidden in it"
+        ["shown", "hidden"], 0.48, 0.016, TENTH[0], (1.1, 0.1, 0.1), "1 node is hidden in it"
     ),
     "l01_epsg2263_only.las": Reads(
         ["l01_epsg2263_only"],
@@ -92,7 +92,7 @@ EXPECTED: dict[str, Reads | str] = {
         2e-6,
         BOX_3MF[0],
         (0.035, 0.005, 0.005),
-        "1 objects are of the type support",
+        "1 object is of the type support",
     ),
     "o01_concave_U.obj": Reads(["U"], 7, 0, (0, 0, 0), (3, 3, 0)),
     "o04_utf16.obj": Reads(["box"], 6, 1, *HALF),
@@ -180,7 +180,7 @@ def test_triangle_strips_of_a_ply_are_read_and_other_elements_told(tmp_path: Pat
     content = f"ply\nformat ascii 1.0\n{head}{FLAT_U}7\n8 0 1 7 2 -1 4 5 6\n"
     file = parse_in_process(text(tmp_path / "strip.ply", content))
     assert len(file.parts[0].triangles()) == 3
-    assert "1 elements of the kind 'edge'" in file.notes[0]
+    assert "1 element of the kind 'edge'" in file.notes[0]
 
 
 @pytest.mark.parametrize("encoding", ["utf-8-sig", "utf-16", "utf-16-le", "utf-16-be", "utf-32"])
@@ -212,7 +212,7 @@ def test_lines_that_are_passed_over_are_counted(tmp_path: Path) -> None:
         in parse_in_process(path).notes
     )
     path = text(tmp_path / "a.off", "OFF\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n3 0 2 1\n")
-    assert "1 lines behind the last face are passed over" in parse_in_process(path).notes
+    assert "1 line behind the last face is passed over" in parse_in_process(path).notes
 
 
 def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
@@ -231,7 +231,7 @@ def test_joined_files_keep_all_triangles(tmp_path: Path) -> None:
     (tmp_path / "named.stl").write_bytes(named + named)
     assert names(parse_in_process(tmp_path / "named.stl")) == ["named", "named #2"]
     path = text(tmp_path / "more.stl", f"solid a\n{FACET}endsolid a\nand more\n")
-    assert parse_in_process(path).notes == ("1 lines begin with unknown words and are passed over",)
+    assert parse_in_process(path).notes == ("1 line begins with unknown words and is passed over",)
     square = FACET.replace("endloop", "vertex 1 1 0\nendloop")
     path = text(tmp_path / "square.stl", f"solid a\n{square * 3}endsolid a\n")
     assert "other than three corners" in cause(path)

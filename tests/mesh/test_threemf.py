@@ -37,7 +37,7 @@ def test_a_3mf_file_says_which_model_is_missing(tmp_path: Path) -> None:
 def test_what_a_3mf_file_does_not_build_is_counted(tmp_path: Path) -> None:
     two = "".join(f'<object id="{n}">{MESH_3MF}</object>' for n in (1, 2))
     file = parse_in_process(threemf(tmp_path / "a.3mf", two, ITEM))
-    assert file.notes == ("1 objects are not in its build and are left out",)
+    assert file.notes == ("1 object is not in its build and is left out",)
     assert "2 objects are not in its build" in cause(threemf(tmp_path / "b.3mf", two, ""))
 
 
@@ -51,7 +51,7 @@ def test_volumes_that_a_slicer_subtracts_or_changes_are_told(
     beside = {f"Metadata__{settings}_DOT_config": f'<part subtype="{kind}"/>'}
     thing = f'<object id="1">{MESH_3MF}</object>'
     file = parse_in_process(model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", thing, **beside))
-    assert file.notes == (f"1 objects are of the type {kind}, and come in like any other",)
+    assert file.notes == (f"1 object is of the type {kind}, and comes in like any other",)
 
 
 def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.mesh.part import Defects, MeshFile, Part
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, told
 from hapticdb.units import length_text
 
 Scalar = TypeVar("Scalar", bound=np.generic)
@@ -82,7 +82,7 @@ def _coarse(parsed: Parsed, scale: float) -> list[str]:
                 f"'{placement.name}' lies {length_text(farthest * scale)} from the origin, where "
                 f"its 32-bit numbers are {length_text(step * scale)} apart: details are lost"
             )
-    return found[:1] + ([f"{len(found) - 1} more parts, likewise"] if len(found) > 1 else [])
+    return found[:1] + told(len(found) - 1, "more part{s}, likewise")
 
 
 def _checked(

@@ -14,6 +14,9 @@ from hapticdb.mesh.part import Defects
 Node = TypeVar("Node", bound=Hashable)
 
 _COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
+_ONE = {"s": "", "es": "", "ies": "y", "are": "is", "begin": "begins", "come": "comes",
+        "hold": "holds", "refer": "refers"}  # fmt: skip
+"""Endings and verbs, and what they are for one thing."""
 MAX_NODES = 2_000_000
 """Most placements in a file: placements of nested assemblies multiply. A larger value lets a small
 file take more memory and time."""
@@ -87,9 +90,13 @@ class NameBudget:
         return name
 
 
-def slash_note(n: int) -> str:
-    """Say that so many names hold what separates levels."""
-    return f"{n} names hold '/', which also separates a part's name from those above it"
+def told(n: int, words: str, **named: str) -> list[str]:
+    """Note of so many things, in the singular for one; none of none.
+
+    words : with the endings and verbs of `_ONE`, and what else is named, in braces.
+    """
+    forms = _ONE if n == 1 else {many: many for many in _ONE}
+    return [f"{n:,} {words.format(**forms, **named)}"] if n > 0 else []
 
 
 def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import fan, strip, triangulated
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, walk
+from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, told, walk
 from hapticdb.mesh.text import xml_of
 from hapticdb.poses import rotation_of
 
@@ -28,6 +28,7 @@ _Geometry = tuple[ET.Element, _Palette]
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
+_UNREAD = "piece{s} of the kind '{kind}' {are} not read"
 _INSTANCES = {
     "instance_geometry": ("geometry",),
     "instance_controller": ("controller",),
@@ -162,20 +163,14 @@ class _Document:
             one.get("id") not in targets and id(one) not in placed for one in root.iter("geometry")
         )
         others = sum(1 for _ in root.iter("visual_scene")) - 1
-        return [
-            *(f"{n} pieces of the kind '{kind}' are not read" for kind, n in strange.items()),
-            *([f"{outside} geometries are not in its scene and are left out"] if outside else []),
-            *(
-                [f"{missing} of its {len(wanted)} placements refer to what is not there"]
-                if missing
-                else []
-            ),
-            *(
-                f"{n} geometries have a {kind}: they are read in their rest pose"
-                for kind, n in posed.items()
-            ),
-            *([f"{others} more scenes are not read"] if others > 0 else []),
+        notes = [
+            *(note for kind, n in strange.items() for note in told(n, _UNREAD, kind=kind)),
+            *told(outside, "geometr{ies} {are} not in its scene and {are} left out"),
+            *told(missing, f"of its {len(wanted)} placements {{refer}} to what is not there"),
         ]
+        for kind, n in posed.items():
+            notes += told(n, "geometr{ies} with a {kind} {are} read in rest pose", kind=kind)
+        return [*notes, *told(others, "more scene{s} {are} not read")]
 
 
 def _turn(values: Floats) -> Floats:
@@ -231,7 +226,7 @@ def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
         return found, []
     first = next(iter(lost.values()))
     why = str(first) if isinstance(first, UnreadableError) else "it is damaged"
-    return found, [f"{len(lost)} of its geometries cannot be read: {why}"]
+    return found, told(len(lost), "of its geometries cannot be read: {why}", why=why)
 
 
 def _shape(geometry: ET.Element, palette: _Palette) -> Shape:

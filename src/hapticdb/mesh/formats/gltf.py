@@ -43,7 +43,7 @@ from hapticdb.mesh.raw import (
     Placement,
     Shape,
     UnreadableError,
-    slash_note,
+    told,
     walk,
 )
 from hapticdb.mesh.text import text_of
@@ -103,18 +103,14 @@ def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]]) -> list
             waiting += one.values() if isinstance(one, dict) else one
     slashed = sum("/" in _name(nodes[n], n) for n in worlds)
     unread = {name: n for name, n in found.items() if not name.startswith(_HARMLESS)}
-    placed = {node["mesh"] for node in nodes if "mesh" in node}
-    unplaced = sum(n not in placed for n in range(len(objects_of(tree, "meshes"))))
+    placed = {str(node.get("mesh")) for node in nodes}
+    unplaced = sum(str(n) not in placed for n in range(len(objects_of(tree, "meshes"))))
     return [
-        *(
-            [f"{outside} nodes with a mesh are not in its scene and are left out"]
-            if outside
-            else []
-        ),
-        *([f"{unplaced} meshes are in no node and are left out"] if unplaced else []),
-        *([slash_note(slashed)] if slashed else []),
-        *([f"{hidden} nodes are hidden in it, and come in like any other"] if hidden else []),
-        *(f"its extension {name}, used {n} times, is not read" for name, n in unread.items()),
+        *told(outside, "node{s} with a mesh {are} not in its scene and {are} left out"),
+        *told(unplaced, "mesh{es} {are} in no node and {are} left out"),
+        *told(slashed, "name{s} {hold} '/', which also separates a part's name from one above it"),
+        *told(hidden, "node{s} {are} hidden in it, and {come} in like any other"),
+        *(f"its extension {name} is not read ({n}x)" for name, n in unread.items()),
     ]
 
 

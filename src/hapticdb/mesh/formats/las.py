@@ -12,7 +12,7 @@ from laspy.vlrs.known import GeoKeyDirectoryVlr, WktCoordinateSystemVlr
 from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import Colours
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once, told
 
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
 """Numbers of GeoTIFF keys."""
@@ -69,10 +69,10 @@ def read(path: Path) -> Parsed:
     whole = np.concatenate(pieces) if pieces else np.empty((0, 3))
     whole[:, 2] *= lengths.rise
     parsed = placed_once([(path.stem, Shape(whole, None, colours=_screen(painted)))])
-    told = f"{n_withheld:,} points are withheld (deleted) in it, and come in like any other"
+    words = "point{s} {are} withheld (deleted) in it, and {come} in like any other"
     return replace(
         parsed, likely_metres=lengths.metres, up="z", not_lengths=lengths.not_lengths,
-        notes=[*lengths.notes, *([told] if n_withheld else [])],
+        notes=[*lengths.notes, *told(n_withheld, words)],
     )  # fmt: skip
 
 
@@ -142,8 +142,8 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
     heights = [*axes[2:3], *([] if vertical is None else vertical.axis_info[:1])]
     height = heights[-1].unit_conversion_factor if heights else metres
     height = by_code.get(keys.get(_VERTICAL_UNIT, 0), height)
-    told = f"its heights are in units of {height:.6g} m, its positions of {metres:.6g} m"
-    return _Lengths(metres, height / metres, (told,) if height != metres else ())
+    differ = f"its heights are in units of {height:.6g} m, its positions of {metres:.6g} m"
+    return _Lengths(metres, height / metres, (differ,) if height != metres else ())
 
 
 def _check_chunks(header: laspy.LasHeader) -> None:

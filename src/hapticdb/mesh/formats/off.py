@@ -8,7 +8,7 @@ import numpy as np
 
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import triangulated
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import text_of
 
 _KEYWORD = re.compile(r"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
@@ -46,8 +46,7 @@ def read(path: Path) -> Parsed:
     faces, incomplete = triangulated(vertices, polygons)
     parsed = placed_once([(path.stem, Shape(vertices, faces, Defects(incomplete=incomplete)))])
     extra = len(body) - n_vertices - n_faces
-    told = f"{extra:,} lines behind the last face are passed over"
-    return replace(parsed, notes=[told] if extra else [])
+    return replace(parsed, notes=told(extra, "line{s} behind the last face {are} passed over"))
 
 
 def _polygon(line: str) -> list[int]:

@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import strip, triangulated, triangulated_equal
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import recoded
 
 Column = NDArray[Any] | list[NDArray[Any]]
@@ -67,10 +67,12 @@ def read(path: Path) -> Parsed:
     faces, incomplete = _faces(vertices, tables)
     colours = _colours(tables, faces)
     shape = Shape(vertices, faces, Defects(incomplete=incomplete), colours)
+    words = "element{s} of the kind '{kind}' {are} passed over"
     notes = [
-        f"{len(next(iter(table.values()))):,} elements of the kind '{name}' are passed over"
-        for name, table in tables.items()
-        if name not in {"vertex", "face", "tristrips"} and table
+        note
+        for kind, table in tables.items()
+        if kind not in {"vertex", "face", "tristrips"} and table
+        for note in told(len(next(iter(table.values()))), words, kind=kind)
     ]
     return replace(placed_once([(path.stem, shape)]), notes=notes)
 

@@ -10,7 +10,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import recoded, text_of
 
 _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -44,8 +44,8 @@ def read(path: Path) -> Parsed:
     n_behind, rest = divmod(len(content) - _HEADER, _FACET.itemsize)
     if n_facets in _NO_COUNT and n_behind and not rest:
         parsed = placed_once([(path.stem, _binary(content, 0, n_behind))])
-        told = f"its header counts {n_facets:,} triangles, and {n_behind:,} follow: all are read"
-        return replace(parsed, notes=[told])
+        note = f"its header counts {n_facets:,} triangles, and {n_behind:,} follow: all are read"
+        return replace(parsed, notes=[note])
     if n_facets > 0 and n_bytes < len(content):
         return _joined(content, path.stem)
     raise UnreadableError(
@@ -65,8 +65,8 @@ def _joined(content: bytes, stem: str) -> Parsed:
             break
         solids.append((stem, _binary(content, at, n_facets)))
         at = end
-    told = f"{len(content) - at:,} bytes behind the last triangle are passed over"
-    return replace(placed_once(solids), notes=[told] if at < len(content) else [])
+    words = "byte{s} behind the last triangle {are} passed over"
+    return replace(placed_once(solids), notes=told(len(content) - at, words))
 
 
 def _binary(content: bytes, at: int, n_facets: int) -> Shape:
@@ -101,8 +101,8 @@ def _text(text: str, stem: str) -> Parsed:
         if must_be or (is_closed and not is_end[n]):
             solids.append((name or stem, shape))
     n_strange = len(_STRANGE.findall(text))
-    told = f"{n_strange:,} lines begin with unknown words and are passed over"
-    return replace(placed_once(solids), notes=[told] if n_strange else [])
+    words = "line{s} {begin} with unknown words and {are} passed over"
+    return replace(placed_once(solids), notes=told(n_strange, words))
 
 
 def _facets(chunk: str, name: str) -> Shape:

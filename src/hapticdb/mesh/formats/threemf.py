@@ -20,7 +20,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import PLAIN
-from hapticdb.mesh.raw import NameBudget, Parsed, Placement, Shape, UnreadableError, numbers, walk
+from hapticdb.mesh.raw import (
+    NameBudget,
+    Parsed,
+    Placement,
+    Shape,
+    UnreadableError,
+    numbers,
+    told,
+    walk,
+)
 
 _METRES = {
     "micron": 1e-6,
@@ -90,15 +99,14 @@ class _Model:
         outside = sum(
             bool(thing.indices) and key not in self.placed for key, thing in self.objects.items()
         )
-        told = [f"{outside} objects are not in its build and are left out"] if outside else []
-        told += [
-            f"{n} objects are of the type {kind}, and come in like any other"
-            for kind, n in self.types.items()
-        ]
+        notes = told(outside, "object{s} {are} not in its build and {are} left out")
+        for kind, n in self.types.items():
+            words = "object{s} {are} of the type {kind}, and {come} in like any other"
+            notes += told(n, words, kind=kind)
         for extension, elements in self.unread.items():
             most = ", ".join(f"{n} {kind}" for kind, n in elements.most_common(_MOST_KINDS))
-            told.append(f"its extension {extension} is not read: {most}")
-        return told
+            notes.append(f"its extension {extension} is not read: {most}")
+        return notes
 
 
 def read(path: Path) -> Parsed:

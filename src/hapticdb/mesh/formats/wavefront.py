@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import triangulated, triangulated_equal
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once
+from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import text_of
 
 _COMMENT = re.compile(r"(?<!\.)#")  # 1.#IND is no comment
@@ -92,9 +92,9 @@ def read(path: Path) -> Parsed:
         ("/".join(filter(None, names)) or path.stem, _coloured(group, vertices, palette, painted))
         for names, group in groups.items()
     )
-    told = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
-    lines = f"{strange.total():,} lines begin with unknown words and are passed over: {told}"
-    return replace(parsed, notes=[lines] if strange else [])
+    most = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
+    words = "line{s} {begin} with unknown words and {are} passed over: {most}"
+    return replace(parsed, notes=told(strange.total(), words, most=most))
 
 
 def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:

@@ -29,7 +29,9 @@ _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
 _UNREAD = "piece{s} of the kind '{kind}' {are} not read"
-_INSTANCES = {
+_MOST_CONTROLLERS = 4
+"""Controllers of controllers that are followed: a skin of a morph is two."""
+_INSTANCES: dict[str, tuple[str, ...]] = {
     "instance_geometry": ("geometry",),
     "instance_controller": ("controller",),
     "instance_node": ("node",),
@@ -58,7 +60,7 @@ def read(path: Path) -> Parsed:
             if key not in shapes:
                 shapes[key] = len(geometries)
                 geometries.append((geometry, palette))
-            names = [node.get("name") or node.get("id", "") for node in nodes]
+            names = [node.get("name") or node.get("id") or "" for node in nodes]
             name = "/".join(filter(None, names)) or geometry.get("name", geometry.get("id", ""))
             # A skin is where it is bound, whatever its node says.
             world = world_from_node if bound is None else bound
@@ -109,22 +111,24 @@ class _Document:
 
     def geometries(self, node: ET.Element) -> list[tuple[ET.Element, _Palette, Floats | None]]:
         """Geometries of a node itself, colours, and where the skin of one is bound."""
-        found = []
-        for child in node:
-            bound, key, one = None, "url", child
-            kinds = _INSTANCES.get(child.tag, ())
-            while (target := self.referred(one, *kinds, key=key)) is not None:
-                if target.tag == "geometry":
-                    found.append((target, self._palette(child), bound))
-                inner = [part for part in target if part.tag in {"skin", "morph"}]
-                if not inner or one is inner[0]:
-                    break
-                one, key, kinds = inner[0], "source", ("geometry", "controller")
-                if one.tag == "skin":
-                    text = one.findtext("bind_shape_matrix") or ""
-                    bound = np.asarray(numbers(text, np.float64), dtype=np.float64).reshape(-1)
-                    bound = bound.reshape(4, 4) if bound.size else np.eye(4)
-        return found
+        found = [(*self._geometry(child), self._palette(child)) for child in node]
+        return [(one, palette, bound) for one, bound, palette in found if one is not None]
+
+    def _geometry(self, instance: ET.Element) -> tuple[ET.Element | None, Floats | None]:
+        """Geometry that an element places, also through skins and morphs, and where it is bound."""
+        inner: ET.Element | None = instance
+        key, kinds = "url", _INSTANCES.get(instance.tag, ())
+        bound: Floats | None = None
+        for _ in range(_MOST_CONTROLLERS):
+            target = self.referred(inner, *kinds, key=key)
+            if target is None or target.tag == "geometry":
+                return target, bound
+            inner = next((part for part in target if part.tag in {"skin", "morph"}), None)
+            key, kinds = "source", ("geometry", "controller")
+            if inner is not None and inner.tag == "skin":
+                values = _floats(inner.findtext("bind_shape_matrix"))
+                bound = values.reshape(4, 4) if values.size else np.eye(4)
+        return None, None
 
     def _palette(self, instance: ET.Element) -> _Palette:
         """Colours of the materials that a placement binds to the symbols of its triangles."""
@@ -136,7 +140,7 @@ class _Document:
             if effect is None:
                 continue
             with suppress(UnreadableError, ValueError):
-                diffuse = numbers(effect.findtext(".//diffuse/color") or "", np.float64)
+                diffuse = _floats(effect.findtext(".//diffuse/color"))
                 clear = float(effect.findtext(".//transparency/float") or 1)
                 if len(diffuse) in (3, 4):
                     opacity = clear if 0 < clear < 1 else 1.0
@@ -173,12 +177,18 @@ class _Document:
         return [*notes, *told(others, "more scene{s} {are} not read")]
 
 
+def _floats(text: str | None) -> Floats:
+    """Numbers of a text, none of None."""
+    return np.asarray(numbers(text or "", np.float64), dtype=np.float64)
+
+
 def _turn(values: Floats) -> Floats:
     """Rotation by an axis and degrees."""
     half = np.radians(values[3]) / 2
     length = np.linalg.norm(values[:3])
     axis = np.sin(half) * values[:3] / (length or 1.0)
-    return rotation_of(np.array([np.cos(half), *axis]))[0]
+    turned: Floats = rotation_of(np.array([np.cos(half), *axis]))[0]
+    return turned
 
 
 def _look(values: Floats) -> Floats:
@@ -206,8 +216,7 @@ def _parent_from_node(node: ET.Element) -> Floats:
     for step in node:
         if step.tag in _STEPS:
             one = np.eye(4)
-            values = np.asarray(numbers(step.text or "", np.float64), dtype=np.float64)
-            found = _STEPS[step.tag](values)
+            found = _STEPS[step.tag](_floats(step.text))
             one[: found.shape[0], : found.shape[1]] = found
             whole = whole @ one
     return whole
@@ -279,7 +288,7 @@ def _inputs(holder: ET.Element) -> dict[str, tuple[int, str]]:
 
 def _values(source: ET.Element, least: int) -> Floats:
     """Numbers of a source, row by row: those that its accessor names, at least so many."""
-    found = np.asarray(numbers(source.findtext("float_array") or "", np.float64), dtype=np.float64)
+    found = _floats(source.findtext("float_array"))
     accessor = source.find("technique_common/accessor")
     named: list[int] = []
     stride, start = least, 0

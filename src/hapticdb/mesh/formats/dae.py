@@ -154,10 +154,10 @@ class _Document:
         """
         root = self._root
         strange = Counter(
-            piece.tag for mesh in root.iter("mesh") for piece in mesh if piece.tag not in _OF_A_MESH
-        )
-        strange += Counter(
-            step.tag for node in root.iter("node") for step in node if step.tag == "skew"
+            one.tag
+            for holder in root.iter()
+            for one in holder
+            if one.tag == "skew" or (holder.tag == "mesh" and one.tag not in _OF_A_MESH)
         )
         wanted = [one for one in root.iter() if one.tag in _INSTANCES]
         missing = sum(self.referred(one, *_INSTANCES[one.tag]) is None for one in wanted)

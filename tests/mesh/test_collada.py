@@ -128,7 +128,8 @@ def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path
         ),
     }
     for old, new in beside.values():
-        file = parse_in_process(text(tmp_path / "a.dae", COLLADA.replace(old, new)))
+        content = COLLADA.replace(old, new).replace('id="g"', 'id="g g"').replace("#g", "#g%20g")
+        file = parse_in_process(text(tmp_path / "a.dae", content))
         assert area_and_volume(file)[0] == pytest.approx(4 * 2e-4)
     broken = COLLADA[COLLADA.index("<geometry") : COLLADA.index("</library_geometries")]
     for old, new, why in (
@@ -136,6 +137,7 @@ def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path
         ("0 0 0 1 0 0", "0 0 0 1,0 0 0", "where a number should be"),
         ("<p>0 1 2</p>", "<p>0 1 x</p>", "where a number should be"),
         ('stride="3"', 'stride="x"', "it is damaged"),
+        ('stride="3"', 'stride="0"', "it is damaged"),
     ):
         second = broken.replace('id="g"', 'id="b"').replace(old, new)
         content = COLLADA.replace("</library_geometries>", second + "</library_geometries>")

@@ -77,3 +77,11 @@ def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path
             link = f'<Relationship Target="{target}" Id="r" Type="{kind}"/>'
             archive.writestr("_rels/.rels", f"<Relationships>{link}</Relationships>")
         assert names(parse_in_process(named)) == ["old"]
+
+
+def test_damage_beside_the_models_of_a_3mf_file_loses_nothing(tmp_path: Path) -> None:
+    beside = {"Metadata__model_settings_DOT_config": "settings of a slicer"}
+    thing = f'<object id="1">{MESH_3MF}</object>'
+    path = model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", thing, **beside)
+    path.write_bytes(path.read_bytes().replace(b"settings of a slicer", b"Settings of a slicer"))
+    assert len(parse_in_process(path).parts) == 1

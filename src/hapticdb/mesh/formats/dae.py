@@ -9,6 +9,7 @@ from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
+from urllib.parse import unquote
 from xml.etree import ElementTree as ET
 
 import numpy as np
@@ -96,7 +97,7 @@ class _Document:
 
     def referred(self, one: ET.Element | None, *kinds: str, key: str = "url") -> ET.Element | None:
         """Element of a kind that the attribute `key` of an element refers to."""
-        name = "" if one is None else one.get(key, "").removeprefix("#")
+        name = "" if one is None else unquote(one.get(key, "")).removeprefix("#")
         found = (self._known.get((kind, name)) for kind in kinds)
         return next((element for element in found if element is not None), None)
 
@@ -228,7 +229,7 @@ def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
     for geometry, palette in geometries:
         try:
             found.append(_shape(geometry, palette))
-        except (UnreadableError, ValueError, LookupError, TypeError, AttributeError) as error:
+        except (UnreadableError, ValueError, LookupError, ArithmeticError) as error:
             lost[id(geometry)] = error
             found.append(Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)))
     if not lost:

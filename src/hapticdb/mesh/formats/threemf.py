@@ -8,7 +8,9 @@ import array
 import posixpath
 import re
 import zipfile
+import zlib
 from collections import Counter, defaultdict
+from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import IO
@@ -134,15 +136,21 @@ def read(path: Path) -> Parsed:
 def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
     """Name of the root model: the archive's relationships say it, or it is the usual one."""
     usual = "3d/3dmodel.model"
-    name = members.get("_rels/.rels")
-    if name is None or archive.getinfo(name).file_size > _PIECE:
-        return usual
+    content = _beside(archive, members.get("_rels/.rels"))
     try:
-        links = ET.fromstring(archive.read(name))  # noqa: S314 - expat stops entities that multiply
+        links = ET.fromstring(content)  # noqa: S314 - expat stops entities that multiply
     except ET.ParseError:
         return usual
     targets = [one.get("Target", "") for one in links if one.get("Type", "").endswith("/3dmodel")]
     return _member(targets[0]) if targets else usual
+
+
+def _beside(archive: zipfile.ZipFile, name: str | None) -> bytes:
+    """Content of a small member beside the models; nothing where it cannot be read."""
+    with suppress(zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError):
+        if name is not None and archive.getinfo(name).file_size <= _PIECE:
+            return archive.read(name)
+    return b""
 
 
 def _member(name: str) -> str:
@@ -160,9 +168,9 @@ def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
             raise UnreadableError("it is no 3MF file: a ZIP archive without a model in it")
         raise UnreadableError(f"its root model {root} is missing; {models[0]} is in it")
     model = _Model(packed=n_bytes)
-    for name in {members.get(settings) for settings in _SETTINGS} - {None}:
-        if archive.getinfo(str(name)).file_size <= _PIECE:
-            model.types.update(w.decode() for w in _MODIFIER.findall(archive.read(str(name))))
+    for settings in _SETTINGS:
+        found = _MODIFIER.findall(_beside(archive, members.get(settings)))
+        model.types.update(kind.decode() for kind in found)
     waiting, seen = [root], {root}
     while waiting:
         member = waiting.pop()

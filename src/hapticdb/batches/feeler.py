@@ -172,11 +172,19 @@ class Feeler(Closes):
     ) -> ClearanceBatch:
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
-        poses : as for `touch`; reach : greatest distance that is searched, metres; 32 voxels unless
-        given; progress : as for `touch`.
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            As for `touch`.
+        reach : float or None
+            Greatest distance that is searched, metres; 32 voxels unless given.
+        progress : callable or None
+            As for `touch`.
 
-        Raises `UsageError`, `ObjectNotFoundError` as for `touch`; also if the reach is not a
-        positive number, or needs too many cells.
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`; also if the reach is not a positive number, or needs too many cells.
         """
         size = self._residency.grid.voxel_size
         limit = reach_of(reach, size)
@@ -203,11 +211,19 @@ class Feeler(Closes):
 
         The search of a pose ends at the first hit, so it takes less time than the force.
 
-        poses, progress : as for `touch`.
+        Parameters
+        ----------
+        poses, progress
+            As for `touch`.
 
-        Returns (B,) array of bool
+        Returns
+        -------
+        (B,) array of bool
 
-        Raises `UsageError`, `ObjectNotFoundError` as for `touch`.
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`.
         """
         if self._gpu is not None:
             return self.touch(poses, progress=progress).hits > 0

@@ -176,10 +176,21 @@ class Queries:
     ) -> NDArray[np.bool_]:
         """Whether the tool hits anything at many poses, (B,): `touch` has hits there.
 
-        poses : world_from_tool, rigid, metres, in any order; shell, where, exclude : as for
-        `touch`; device : as for `feeler`; progress : as for `Feeler.touch`.
+        Parameters
+        ----------
+        poses : (B, 4, 4) array
+            world_from_tool, rigid, metres, in any order.
+        shell, where, exclude
+            As for `touch`.
+        device
+            As for `feeler`.
+        progress
+            As for `Feeler.touch`.
 
-        Raises `UsageError`, `ObjectNotFoundError` as for `touch`.
+        Raises
+        ------
+        UsageError, ObjectNotFoundError
+            As for `touch`.
         """
         with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.collides(poses, progress=progress)

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.query.frame import Query
+from hapticdb.query.touches import Query
 
 CHUNK = 20
 """Poses that an alternative runs in one turn. More poses warm the processor's caches better and let

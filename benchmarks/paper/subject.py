@@ -9,10 +9,11 @@ from hapticdb.environment import Environment
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel
-from hapticdb.query.frame import HapticQuery, Query, Strategy
+from hapticdb.query.frame import HapticQuery, Strategy
 from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.query.quantiles import QuantileVector
+from hapticdb.query.touches import Query
 from hapticdb.store.sqlite.store import SQLiteStore
 from paper.measure import Alternative, Cell, Pose
 from paper.workload import Task

@@ -57,10 +57,10 @@ if TYPE_CHECKING:
     from hapticdb.proportions import Proportions as Proportions
     from hapticdb.proportions import compare_proportions as compare_proportions
     from hapticdb.query.cost_model import CostModel as CostModel
-    from hapticdb.query.frame import Query as Query
     from hapticdb.query.law import DistanceField as DistanceField
     from hapticdb.query.law import TangentPlane as TangentPlane
     from hapticdb.query.quantiles import QuantileVector as QuantileVector
+    from hapticdb.query.touches import Query as Query
     from hapticdb.query.touches import Touch as Touch
     from hapticdb.ready import warm_up as warm_up
     from hapticdb.realtime.coupling import Coupling as Coupling

@@ -21,8 +21,8 @@ from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
-from hapticdb.query.frame import Query, Strategy
-from hapticdb.query.touches import Touch
+from hapticdb.query.frame import Strategy
+from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout

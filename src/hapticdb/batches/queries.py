@@ -16,7 +16,7 @@ from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
 from hapticdb.query.touches import Touch
 from hapticdb.query.touching import Touching
 from hapticdb.store.base import Store
-from hapticdb.store.filtering import Filter, FiltersOfWords
+from hapticdb.store.filtering import ALL, NOTHING, Filter, FiltersOfWords
 from hapticdb.store.finding import Words
 
 if TYPE_CHECKING:
@@ -41,8 +41,8 @@ class Queries:
         pose: ArrayLike,
         strategy: Strategy = "auto",
         *,
-        where: Words = (),
-        exclude: Words = (),
+        where: Words = NOTHING,
+        exclude: Words = NOTHING,
         maxgap: int = DEFAULT_MAXGAP,
         law: ForceLaw | LawName | None = None,
     ) -> Touch: ...
@@ -53,8 +53,8 @@ class Queries:
         shell: PointShell,
         *,
         poses: ArrayLike,
-        where: Words = (),
-        exclude: Words = (),
+        where: Words = NOTHING,
+        exclude: Words = NOTHING,
         law: ForceLaw | LawName | None = None,
         objects: bool = False,
         device: "BatchDevice" = "cpu",
@@ -68,8 +68,8 @@ class Queries:
         strategy: Strategy = "auto",
         *,
         poses: ArrayLike | None = None,
-        where: Words = (),
-        exclude: Words = (),
+        where: Words = NOTHING,
+        exclude: Words = NOTHING,
         maxgap: int = DEFAULT_MAXGAP,
         law: ForceLaw | LawName | None = None,
         objects: bool = False,
@@ -77,6 +77,8 @@ class Queries:
         progress: "PoseCallback | None" = None,
     ) -> "Touch | TouchBatch":
         """Force and torque that the environment exerts on the tool at one pose, or at many.
+
+        Points outside the grid miss. All statements of a touch read one committed revision.
 
         Parameters
         ----------
@@ -107,16 +109,13 @@ class Queries:
             If a pose is not rigid, the strategy unknown, or objects lack what the law reads.
         ObjectNotFoundError
             If a word of `where` or `exclude` chooses no object.
-
-        Notes
-        -----
-        Points outside the grid miss. All statements of a touch read one committed revision.
         """
         if (pose is None) == (poses is None):
             raise UsageError("touch: give either one pose, or poses=...")
         if pose is not None:
-            felt = self._filters.of(where, exclude)
-            return self._touching.touch(shell, pose, strategy, maxgap, felt, as_law(law))
+            felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
+            chosen = as_law(law) if isinstance(law, str) else law
+            return self._touching.touch(shell, pose, strategy, maxgap, felt, chosen)
         if strategy != "auto":
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
         with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:

@@ -1,10 +1,11 @@
 """The haptic query: plan, fetch, refine (the paper, section 4.2)."""
 
+import math
 import operator
 import time
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from functools import partial
-from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
+from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,11 +15,19 @@ from hapticdb.kernels import law as laws
 from hapticdb.kernels.field import lattice
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
-from hapticdb.query.auto import grouping_threshold, ranges_worth_scanning
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.law import PLANE, ForceLaw, TangentPlane, frames_by
+from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
+from hapticdb.store.base import (
+    Keys,
+    LocatedShell,
+    Object,
+    Rows,
+    Store,
+    SupportsStatement,
+    row_shift,
+)
 from hapticdb.store.parsing import damaged
 
 if TYPE_CHECKING:
@@ -28,68 +37,28 @@ if TYPE_CHECKING:
 
 Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+GROUPING = ("maxgap", "cbgroup")
+"""Strategies that always scan ranges."""
 MOST_KEYS = 2048
 """Row keys of successive poses after which one statement is sent for all of them. A larger value
 sends fewer statements, but then there are more rows of other poses among the rows of each pose."""
 MOST_POINTS = 1 << 17
 """Most shell points, summed over the poses that one statement serves: 12 MB. A larger value takes
 more memory."""
+LEAST_GROUPED = 1024
+"""Distinct keys of a frame from which `auto` groups, on engines that set no number of their own.
+
+Measured on SQLite. A smaller value groups more frames whose lookup would have been faster; a larger
+one leaves more large frames to a lookup that is up to 1.1 times slower than their ranges."""
+KEYS_PER_RANGE = 2
+"""Mean keys of a range from which `auto` scans ranges. A larger value scans fewer frames: a range
+costs more than a key of a lookup, so ranges of one key each would be slower."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
-NO_POINTS = np.empty(0, dtype=np.int64)
-NO_DEPTHS = np.empty(0)
+NO_OBJECTS: Mapping[int, Object] = {}
 
 
-class Query(NamedTuple):
-    """How a frame asked the database.
-
-    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges : index
-    ranges in these statements, each single key is one; rows : rows read, false hits included;
-    elapsed_us : time of the whole frame, microseconds.
-    """
-
-    strategy: str
-    statements: int
-    ranges: int
-    rows: int
-    elapsed_us: float
-
-
-_Asked = tuple[Strategy, int, int, int]
+_Asked = tuple[str, int, int, int]
 """Fields of `Query` without the last, which is known only at the end of a frame."""
-
-
-class Answer(NamedTuple):
-    """The result of a frame; users get it as a `Touch`.
-
-    wrench (6,) N and N m; hits (H,) indices, ascending; depths (H,) metres; ids : objects of all
-    hits, ascending; pairs : () -> (P, 2) int64, every (hit, object id), computed when asked for;
-    placed (N + 1, 6) : the shell's points in metres and normals, world frame, last its centre;
-    touched : contacts (C,) -> (P, 2) int64, every (contact, object id), under a law that reads
-    distances; None where contacts are hits;
-    apart (A,) : indices of felt points that are no hits, ascending; apart_depths (A,) metres.
-    """
-
-    wrench: NDArray[np.float64]
-    hits: NDArray[np.int64]
-    depths: NDArray[np.float64]
-    ids: list[int]
-    pairs: Callable[[], NDArray[np.int64]]
-    query: Query
-    placed: NDArray[np.float64]
-    law: ForceLaw
-    touched: Callable[[NDArray[np.int64]], NDArray[np.int64]] | None = None
-    apart: NDArray[np.int64] = NO_POINTS
-    apart_depths: NDArray[np.float64] = NO_DEPTHS
-
-    def contacts(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
-        """Indices (C,) of the points that are felt, ascending, and their depths (C,), above 0."""
-        is_felt = self.depths > 0
-        points, depths = self.hits[is_felt], self.depths[is_felt]
-        if self.apart.size:
-            points = np.concatenate([points, self.apart])
-            order = np.argsort(points)
-            points, depths = points[order], np.concatenate([depths, self.apart_depths])[order]
-        return points, depths
 
 
 class HapticQuery:
@@ -109,9 +78,10 @@ class HapticQuery:
     ) -> None:
         self._store = store
         self._quantiles_and_costs = quantiles_and_costs
-        self._grouping_threshold = grouping_threshold(store)
-        self._shift = row_shift(store.layout)
-        self._grid = store.grid.for_kernels(self._shift)
+        least = getattr(store, "grouping_threshold", LEAST_GROUPED)
+        self._least_grouped = math.inf if least is None else least
+        self._ready: dict[tuple[Strategy, type], bool] = {}
+        self._grid = store.grid.for_kernels(row_shift(store.layout))
 
     def run(
         self,
@@ -120,24 +90,61 @@ class HapticQuery:
         strategy: Strategy = "auto",
         gap: int = DEFAULT_MAXGAP,
         exclude: Keys = NOTHING_EXCLUDED,
-        law: ForceLaw = TangentPlane(),  # noqa: B008 - frozen, and a frame counts microseconds
-    ) -> Answer:
-        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
-        make_ready("statement" if strategy == "statement" else frames_by(law, "touch"))
-        if strategy in {"maxgap", "cbgroup"}:
-            make_ready("calibrate")
+        law: ForceLaw = PLANE,
+        known: Mapping[int, Object] = NO_OBJECTS,
+    ) -> Touch:
+        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`.
+
+        known : the objects by id, as the result names them.
+        """
+        reads = self._ready.get((strategy, type(law.for_kernels)))
+        if reads is None:
+            reads = self._get_ready(strategy, law)
         started = time.perf_counter_ns()
-        if strategy not in STRATEGIES:
-            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
-        located = self.locate(shell, as_floats(world_from_tool, "a pose"))
+        pose = as_floats(world_from_tool, "a pose")
+        if pose.shape != (4, 4):
+            raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
+        try:
+            located = contact.locate(shell.points, shell.normals, shell.center, pose, self._grid)
+        except ValueError as error:
+            raise UsageError(f"{error}: give finite numbers and a rotation") from error
         if strategy == "statement":
-            return self._by_statement(located, exclude, law, started)
-        distances = laws.reads_distances(law.for_kernels)
-        asked, rows = self._fetch(strategy, located, gap, distances=distances)
-        payload = self._distances_of(rows, located.keys) if distances else None
-        return self._refined(located, rows, payload, exclude, law, asked, started)
+            return self._by_statement(located, exclude, law, known, started)
+        store, keys, ranges = self._store, located.keys, None
+        if strategy in GROUPING or (strategy == "auto" and len(keys) >= self._least_grouped):
+            ranges = self._ranges_of(located, strategy, gap, distances=reads)
+        if strategy == "points":
+            with store.snapshot():
+                rows = store.lookup_each(keys, distances=reads)
+            asked: _Asked = ("points", len(keys), len(keys), len(rows.keys))
+        elif ranges is None:
+            rows = store.lookup(keys, distances=reads)
+            asked = ("array", 1, len(keys), len(rows.keys))
+        else:
+            rows = store.scan(*ranges, distances=reads)
+            used = "maxgap" if strategy == "maxgap" else "cbgroup"
+            asked = (used, 1, len(ranges.lows), len(rows.keys))
+        payload = self._distances_of(rows, keys) if reads else None
+        return self._refined(located, rows, payload, exclude, law, known, asked, started)
+
+    def _get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
+        """Compile what frames of a strategy and a law call; returns whether they read distances.
+
+        Raises
+        ------
+        UsageError
+            If there is no such strategy.
+        """
+        if strategy not in STRATEGIES:
+            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+        make_ready("statement" if strategy == "statement" else frames_by(law, "touch"))
+        if strategy in GROUPING:
+            make_ready("calibrate")
+        numbers = law.for_kernels
+        reads = self._ready[strategy, type(numbers)] = laws.reads_distances(numbers)
+        return reads
 
     def _distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
         """Distances (R, 1000) of rows. Rows whose keys are not among `keys` are left unset.
@@ -166,30 +173,20 @@ class HapticQuery:
         payload: NDArray[np.uint8] | None,
         exclude: Keys,
         law: ForceLaw,
-        query: _Asked,
+        known: Mapping[int, Object],
+        asked: _Asked,
         started: int,
-    ) -> Answer:
-        """Answer of a frame from its rows; rows of other poses may lie among them."""
+    ) -> Touch:
+        """Result of a frame from its rows; rows of other poses may lie among them."""
         row_keys, row_ids, occupancy, _ = rows
-        wrench, hits, depths, ids, apart, apart_depths = refining.refine(
+        refined = refining.refine(
             located, row_keys, row_ids, occupancy, payload, exclude, self._grid, law.for_kernels
         )
-        elapsed_us = (time.perf_counter_ns() - started) / 1000
-        return Answer(
-            wrench,
-            hits,
-            depths,
-            ids.tolist(),
-            partial(self._touched, located, rows, exclude, PLANE, hits),
-            Query(*query, elapsed_us),
-            located.placed,
-            law,
-            None if payload is None else partial(self._touched, located, rows, exclude, law),
-            apart,
-            apart_depths,
-        )
+        query = Query(*asked, (time.perf_counter_ns() - started) / 1000)
+        pairs_of = partial(self._pairs_of, located, rows, exclude)
+        return Touch(refined, located.placed, law, query, pairs_of, known)
 
-    def _touched(
+    def _pairs_of(
         self,
         located: "contact.Located",
         rows: Rows,
@@ -197,9 +194,10 @@ class HapticQuery:
         law: ForceLaw,
         points: NDArray[np.int64],
     ) -> NDArray[np.int64]:
-        """Every (point, object) pair (P, 2) of points of a frame: of its hits under the plane."""
-        make_ready(frames_by(law, "pairs"))
+        """Every (point, object) pair (P, 2) of points of a frame that a law has felt."""
         reads = laws.reads_distances(law.for_kernels)
+        law = law if reads else PLANE  # every law that reads none feels the objects of hits
+        make_ready(frames_by(law, "pairs"))
         payload = self._distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_points(  # type: ignore[no-any-return]
@@ -212,16 +210,17 @@ class HapticQuery:
         poses: NDArray[np.float64],
         exclude: Keys,
         law: ForceLaw,
-    ) -> Iterator[Answer]:
-        """Answers at poses (n, 4, 4), in their order; one statement reads the rows of several.
+    ) -> Iterator[Touch]:
+        """Touches at rigid poses (n, 4, 4), in their order; one statement reads rows of several.
 
-        Such a statement is counted in the first pose's answer only.
+        Such a statement is counted in the first pose's query only.
         """
         make_ready(frames_by(law, "touch"))
+        points, normals, center = shell.points, shell.normals, shell.center
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
         for pose in poses:
-            batch.append(self.locate(shell, pose))
+            batch.append(contact.locate(points, normals, center, pose, self._grid))
             n_keys += len(batch[-1].keys)
             if n_keys >= MOST_KEYS or len(batch) >= most:
                 yield from self._look_up_together(batch, exclude, law)
@@ -231,13 +230,13 @@ class HapticQuery:
 
     def _look_up_together(
         self, batch: "list[contact.Located]", exclude: Keys, law: ForceLaw
-    ) -> Iterator[Answer]:
-        """Answers of poses, in their order; one statement fetches the rows of all poses."""
+    ) -> Iterator[Touch]:
+        """Touches at poses, in their order; one statement fetches the rows of all poses."""
         started = time.perf_counter_ns()
         keys = np.unique(np.concatenate([located.keys for located in batch]))
         reads = laws.reads_distances(law.for_kernels)
         fetched = self._store.lookup(keys, distances=reads)
-        query: _Asked = ("array", 1, len(keys), len(fetched))
+        asked: _Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
         distances = self._distances_of(fetched, keys) if reads else None
         for located in batch:
@@ -248,57 +247,34 @@ class HapticQuery:
                 high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
             payload = None if distances is None else distances[low:high]
-            yield self._refined(located, rows, payload, exclude, law, query, started)
-            query, started = ("array", 0, 0, 0), time.perf_counter_ns()
+            yield self._refined(located, rows, payload, exclude, law, NO_OBJECTS, asked, started)
+            asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
 
-    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
-        """Place a shell (N points) at a pose (4, 4), and compute the row keys to ask for."""
-        if pose.shape != (4, 4):
-            raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
-        points, normals, center = shell.points, shell.normals, shell.center
-        try:
-            return contact.locate(points, normals, center, pose, self._grid)
-        except ValueError as error:
-            raise UsageError(f"{error}: give finite numbers and a rotation") from error
+    def _ranges_of(
+        self, located: "contact.Located", strategy: Strategy, gap: int, *, distances: bool
+    ) -> Ranges | None:
+        """Ranges of a frame that is grouped; None where `auto` had better look its keys up.
 
-    def _figures(self, *, distances: bool) -> "tuple[QuantileVector, CostModel]":
-        """Quantile vector, and the cost model of rows with their distances or without."""
-        make_ready("calibrate")
-        quantiles, costs = self._quantiles_and_costs()
-        return quantiles, costs.with_distances if distances else costs
-
-    def _fetch(
-        self, strategy: Strategy, located: "contact.Located", gap: int, *, distances: bool
-    ) -> tuple[_Asked, Rows]:
-        """Rows of a frame, and the fields of `Query` that say how they were asked for."""
+        The decision depends on the frame alone, not on frames before it.
+        """
         _, asked, keys = located
-        if strategy == "points":
-            with self._store.snapshot():
-                rows = self._store.lookup_each(keys, distances=distances)
-            return ("points", len(keys), len(keys), len(rows)), rows
-        ranges: Ranges | None = None
         if strategy == "maxgap":
-            first, last = contact.spans_of_keys(asked, keys, self._grid)
-            ranges = maxgap(keys, first, last, gap)
-        elif strategy == "cbgroup":
-            ranges = cbgroup(keys, *self._figures(distances=distances))
-        elif strategy == "auto":
-            figures = partial(self._figures, distances=distances)
-            ranges = ranges_worth_scanning(keys, self._grouping_threshold, figures)
-            strategy = "array" if ranges is None else "cbgroup"
-        if ranges is None:
-            rows = self._store.lookup(keys, distances=distances)
-            return ("array", 1, len(keys), len(rows)), rows
-        rows = self._store.scan(*ranges, distances=distances)
-        return (strategy, 1, len(ranges.lows), len(rows)), rows
+            return maxgap(keys, *contact.spans_of_keys(asked, keys, self._grid), gap)
+        if strategy == "auto":
+            make_ready("calibrate")
+        quantiles, costs = self._quantiles_and_costs()
+        ranges = cbgroup(keys, quantiles, costs.with_distances if distances else costs)
+        is_worth = strategy == "cbgroup" or KEYS_PER_RANGE * len(ranges.lows) <= len(keys)
+        return ranges if is_worth else None
 
     def _by_statement(
         self,
         located: "contact.Located",
         exclude: Keys,
         law: ForceLaw,
+        known: Mapping[int, Object],
         started: int,
-    ) -> Answer:
+    ) -> Touch:
         """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
         store = self._store
         if not isinstance(law, TangentPlane):
@@ -313,17 +289,20 @@ class HapticQuery:
         with store.snapshot():
             wrench = store.statement(frame)
             ordinals, ids = store.statement_hits(frame)
-        pairs = np.stack([ordinals, ids], axis=1)
         hits = np.unique(ordinals)
         depths = np.empty(len(hits))
         refining.wrench_of_addresses(
             placed, hits, addresses[hits], self._grid, law.for_kernels, depths
         )
-        touched = np.unique(ids).tolist()
+        refined = (wrench, hits, depths, np.unique(ids), NOTHING_EXCLUDED, depths[:0])
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
-        order = np.lexsort((ids, ordinals))
-        return Answer(wrench, hits, depths, touched, lambda: pairs[order], query, placed, law)
+        pairs = np.stack([ordinals, ids], axis=1)[np.lexsort((ids, ordinals))]
+
+        def pairs_of(_: ForceLaw, points: NDArray[np.int64]) -> NDArray[np.int64]:
+            return pairs[np.isin(pairs[:, 0], points)]
+
+        return Touch(refined, placed, law, query, pairs_of, known)
 
 
 def as_poses(poses: ArrayLike) -> NDArray[np.float64]:

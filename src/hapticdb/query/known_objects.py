@@ -1,7 +1,6 @@
 """The objects, by id, of the revision that the last frame read."""
 
 import contextlib
-from collections.abc import Iterable
 
 import numpy as np
 
@@ -10,7 +9,6 @@ from hapticdb.kernels import law as laws
 from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
 from hapticdb.store.base import Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
-from hapticdb.store.parsing import damaged
 
 MOST_READ = 16
 """Writes since the last listing after which all objects are listed. A larger value reads more of
@@ -43,23 +41,18 @@ class KnownObjects:
         self._last: Change | None = None
 
     def learn(self) -> bool:
-        """List the objects if the snapshot's revision is new; returns whether it is new."""
-        self._store.revision()  # `version` then tells of this snapshot
-        if self._store.version() == self.version:
+        """List the objects, unless this revision is known already; returns whether it did."""
+        revision = self._store.revision()  # `version` then tells of this read
+        version = self._store.version()  # before they are read: another may write meanwhile
+        if version == self.version:
             return False
-        self.learn_newest()
+        self._list(revision)
+        self.version = version
         return True
 
-    def learn_newest(self) -> None:
-        """List the objects as they are now, whatever was known."""
-        self._store.revision()
-        version = self._store.version()  # before they are read: another may write meanwhile
-        self._list()
-        self.version = version
-
-    def _list(self) -> None:
+    def _list(self, revision: int) -> None:
         """Read the objects that were written since the last time; all if that is not known."""
-        log, last = self._writes_since()
+        log, last = self._writes_since(revision)
         if log == []:
             return
         if log is None:
@@ -77,12 +70,12 @@ class KnownObjects:
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
         self.own_law = SMOOTH if self.have_distances else PLANE
 
-    def _writes_since(self) -> tuple[list[Change] | None, Change | None]:
-        """Writes since the last listing, and the last of all.
+    def _writes_since(self, revision: int) -> tuple[list[Change] | None, Change | None]:
+        """Writes since the last listing, and the last of all; revision : the newest, or an older.
 
         None for too many, or if the log is another one by now.
         """
-        revision, known = self._store.revision(), self._last
+        known = self._last
         is_near = known is not None and 0 <= revision - known.revision <= MOST_READ
         first = known.revision if known is not None and is_near else revision
         log = list(self._store.changes(first - 1))
@@ -92,18 +85,6 @@ class KnownObjects:
     def forget(self) -> None:
         """Make the next frame list the objects again."""
         self.version = None
-
-    def check_answer(self, ids: Iterable[int]) -> None:
-        """Refuse ids of rows if no object has such an id.
-
-        Raises
-        ------
-        DamagedError
-            When a row has an id without an object.
-        """
-        for object_id in ids:
-            if object_id not in self.by_id:
-                raise damaged(self._store.url, f"rows of object {object_id}, which is not there")
 
     def left_out(self, felt: Filter) -> Keys:
         """Ids (E,) of the objects that a filter leaves out, ascending; of those known now."""
@@ -117,9 +98,9 @@ class KnownObjects:
         ObjectNotFoundError
             It names the word.
         """
-        if felt.is_empty or not self._left_out_by(felt).missing:
+        if not self._left_out_by(felt).missing:
             return
-        self._list()  # frames without a query learn nothing
+        self._list(self._store.revision())  # frames without a query learn nothing
         for error in self._left_out_by(felt).missing:
             raise error
 
@@ -131,9 +112,9 @@ class KnownObjects:
             keep_last(self._unfelt, felt, found)
         return found
 
-    def fits(self, law: ForceLaw | None) -> bool:
+    def fits(self, law: ForceLaw) -> bool:
         """Whether the objects have what the law reads."""
-        return law is None or self.have_distances or not laws.reads_distances(law.for_kernels)
+        return self.have_distances or not laws.reads_distances(law.for_kernels)
 
     def check_distances(self) -> None:
         """Refuse a law that reads distances where an object has none.

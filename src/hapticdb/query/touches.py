@@ -1,14 +1,35 @@
 """Result of the haptic query: what a tool felt at one pose."""
 
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from html import escape
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.query.frame import Answer, Query
-from hapticdb.query.law import ForceLaw
+from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.store.base import Object
+
+if TYPE_CHECKING:
+    from hapticdb.kernels.query.refining import Refined
+
+PairsOf = Callable[[ForceLaw, NDArray[np.int64]], NDArray[np.int64]]
+"""Every (point, object id) pair (P, 2) of some points (C,) of a frame that a law has felt."""
+
+
+class Query(NamedTuple):
+    """How a frame asked the database.
+
+    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges : index
+    ranges in these statements, each single key is one; rows : rows read, false hits included;
+    elapsed_us : time of the whole frame, microseconds.
+    """
+
+    strategy: str
+    statements: int
+    ranges: int
+    rows: int
+    elapsed_us: float
 
 
 class Touch:
@@ -25,54 +46,62 @@ class Touch:
     depths : (H,) float64
         Depth of each hit in metres, 0 where the law does not feel it: above its tangent plane or,
         under `DistanceField`, where the distance does not grow along the point's normal.
+    ids : list of int
+        Ids of `objects`.
+    law : ForceLaw
+        The force law that was felt.
     query : Query
         How the database was asked.
     """
 
-    __slots__ = ("_answer", "_known", "depths", "force", "hits", "query", "torque")
+    __slots__ = (
+        "_apart", "_known", "_pairs_of", "_placed", "depths", "force", "hits", "ids", "law",
+        "query", "torque",
+    )  # fmt: skip
 
-    def __init__(self, answer: Answer, known: Mapping[int, Object]) -> None:
-        self._answer = answer
+    def __init__(
+        self,
+        refined: "Refined",
+        placed: NDArray[np.float64],
+        law: ForceLaw,
+        query: Query,
+        pairs_of: PairsOf,
+        known: Mapping[int, Object],
+    ) -> None:
+        wrench, self.hits, self.depths, ids, *self._apart = refined
+        self.force: NDArray[np.float64] = wrench[:3]
+        self.torque: NDArray[np.float64] = wrench[3:]
+        self.ids: list[int] = ids.tolist()
+        self.law = law
+        self.query = query
+        self._placed = placed
+        self._pairs_of = pairs_of
         self._known = known
-        self.force: NDArray[np.float64] = answer.wrench[:3]
-        self.torque: NDArray[np.float64] = answer.wrench[3:]
-        self.hits: NDArray[np.int64] = answer.hits
-        self.depths: NDArray[np.float64] = answer.depths
-        self.query: Query = answer.query
 
     @property
     def contacts(self) -> NDArray[np.int64]:
         """Indices (C,) of the shell's points that the law feels, ascending."""
-        return self._answer.contacts()[0]
+        return self._felt()[0]
 
     @property
     def contact_depths(self) -> NDArray[np.float64]:
         """Depths (C,) of the contacts in metres, all above 0."""
-        return self._answer.contacts()[1]
+        return self._felt()[1]
 
     @property
     def contact_points(self) -> NDArray[np.float64]:
         """Places (C, 3) of the contacts, metres, world frame."""
-        return self._answer.placed[self.contacts, :3]
+        return self._placed[self.contacts, :3]
 
     @property
     def contact_normals(self) -> NDArray[np.float64]:
         """Unit normals (C, 3) of the contacts, which point into the tool, world frame."""
-        return self._answer.placed[self.contacts, 3:]
-
-    @property
-    def law(self) -> ForceLaw:
-        """The force law that was felt."""
-        return self._answer.law
+        return self._placed[self.contacts, 3:]
 
     @property
     def contact_pairs(self) -> NDArray[np.int64]:
         """Every contact with every object that it touches, (P, 2): index of the point, id."""
-        contacts = self.contacts
-        if self._answer.touched is not None:
-            return self._answer.touched(contacts)
-        pairs = self.pairs
-        return pairs[np.isin(pairs[:, 0], contacts)]
+        return self._pairs_of(self.law, self.contacts)
 
     @property
     def objects(self) -> list[Object]:
@@ -80,12 +109,23 @@ class Touch:
 
         A contact touches the objects that it would feel alone, or the nearest one.
         """
-        return [self._known[i] for i in self._answer.ids]
+        return [self._known[i] for i in self.ids]
 
     @property
     def pairs(self) -> NDArray[np.int64]:
         """Every hit with every object in its voxel, (P, 2): index of the point, id."""
-        return self._answer.pairs()
+        return self._pairs_of(PLANE, self.hits)
+
+    def _felt(self) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """Contacts and their depths; some may be no hits."""
+        is_felt = self.depths > 0
+        points, depths = self.hits[is_felt], self.depths[is_felt]
+        apart, apart_depths = self._apart
+        if apart.size:
+            points = np.concatenate([points, apart])
+            order = np.argsort(points)
+            points, depths = points[order], np.concatenate([depths, apart_depths])[order]
+        return points, depths
 
     def _repr_html_(self) -> str:
         """Force, torque and what is touched, for notebooks."""
@@ -98,5 +138,5 @@ class Touch:
         x, y, z = self.force
         return (
             f"Touch(force=({x:.4g}, {y:.4g}, {z:.4g}) N, {len(self.hits)} hits, "
-            f"{len(self.contacts)} contacts, objects {self._answer.ids})"
+            f"{len(self.contacts)} contacts, objects {self.ids})"
         )

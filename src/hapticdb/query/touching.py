@@ -5,12 +5,13 @@ from numpy.typing import ArrayLike
 from hapticdb.errors import ConnectionLostError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import Answer, HapticQuery, Strategy
+from hapticdb.query.frame import NOTHING_EXCLUDED, HapticQuery, Strategy
 from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import PLANE, ForceLaw
+from hapticdb.query.law import ForceLaw
 from hapticdb.query.touches import Touch
 from hapticdb.store.base import Object, Store
-from hapticdb.store.filtering import Filter
+from hapticdb.store.filtering import ALL, Filter
+from hapticdb.store.parsing import damaged
 
 
 class Touching:
@@ -35,7 +36,8 @@ class Touching:
 
     def newest(self) -> list[Object]:
         """All objects, ordered by id; only those written since the last time are read."""
-        self.known.learn_newest()  # in no snapshot, which asks servers that have rows alone, too
+        self.known.forget()
+        self.known.learn()  # in no snapshot, which asks servers that have rows alone, too
         self._figures.drop_empty_statistics()
         return [*self.known.by_id.values()]
 
@@ -58,16 +60,24 @@ class Touching:
         law: ForceLaw | None,
     ) -> Touch:
         """Compute one frame."""
+        known = self.known
         try:
-            answer = self._answer(shell, pose, strategy, maxgap, felt, law)
+            touch = None
+            if known.version is not None and (law is None or known.fits(law)):
+                exclude = NOTHING_EXCLUDED if felt is ALL else known.left_out(felt)
+                chosen = law or known.own_law
+                touch = self._query.run(shell, pose, strategy, maxgap, exclude, chosen, known.by_id)
+            if touch is None or self._store.version() != known.version:
+                touch = self._touch_anew(shell, pose, strategy, maxgap, felt, law)
         except ConnectionLostError:
-            answer = self._answer(shell, pose, strategy, maxgap, felt, law)
+            touch = self._touch_anew(shell, pose, strategy, maxgap, felt, law)
+        for stray in set(touch.ids).difference(known.by_id):
+            raise damaged(self._store.url, f"rows of object {stray}, which is not there")
         if not felt.is_empty:
-            self.known.check_words(felt)
-        self.known.check_answer(answer.ids)
-        return Touch(answer, self.known.by_id)
+            known.check_words(felt)
+        return touch
 
-    def _answer(
+    def _touch_anew(
         self,
         shell: PointShell,
         pose: ArrayLike,
@@ -75,31 +85,21 @@ class Touching:
         maxgap: int,
         felt: Filter,
         law: ForceLaw | None,
-    ) -> Answer:
-        """Answer of a frame; also loads the objects of the revision that the frame read."""
+    ) -> Touch:
+        """Compute one frame in a snapshot, whose objects are loaded first."""
         known = self.known
-        is_fitting = known.fits(law)
-        chosen = (law or known.own_law) if is_fitting else PLANE
-        answer = self._query.run(shell, pose, strategy, maxgap, known.left_out(felt), chosen)
-        if not is_fitting or self._store.version() != known.version:
-            with self._store.snapshot():
-                chosen = self._law_of_snapshot(law)
-                answer = self._query.run(
-                    shell, pose, strategy, maxgap, known.left_out(felt), chosen
-                )
-        return answer
+        with self._store.snapshot():
+            chosen = self._law_of_snapshot(law)
+            exclude = known.left_out(felt)
+            return self._query.run(shell, pose, strategy, maxgap, exclude, chosen, known.by_id)
 
     def _law_of_snapshot(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame in this snapshot; also loads the snapshot's objects.
 
         UsageError if the law reads distances, and an object has none.
         """
-        self._learn()
-        if not self.known.fits(law):
-            self.known.check_distances()
-        return law or self.known.own_law
-
-    def _learn(self) -> None:
-        """Load this snapshot's objects."""
         if self.known.learn():
             self._figures.drop_empty_statistics()
+        if law is not None and not self.known.fits(law):
+            self.known.check_distances()
+        return law or self.known.own_law

@@ -103,6 +103,8 @@ def _chosen(
     return found
 
 
+NOTHING: Words = ()
+"""No words."""
 ALL = Filter()
 """The filter under which every object is felt."""
 

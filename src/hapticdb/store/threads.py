@@ -26,7 +26,7 @@ def this_thread() -> int:
 
 def check_thread(owner: int, url: str) -> None:
     """Refuse a call from another thread, or process, than the one that a store belongs to."""
-    if this_thread() != owner:
+    if get_ident() + _forked_as != owner:  # `this_thread`, without another call in each frame
         raise UsageError(
             f"{url} belongs to the thread that opened it, in its own process: open it here, too"
         )

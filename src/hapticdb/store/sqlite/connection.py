@@ -1,6 +1,7 @@
 """A connection to one file: statements, snapshots, transactions, and the thread that may use it."""
 
 import contextlib
+import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -107,9 +108,8 @@ class FileConnection:
     def version(self) -> int:
         """SQLite's data version: changes when another connection's commit has been seen."""
         seen = self.driver.data_version()
-        if seen == self._seen:
-            self.file.check()
-        else:  # perhaps of another file: files that had one path share a log
+        # a new one is perhaps of another file: files that had one path share a log
+        if seen != self._seen or time.monotonic() >= self.file.due:
             self.file.look()
             self._seen = seen
         return seen

@@ -41,7 +41,7 @@ class OpenedFile:
         self._real = path.resolve()
         """The file itself, if the path is a link. SQLite keeps its log beside it."""
         self._log = f"{self._real}-wal"
-        self._due = 0.0
+        self.due = 0.0
         self._connection: apsw.Connection | None = None
         self._beside: dict[str, Identity] = {}
         self.stamp: Stamp | None = None
@@ -68,7 +68,7 @@ class OpenedFile:
 
     def check(self) -> None:
         """Call `look` if the last one is `LOOK_SECONDS` ago: cheap enough for each read."""
-        if time.monotonic() >= self._due:
+        if time.monotonic() >= self.due:
             self.look()
 
     def look(self, *, has_committed: bool = False) -> None:
@@ -89,7 +89,7 @@ class OpenedFile:
                     f"end all that has {self._path.name} open, then open it again"
                 )
         self._check_mark()
-        self._due = time.monotonic() + LOOK_SECONDS
+        self.due = time.monotonic() + LOOK_SECONDS
 
     def check_stamp(self) -> None:
         """Refuse to read on after somebody else has written.

@@ -68,9 +68,7 @@ class SQLiteReader(FileTables):
             if form == "rows_of":
                 sql, bindings = f"{sql} AND {table}.id = ?4", (*bindings, asked[2])
             found = fetch(sql, bindings)
-        if table == "band":
-            return sqlite_rows.rows_with_distances(self.url, found)
-        return sqlite_rows.rows_of(self.url, found, has_bricks=table == "brick")
+        return sqlite_rows.rows_of(self.url, found, table)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         """How many rows `scan` would return, counted inside the engine."""

@@ -24,6 +24,7 @@ from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import Band, Layout, Rows
 from hapticdb.store.sqlite.tables.reading import SQLiteReader
 from hapticdb.testing import blob, voxel_object, with_distances, write_voxels
@@ -256,7 +257,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
                     voxel_object(env.grid, moved, "blob 2"), id=5, transform=placement(1, 0, 0)
                 )
                 rows = rows_of_voxels(moved, env.grid, env.layout)
-                env.store.replace(turned, rows, env._covering)
+                env.store.replace(turned, rows, covering(env.store))
 
     report = copy_environment(source, tmp_path / "b.db", curve="hilbert", progress=edit)
     assert report.copied == 4

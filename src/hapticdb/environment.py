@@ -20,7 +20,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import as_id
-from hapticdb.query.grouping import Ranges, object_ranges
+from hapticdb.query.grouping import covering, object_ranges
 from hapticdb.query.law import inset_of
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Size, Store
@@ -254,14 +254,14 @@ class Environment(Queries, Closes):
         self._check_writable()
         removed: list[Object] = []
 
-        def covering(known: Object) -> Iterable[tuple[int, int]]:
+        def ranges(known: Object) -> Iterable[tuple[int, int]]:
             if revision is not None:  # inside the transaction
                 check_unwritten(replace(known, revision=revision), known, self.url)
             surface = self._store.surfaces([known.digest]).get(known.digest)
             removed.append(replace(known, surface=surface))
-            return self._covering(known)
+            return covering(self._store)(known)
 
-        self._store.remove(as_id(object_id), covering)
+        self._store.remove(as_id(object_id), ranges)
         self._forget()
         return removed[-1]
 
@@ -308,7 +308,7 @@ class Environment(Queries, Closes):
         """
         self._check_writable()
         old = self.object(object_id)
-        move_object(self._store, old, transform, revision, self._covering)
+        move_object(self._store, old, transform, revision)
         self._forget()
         return self.object(object_id)
 
@@ -329,7 +329,7 @@ class Environment(Queries, Closes):
             As for `move`; then no object is shifted.
         """
         self._check_writable()
-        shifted = shift_objects(self._store, object_ids, way, self._covering)
+        shifted = shift_objects(self._store, object_ids, way)
         self._forget()
         return shifted
 
@@ -337,7 +337,7 @@ class Environment(Queries, Closes):
         """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
         with self._store.snapshot():
             obj = self.object(object_id)
-            rows = self._store.rows_of(obj.id, *self._ranges_of(obj))
+            rows = self._store.rows_of(obj.id, *object_ranges(self.grid, self.layout, obj))
         return voxels_of_rows(rows, self.grid, self.layout)
 
     # -- statistics --------------------------------------------------------------------------
@@ -374,13 +374,6 @@ class Environment(Queries, Closes):
     def _check_writable(self) -> None:
         if self._store.is_read_only:
             raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
-
-    def _covering(self, obj: Object) -> Iterable[tuple[int, int]]:
-        lows, highs = self._ranges_of(obj)
-        return zip(lows.tolist(), highs.tolist(), strict=True)
-
-    def _ranges_of(self, obj: Object) -> Ranges:
-        return object_ranges(self.grid, self.layout, obj)
 
 
 def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open

@@ -18,6 +18,7 @@ from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.cost_model import CostModel, machine_name
 from hapticdb.query.frame import STRATEGIES
+from hapticdb.query.grouping import covering
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.postgres.address import with_environment
@@ -25,7 +26,6 @@ from hapticdb.store.postgres.private_server import Binaries
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import voxel_object
-from hapticdb.testing.scenes import covering
 from naive import Voxel
 from query.test_frame import (
     BITS,

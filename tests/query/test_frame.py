@@ -16,13 +16,14 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.address import with_environment
 from hapticdb.store.postgres.private_server import Binaries
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import KINDS, blob, write_voxels
-from hapticdb.testing.scenes import EVERYWHERE, covering
+from hapticdb.testing.scenes import EVERYWHERE
 from naive_frame import NaiveTouch, touch_of_shell
 from realtime.worlds import turned
 from servers import FOUND, Place, base_url, named

@@ -30,6 +30,7 @@ from hapticdb.cli import main
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.query.frame import STRATEGIES
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import link
@@ -172,7 +173,7 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
             assert time.monotonic() < deadline
             assert all(child.is_alive() for child in children)
             n_moves += 1
-            env.store.replace(*places[n_moves % 2], env._covering)
+            env.store.replace(*places[n_moves % 2], covering(env.store))
             waiting = [
                 child for (ours, _), child in zip(pipes, children, strict=True) if not ours.poll()
             ]

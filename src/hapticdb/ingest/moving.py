@@ -13,19 +13,18 @@ from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import Covering, Object, Store
 from hapticdb.store.finding import MOST_IDS
 
 Floats = NDArray[np.float64]
 
 
-def move_object(
-    store: Store, old: Object, transform: ArrayLike, revision: int | None, covering: Covering
-) -> None:
+def move_object(store: Store, old: Object, transform: ArrayLike, revision: int | None) -> None:
     """Move an object; see `Environment.move`."""
     placed = _as_transform(transform)
     ((_, part),) = parts_of(store, [old])
-    _write_moved(store, old, part, placed, revision or 0, covering)
+    _write_moved(store, old, part, placed, revision or 0, covering(store))
 
 
 def restore_object(store: Store, record: Object) -> int:
@@ -59,9 +58,7 @@ def rewrite_object(store: Store, obj: Object) -> None:
     _write_moved(store, obj, part, obj.transform, 0, lambda _: [(0, MOST_IDS - 1)])
 
 
-def shift_objects(
-    store: Store, ids: Iterable[int], way: ArrayLike, covering: Covering
-) -> list[Object]:
+def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Object]:
     """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
@@ -72,7 +69,8 @@ def shift_objects(
         obj = known
         while True:
             try:
-                _write_moved(store, obj, part, shift @ obj.transform, obj.revision, covering)
+                placed = shift @ obj.transform
+                _write_moved(store, obj, part, placed, obj.revision, covering(store))
                 break
             except ConflictError:  # another user has moved it: shift it from its new place
                 obj = store.object(obj.id)
@@ -82,7 +80,7 @@ def shift_objects(
 
 
 def _write_moved(
-    store: Store, old: Object, part: Part, placed: Floats, revision: int, covering: Covering
+    store: Store, old: Object, part: Part, placed: Floats, revision: int, old_rows: Covering
 ) -> None:
     """Replace an object's rows by those of its part at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
@@ -98,7 +96,7 @@ def _write_moved(
         rows_crc=None,
         distances_crc=None,
     )
-    store.replace(new, rows, covering)
+    store.replace(new, rows, old_rows)
 
 
 def _as_way(way: ArrayLike) -> Floats:

@@ -259,7 +259,8 @@ class HapticQuery:
         """
         _, asked, keys = located
         if strategy == "maxgap":
-            return maxgap(keys, *contact.spans_of_keys(asked, keys, self._grid), gap)
+            first, last = contact.spans_of_keys(asked, keys, self._grid)
+            return maxgap(keys, first, last, gap)
         if strategy == "auto":
             make_ready("calibrate")
         quantiles, costs = self._quantiles_and_costs()

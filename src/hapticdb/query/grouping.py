@@ -1,5 +1,6 @@
 """Grouping a frame's sorted keys into ranges: points, MaxGap, CBGroup (the paper, section 5)."""
 
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -10,7 +11,7 @@ from hapticdb.grid import Grid
 from hapticdb.kernels.query import grouping as kernels
 from hapticdb.query.cost_model import CostModel
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import Keys, Layout, Object, row_shift
+from hapticdb.store.base import Covering, Keys, Layout, Object, Store, row_shift
 
 DEFAULT_MAXGAP = 500
 """The paper's MAXGAP, in voxel keys. A larger value gives fewer ranges, which hold more rows."""
@@ -78,6 +79,16 @@ def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
     low, high = grid.voxels_of(obj.bounds)
     margin = BAND_MARGIN if obj.has_distances else 1
     return box_ranges(grid, layout, low - margin, high + margin)
+
+
+def covering(store: Store) -> Covering:
+    """Argument `covering` of a write: `object_ranges` of a store's objects."""
+
+    def ranges(obj: Object) -> Iterator[tuple[int, int]]:
+        lows, highs = object_ranges(store.grid, store.layout, obj)
+        return zip(lows.tolist(), highs.tolist(), strict=True)
+
+    return ranges
 
 
 def box_ranges(

@@ -12,6 +12,7 @@ from hapticdb.errors import (
     ReadOnlyError,
     UsageError,
 )
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import (
     Rows,
     Store,
@@ -20,7 +21,6 @@ from hapticdb.store.threads import NOBODY, this_thread
 from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import (
     blob,
-    covering,
     everything,
     write_voxels,
 )

@@ -12,6 +12,7 @@ from hapticdb.errors import (
     ObjectNotFoundError,
 )
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import (
     Object,
     Store,
@@ -20,7 +21,6 @@ from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import (
     EVERYWHERE,
     blob,
-    covering,
     kind,
     voxel_object,
     write_voxels,

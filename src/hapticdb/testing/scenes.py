@@ -5,8 +5,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.grouping import object_ranges
-from hapticdb.store.base import BRICK_BYTES, Band, Covering, Layout, Object, Rows, Store
+from hapticdb.store.base import BRICK_BYTES, Band, Layout, Object, Rows, Store
 
 KINDS: list[tuple[Layout, CurveName]] = [
     ("voxel", "z"),
@@ -81,16 +80,6 @@ def with_distances(ijk: NDArray[np.int64], grid: Grid, layout: Layout, seed: int
 def kind(store: Store) -> tuple[Grid, Layout]:
     """Grid and layout of a store, the arguments that make rows."""
     return store.grid, store.layout
-
-
-def covering(store: Store) -> Covering:
-    """Argument `covering` of a write: says where the rows of an object are."""
-
-    def ranges(obj: Object) -> list[tuple[int, int]]:
-        found = object_ranges(store.grid, store.layout, obj)
-        return list(zip(found.lows.tolist(), found.highs.tolist(), strict=True))
-
-    return ranges
 
 
 def everything(store: Store) -> Rows:

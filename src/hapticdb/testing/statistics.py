@@ -3,13 +3,13 @@
 import numpy as np
 import pytest
 
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import (
     Store,
 )
 from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import (
     EVERYWHERE,
-    covering,
 )
 
 

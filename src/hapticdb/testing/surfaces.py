@@ -6,9 +6,10 @@ import pytest
 
 from hapticdb.errors import EnvironmentExistsError, ReadOnlyError
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.testing.case import StoreCase
-from hapticdb.testing.scenes import blob, covering, kind, voxel_object
+from hapticdb.testing.scenes import blob, kind, voxel_object
 
 BALL, CONE = bytes(range(256)) * 40, b"\0cone"
 """Surfaces, made up: a store never unpacks them."""

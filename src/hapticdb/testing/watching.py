@@ -11,6 +11,7 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import covering
 from hapticdb.store.base import (
     Store,
     SupportsWatch,
@@ -19,7 +20,6 @@ from hapticdb.testing.case import StoreCase
 from hapticdb.testing.scenes import (
     EVERYWHERE,
     blob,
-    covering,
     kind,
     write_voxels,
 )

@@ -6,8 +6,8 @@ import that was interrupted and is run again ends with the same rows and ids as 
 
 import contextlib
 import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, field
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
@@ -17,16 +17,18 @@ from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.errors import (
     EnvironmentExistsError,
     FileError,
-    GeometryChangedError,
     HapticDBError,
     MissingExtraError,
+    ObjectNotFoundError,
     UsageError,
 )
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.ingest.checking import check_inside, check_names
-from hapticdb.ingest.known_parts import KnownParts, added_or_present, drop_others, replace_changed
+from hapticdb.ingest.known_parts import KnownParts, added_or_present
+from hapticdb.ingest.planning import Plan, planned
 from hapticdb.ingest.voxelizing import voxelize_parts
-from hapticdb.mesh import Defects, MeshFile, Part, read_file
+from hapticdb.mesh import Defects, MeshFile, read_file
+from hapticdb.query.grouping import covering
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
@@ -168,7 +170,6 @@ def import_files(
             for file in files:
                 reports.append(_import_file(target, file, chosen, progress, workers))
                 target.is_first_file = False
-                target.has_written |= bool(reports[-1].added)
         if target.store is not None and target.store.revision():
             target.store.analyze(DEFAULT_RESOLUTION)
     return reports
@@ -199,7 +200,7 @@ class _Target:
         self._is_new = self._is_loading = False
         self.loading = contextlib.ExitStack()
         """Keeps `Store.loading` active from the first usable file on."""
-        self.is_first_file, self.has_written = True, False
+        self.is_first_file = True
         self.store: Store | None = None
         if exists(url):
             self._join(options.layout, options.grid)
@@ -214,7 +215,7 @@ class _Target:
         """Close the store; remove an environment that was made here if nothing was written."""
         if self.store is None:
             return
-        if self._is_new and not self.has_written and not self.store.revision():
+        if self._is_new and not self.store.revision():
             self.store.discard()
         else:
             self.store.close()
@@ -272,15 +273,20 @@ def ingest_file(
     GeometryChangedError
         If a part has another geometry than the object of its name, which is not to be replaced.
     """
-    plan = _planned(store, mesh_file, options)
+    check_names(mesh_file)
+    known = KnownParts(store, mesh_file.link)
+    plan = planned(
+        mesh_file, options.unit, store.grid, known.by_name, store.removed(mesh_file.link),
+        replace=options.replace, keep_removed=options.keep_removed,
+    )  # fmt: skip
     jobs = workers or options.jobs or os.cpu_count() or 1
-    id_of = {part.name: i for i, part in plan.changed.items()}
-    anew = voxelize_parts(plan.changed.values(), mesh_file, store, options.unit, jobs)
-    with contextlib.closing(anew):
-        n_replaced = replace_changed(store, anew, id_of)
-    added = _add_missing(store, mesh_file, plan, (options.unit, jobs), progress)
-    n_dropped = drop_others(store, mesh_file) if options.replace else 0
-    written = tuple(obj for obj in store.objects() if obj.id in added) if added else ()
+    added, n_replaced = _write_parts(store, mesh_file, plan, known, (options.unit, jobs), progress)
+    n_dropped = 0
+    for object_id in plan.dropped:
+        with contextlib.suppress(ObjectNotFoundError):  # another process has removed it
+            store.remove(object_id, covering(store))
+            n_dropped += 1
+    written = tuple(store.objects(added)) if added else ()
     n_kept = len(plan.removed) if options.keep_removed else 0
     return FileReport(
         mesh_file.link,
@@ -297,69 +303,40 @@ def ingest_file(
     )
 
 
-class _Plan(NamedTuple):
-    """Planned changes for a file's parts."""
-
-    known: KnownParts  # that the environment has
-    missing: list[Part]  # to add, in the file's order
-    removed: set[str]  # names of the file's parts that were removed from the environment
-    changed: dict[int, Part]  # new parts, by the ids of the objects that they replace
-
-
-def _planned(store: Store, mesh_file: MeshFile, options: ImportOptions) -> _Plan:
-    """Compare a file with the environment; refuse unsuitable parts before any write."""
-    check_names(mesh_file)
-    known = KnownParts(store, mesh_file.link)
-    missing = [part for part in mesh_file.parts if known.digest_of(part.name) is None]
-    removed = {part.name for part in missing} & store.removed(mesh_file.link)
-    if options.keep_removed:
-        missing = [part for part in missing if part.name not in removed]
-    for part in mesh_file.parts:
-        if known.digest_of(part.name) not in {None, part.digest} and not options.replace:
-            raise GeometryChangedError(
-                f"{mesh_file.link}: part {part.name!r} has changed since it was imported, or was "
-                "read with another --unit; --replace puts the file's in its place"
-            )
-    changed = known.changed(mesh_file.parts, options.unit) if options.replace else {}
-    check_inside([*missing, *changed.values()], mesh_file.link, store.grid)
-    return _Plan(known, missing, removed, changed)
-
-
-def _add_missing(
+def _write_parts(
     store: Store,
     mesh_file: MeshFile,
-    plan: _Plan,
+    plan: Plan,
+    known: KnownParts,
     unit_and_jobs: tuple[str | None, int | Cluster],
     progress: ImportCallback | None,
-) -> set[int]:
-    """Add the missing parts, except those that another process adds meanwhile; returns the ids."""
-    added: set[int] = set()
+) -> tuple[list[int], int]:
+    """Write the parts of a plan, each in a transaction; ids of those added, number of replaced."""
+    id_of = {part.name: object_id for part, object_id in plan.replaced}
+    todo = [*(part for part, _ in plan.replaced), *plan.added]
     n_parts = len(mesh_file.parts)
-    n_done = n_parts - len(plan.missing)
-    voxels = 0
-
-    def still_missing() -> Iterator[Part]:
-        nonlocal n_done
-        for part in plan.missing:
-            if plan.known.digest_of(part.name) == part.digest:
-                n_done += 1  # another process imports the same file
-            else:
-                yield part
-
-    def report_share(share: float) -> None:
-        if progress is not None:
-            progress(ImportProgress(mesh_file.link, n_done, n_parts, voxels, share))
-
-    parts = voxelize_parts(still_missing(), mesh_file, store, *unit_and_jobs, report_share)
-    with contextlib.closing(parts):
-        for obj, rows, surface in parts:
-            n_done += 1
-            new_id = added_or_present(store, obj, rows, surface, plan.known)
-            if new_id is not None:
-                added.add(new_id)
-            voxels += obj.voxels
-            report_share(0.0)
-    return added
+    n_done = n_parts - len(todo)
+    places = {part.name: n for n, part in enumerate(todo, start=n_done + 1)}
+    # what another process has added meanwhile is left out before it is voxelized
+    parts = (part for part in todo if part.name in id_of or not known.has(part))
+    added: list[int] = []
+    n_replaced = voxels = 0
+    with contextlib.closing(voxelize_parts(parts, mesh_file, store, *unit_and_jobs)) as made:
+        for one in made:
+            if not isinstance(one, float):
+                obj, rows, surface = one
+                if obj.name not in id_of:
+                    added += added_or_present(store, obj, rows, surface, known)
+                else:
+                    new = replace(obj, id=id_of[obj.name])
+                    with contextlib.suppress(ObjectNotFoundError):  # another has removed it
+                        store.replace(new, rows, covering(store), surface)
+                        n_replaced += 1
+                n_done, voxels = places[obj.name], voxels + obj.voxels
+            if progress is not None:
+                share = one if isinstance(one, float) else 0.0
+                progress(ImportProgress(mesh_file.link, n_done, n_parts, voxels, share))
+    return added, n_replaced
 
 
 def _check_options(store: Store, layout: Layout | None, distances: bool | None) -> None:  # noqa: FBT001 - an option as given

@@ -15,10 +15,9 @@ import numpy as np
 from hapticdb.errors import ConflictError, FileError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.files import ImportCallback, ImportProgress
 from hapticdb.ingest.geometry import found_parts, packed_surface
-from hapticdb.ingest.known_parts import covering
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part, read_file
-from hapticdb.query.grouping import object_ranges
+from hapticdb.query.grouping import covering, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.connect import open_store
@@ -156,8 +155,12 @@ class _Run:
             except FileError as error:  # too large for the memory that is left
                 return obj, error
 
-        with closing(in_threads(self._found(objects), measured, jobs, self._tell)) as done:
-            for obj, found in done:
+        with closing(in_threads(self._found(objects), measured, jobs)) as done:
+            for one in done:
+                if isinstance(one, float):
+                    self._tell(one)
+                    continue
+                obj, found = one
                 self._link = obj.link
                 error = found if isinstance(found, HapticDBError) else self._write(obj, found)
                 if error is not None:

@@ -26,10 +26,10 @@ from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, S
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 ShareCallback = Callable[[float], None]
-"""Called often with the share of a part that is done, 0 to 1; from any thread. May raise an error,
-which ends the work."""
+"""Called often with the share of a part that is done, 0 to 1. May raise an error, which ends the
+work."""
 SHARE_EVERY_S = 0.2
-"""Seconds between two calls with the share of a long part. Larger: fewer calls."""
+"""Seconds between two shares of a long part. A larger value tells of it less often."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
 """Memory of a brick, bytes: its key and its occupancy."""
 _BYTES_A_ROW = 8 + 8 + BRICK_BYTES
@@ -215,18 +215,13 @@ class Recipe(NamedTuple):
 
 
 def voxelize_parts(
-    parts: Iterable[Part],
-    file: MeshFile,
-    store: Store,
-    unit: str | None,
-    jobs: int | Cluster,
-    progress: ShareCallback = lambda _share: None,
-) -> Generator[tuple[Object, Rows, bytes], None, None]:
+    parts: Iterable[Part], file: MeshFile, store: Store, unit: str | None, jobs: int | Cluster
+) -> Generator[tuple[Object, Rows, bytes] | float, None, None]:
     """Yield objects, rows and packed surfaces of parts, in order, a few of them made in advance.
 
-    Threads suffice because the voxelizer runs without the interpreter lock. unit : in which the
-    file was read, stored with the objects; jobs : threads here, or workers elsewhere; progress : as
-    for `in_threads`.
+    Between them come shares of long parts, as from `in_threads`. Threads suffice because the
+    voxelizer runs without the interpreter lock. unit : in which the file was read, stored with the
+    objects; jobs : threads here, or workers elsewhere.
     """
     given = {"unit": unit, "up": file.up}
     attributes: dict[str, object] = {name: value for name, value in given.items() if value}
@@ -239,29 +234,30 @@ def voxelize_parts(
             yield part, part.digest not in asked  # instances share a surface
             asked.add(part.digest)
 
-    made = (
-        in_threads(items(), recipe.object_of, jobs, progress)
+    made: Generator[tuple[Object, Rows, bytes | None] | float, None, None] = (
+        in_threads(items(), recipe.object_of, jobs)
         if isinstance(jobs, int)
         else jobs.each(recipe.object_of, items())
     )
     with closing(made):
-        for obj, rows, surface in made:
+        for one in made:
+            if isinstance(one, float):
+                yield one
+                continue
+            obj, rows, surface = one
             if surface is not None:
                 surfaces[obj.digest] = surface
             yield obj, rows, surfaces[obj.digest]
 
 
 def in_threads(
-    items: Iterable[Item],
-    work: Callable[[Item, ShareCallback], Done],
-    jobs: int,
-    progress: ShareCallback = lambda _share: None,
-) -> Generator[Done, None, None]:
+    items: Iterable[Item], work: Callable[[Item, ShareCallback], Done], jobs: int
+) -> Generator[Done | float, None, None]:
     """Yield the results of `work` on items, in order; `jobs` threads compute a few in advance.
 
-    `work` is called in a thread with an item, and with what it calls often with the share that is
-    done; `progress` in the caller's thread, with the share of the item that it waits for. When this
-    generator ends early, so does the work: the next call with a share raises an error.
+    While the next result is not there, the share of it that is done comes instead, 0 to 1, five
+    times a second. `work` is called in a thread with an item, and with what it calls often with its
+    share. When this generator ends early, so does the work: the next such call raises an error.
     """
     shares: dict[int, float] = {}
     ended = Event()
@@ -276,21 +272,21 @@ def in_threads(
 
     waiting: deque[tuple[int, Future[Done]]] = deque()
 
-    def next_result() -> Done:
+    def next_result() -> Iterator[Done | float]:
         number, future = waiting.popleft()
         while not wait([future], SHARE_EVERY_S).done:
-            progress(shares.get(number, 0.0))
+            yield shares.get(number, 0.0)
         shares.pop(number, None)
-        return future.result()
+        yield future.result()
 
     pool = ThreadPoolExecutor(jobs, thread_name_prefix="voxelize")
     try:
         for number, item in enumerate(items):
             waiting.append((number, pool.submit(worked, number, item)))
             if len(waiting) > 2 * jobs:
-                yield next_result()
+                yield from next_result()
         while waiting:
-            yield next_result()
+            yield from next_result()
     finally:
         ended.set()
         pool.shutdown(wait=True, cancel_futures=True)

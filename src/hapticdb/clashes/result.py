@@ -6,7 +6,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from hapticdb.store.pairs import KINDS, KeptPairs, Kind, PairRow, Status
+from hapticdb.store.pairs import KIND, KINDS, KeptPairs, Kind, PairRow, Status
 from hapticdb.units import length_text
 
 Shown = Literal[Status, "accepted", "not looked at"]
@@ -121,7 +121,7 @@ class Clashes:
 
     def counts(self) -> dict[str, int]:
         """How many pairs are of each kind, those that are gone left out."""
-        found = Counter[str](row[2] for row in self.rest.rows)
+        found = Counter[str](row[KIND] for row in self.rest.rows)
         found.update(one.kind for one in self.told if one.status != "gone")
         return {kind: found[kind] for kind in GRAVITY}
 

@@ -26,7 +26,7 @@ from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words, find_objects
-from hapticdb.store.pairs import KeptPairs, Mark, Outlines, PairRow, Status
+from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
 
 Floats = NDArray[np.float64]
 ClashCallback = Callable[[int, int], object]
@@ -178,16 +178,15 @@ class _Search:
                 for words in (asked.of, asked.against)
             )
             self._mark, is_whole = kept.mark, of is None and against is None
+            rest = kept.none()
             if is_whole and (of := self._changed(kept, revision)) is not None:
                 kept, rest = kept.parted(of)
-            else:
-                rest, kept = kept.parted(())
             rows = {(row.a, row.b): row for row in kept}
             near = self._near(outlines, of, against)
             looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
             keys = [key for key in near if key not in looked]
             by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}
-        n_kept = len(looked) + sum(row[2] != "far" or row[-2] is None for row in rest.rows)
+        n_kept = len(looked) + sum(row[KIND] != "far" or row[BECAUSE] is None for row in rest.rows)
         known = zip(outlines.names, outlines.digests, strict=True)
         self._known = dict(zip(outlines.ids.tolist(), known, strict=True))
         stale = [(by_id[a], by_id[b]) for a, b in keys]

@@ -15,6 +15,10 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 COLUMNS = "a, b, kind, at_least, at_most, a_x, a_y, a_z, b_x, b_y, b_z, status, revision, setting"
 """Columns of the table `pair` that a measurement writes."""
 ALL = f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b"
+A, B, KIND, SETTING, BECAUSE = map(
+    [*COLUMNS.split(", "), "because"].index, ("a", "b", "kind", "setting", "because")
+)
+"""Places of columns in a row of `ALL` as the engine gives it."""
 PUT = f"""
 INSERT INTO pair ({COLUMNS}) {{values}}
     ON CONFLICT (a, b) DO UPDATE
@@ -96,7 +100,7 @@ class KeptPairs:
     def __init__(
         self, rows: Sequence[Sequence[Any]], checked: Callable[[Sequence[Any]], PairRow]
     ) -> None:
-        has_mark = bool(rows) and rows[0][0] == MARK[0]
+        has_mark = bool(rows) and rows[0][A] == MARK[0]
         row = checked(rows[0]) if has_mark else None
         self.mark = Mark() if row is None else Mark(row.setting, row.revision)
         self.rows, self._checked = rows[has_mark:], checked
@@ -108,7 +112,7 @@ class KeptPairs:
         Programs that know of no mark, and people, write without changing it.
         """
         return self._n_marked == len(self.rows) and all(
-            row[-3] == setting or row[-2] is not None for row in self.rows
+            row[SETTING] == setting or row[BECAUSE] is not None for row in self.rows
         )
 
     def __iter__(self) -> Iterator[PairRow]:
@@ -116,9 +120,13 @@ class KeptPairs:
 
     def parted(self, ids: Container[int]) -> tuple["KeptPairs", "KeptPairs"]:
         """Rows of pairs that one of these objects is in, and the other rows."""
-        some = [row for row in self.rows if row[0] in ids or row[1] in ids]
-        others = [row for row in self.rows if row[0] not in ids and row[1] not in ids]
+        some = [row for row in self.rows if row[A] in ids or row[B] in ids]
+        others = [row for row in self.rows if row[A] not in ids and row[B] not in ids]
         return KeptPairs(some, self._checked), KeptPairs(others, self._checked)
+
+    def none(self) -> "KeptPairs":
+        """No rows."""
+        return KeptPairs((), self._checked)
 
 
 class Outlines(NamedTuple):

@@ -196,7 +196,7 @@ class ClashPanel:
             if self._found is not None:
                 now = one._replace(status="accepted" if reason else "same", because=reason)
                 told = tuple(now if old is one else old for old in self._found.pairs)
-                self._found = replace(self._found, told=told, rest=self._found.rest.parted(())[0])
+                self._found = replace(self._found, told=told, rest=self._found.rest.none())
                 self._fill()
                 self._choose(now)
 

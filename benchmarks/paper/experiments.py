@@ -8,12 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from dense_frame import dense_bitmap, dense_feel
-from hapticdb import Environment
+from hapticdb import Environment, Query
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
 from hapticdb.query.frame import Strategy
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.query.touches import Query
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
-from hapticdb.environment import Environment
+from hapticdb import Environment, Query
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.calibration import calibrate
 from hapticdb.query.cost_model import CostModel
@@ -13,7 +13,6 @@ from hapticdb.query.frame import HapticQuery, Strategy
 from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.query.touches import Query
 from hapticdb.store.sqlite.store import SQLiteStore
 from paper.measure import Alternative, Cell, Pose
 from paper.workload import Task

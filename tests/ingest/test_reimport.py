@@ -142,8 +142,10 @@ def test_an_interrupted_replacement_goes_on(
         with pytest.raises(KeyboardInterrupt):
             hapticdb.import_files(url, [file], again)
     assert names(url) == ["box0", "box1", "box2"]
-    (report,) = hapticdb.import_files(url, [file], again)
+    told: list[int] = []
+    (report,) = hapticdb.import_files(url, [file], again, lambda now: told.append(now.parts_done))
     assert (report.error, report.replaced, report.present) == (None, 2, 1)
+    assert sorted({1, *told}) == [1, 2, 3]
     with hapticdb.open(url, read_only=True) as env:
         for obj in env.objects():
             assert np.allclose(np.ptp(obj.bounds, axis=0), 0.12)

@@ -216,11 +216,10 @@ class HapticQuery:
         Such a statement is counted in the first pose's query only.
         """
         make_ready(frames_by(law, "touch"))
-        points, normals, center = shell.points, shell.normals, shell.center
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
         for pose in poses:
-            batch.append(contact.locate(points, normals, center, pose, self._grid))
+            batch.append(self.locate(shell, pose))
             n_keys += len(batch[-1].keys)
             if n_keys >= MOST_KEYS or len(batch) >= most:
                 yield from self._look_up_together(batch, exclude, law)
@@ -249,6 +248,10 @@ class HapticQuery:
             payload = None if distances is None else distances[low:high]
             yield self._refined(located, rows, payload, exclude, law, NO_OBJECTS, asked, started)
             asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
+
+    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
+        """Place a shell at a rigid pose (4, 4), and compute the row keys to ask for."""
+        return contact.locate(shell.points, shell.normals, shell.center, pose, self._grid)
 
     def _ranges_of(
         self, located: "contact.Located", strategy: Strategy, gap: int, *, distances: bool

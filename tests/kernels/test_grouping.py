@@ -128,12 +128,3 @@ def test_a_box_is_covered_by_a_range_a_slab_in_lexicographic_order(
     assert set(encode(voxels_between(low, high), BITS, LEXICOGRAPHIC).tolist()) <= set(keys)
     assert len(set(keys)) == len(keys)
     assert len(ranges) == high[0] - low[0] + 1
-
-
-@pytest.mark.parametrize("curve", [Z_ORDER, HILBERT], ids=["z", "hilbert"])
-def test_ranges_grow_with_the_surface_of_a_box_and_not_with_its_volume(curve: int) -> None:
-    """Box of M cubes an edge: one range a cube in the two outer layers, larger cubes inside."""
-    low = np.array([1, 1, 1], dtype=np.int64)
-    for n_cubes in (16, 32, 64):
-        high = np.full(3, 8 * n_cubes - 2, dtype=np.int64)
-        assert len(ranges_of_box(low, high, 21, curve, 3)) <= 16 * n_cubes**2

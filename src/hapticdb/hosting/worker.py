@@ -26,7 +26,7 @@ from hapticdb.realtime.timing import undisturbed
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 
-ENTRIES = ("period.loop.run", "resident.feeling.bounding_spheres")
+ENTRIES = ("period.loop.run",)
 """Kernels that a worker calls; the loop's has all others that a frame needs within it."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""

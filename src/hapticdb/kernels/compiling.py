@@ -14,17 +14,16 @@ import hashlib
 import importlib
 import os
 import re
+import select
 import subprocess
 import sys
-from collections.abc import Callable, Collection
-from concurrent.futures import ThreadPoolExecutor, as_completed
+from collections.abc import Callable, Collection, Iterator, Sequence
 from fnmatch import fnmatchcase
 from importlib.metadata import version
 from itertools import chain
 from pathlib import Path
-from threading import Lock, Timer
 from types import ModuleType
-from typing import NamedTuple, Self
+from typing import NamedTuple
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
@@ -59,8 +58,8 @@ TOGETHER = {
 """Modules that are compiled after another module, if it is compiled, too, in the same process: they
 share its leaves."""
 LONGEST_S = 600.0
-"""Seconds after which a process that compiles a job is ended. What it has not compiled is compiled
-where it is first called."""
+"""Seconds without a compiled job after which all processes are ended. What they have not compiled
+is compiled where it is first called."""
 SERVE = "from hapticdb.kernels.compiling import serve; serve()"
 """Python code that a compiling process runs."""
 
@@ -71,29 +70,27 @@ _VOXELIZE = (
     "curves.encode_kernel",
     "field.packing.pack_kernel",
 )
-_RANGES = ("query.grouping.ranges_of_box", "surfaces.bricks.brick_voxels_kernel")
+_RANGES = ("curves.encode_kernel", "surfaces.bricks.brick_voxels_kernel")
 _LOCATE = "query.contact.locate_kernel"
 _COST = (
     _LOCATE,
     "query.contact.spans_of_keys",
     "query.refining.wrench_of_addresses",
     "query.grouping.gap_rows",
-    "query.grouping.group_by_gap",
     "query.grouping.group_by_cost",
     "curves.*",
 )
 _RESIDENT = (
     "resident.cell_table.*",
     "resident.near_voxels.*",
-    "resident.feeling.bounding_spheres",
     "field.packing.unpack_kernel",
     *_COST,
 )
 _FRAMES = "resident.budget.feel_kernel"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
-    "points": ("surfaces.bricks.mark_points_kernel",),
-    "move": (*_VOXELIZE, *_RANGES, "surfaces.bricks.mark_points_kernel"),
+    "points": ("curves.encode_kernel",),
+    "move": (*_VOXELIZE, *_RANGES),
     "demo": (
         *_VOXELIZE,
         *_SHELL,
@@ -108,7 +105,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "touch by distance": (
         _LOCATE,
         "query.refining.refine_kernel@distances",
-        "query.refining.unpack_asked_kernel",
+        "field.packing.unpack_kernel",
     ),
     "pairs": ("query.refining.pairs_of_points",),
     "pairs by distance": ("query.refining.pairs_of_points@distances",),
@@ -181,22 +178,16 @@ def compile_missing(
         return 0
     total, done = len(wanted), 0
     queue = jobs_of(wanted)
-    workers = min(jobs or os.cpu_count() or 1, len(queue))
     tell = progress or (lambda _: None)
     tell(Compiled(0, total))
-    pool: ThreadPoolExecutor
-    with _Workers() as started, ThreadPoolExecutor(workers, thread_name_prefix="compile") as pool:
-        try:
-            waiting = [pool.submit(started.compile, job) for job in queue]
-            for name in wanted:  # meanwhile: this process will call them
-                _module_of(name)
-            for finished in as_completed(waiting):
-                done += finished.result()
-                tell(Compiled(done, total))
-        except BaseException:
-            pool.shutdown(wait=False, cancel_futures=True)
-            started.end()
-            raise
+    with _workers(queue, min(jobs or os.cpu_count() or 1, len(queue))) as told:
+        for name in wanted:  # meanwhile: this process will call them
+            _module_of(name)
+        while select.select([told], [], [], LONGEST_S)[0] and (ended := os.read(told, 1)):
+            done += len(queue[ended[0]])
+            tell(Compiled(done, total))
+    if done < total:
+        tell(Compiled(total, total))
     return total
 
 
@@ -217,84 +208,50 @@ def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
     return list(map(tuple, jobs.values()))
 
 
-class _Workers:
-    """Compiling processes. They are started when threads ask for them and all ended at exit."""
+@contextlib.contextmanager
+def _workers(queue: Sequence[tuple[str, ...]], count: int) -> Iterator[int]:
+    """Start processes that compile the jobs of a queue, and end them, even compiling ones.
 
-    def __init__(self) -> None:
-        self._idle: list[subprocess.Popen[str]] = []
-        self._all: list[subprocess.Popen[str]] = []
-        self._lock = Lock()
-        self._has_ended = False
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(self, *_: object) -> None:
-        """End the processes when no thread uses one any more."""
-        self.end()
-        for worker in self._all:
-            for pipe in (worker.stdin, worker.stdout):
-                with contextlib.suppress(OSError):  # data for a process that has ended
-                    if pipe is not None:
-                        pipe.close()
-
-    def compile(self, job: tuple[str, ...]) -> int:
-        """Let a process compile that job; returns how many entries it has, compiled or not."""
-        with self._lock:
-            if self._has_ended:
-                return 0
-            worker = self._idle.pop() if self._idle else self._started()
-        if worker is not None and worker.stdin is not None and worker.stdout is not None:
-            patience = Timer(LONGEST_S, worker.kill)
-            patience.start()
-            try:
-                worker.stdin.write(" ".join(job) + "\n")
-                worker.stdin.flush()
-                if worker.stdout.readline():
-                    with self._lock:
-                        self._idle.append(worker)
-            except (OSError, ValueError):
-                pass  # it was ended: the first call compiles
-            finally:
-                patience.cancel()
-        return len(job)
-
-    def end(self) -> None:
-        """End every process, even a compiling one: no half-written file stays (numba renames)."""
-        with self._lock:
-            self._has_ended = True
-            self._idle.clear()
-            for worker in self._all:
-                worker.kill()
-                worker.wait()
-
-    def _started(self) -> "subprocess.Popen[str] | None":
-        # the package is found in the same place as here, in any working folder
-        path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
-        try:
-            worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
-                [sys.executable, "-c", SERVE],
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.DEVNULL,
-                env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
-                text=True,
-                start_new_session=True,  # the parent handles Ctrl-C and ends this process
-            )
-        except OSError:
-            return None
-        self._all.append(worker)
-        return worker
+    They take the numbers of jobs, a byte each, from one pipe, and write a number into another pipe,
+    whose end for reading this gives, when the job is done. That pipe ends with the processes. No
+    half-written file stays (numba renames).
+    """
+    asked, ask = os.pipe()
+    told, tell = os.pipe()
+    os.write(ask, bytes(range(len(queue))))
+    os.close(ask)
+    # the package is found in the same place as here, in any working folder
+    path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+    workers: list[subprocess.Popen[bytes]] = []
+    try:
+        with contextlib.suppress(OSError):  # then the first calls compile
+            for _ in range(count):
+                worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
+                    [sys.executable, "-c", SERVE, *map(" ".join, queue)],
+                    stdin=asked,
+                    stdout=tell,
+                    stderr=subprocess.DEVNULL,
+                    env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
+                    start_new_session=True,  # the parent handles Ctrl-C and ends this process
+                )
+                workers.append(worker)
+        os.close(tell)
+        yield told
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+        os.close(asked)
+        os.close(told)
 
 
 def serve() -> None:
-    """Run a compiling process: read a line of names, write it back when they are compiled."""
+    """Run a compiling process, whose arguments are the jobs; see `_workers`."""
     gc.set_threshold(100_000, 50, 100)  # compiling makes many objects and few cycles
-    for line in sys.stdin:
-        for name in line.split():
+    while number := os.read(0, 1):
+        for name in sys.argv[1 + number[0]].split():
             _compile_here(name)
-        sys.stdout.write(line)
-        sys.stdout.flush()
+        os.write(1, number)
 
 
 def _module_of(name: str) -> ModuleType:

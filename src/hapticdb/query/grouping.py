@@ -100,7 +100,7 @@ def box_ranges(
     longest = int((high - low).max()) + 1
     finest = max((longest // BOX_CUBES).bit_length(), 3)
     found = kernels.ranges_of_box(low, high, grid.bits, grid.curve_code, min(finest, grid.bits))
-    found = (found >> row_shift(layout))[np.argsort(found[:, 0])]
+    found >>= row_shift(layout)
     starts = np.flatnonzero(np.append(True, found[1:, 0] > found[:-1, 1] + 1))
     ends = np.append(starts[1:], len(found)) - 1
     return Ranges(found[starts, 0].copy(), found[ends, 1].copy())

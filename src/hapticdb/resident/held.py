@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.resident.budget import COUNTS, Budget
 from hapticdb.kernels.resident.cells import BLOCK, GROUP, SCRATCH_ROWS, Clusters
-from hapticdb.kernels.resident.feeling import bounding_spheres
 from hapticdb.pointshell.shell import PointShell
 
 RUN = 64
@@ -67,12 +66,24 @@ def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) ->
 
 def spheres_of(points: Floats, voxel_size: float, run: int) -> tuple[Floats, Floats]:
     """Bounding spheres of runs of points (N, 6), and of groups and blocks, as `Clusters` has."""
-    spheres = np.empty((-(-len(points) // run) if run else 0, 4))
-    groups = np.empty((-(-len(spheres) // GROUP), 4))
-    if run:
-        bounding_spheres(points, run, 1e-3 * voxel_size, spheres)
-        bounding_spheres(points, GROUP * run, 1e-3 * voxel_size, groups)
+    if not run:
+        return np.zeros((0, 4)), np.zeros((0, 4))
+    spheres = _around(points, run, 1e-3 * voxel_size)
+    groups = _around(points, GROUP * run, 1e-3 * voxel_size)
     return spheres, np.vstack([groups, _blocks_of(spheres)])
+
+
+def _around(points: Floats, run: int, slack: float) -> Floats:
+    """Sphere (C, 4) at the centre of the box of each run of points (N, 3+), radius plus `slack`.
+
+    The radius also has room for the stretch of a pose that `is_rigid` just accepts.
+    """
+    starts = np.arange(0, len(points), run)
+    low = np.minimum.reduceat(points[:, :3], starts)
+    centers = 0.5 * (low + np.maximum.reduceat(points[:, :3], starts))
+    x, y, z = (points[:, :3] - np.repeat(centers, run, axis=0)[: len(points)]).T
+    radii = np.sqrt(np.maximum.reduceat(x * x + y * y + z * z, starts)) * (1.0 + 1e-5) + slack
+    return np.column_stack([centers, radii])
 
 
 def _blocks_of(spheres: Floats) -> Floats:

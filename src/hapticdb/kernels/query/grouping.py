@@ -1,9 +1,12 @@
 """Grouping of sorted keys into ranges (the paper, section 5), and ranges that cover a box."""
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, INT, INTS, entry, leaf, maker
-from hapticdb.kernels.curves import LEXICOGRAPHIC, key_of
+from hapticdb.kernels._jit import FLOAT, INT, INTS, entry, leaf
+from hapticdb.kernels.curves import LEXICOGRAPHIC, encode
+
+Ints = NDArray[np.int64]
 
 
 @leaf
@@ -80,25 +83,15 @@ def gap_rows(left, right, bounds, rows_per_bucket):
     return _rows_between(left, right, bounds, rows_per_bucket, np.int64(0))
 
 
-@entry(INTS, INTS, INTS, INT)
-def group_by_gap(keys, first, last, maxgap):
+def group_by_gap(keys: Ints, first: Ints, last: Ints, maxgap: int) -> tuple[Ints, Ints]:
     """MaxGap: neighbouring keys p < q share a range if and only if q - p <= maxgap.
 
     keys (U,) row keys, ascending; first, last (U,) the lowest and highest voxel key asked for under
     each. Returns the ranges' lowest and highest row keys.
     """
-    total = keys.shape[0]
-    lows = np.empty(total, dtype=np.int64)
-    highs = np.empty(total, dtype=np.int64)
-    count = 0
-    for n in range(total):
-        if n > 0 and first[n] - last[n - 1] <= maxgap:
-            highs[count - 1] = keys[n]
-            continue
-        lows[count] = keys[n]
-        highs[count] = keys[n]
-        count += 1
-    return lows[:count], highs[:count]
+    is_apart = first[1:] - last[:-1] > maxgap
+    lows, highs = (keys[:1], keys[1:][is_apart]), (keys[:-1][is_apart], keys[-1:])
+    return np.concatenate(lows), np.concatenate(highs)
 
 
 @entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)
@@ -124,77 +117,18 @@ def group_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
     return count
 
 
-@maker
-def _add_range(ranges, count, low, high):
-    """Append a closed range; returns the array, larger when it was full, and the new count."""
-    if count == ranges.shape[0]:
-        larger = np.empty((2 * count, 2), dtype=np.int64)
-        for n in range(count):
-            larger[n, 0] = ranges[n, 0]
-            larger[n, 1] = ranges[n, 1]
-        ranges = larger
-    ranges[count, 0] = low
-    ranges[count, 1] = high
-    return ranges, count + 1
-
-
-@entry(INTS, INTS, INT, INT, INT)
-def ranges_of_box(low, high, bits, curve, finest):
+def ranges_of_box(low: Ints, high: Ints, bits: int, curve: int, finest: int) -> Ints:
     """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both included.
 
-    On a hierarchical curve each range is a cube. Cubes with an edge of 2^finest voxels are not
-    split, so the number of ranges is in proportion to the box's surface, measured in such cubes.
-    In lexicographic order each range is a run of slabs, at most 1024. Neither sorted nor merged.
+    On a hierarchical curve each range is a cube with an edge of 2^finest voxels. In lexicographic
+    order it is a run of slabs, at most 1024. Ascending, and not merged.
     """
-    ranges = np.empty((64, 2), dtype=np.int64)
-    count = np.int64(0)
     if curve == LEXICOGRAPHIC:
-        step = (high[0] - low[0]) // 1024 + 1
-        for i in range(low[0], high[0] + 1, step):
-            last = min(i + step - 1, high[0])
-            ranges, count = _add_range(
-                ranges,
-                count,
-                key_of(i, low[1], low[2], bits, curve),
-                key_of(last, high[1], high[2], bits, curve),
-            )
-        return ranges[:count]
-    stack = np.empty((8 * (bits + 1), 4), dtype=np.int64)
-    stack[0, 0] = bits
-    stack[0, 1] = stack[0, 2] = stack[0, 3] = 0
-    depth = 1
-    while depth > 0:
-        depth -= 1
-        level = stack[depth, 0]
-        i = stack[depth, 1]
-        j = stack[depth, 2]
-        k = stack[depth, 3]
-        edge = (1 << level) - 1
-        i0 = i << level
-        j0 = j << level
-        k0 = k << level
-        if i0 > high[0] or j0 > high[1] or k0 > high[2]:
-            continue
-        if i0 + edge < low[0] or j0 + edge < low[1] or k0 + edge < low[2]:
-            continue
-        is_inside = (
-            low[0] <= i0
-            and i0 + edge <= high[0]
-            and low[1] <= j0
-            and j0 + edge <= high[1]
-            and low[2] <= k0
-            and k0 + edge <= high[2]
-        )
-        if is_inside or level <= finest:
-            key = key_of(i, j, k, bits - level, curve) if level < bits else 0
-            ranges, count = _add_range(
-                ranges, count, key << (3 * level), ((key + 1) << (3 * level)) - 1
-            )
-            continue
-        for child in range(8):
-            stack[depth, 0] = level - 1
-            stack[depth, 1] = 2 * i + (child >> 2)
-            stack[depth, 2] = 2 * j + ((child >> 1) & 1)
-            stack[depth, 3] = 2 * k + (child & 1)
-            depth += 1
-    return ranges[:count]
+        starts = np.arange(low[0], high[0] + 1, (high[0] - low[0]) // 1024 + 1)
+        ends = np.append(starts[1:] - 1, high[0])
+        corners = (np.broadcast_arrays(starts, *low[1:]), np.broadcast_arrays(ends, *high[1:]))
+        return np.stack([encode(np.stack(at, axis=1), bits, curve) for at in corners], axis=1)
+    axes = [np.arange(*ends) for ends in zip(low >> finest, (high >> finest) + 1, strict=True)]
+    cubes = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
+    keys = np.sort(encode(cubes, bits - finest, curve))
+    return np.stack([keys << 3 * finest, ((keys + 1) << 3 * finest) - 1], axis=1)

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, chosen_by_type, entry, inlined, leaf
+from hapticdb.kernels._jit import chosen_by_type, inlined, leaf
 from hapticdb.kernels.field.corners import fetch_corners, interpolated
 from hapticdb.kernels.field.lattice import CELL_VALUES, VOXELS_A_STEP, cell_place, place_before
 from hapticdb.kernels.field.law import AHEAD, DistanceFieldLaw, agreement, depth_and_weight
@@ -313,28 +313,3 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     out[HITS], out[CONTACTS] = n_hits, n_contacts
     out[UNKNOWNS], out[DEEPEST] = n_unknown, deepest
     missed[LISTED] = n_missed
-
-
-@entry(FLOATS2, INT, FLOAT, FLOATS2)
-def bounding_spheres(points, run, slack, out):
-    """Sphere (C, 4) at the centre of the box of each run of points (N, 6), radius plus `slack`.
-
-    The radius also has room for the stretch of a pose that `is_rigid` just accepts.
-    """
-    total = points.shape[0]
-    for cluster in range(out.shape[0]):
-        start = cluster * run
-        end = min(start + run, total)
-        for axis in range(3):
-            low = high = points[start, axis]
-            for n in range(start + 1, end):
-                low = min(low, points[n, axis])
-                high = max(high, points[n, axis])
-            out[cluster, axis] = 0.5 * (low + high)
-        furthest = 0.0
-        for n in range(start, end):
-            x = points[n, 0] - out[cluster, 0]
-            y = points[n, 1] - out[cluster, 1]
-            z = points[n, 2] - out[cluster, 2]
-            furthest = max(furthest, x * x + y * y + z * z)
-        out[cluster, 3] = np.sqrt(furthest) * (1.0 + 1e-5) + slack

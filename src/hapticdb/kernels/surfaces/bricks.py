@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOATS2, INT, INTS, INTS2, entry, leaf, maker
+from hapticdb.kernels._jit import INTS, INTS2, entry, leaf, maker
 from hapticdb.kernels.curves import Z_ORDER, compact, encode
 
 FIRST_CAPACITY = np.int64(256)
@@ -167,29 +167,6 @@ def mark_runs(table, n_bricks, runs, n_runs):
         table = grown(table, n_bricks, n_bricks + bricks_of_run(first, last))
 
 
-@entry(FLOATS2, INT)
-def mark_points_kernel(points, bits):
-    """Mark the voxels that hold points (N, 3), half-open. Returns packed keys, words, count."""
-    edge = float(1 << bits)
-    table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
-    runs, n_runs = np.empty((RUNS_AT_ONCE, 5), np.int64), np.int64(0)
-    for n in range(points.shape[0]):
-        x, y, z = points[n, 0], points[n, 1], points[n, 2]
-        if not (0.0 <= x < edge and 0.0 <= y < edge and 0.0 <= z < edge):
-            continue
-        if n_runs == RUNS_AT_ONCE:
-            table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
-            n_runs = np.int64(0)
-        runs[n_runs, 0] = int(x)
-        runs[n_runs, 1] = int(y)
-        runs[n_runs, 2] = int(z)
-        runs[n_runs, RUN_AXIS] = 0
-        runs[n_runs, RUN_LAST] = int(z)
-        n_runs += 1
-    table, n_bricks = mark_runs(table, n_bricks, runs, n_runs)
-    return table.keys, table.words, n_bricks
-
-
 @entry(INTS, INTS2, INTS2)
 def brick_voxels_kernel(bricks_z, words, out):
     """Voxels of bricks. bricks_z (B,), words (B, 8) int64; out (voxels, 3) int64."""
@@ -232,8 +209,12 @@ def mark_points(
     In voxels from the grid's origin; points outside the grid, or not finite, are left out. Boxes
     are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
     """
-    in_voxels = np.ascontiguousarray(points, dtype=np.float64).reshape(-1, 3)
-    return sorted_bricks(*mark_points_kernel(in_voxels, bits))
+    in_grid = ((points >= 0.0) & (points < float(1 << bits))).all(axis=1)
+    keys = np.sort(encode(points[in_grid].astype(np.int64), bits, Z_ORDER))
+    bricks_z, brick = np.unique(keys >> 9, return_inverse=True)
+    occupancy = np.zeros((len(bricks_z), 64), dtype=np.uint8)
+    np.bitwise_or.at(occupancy, (brick, (keys & 511) >> 3), (1 << (keys & 7)).astype(np.uint8))
+    return bricks_z, occupancy
 
 
 def count_voxels(occupancy: NDArray[np.uint8]) -> int:

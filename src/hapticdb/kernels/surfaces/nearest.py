@@ -8,8 +8,8 @@ the caller's choice.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, leaf
-from hapticdb.kernels.rigid import gap
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, inlined, leaf
+from hapticdb.kernels.rigid import gap, moment
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, STACK, TREE, TriangleTree
 
 Floats = NDArray[np.float64]
@@ -35,31 +35,44 @@ def _square_to_edge(px, py, pz, ux, uy, uz):
     return x * x + y * y + z * z
 
 
-@leaf
-def _square_to_triangle(corners, n, x, y, z):
-    """Squared distance from (x, y, z) to triangle n: to an edge, or to the plane above it."""
+@inlined
+def sides_of(corners, n):
+    """Corner a of triangle n, its sides u and v from there, and u x v: twelve numbers."""
     ax, ay, az = corners[n, 0, 0], corners[n, 0, 1], corners[n, 0, 2]
     ux, uy, uz = corners[n, 1, 0] - ax, corners[n, 1, 1] - ay, corners[n, 1, 2] - az
     vx, vy, vz = corners[n, 2, 0] - ax, corners[n, 2, 1] - ay, corners[n, 2, 2] - az
+    nx, ny, nz = moment(ux, uy, uz, vx, vy, vz)
+    return ax, ay, az, ux, uy, uz, vx, vy, vz, nx, ny, nz
+
+
+@inlined
+def shares_of(sides, x, y, z):
+    """Area of a triangle of `sides_of`, and shares of u and v at a place's image in its plane.
+
+    (x, y, z): from corner a. All three times twice the area and in its square, so that nothing is
+    divided; the image is inside where both shares are 0 or more and together at most the area.
+    """
+    _, _, _, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
+    along = (y * vz - z * vy) * nx + (z * vx - x * vz) * ny + (x * vy - y * vx) * nz
+    across = (uy * z - uz * y) * nx + (uz * x - ux * z) * ny + (ux * y - uy * x) * nz
+    return nx * nx + ny * ny + nz * nz, along, across
+
+
+@leaf
+def _square_to_triangle(corners, n, x, y, z):
+    """Squared distance from (x, y, z) to triangle n: to an edge, or to the plane above it."""
+    sides = sides_of(corners, n)
+    ax, ay, az, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
     px, py, pz = x - ax, y - ay, z - az
     square = min(
         _square_to_edge(px, py, pz, ux, uy, uz),
         _square_to_edge(px, py, pz, vx, vy, vz),
         _square_to_edge(px - ux, py - uy, pz - uz, vx - ux, vy - uy, vz - uz),
     )
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    area = nx * nx + ny * ny + nz * nz
-    if area > 0.0:
-        # shares of the corners at the place's image in the plane; all positive inside
-        along = (
-            (py * vz - pz * vy) * nx + (pz * vx - px * vz) * ny + (px * vy - py * vx) * nz
-        )  # fmt: skip
-        across = (
-            (uy * pz - uz * py) * nx + (uz * px - ux * pz) * ny + (ux * py - uy * px) * nz
-        )  # fmt: skip
-        if along >= 0.0 and across >= 0.0 and along + across <= area:
-            over = px * nx + py * ny + pz * nz
-            square = min(square, over * over / area)
+    area, along, across = shares_of(sides, px, py, pz)
+    if area > 0.0 and along >= 0.0 and across >= 0.0 and along + across <= area:
+        over = px * nx + py * ny + pz * nz
+        square = min(square, over * over / area)
     return square
 
 

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
 from hapticdb.kernels.rigid import moved, transform_of
+from hapticdb.kernels.surfaces.nearest import sides_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.pairs import ROUNDING, measure_pair
 
@@ -137,10 +138,7 @@ def triangle_gap(one, n, other, m):
 @leaf
 def plane_gap(one, n, other, m):
     """How far triangle m keeps from the plane of triangle n, all of it on one side; else 0."""
-    x, y, z = one[n, 0, 0], one[n, 0, 1], one[n, 0, 2]
-    ux, uy, uz = one[n, 1, 0] - x, one[n, 1, 1] - y, one[n, 1, 2] - z
-    vx, vy, vz = one[n, 2, 0] - x, one[n, 2, 1] - y, one[n, 2, 2] - z
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    x, y, z, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides_of(one, n)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
     if not length > FLAT * longest:

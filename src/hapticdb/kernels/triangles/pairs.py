@@ -12,6 +12,7 @@ the other triangle and the distance is 0, or the bound from below is 0.
 import math
 
 from hapticdb.kernels._jit import leaf
+from hapticdb.kernels.surfaces.nearest import shares_of, sides_of
 
 ROUNDING = 2.0**-48
 """Greatest error of a separation, as a share of the largest coordinate. It is 16 units in the last
@@ -50,17 +51,10 @@ def _note(found, square, px, py, pz, qx, qy, qz, is_first):
 @leaf
 def _try_inside(found, px, py, pz, other, m, is_first):
     """Note the foot of p on the plane of triangle m, if it is inside the triangle and nearer."""
-    ax, ay, az = other[m, 0, 0], other[m, 0, 1], other[m, 0, 2]
-    ux, uy, uz = other[m, 1, 0] - ax, other[m, 1, 1] - ay, other[m, 1, 2] - az
-    vx, vy, vz = other[m, 2, 0] - ax, other[m, 2, 1] - ay, other[m, 2, 2] - az
-    rx, ry, rz = px - ax, py - ay, pz - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
-    area = nx * nx + ny * ny + nz * nz
-    if not area > 0.0:
-        return
-    along = (ry * vz - rz * vy) * nx + (rz * vx - rx * vz) * ny + (rx * vy - ry * vx) * nz
-    across = (uy * rz - uz * ry) * nx + (uz * rx - ux * rz) * ny + (ux * ry - uy * rx) * nz
-    if along < 0.0 or across < 0.0 or along + across > area:
+    sides = sides_of(other, m)
+    ax, ay, az, ux, uy, uz, vx, vy, vz, _, _, _ = sides
+    area, along, across = shares_of(sides, px - ax, py - ay, pz - az)
+    if not area > 0.0 or along < 0.0 or across < 0.0 or along + across > area:
         return
     s, t = along / area, across / area
     qx, qy, qz = ax + s * ux + t * vx, ay + s * uy + t * vy, az + s * uz + t * vz
@@ -126,10 +120,8 @@ def edge_goes_through(one, n, i, other, m, beside):
     the plane does not go through.
     """
     k = (i + 1) % 3
-    ax, ay, az = other[m, 0, 0], other[m, 0, 1], other[m, 0, 2]
-    ux, uy, uz = other[m, 1, 0] - ax, other[m, 1, 1] - ay, other[m, 1, 2] - az
-    vx, vy, vz = other[m, 2, 0] - ax, other[m, 2, 1] - ay, other[m, 2, 2] - az
-    nx, ny, nz = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    sides = sides_of(other, m)
+    ax, ay, az, _, _, _, _, _, _, nx, ny, nz = sides
     px, py, pz = one[n, i, 0] - ax, one[n, i, 1] - ay, one[n, i, 2] - az
     qx, qy, qz = one[n, k, 0] - ax, one[n, k, 1] - ay, one[n, k, 2] - az
     here = px * nx + py * ny + pz * nz
@@ -138,9 +130,7 @@ def edge_goes_through(one, n, i, other, m, beside):
         return -1.0
     share = here / (here - there)
     x, y, z = px + share * (qx - px), py + share * (qy - py), pz + share * (qz - pz)
-    area = nx * nx + ny * ny + nz * nz
-    along = (y * vz - z * vy) * nx + (z * vx - x * vz) * ny + (x * vy - y * vx) * nz
-    across = (uy * z - uz * y) * nx + (uz * x - ux * z) * ny + (ux * y - uy * x) * nz
+    area, along, across = shares_of(sides, x, y, z)
     least = -beside * area
     if along < least or across < least or along + across > area - least:
         return -1.0

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, INTS2, entry, fields_of, leaf
 from hapticdb.kernels.rigid import moved as placed_by
 from hapticdb.kernels.rigid import transform_of
+from hapticdb.kernels.surfaces.nearest import sides_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
 from hapticdb.kernels.triangles.motion import MOTION, Moved, PathMotion, bend, move, velocity
 from hapticdb.kernels.triangles.nearest import largest, middle_of, place_corners
@@ -160,11 +161,8 @@ def _bound_along(nx, ny, nz, one, n, placed, m, speeds):
 @leaf
 def _bound_by_plane(of, k, one, n, placed, m, speeds):
     """The same along the normal of triangle k of some (.., 3, 3)."""
-    ux, uy, uz = of[k, 1, 0] - of[k, 0, 0], of[k, 1, 1] - of[k, 0, 1], of[k, 1, 2] - of[k, 0, 2]
-    vx, vy, vz = of[k, 2, 0] - of[k, 0, 0], of[k, 2, 1] - of[k, 0, 1], of[k, 2, 2] - of[k, 0, 2]
-    return _bound_along(
-        uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx, one, n, placed, m, speeds
-    )
+    _, _, _, _, _, _, _, _, _, nx, ny, nz = sides_of(of, k)
+    return _bound_along(nx, ny, nz, one, n, placed, m, speeds)
 
 
 @leaf

@@ -209,6 +209,7 @@ def mark_points(
     In voxels from the grid's origin; points outside the grid, or not finite, are left out. Boxes
     are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
     """
+    points = points.reshape(-1, 3)
     in_grid = ((points >= 0.0) & (points < float(1 << bits))).all(axis=1)
     keys = np.sort(encode(points[in_grid].astype(np.int64), bits, Z_ORDER))
     bricks_z, brick = np.unique(keys >> 9, return_inverse=True)

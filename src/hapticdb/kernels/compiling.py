@@ -54,6 +54,8 @@ NAMES = _names()
 TOGETHER = {
     "resident.budget": "period.direct",
     "proxy.linearize": "period.loop",
+    "triangles.sweeping": "triangles.nearest",
+    "triangles.parting": "surfaces.nearest",
 }
 """Modules that are compiled after another module, if it is compiled, too, in the same process: they
 share its leaves."""

@@ -22,8 +22,8 @@ def sorting_order(keys):
     for n in range(count):
         order[n] = n
     while gap > 0:
-        for n in range(gap, count):
-            moved, at = order[n], n
+        for m in range(gap, count):
+            moved, at = order[m], m
             while at >= gap and keys[order[at - gap]] > keys[moved]:
                 order[at] = order[at - gap]
                 at -= gap

@@ -79,6 +79,7 @@ _COST = (
     "query.contact.spans_of_keys",
     "query.refining.wrench_of_addresses",
     "query.grouping.gap_rows",
+    "query.grouping.group_by_gap",
     "query.grouping.group_by_cost",
     "curves.*",
 )
@@ -107,7 +108,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "touch by distance": (
         _LOCATE,
         "query.refining.refine_kernel@distances",
-        "field.packing.unpack_kernel",
+        "query.refining.unpack_asked_kernel",
     ),
     "pairs": ("query.refining.pairs_of_points",),
     "pairs by distance": ("query.refining.pairs_of_points@distances",),

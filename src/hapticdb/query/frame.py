@@ -12,7 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
-from hapticdb.kernels.field import lattice, packing
+from hapticdb.kernels.field import lattice
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
@@ -162,8 +162,7 @@ class HapticQuery:
                 "the law TangentPlane"
             )
         try:
-            is_asked = np.searchsorted(keys, rows.keys, "right") > np.searchsorted(keys, rows.keys)
-            return packing.unpack(*rows.distances, is_asked)
+            return refining.unpack_asked(keys, rows.keys, *rows.distances)
         except ValueError as error:
             raise damaged(self._store.url, str(error)) from error
 

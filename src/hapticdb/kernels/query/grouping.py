@@ -83,15 +83,25 @@ def gap_rows(left, right, bounds, rows_per_bucket):
     return _rows_between(left, right, bounds, rows_per_bucket, np.int64(0))
 
 
-def group_by_gap(keys: Ints, first: Ints, last: Ints, maxgap: int) -> tuple[Ints, Ints]:
+@entry(INTS, INTS, INTS, INT)
+def group_by_gap(keys, first, last, maxgap):
     """MaxGap: neighbouring keys p < q share a range if and only if q - p <= maxgap.
 
     keys (U,) row keys, ascending; first, last (U,) the lowest and highest voxel key asked for under
     each. Returns the ranges' lowest and highest row keys.
     """
-    is_apart = first[1:] - last[:-1] > maxgap
-    lows, highs = (keys[:1], keys[1:][is_apart]), (keys[:-1][is_apart], keys[-1:])
-    return np.concatenate(lows), np.concatenate(highs)
+    total = keys.shape[0]
+    lows = np.empty(total, dtype=np.int64)
+    highs = np.empty(total, dtype=np.int64)
+    count = 0
+    for n in range(total):
+        if n > 0 and first[n] - last[n - 1] <= maxgap:
+            highs[count - 1] = keys[n]
+            continue
+        lows[count] = keys[n]
+        highs[count] = keys[n]
+        count += 1
+    return lows[:count], highs[:count]
 
 
 @entry(INTS, INTS, INTS, FLOAT, FLOAT, FLOAT)

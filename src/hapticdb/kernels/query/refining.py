@@ -23,7 +23,9 @@ from hapticdb.kernels._jit import (
     maker,
     record_of,
 )
+from hapticdb.kernels.field.lattice import ROW_VALUES
 from hapticdb.kernels.field.law import DISTANCE_FIELD
+from hapticdb.kernels.field.packing import unpack_rows
 from hapticdb.kernels.law import (
     NO_WRENCH,
     NOTHING_NEAR,
@@ -307,6 +309,40 @@ def pairs_of_points(
                 pairs[count, 1] = row_ids[row]
                 count += 1
     return pairs[:count]
+
+
+@entry(INTS, INTS, READ_BYTES, INTS, BYTES2)
+def unpack_asked_kernel(keys, row_keys, data, ends, out):
+    """`unpack_asked` into out (R, 1000); return the first row that is damaged, or -1."""
+    starts, after = _rows_of_keys(keys, row_keys)
+    is_asked = np.zeros(row_keys.shape[0], dtype=np.bool_)
+    for n in range(keys.shape[0]):
+        for row in range(starts[n], after[n]):
+            is_asked[row] = True
+    return unpack_rows(data, ends, is_asked, out)
+
+
+def unpack_asked(
+    keys: Ints, row_keys: Ints, data: NDArray[np.uint8], ends: Ints
+) -> NDArray[np.uint8]:
+    """Unpack the distances of those rows whose keys a shell asks for: (R, 1000) uint8.
+
+    keys (U,) and row_keys (R,) int64, both ascending; data (n,) and ends (R,) as `packing.pack`
+    gives them. Rows of other keys, the false hits, are left unset.
+
+    Raises
+    ------
+    ValueError
+        If the bytes of a row that is asked for are no packed row.
+    """
+    if data.flags.writeable:
+        data = data.view()
+        data.flags.writeable = False
+    out = np.empty((row_keys.shape[0], ROW_VALUES), dtype=np.uint8)
+    damaged = unpack_asked_kernel(keys, row_keys, data, ends, out)
+    if damaged >= 0:
+        raise ValueError(f"row {damaged} of {len(ends)} packed rows of distances is damaged")
+    return out
 
 
 @entry(FLOATS2, INTS, INTS, record_of(GRID), TANGENT_PLANE, FLOATS)

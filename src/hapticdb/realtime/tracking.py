@@ -109,7 +109,7 @@ class Wish(NamedTuple):
         if (first > last).any():
             return np.empty(0, dtype=np.int64), np.empty(0)
         self._trim(first, last)
-        cells = np.indices(tuple(last - first + 1)).reshape(3, -1) + first[:, None]
+        cells: Keys = np.indices(tuple(last - first + 1)).reshape(3, -1) + first[:, None]
         urgency = self._urgency(CELL * cells + 0.5 * CELL)
         order = np.argsort(urgency, kind="stable")[: np.count_nonzero(np.isfinite(urgency))]
         return ((cells[0] << 32) | (cells[1] << 16) | cells[2])[order], urgency[order]

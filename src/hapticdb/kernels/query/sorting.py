@@ -16,7 +16,7 @@ def sorting_order(keys):
     """
     count = keys.shape[0]
     order = np.empty(count, dtype=np.int64)
-    gap = np.int64(1)
+    gap = 1
     while 3 * gap < count:
         gap = 3 * gap + 1
     for n in range(count):

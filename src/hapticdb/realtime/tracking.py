@@ -110,7 +110,7 @@ class Wish(NamedTuple):
             return np.empty(0, dtype=np.int64), np.empty(0)
         self._trim(first, last)
         cells: Keys = np.indices(tuple(last - first + 1)).reshape(3, -1) + first[:, None]
-        urgency = self._urgency(CELL * cells + 0.5 * CELL)
+        urgency = self._urgency(CELL * (cells + 0.5).astype(np.float64))
         order = np.argsort(urgency, kind="stable")[: np.count_nonzero(np.isfinite(urgency))]
         return ((cells[0] << 32) | (cells[1] << 16) | cells[2])[order], urgency[order]
 

@@ -242,7 +242,6 @@ class Session(Closes):
         table.desk.pids[self._row] = self._process.pid
         self._process.await_ready("loop's", START_PATIENCE)
 
-
     def __del__(self) -> None:
         with suppress(Exception):
             self.close()

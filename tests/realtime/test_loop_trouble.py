@@ -172,6 +172,22 @@ def test_a_loop_told_to_end_while_it_runs_lets_its_device_go(world: World) -> No
     assert not hand.sent[-1].any()
 
 
+def test_a_loop_told_to_end_while_its_device_hangs_lets_it_go(world: World) -> None:
+    class Hanging(Pressing):
+        def read(self) -> Reading:
+            if len(self.sent) == 20:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(60.0)
+            return super().read()
+
+    signal.signal(signal.SIGTERM, _end)
+    hand, started = Hanging(-0.004), time.monotonic()
+    with pytest.raises(Ended):
+        work(requested(world, hand, seconds=60.0), Heard())
+    assert time.monotonic() - started < 50.0
+    assert not hand.sent[-1].any()
+
+
 @pytest.mark.parametrize("when", ["apply", "close"])
 def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
     world: World, when: str

@@ -202,7 +202,6 @@ class Loop:
         called = self._called(self._read_hand), self._called(self._pusher())
         row["reads"], row["pushes"] = map(address_of, called)
         row["is_frame"] = True
-        # an error that a signal raises where a kernel calls could be lost: it is raised below
         before = signal.signal(signal.SIGTERM, self._end)
         try:
             seconds = self.stations.run(timing.rate, self.request.seconds)
@@ -216,8 +215,13 @@ class Loop:
         return LoopFigures.of_seat(self.board.seats[0], seconds)
 
     def _end(self, number: int, _: object) -> None:
+        """End the loop, and the call of a device that hangs.
+
+        What is raised at the entrance of a kernel's call is lost; `run` then raises the signal.
+        """
         self._signal = number
         self.stations.stop()
+        raise SystemExit(128 + number)
 
     def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
         """Return what a kernel calls for `work`, which says if the loop ends: an error ends it."""

@@ -139,14 +139,14 @@ class HandDrawing:
         self._seen = seen
         with self._client.atomic():
             longest = LONGEST_ARROW * self._diagonal
-            middle = tool[:3]
-            self._arrow(self._force, middle, wrench[:3] * (longest / self.cap))
+            place = tool[:3]
+            self._arrow(self._force, place, wrench[:3] * (longest / self.cap))
             lever = 0.03 * self._diagonal
-            self._arrow(self._torque, middle, wrench[3:] * (longest / (self.cap * lever)))
-            apart = float(np.linalg.norm(hand[:3] - middle))
+            self._arrow(self._torque, place, wrench[3:] * (longest / (self.cap * lever)))
+            apart = float(np.linalg.norm(hand[:3] - place))
             self._tether.visible = apart > 0.002 * self._diagonal
             if self._tether.visible:
-                self._tether.points = self._sent([[middle, hand[:3]]])
+                self._tether.points = self._sent([[place, hand[:3]]])
 
     def _sent(self, points: ArrayLike) -> NDArray[np.float32]:
         """Points as their nodes have them."""

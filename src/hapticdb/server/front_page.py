@@ -35,18 +35,15 @@ LOADER = re.compile(
     re.DOTALL,
 )
 TITLE = "<title>Viser</title>"
-SETTINGS = ".mantine-TextInput-root input[value*='://']"
-"""Viser's own settings begin with the server's address."""
 HIDING = (
     "<style>#webgl-software-rendering,"
     ".mantine-ActionIcon-root:has(.tabler-icon-adjustments,.tabler-icon-share)"
-    f"{{display:none!important}}.mantine-Stack-root:has(>{SETTINGS}),"
-    f".mantine-Paper-root:has([aria-hidden=false]>div>.mantine-Stack-root>{SETTINGS})"
+    "{display:none!important}"
+    ".mantine-Stack-root:has(>.mantine-TextInput-root input[value*='://'])"
     "{visibility:hidden!important}</style>"
 )
-"""Hides viser's note about drawing in software, its settings and their buttons, and its panel until
-the scene's first widget takes the place of the settings. All stays laid out, because viser measures
-it."""
+"""Hides viser's note about drawing in software, and its settings, which begin with the server's
+address, with their buttons. They stay laid out, because viser measures them."""
 
 
 class ClientPage(NamedTuple):

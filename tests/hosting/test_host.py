@@ -66,7 +66,7 @@ def press(
 
     def is_true() -> object:
         for session in sessions:
-            session.move(row_of_pose(pose))
+            session.move(pose)
         return claim()
 
     until(is_true, every=0.02)
@@ -87,7 +87,7 @@ def test_the_hand_moves_in_steps_of_the_loop_between_arrivals(
     session.record(tmp_path / "way.hdbrec")
     poses = [at(0.0, 0.0, z) for z in np.linspace(0.02, 0.05, 16)]
     for pose in poses:  # 1 m/s at 33 Hz: 2 mm a step, 30 mm in all
-        session.move(row_of_pose(pose))
+        session.move(pose)
         time.sleep(0.03)
     until(lambda: _height(session) == pytest.approx(0.05, abs=1e-9))
     assert session.stop_recording() > 0
@@ -176,7 +176,7 @@ def test_a_new_coupling_is_felt(session: HostedSession) -> None:
 
 @pytest.mark.parametrize(
     "pose",
-    [np.eye(4), np.zeros(7), np.full(7, np.nan), row_of_pose(at(2e9, 0.0, 0.0)), np.ones(7)],
+    [np.zeros((4, 4)), np.full((4, 4), np.nan), at(2e9, 0.0, 0.0), np.ones(7), np.full(7, np.nan)],
 )
 def test_a_pose_that_is_none_is_refused(session: HostedSession, pose: Floats) -> None:
     with pytest.raises(UsageError):
@@ -201,7 +201,7 @@ def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell)
     session.end()
     session.end()
     assert session.is_over
-    for use in (lambda: session.move(row_of_pose(ABOVE)), session.latest, session.figures):
+    for use in (lambda: session.move(ABOVE), session.latest, session.figures):
         with pytest.raises(UsageError, match="is over"):
             use()
 
@@ -276,7 +276,7 @@ def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
         os.kill(host.pids[0], signal.SIGKILL)
         until(lambda: session.is_over)
         with pytest.raises(UsageError, match="is over"):
-            session.move(row_of_pose(ABOVE))
+            session.move(ABOVE)
         session.end()
         another = host.begin(sphere, ABOVE)
         press([another], lambda: pushed(another) > 0.5)

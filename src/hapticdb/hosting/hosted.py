@@ -11,6 +11,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import FARTHEST
+from hapticdb.kernels.rigid import is_rigid
+from hapticdb.poses import row_of_pose
 from hapticdb.realtime.board import TAKEN, Board
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.report import LoopFigures, Spread
@@ -75,7 +77,9 @@ class HostedSession:
         return self.seat
 
     def move(self, pose: ArrayLike) -> None:
-        """Put the hand at a pose (7,), as `poses.row_of_pose` makes it; the newest one counts.
+        """Put the hand at a pose (4, 4) of the scene, metres; the newest one counts.
+
+        A position and a unit quaternion, (7,), are a pose, too, and save the conversion.
 
         The hand moves there from where it is, in about the time between two calls, so that calls at
         20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
@@ -83,13 +87,15 @@ class HostedSession:
         Raises
         ------
         UsageError
-            If that is no position within 1e9 m and unit quaternion, or the session is over.
+            If the pose is no rigid transform or is beyond 1e9 m, or the session is over.
         """
         row = np.asarray(pose, dtype=np.float64)
+        if row.shape == (4, 4) and is_rigid(row):
+            row = row_of_pose(row)
         if row.shape != (7,) or not (
             np.abs(row).max() <= FARTHEST and abs(math.hypot(*row[3:]) - 1.0) <= 1e-6
         ):
-            raise UsageError("a hand moves to a position (3,) and a unit quaternion (4,), as a row")
+            raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
         self._board.put_hand(self._open_seat(), time.monotonic_ns(), row)
 
     def latest(self) -> Frames | None:

@@ -38,7 +38,7 @@ from hapticdb.store.filtering import Filter
 
 LOG = logging.getLogger("hapticdb.hosting")
 MOST_SESSIONS = 64
-"""Most sessions of a host. Larger: more shared memory, 740 kB each."""
+"""Most sessions of a host. Larger: more shared memory, 960 kB each."""
 TEND_EVERY = 0.05
 """Seconds between two looks after recordings and processes. Larger: less work, and what has died is
 noticed later. A recording loses frames from 2 s on."""

@@ -320,8 +320,8 @@ FIGURES: Layout = _record(
 MOST_SHOWN = 64
 """Most contacts of a hosted session that others see. Larger: broad contacts are drawn more
 densely."""
-TIME_BINS, TIME_BIN = 5000, 1e-6
-"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 5 ms. Larger
+TIME_BINS, TIME_BIN = 20_000, 1e-6
+"""Number and width (s) of the bins of a seat's histograms of times, which cover 0 to 20 ms. Larger
 bins: less exact percentiles. The worst time is kept exactly."""
 
 SEAT: Layout = _record(

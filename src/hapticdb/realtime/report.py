@@ -13,7 +13,10 @@ from hapticdb.realtime.resident_cells import CacheFigures
 
 
 class Spread(NamedTuple):
-    """Distribution of a time over frames, seconds: percentiles exact to 1 us, and the worst."""
+    """Distribution of a time over frames, seconds.
+
+    Percentiles are exact to 1 us; one above 20 ms is told as the worst.
+    """
 
     p50: float
     p99: float

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import CELL_BITS, Grid
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.kernels.records import MOST_ASKED
+from hapticdb.kernels.resident.cell_table import cells_ahead
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -109,24 +110,12 @@ class Wish(NamedTuple):
         if (first > last).any():
             return np.empty(0, dtype=np.int64), np.empty(0)
         self._trim(first, last)
-        cells: Keys = np.indices(tuple(last - first + 1)).reshape(3, -1) + first[:, None]
-        urgency = self._urgency(CELL * (cells + 0.5).astype(np.float64))
-        order = np.argsort(urgency, kind="stable")[: np.count_nonzero(np.isfinite(urgency))]
-        return ((cells[0] << 32) | (cells[1] << 16) | cells[2])[order], urgency[order]
-
-    def _urgency(self, centers: Floats) -> Floats:
-        """Urgency (n,) of cells with those centres (3, n), voxels; infinite beyond the margin."""
-        x, y, z = self.move
-        length = x * x + y * y + z * z
-        along = np.zeros(centers.shape[1])
-        if length > 0.0:
-            dx, dy, dz = centers - self.start[:, None]
-            along = np.clip((dx * x + dy * y + dz * z) / length, 0.0, 1.0)
-        nearest = self.start[:, None] + along * self.move[:, None]
-        gap = np.sqrt(_square_to_cells(nearest, centers)) - self.radius
-        is_met = _square_to_cells(self.start[:, None], centers) <= self.radius * self.radius
-        urgency = np.where(is_met, 0.0, np.maximum(gap, 0.0) + along * np.sqrt(length))
-        return np.where(gap <= self.margin + 2.0 * SLACK_VOXELS, urgency, np.inf)
+        room = int(np.prod(last - first + 1))
+        keys, urgency = np.empty(room, dtype=np.int64), np.empty(room)
+        margin = self.margin + 2.0 * SLACK_VOXELS
+        count = cells_ahead(first, last, self.start, self.move, self.radius, margin, keys, urgency)
+        order = np.argsort(urgency[:count], kind="stable")
+        return keys[:count][order], urgency[:count][order]
 
     def _trim(self, first: Keys, last: Keys) -> None:
         """Cut a box of too many cells, first .. last, at its far ends; in place."""
@@ -139,13 +128,6 @@ class Wish(NamedTuple):
             else:
                 last[axis] -= max(spans[axis] // 4, 1)
             spans = last - first + 1
-
-
-def _square_to_cells(place: Floats, centers: Floats) -> Floats:
-    """Squared distances (n,) of a place (3, 1), or of places (3, n), from cells, voxels."""
-    x, y, z = np.maximum(np.abs(place - centers) - 0.5 * CELL, 0.0)
-    square: Floats = x * x + y * y + z * z
-    return square
 
 
 @dataclass

@@ -6,6 +6,7 @@ from hapticdb.kernels._jit import (
     BYTES,
     BYTES2,
     FLOAT,
+    FLOATS,
     FLOATS2,
     FLOATS3,
     INT,
@@ -239,6 +240,48 @@ def oldest_version_read(readers):
         if readers[n] > 0:
             oldest = min(oldest, readers[n])
     return oldest
+
+
+@entry(INTS, INTS, FLOATS, FLOATS, FLOAT, FLOAT, INTS, FLOATS)
+def cells_ahead(first, last, start, move, radius, margin, keys, urgency):
+    """Cells of a box that a sphere comes near on a straight way, and the urgency of each.
+
+    first, last (3,) int64: the box, in cells, both included; start, move (3,), radius: the sphere's
+    way; margin: the largest distance that counts as near; all in voxels. keys (n,) and urgency (n,)
+    take the cells. The urgency is the way to the sphere's nearest position plus the distance there,
+    in voxels, 0 for a cell that the sphere meets already. Returns the number of cells.
+    """
+    length = move[0] * move[0] + move[1] * move[1] + move[2] * move[2]
+    way = np.sqrt(length)
+    count = 0
+    for i in range(first[0], last[0] + 1):
+        x = 32.0 * i + 16.0
+        for j in range(first[1], last[1] + 1):
+            y = 32.0 * j + 16.0
+            for k in range(first[2], last[2] + 1):
+                z = 32.0 * k + 16.0
+                along = 0.0
+                if length > 0.0:
+                    along = (
+                        (x - start[0]) * move[0]
+                        + (y - start[1]) * move[1]
+                        + (z - start[2]) * move[2]
+                    ) / length
+                    along = min(max(along, 0.0), 1.0)
+                dx = max(abs(start[0] + along * move[0] - x) - 16.0, 0.0)
+                dy = max(abs(start[1] + along * move[1] - y) - 16.0, 0.0)
+                dz = max(abs(start[2] + along * move[2] - z) - 16.0, 0.0)
+                gap = np.sqrt(dx * dx + dy * dy + dz * dz) - radius
+                if gap <= margin:
+                    dx = max(abs(start[0] - x) - 16.0, 0.0)
+                    dy = max(abs(start[1] - y) - 16.0, 0.0)
+                    dz = max(abs(start[2] - z) - 16.0, 0.0)
+                    keys[count] = key_of_cell(i, j, k)
+                    urgency[count] = 0.0
+                    if dx * dx + dy * dy + dz * dz > radius * radius:
+                        urgency[count] = max(gap, 0.0) + along * way
+                    count += 1
+    return count
 
 
 @entry(FLOATS2, INT, INT, FLOAT, FLOATS3, PLACE, INTS, INT)

@@ -156,6 +156,11 @@ def proxy_of(n: int = 2) -> ProxyState:
     )  # fmt: skip
 
 
+def test_places_of_surveys_are_read() -> None:
+    hand = HandState(1, 0.0, np.array([5e5, 4.9e6, -1e9]), np.eye(4)[0], np.zeros(6))
+    np.testing.assert_array_equal(unpack_hand(pack_hand(hand)).position, hand.position)
+
+
 @pytest.mark.parametrize("value", [np.nan, -np.inf, 1e30])
 def test_a_number_that_is_not_finite_or_too_large_is_refused(value: float) -> None:
     hand = vars(HandState(1, 0.0, np.zeros(3), np.eye(4)[0], np.zeros(6)))

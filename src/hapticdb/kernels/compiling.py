@@ -186,7 +186,9 @@ def compile_missing(
     with _workers(queue, min(jobs or os.cpu_count() or 1, len(queue))) as told:
         for name in wanted:  # meanwhile: this process will call them
             _module_of(name)
-        while select.select([told], [], [], LONGEST_S)[0] and (ended := os.read(told, 1)):
+        news = select.poll()  # `select.select` knows no descriptor above 1,023
+        news.register(told, select.POLLIN)
+        while news.poll(1000 * LONGEST_S) and (ended := os.read(told, 1)):
             done += len(queue[ended[0]])
             tell(Compiled(done, total))
     if done < total:
@@ -227,18 +229,20 @@ def _workers(queue: Sequence[tuple[str, ...]], count: int) -> Iterator[int]:
     path = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
     workers: list[subprocess.Popen[bytes]] = []
     try:
-        with contextlib.suppress(OSError):  # then the first calls compile
-            for _ in range(count):
-                worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
-                    [sys.executable, "-c", SERVE, *map(" ".join, queue)],
-                    stdin=asked,
-                    stdout=tell,
-                    stderr=subprocess.DEVNULL,
-                    env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
-                    start_new_session=True,  # the parent handles Ctrl-C and ends this process
-                )
-                workers.append(worker)
-        os.close(tell)
+        try:
+            with contextlib.suppress(OSError):  # then the first calls compile
+                for _ in range(count):
+                    worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
+                        [sys.executable, "-c", SERVE, *map(" ".join, queue)],
+                        stdin=asked,
+                        stdout=tell,
+                        stderr=subprocess.DEVNULL,
+                        env=os.environ | {IN_WORKER: "1", "PYTHONPATH": path},
+                        start_new_session=True,  # the parent handles Ctrl-C and ends this process
+                    )
+                    workers.append(worker)
+        finally:
+            os.close(tell)
         yield told
     finally:
         for worker in workers:

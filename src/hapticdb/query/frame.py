@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
+from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.kernels.field import lattice
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
@@ -99,7 +100,7 @@ class HapticQuery:
         """
         reads = self._ready.get((strategy, type(law.for_kernels)))
         if reads is None:
-            reads = self._get_ready(strategy, law)
+            reads = self.get_ready(strategy, law)
         started = time.perf_counter_ns()
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
@@ -129,8 +130,10 @@ class HapticQuery:
         payload = self._distances_of(rows, keys) if reads else None
         return self._refined(located, rows, payload, exclude, law, known, asked, started)
 
-    def _get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
-        """Compile what frames of a strategy and a law call; returns whether they read distances.
+    def get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
+        """Compile and load what frames of a strategy and a law call.
+
+        Returns whether they read distances.
 
         Raises
         ------
@@ -139,9 +142,11 @@ class HapticQuery:
         """
         if strategy not in STRATEGIES:
             raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
-        make_ready("statement" if strategy == "statement" else frames_by(law, "touch"))
+        purposes = ["statement" if strategy == "statement" else frames_by(law, "touch")]
         if strategy in GROUPING:
-            make_ready("calibrate")
+            purposes.append("calibrate")
+        make_ready(*purposes)
+        load(entries_for(*purposes))
         numbers = law.for_kernels
         reads = self._ready[strategy, type(numbers)] = laws.reads_distances(numbers)
         return reads

@@ -88,6 +88,8 @@ class Touching:
     ) -> Touch:
         """Compute one frame in a snapshot, whose objects are loaded first."""
         known = self.known
+        if known.version is None:  # the first frame: kernels may have to be compiled
+            self._query.get_ready(strategy, self.law_now(law))
         with self._store.snapshot():
             chosen = self._law_of_snapshot(law)
             exclude = known.left_out(felt)

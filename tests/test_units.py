@@ -109,6 +109,14 @@ def test_a_point_cloud_is_in_the_unit_of_its_reference_system(
     assert file.names_unit == names_unit
 
 
+def test_no_axis_points_up_in_geocentric_metres(tmp_path: Path) -> None:
+    datum = DEGREES.partition(",UNIT")[0].partition(",")[2]
+    file = read_file(cloud(tmp_path / "a.las", f'GEOCCS["c",{datum},UNIT["metre",1]]'))
+    assert file.names_unit
+    assert file.up is None
+    assert read_file(cloud(tmp_path / "b.las")).up == "z"
+
+
 def test_degrees_are_refused_by_name_unless_a_unit_is_given(tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.FileError, match=r"degrees \(g\), which are no lengths"):
         read_file(cloud(tmp_path / "a.las", DEGREES))
@@ -153,7 +161,13 @@ def test_geotiff_keys_name_a_unit_by_its_code_or_that_of_a_system(
 
 @pytest.mark.parametrize(
     ("name", "said", "up"),
-    [("a.glb", None, "y"), ("b.glb", "z", "z"), ("a.stl", None, None), ("a.dae", "X_UP", "x")],
+    [
+        ("a.glb", None, "y"),
+        ("b.glb", "z", "z"),
+        ("a.stl", None, None),
+        ("a.dae", "X_UP", "x"),
+        ("b.dae", None, "y"),
+    ],
 )
 def test_which_axis_points_up_comes_from_the_file(
     tmp_path: Path, name: str, said: str | None, up: str | None
@@ -161,7 +175,7 @@ def test_which_axis_points_up_comes_from_the_file(
     file = tmp_path / name
     mesh = trimesh.creation.box()
     if name.endswith(".dae"):
-        file.write_text(COLLADA.replace("Z_UP", str(said)))
+        file.write_text(COLLADA.replace("Z_UP", said or ""))
     elif said is None:
         mesh.export(file)
     else:

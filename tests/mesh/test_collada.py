@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 
 from hapticdb.mesh import parse_in_process
-from mesh_files import COLLADA, area_and_volume, names, text
+from mesh_files import COLLADA, area_and_volume, cause, names, text
+
+VERTEX = '<input semantic="VERTEX" source="#v" offset="0"/>'
 
 
 def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
@@ -15,6 +17,13 @@ def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
     file = parse_in_process(text(tmp_path / "far.dae", far))
     np.testing.assert_allclose(file.bounds[:, 0], [14000000.0025, 14000000.0225], rtol=1e-15)
     assert not file.notes
+
+
+@pytest.mark.parametrize("declared", ["undefined", "punycode", "unicode_escape"])
+def test_an_encoding_that_is_none_for_files_is_passed_over(tmp_path: Path, declared: str) -> None:
+    content = COLLADA.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
+    path = text(tmp_path / "a.dae", content.replace("branch", r"\ud800"))
+    assert len(parse_in_process(path).parts) == 1
 
 
 @pytest.mark.parametrize("encoding", ["utf-16", "utf-16-be", "utf-32", "iso-8859-1"])
@@ -65,6 +74,72 @@ def collada_source(name: str, floats: str, stride: int = 3, start: int = 0) -> s
         f"<source id='{name}'><float_array>{floats}</float_array><technique_common><accessor "
         f"offset='{start}' stride='{stride}'>{params}</accessor></technique_common></source>"
     )
+
+
+@pytest.mark.parametrize(
+    ("old", "new"),
+    [
+        ('stride="3"', ""),
+        ('<param name="Z" type="float"/>', '<param name="Z"/><param name="W"/>'),
+        ('<source id="p">', '<source id="p p">'),
+        ('<source id="p">', '<source id="p%20p">'),
+        ("</p></polylist>", "</p></polylist><polygons><ph><p>0 1 2</p><h/></ph></polygons>"),
+    ],
+)
+def test_a_collada_geometry_may_be_written_otherwise(tmp_path: Path, old: str, new: str) -> None:
+    assert old in COLLADA
+    content = COLLADA.replace(old, new).replace("<polygons>", f"<polygons>{VERTEX}")
+    if "W" in new:
+        content = content.replace('stride="3"', 'stride="4"')
+        content = content.replace("0 0 0 1 0 0 1 1 0\n0 1 0", "0 0 0 9 1 0 0 9 1 1 0 9 0 1 0 9")
+    if "p" in new.partition("source id=")[2]:
+        content = content.replace('"#p"', '"#p%20p"')
+    file = parse_in_process(text(tmp_path / "a.dae", content))
+    n_halves = 5 if "polygons" in new else 4
+    assert area_and_volume(file)[0] == pytest.approx(n_halves * 2e-4)
+    assert not file.notes
+
+
+@pytest.mark.parametrize(
+    "step",
+    [
+        "<matrix>1 0 0 7 0 1 0 0 0 0 1 0 0 0 0</matrix>",
+        "<translate>1,0 0 0</translate>",
+        "<rotate>0 0 1</rotate>",
+        "<lookat>0 0 0 0 0 0 0 0 1</lookat>",
+    ],
+)
+def test_a_damaged_transform_loses_what_it_places_and_no_more(tmp_path: Path, step: str) -> None:
+    node = f"<node name='lost'>{step}<instance_geometry url='#g'/></node>"
+    skin = "<skin source='#g'><bind_shape_matrix>1 0</bind_shape_matrix></skin></controller>"
+    library = f"<library_controllers><controller id='c'>{skin}</library_controllers><library_geom"
+    content = COLLADA.replace("</visual_scene>", f"{node}</visual_scene>")
+    file = parse_in_process(text(tmp_path / "a.dae", content))
+    assert names(file) == ["tree/branch"]
+    assert file.defects.non_finite == 4
+    assert file.notes == ("1 transform is damaged: parts there are left out",)
+    bound = node.replace(step, "").replace("geometry url='#g'", "controller url='#c'")
+    content = COLLADA.replace("</visual_scene>", f"{bound}</visual_scene>")
+    file = parse_in_process(text(tmp_path / "a.dae", content.replace("<library_geom", library)))
+    assert names(file) == ["tree/branch"]
+    assert "1 transform is damaged" in file.notes[0]
+
+
+@pytest.mark.parametrize("source", ["#gone", "#c"])
+def test_a_skin_of_what_is_not_there_is_told(tmp_path: Path, source: str) -> None:
+    skin = f"<controller id='c'><skin source='{source}'/></controller>"
+    library = f"<library_controllers>{skin}</library_controllers><library_geom"
+    node = "<instance_controller url='#c'/></node></node>"
+    content = COLLADA.replace("</node></node>", node).replace("<library_geom", library)
+    file = parse_in_process(text(tmp_path / "a.dae", content))
+    assert file.notes[0] == "1 of its 2 placements refers to what is not there"
+
+
+def test_names_of_deep_collada_nodes_are_limited(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr("hapticdb.mesh.raw.MOST_CHARACTERS", 10)
+    assert "it nests its nodes too deeply" in cause(text(tmp_path / "a.dae", COLLADA))
 
 
 def test_a_collada_accessor_says_where_positions_are(tmp_path: Path) -> None:
@@ -136,6 +211,8 @@ def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path
         ("<vcount>4 3", "<vcount>4 4", "are not as many as it says"),
         ("0 0 0 1 0 0", "0 0 0 1,0 0 0", "where a number should be"),
         ("<p>0 1 2</p>", "<p>0 1 x</p>", "where a number should be"),
+        ("0 0 0 1 0 0", "0 0 0 1_0 0 0", "it holds '1_0' where a number should be"),
+        ("0 0 0 1 0 0", "0 0 0 1\xa00 0", "where a number should be"),
         ('stride="3"', 'stride="x"', "it is damaged"),
         ('stride="3"', 'stride="0"', "it is damaged"),
     ):

@@ -6,6 +6,7 @@ from pathlib import Path
 
 import laspy
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
 from hapticdb.mesh import read_file
@@ -79,11 +80,26 @@ def test_3mf_triangles_take_their_own_colour_or_the_object_s(tmp_path: Path) -> 
     np.testing.assert_array_equal(colours_of(path), [RED, GLASS])
 
 
-def test_collada_materials_are_those_of_the_placement(tmp_path: Path) -> None:
+@pytest.mark.parametrize(
+    ("clearness", "opacity"),
+    [
+        ("", 1),
+        ("<transparency><float>0</float></transparency>", 1),
+        ("<transparency><float>0.3</float></transparency>", 0.3),
+        ("<transparent><color>1 1 1 0.2</color></transparent>", 0.2),
+        ('<transparent opaque="RGB_ZERO"/><transparency><float>0.3</float></transparency>', 0.7),
+        ('<transparent opaque="RGB_ZERO"><color>0 0 0 1</color></transparent>', 1),
+        ('<transparent opaque="RGB_ZERO"><color>0 1 0 1</color></transparent>', 1 - 0.71516),
+        ('<transparent opaque="RGB_ZERO"><color>1 1 1 1</color></transparent>', 1),
+    ],
+)
+def test_collada_materials_are_those_of_the_placement(
+    tmp_path: Path, clearness: str, opacity: float
+) -> None:
     effect = (
         '<library_effects><effect id="e"><profile_COMMON><technique sid="t"><lambert><diffuse>'
-        "<color>1 0 0 1</color></diffuse></lambert></technique></profile_COMMON></effect>"
-        '</library_effects><library_materials><material id="m"><instance_effect url="#e"/>'
+        f"<color>1 0 0 1</color></diffuse>{clearness}</lambert></technique></profile_COMMON>"
+        '</effect></library_effects><library_materials><material id="m"><instance_effect url="#e"/>'
         "</material></library_materials>"
     )
     bound = (
@@ -94,7 +110,7 @@ def test_collada_materials_are_those_of_the_placement(tmp_path: Path) -> None:
     content = content.replace('<instance_geometry url="#g"/>', bound)
     content = content.replace('<polylist count="2">', '<polylist count="2" material="paint">')
     found = colours_of(text(tmp_path / "a.dae", content))
-    np.testing.assert_array_equal(found[:3], [RED] * 3)
+    np.testing.assert_array_equal(found[:3], [(255, 0, 0, round(255 * opacity))] * 3)
     assert len(found) == 4
 
 

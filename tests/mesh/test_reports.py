@@ -255,6 +255,23 @@ def test_a_word_among_numbers_is_named(tmp_path: Path) -> None:
     assert "it holds '1,5' where a number should be: write decimals with points" in cause(path)
     path = text(tmp_path / "b.obj", corners.format("-1.#IND"))  # and no comment begins there
     assert "it holds '-1.#IND' where a number should be" in cause(path)
+    path = text(tmp_path / "c.obj", corners.format("1_0"))  # a number to Python
+    assert "it holds '1_0' where a number should be" in cause(path)
+
+
+def test_an_obj_comment_may_follow_a_point_and_a_blank_line_holds_any_blank(tmp_path: Path) -> None:
+    content = "v 0 0 0\nv 1 0 0.#c\nv 0 1 0 #INFO\n\xa0\nf 1 2 3\n"
+    file = parse_in_process(text(tmp_path / "a.obj", content))
+    assert len(file.parts[0].triangles()) == 1
+    assert not file.notes
+
+
+def test_a_text_stl_on_one_line_is_read(tmp_path: Path) -> None:
+    two = f"solid a\n{FACET}endsolid a\nsolid b\n{FACET}{FACET}endsolid b"
+    file = parse_in_process(text(tmp_path / "a.stl", " ".join(two.split())))
+    assert names(file) == ["a", "b"]
+    assert [len(part.triangles()) for part in file.parts] == [1, 2]
+    assert not file.notes
 
 
 @pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])

@@ -48,7 +48,7 @@ def test_what_a_3mf_file_does_not_build_is_counted(tmp_path: Path) -> None:
 def test_volumes_that_a_slicer_subtracts_or_changes_are_told(
     tmp_path: Path, settings: str, kind: str
 ) -> None:
-    beside = {f"Metadata__{settings}_DOT_config": f'<part subtype="{kind}"/>'}
+    beside = {f"Metadata__{settings}_DOT_config": f'<a key="support_type"/><b subtype="{kind}"/>'}
     thing = f'<object id="1">{MESH_3MF}</object>'
     file = parse_in_process(model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", thing, **beside))
     assert file.notes == (f"1 object is of the type {kind}, and comes in like any other",)

@@ -116,7 +116,8 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
         try:
             return np.fromstring(text, dtype=dtype, sep=" ")
         except (DeprecationWarning, ValueError):
-            word = next(word for word in text.split() if not _is_number(word, dtype))
+            words = re.findall(r"[^ \t-\r]+", text)  # a no-break space is none to numpy
+            word = next((word for word in words if not _is_number(word, dtype)), words[0])
             commas = ": write decimals with points" if _COMMA.fullmatch(word) else ""
             raise UnreadableError(
                 f"it holds '{word[:40]}' where a number should be{commas}"
@@ -125,8 +126,8 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
 
 def _is_number(word: str, dtype: type[np.float64] | type[np.int64]) -> bool:
     try:
-        dtype(word)
-    except (ValueError, OverflowError):
+        np.fromstring(word, dtype=dtype, sep=" ")  # Python itself takes '1_0', too
+    except (DeprecationWarning, ValueError):
         return False
     return True
 

@@ -37,7 +37,7 @@ def xml_of(content: bytes) -> bytes:
     plain = recoded(content)
     declared = _DECLARED.match(plain)
     if plain is content and declared is not None:
-        with suppress(LookupError, UnicodeDecodeError):
+        with suppress(LookupError, UnicodeError):
             text = plain.decode(declared[1].decode())
             if text.startswith("<"):
                 return text.encode()

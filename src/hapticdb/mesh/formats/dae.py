@@ -8,6 +8,7 @@ empty piece, and a placement for a damaged material; nor trimesh, which loses th
 from collections import Counter
 from collections.abc import Callable
 from contextlib import suppress
+from functools import reduce
 from pathlib import Path
 from urllib.parse import unquote
 from xml.etree import ElementTree as ET
@@ -18,7 +19,16 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import fan, strip, triangulated
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, numbers, told, walk
+from hapticdb.mesh.raw import (
+    NameBudget,
+    Parsed,
+    Placement,
+    Shape,
+    UnreadableError,
+    numbers,
+    told,
+    walk,
+)
 from hapticdb.mesh.text import xml_of
 from hapticdb.poses import rotation_of
 
@@ -30,6 +40,7 @@ _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
 _UNREAD = "piece{s} of the kind '{kind}' {are} not read"
+_LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, by COLLADA 1.4.1
 _MOST_CONTROLLERS = 4
 """Controllers of controllers that are followed: a skin of a morph is two."""
 _INSTANCES: dict[str, tuple[str, ...]] = {
@@ -55,14 +66,15 @@ def read(path: Path) -> Parsed:
     shapes: dict[tuple[object, ...], int] = {}
     geometries: list[_Geometry] = []
     placements: list[Placement] = []
+    budget = NameBudget()
     for nodes, world_from_node in walk(document.links(scene), document.links):
         for geometry, palette, bound in document.geometries(nodes[-1]):
             key = (geometry, *(f"{name} {palette[name]}" for name in sorted(palette)))
             if key not in shapes:
                 shapes[key] = len(geometries)
                 geometries.append((geometry, palette))
-            names = [node.get("name") or node.get("id") or "" for node in nodes]
-            name = "/".join(filter(None, names)) or geometry.get("name", geometry.get("id", ""))
+            names = [*filter(None, (node.get("name") or node.get("id") for node in nodes))]
+            name = budget.joined(names) or geometry.get("name", geometry.get("id", ""))
             # A skin is where it is bound, whatever its node says.
             world = world_from_node if bound is None else bound
             placements.append(Placement(name, shapes[key], world))
@@ -71,7 +83,7 @@ def read(path: Path) -> Parsed:
         read_shapes,
         placements,
         metres=_metres(root),
-        up=_UP_AXES.get((root.findtext("asset/up_axis") or "").strip()),
+        up=_UP_AXES.get((root.findtext("asset/up_axis") or "").strip() or "Y_UP"),
         notes=[*lost, *document.notes({id(geometry) for geometry, _ in geometries})],
     )
 
@@ -91,6 +103,7 @@ class _Document:
     def __init__(self, root: ET.Element) -> None:
         self._root = root
         self._known: dict[tuple[str, str | None], ET.Element] = {}
+        self._damaged: set[ET.Element] = set()  # transforms
         for element in root.iter():
             element.tag = element.tag.rpartition("}")[2]  # without its namespace
             self._known.setdefault((element.tag, element.get("id")), element)
@@ -108,27 +121,45 @@ class _Document:
             for child in node
             if child.tag in {"node", "instance_node"}
         ]
-        return [(one, _parent_from_node(one)) for one in below if one is not None]
+        return [(one, self._parent_from_node(one)) for one in below if one is not None]
+
+    def _parent_from_node(self, node: ET.Element) -> Floats:
+        """Transform (4, 4) of a node: its steps, one behind the other."""
+        steps = (self._transform(step) for step in node if step.tag in _STEPS)
+        return reduce(np.matmul, steps, np.eye(4))
+
+    def _transform(self, step: ET.Element) -> Floats:
+        """Transform (4, 4) of a node's step or a skin; of NaN, and counted, if it is damaged."""
+        whole = np.eye(4)
+        try:
+            with np.errstate(over="raise", invalid="raise", divide="raise"):
+                found = _STEPS[step.tag](_floats(step.text))
+            whole[: found.shape[0], : found.shape[1]] = found
+        except (UnreadableError, ValueError, LookupError, ArithmeticError):
+            self._damaged.add(step)
+            whole[:] = np.nan
+        return whole
 
     def geometries(self, node: ET.Element) -> list[tuple[ET.Element, _Palette, Floats | None]]:
         """Geometries of a node itself, colours, and where the skin of one is bound."""
-        found = [(*self._geometry(child), self._palette(child)) for child in node]
+        placing = [one for one in node if one.tag in {"instance_geometry", "instance_controller"}]
+        found = [(*self._geometry(one), self._palette(one)) for one in placing]
         return [(one, palette, bound) for one, bound, palette in found if one is not None]
 
     def _geometry(self, instance: ET.Element) -> tuple[ET.Element | None, Floats | None]:
-        """Geometry that an element places, also through skins and morphs, and where it is bound."""
+        """Geometry or node that an element places, also through skins, and where it is bound."""
         inner: ET.Element | None = instance
         key, kinds = "url", _INSTANCES.get(instance.tag, ())
         bound: Floats | None = None
         for _ in range(_MOST_CONTROLLERS):
             target = self.referred(inner, *kinds, key=key)
-            if target is None or target.tag == "geometry":
+            if target is None or target.tag in {"geometry", "node"}:
                 return target, bound
             inner = next((part for part in target if part.tag in {"skin", "morph"}), None)
             key, kinds = "source", ("geometry", "controller")
             if inner is not None and inner.tag == "skin":
-                values = _floats(inner.findtext("bind_shape_matrix"))
-                bound = values.reshape(4, 4) if values.size else np.eye(4)
+                matrix = inner.find("bind_shape_matrix")
+                bound = np.eye(4) if matrix is None else self._transform(matrix)
         return None, None
 
     def _palette(self, instance: ET.Element) -> _Palette:
@@ -142,10 +173,8 @@ class _Document:
                 continue
             with suppress(UnreadableError, ValueError):
                 diffuse = _floats(effect.findtext(".//diffuse/color"))
-                clear = float(effect.findtext(".//transparency/float") or 1)
                 if len(diffuse) in (3, 4):
-                    opacity = clear if 0 < clear < 1 else 1.0
-                    found[binding.get("symbol", "")] = (*diffuse[:3].tolist(), opacity)
+                    found[binding.get("symbol", "")] = (*diffuse[:3].tolist(), _opacity(effect))
         return found
 
     def notes(self, placed: set[int]) -> list[str]:
@@ -161,7 +190,7 @@ class _Document:
             if one.tag == "skew" or (holder.tag == "mesh" and one.tag not in _OF_A_MESH)
         )
         wanted = [one for one in root.iter() if one.tag in _INSTANCES]
-        missing = sum(self.referred(one, *_INSTANCES[one.tag]) is None for one in wanted)
+        missing = sum(self._geometry(one)[0] is None for one in wanted)
         posed = Counter(one.tag for kind in ("skin", "morph") for one in root.iter(kind))
         targets = {name for one in root.iter("IDREF_array") for name in (one.text or "").split()}
         outside = sum(
@@ -172,6 +201,7 @@ class _Document:
             *(note for kind, n in strange.items() for note in told(n, _UNREAD, kind=kind)),
             *told(outside, "geometr{ies} {are} not in its scene and {are} left out"),
             *told(missing, f"of its {len(wanted)} placements {{refer}} to what is not there"),
+            *told(len(self._damaged), "transform{s} {are} damaged: parts there are left out"),
         ]
         for kind, n in posed.items():
             notes += told(n, "geometr{ies} with a {kind} {are} read in rest pose", kind=kind)
@@ -181,6 +211,17 @@ class _Document:
 def _floats(text: str | None) -> Floats:
     """Numbers of a text, none of None."""
     return np.asarray(numbers(text or "", np.float64), dtype=np.float64)
+
+
+def _opacity(effect: ET.Element) -> float:
+    """Opacity of an effect, above 0 to 1: exporters that write 0 mean 1."""
+    clear = float(effect.findtext(".//transparency/float") or 1)
+    by = next(effect.iter("transparent"), ET.Element("transparent"))
+    kind = by.get("opaque", "A_ONE")
+    shade = np.array([*_floats(by.findtext("color")), 1.0, 1.0, 1.0, 1.0])[:4]
+    clear *= float(shade[:3] @ _LUMINANCE if kind.startswith("RGB") else shade[3])
+    clear = 1.0 - clear if kind.endswith("_ZERO") else clear
+    return clear if 1 / 510 < clear < 1 else 1.0  # what is less is 0 in 8 bits
 
 
 def _turn(values: Floats) -> Floats:
@@ -203,24 +244,13 @@ def _look(values: Floats) -> Floats:
 
 _STEPS: dict[str, Callable[[Floats], Floats]] = {
     "matrix": lambda values: values.reshape(4, 4),
+    "bind_shape_matrix": lambda values: values.reshape(4, 4) if values.size else np.eye(4),
     "translate": lambda values: np.column_stack([np.eye(3), values]),
     "scale": lambda values: np.diag(values.reshape(3)),
     "rotate": _turn,
     "lookat": _look,
 }
 """Upper left (n, m) of a transform (4, 4), by the numbers of a step."""
-
-
-def _parent_from_node(node: ET.Element) -> Floats:
-    """Transform (4, 4) of a node: its steps, one behind the other."""
-    whole = np.eye(4)
-    for step in node:
-        if step.tag in _STEPS:
-            one = np.eye(4)
-            found = _STEPS[step.tag](_floats(step.text))
-            one[: found.shape[0], : found.shape[1]] = found
-            whole = whole @ one
-    return whole
 
 
 def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
@@ -244,7 +274,7 @@ def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
     mesh = geometry.find("mesh")
     if mesh is None:
         raise UnreadableError("one has no mesh")
-    sources = {f"#{one.get('id')}": one for one in reversed(mesh) if one.tag not in _PIECES}
+    sources = {unquote(f"#{i.get('id')}"): i for i in reversed(mesh) if i.tag not in _PIECES}
     vertices: dict[str, tuple[int, Floats]] = {}
     faces: list[NDArray[np.int64]] = []
     painted: list[tuple[Colours | None, int]] = []
@@ -255,10 +285,10 @@ def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
             continue
         inputs = _inputs(piece)
         at, name = inputs["VERTEX"]
-        of_vertex = _inputs(sources[name])
+        of_vertex = _inputs(sources[unquote(name)])
         place = of_vertex["POSITION"][1]
         if place not in vertices:
-            vertices[place] = n_vertices, _values(sources[place], 3)
+            vertices[place] = n_vertices, _values(sources[unquote(place)])[:, :3]
             n_vertices += len(vertices[place][1])
         offset, corners = vertices[place]
         width = 1 + max(int(one.get("offset", 0)) for one in piece.iter("input"))
@@ -271,7 +301,7 @@ def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
         inputs = {kind: (at, name) for kind, (_, name) in of_vertex.items()} | inputs
         with suppress(UnreadableError, LookupError, ValueError):
             beside, shade = inputs["COLOR"]
-            values = _values(sources[shade], 3)
+            values = _values(sources[unquote(shade)])
             colours = rgba(mean_of_corners(values, index[:, beside][found]))
         painted.append((colours, len(found)))
     defects = Defects(unsupported=unsupported, incomplete=incomplete)
@@ -287,20 +317,20 @@ def _inputs(holder: ET.Element) -> dict[str, tuple[int, str]]:
     return {i.get("semantic", ""): (int(i.get("offset", 0)), i.get("source", "")) for i in found}
 
 
-def _values(source: ET.Element, least: int) -> Floats:
-    """Numbers of a source, row by row: those that its accessor names, at least so many."""
+def _values(source: ET.Element) -> Floats:
+    """Numbers of a source, row by row: those that its accessor names, three or more."""
     found = _floats(source.findtext("float_array"))
     accessor = source.find("technique_common/accessor")
-    named: list[int] = []
-    stride, start = least, 0
+    columns = [] if accessor is None else accessor.findall("param")
+    stride, start = len(columns) or 3, 0
     if accessor is not None:
-        stride, start = int(accessor.get("stride", 1)), int(accessor.get("offset", 0))
-        named = [n for n, one in enumerate(accessor.findall("param")) if one.get("name")]
+        stride, start = int(accessor.get("stride", stride)), int(accessor.get("offset", 0))
+    named = [n for n, one in enumerate(columns) if one.get("name")]
     rows = found[start : start + len(found[start:]) // stride * stride].reshape(-1, stride)
     rows = rows[:, named] if named else rows
-    if rows.shape[1] < least:
-        raise UnreadableError(f"a source has rows of {rows.shape[1]} numbers, not {least}")
-    return rows[:, :4] if least < rows.shape[1] else rows
+    if rows.shape[1] < 3:
+        raise UnreadableError(f"a source has rows of {rows.shape[1]} numbers, not 3")
+    return rows[:, :4]
 
 
 def _faces(
@@ -322,6 +352,7 @@ def _faces(
             rows.append(row(child))
         elif child.tag == "ph":
             loops = [row(one) for one in child if one.tag in {"p", "h"}]
+            loops = loops[:1] + [hole for hole in loops[1:] if len(hole)]
             holes[len(rows)] = np.cumsum([len(loop) for loop in loops[:-1]]).tolist()
             rows.append(np.concatenate(loops))
     index = np.concatenate(rows)

@@ -42,7 +42,7 @@ laspy allocates memory for all of them before it reads the first."""
 
 
 def read(path: Path) -> Parsed:
-    """Points of a LAS or LAZ file, in the unit of its coordinates, z up."""
+    """Points of a LAS or LAZ file, in the unit of its coordinates, z up if that is known."""
     _check_header(path)
     pieces: list[NDArray[np.float64]] = []
     painted: list[NDArray[np.uint16]] = []
@@ -71,7 +71,7 @@ def read(path: Path) -> Parsed:
     parsed = placed_once([(path.stem, Shape(whole, None, colours=_screen(painted)))])
     words = "point{s} {are} withheld (deleted) in it, and {come} in like any other"
     return replace(
-        parsed, likely_metres=lengths.metres, up="z", not_lengths=lengths.not_lengths,
+        parsed, likely_metres=lengths.metres, up=lengths.up, not_lengths=lengths.not_lengths,
         notes=[*lengths.notes, *told(n_withheld, words)],
     )  # fmt: skip
 
@@ -99,13 +99,15 @@ class _Lengths(NamedTuple):
     """What a file's reference system says of its numbers.
 
     metres : of their unit, None if unknown; rise : how much longer that of heights is; notes : what
-    is told; not_lengths : why they are no lengths.
+    is told; not_lengths : why they are no lengths; up : the axis that points up, None around the
+    whole earth.
     """
 
     metres: float | None = None
     rise: float = 1.0
     notes: tuple[str, ...] = ()
     not_lengths: str | None = None
+    up: str | None = "z"
 
 
 def _lengths(header: laspy.LasHeader) -> _Lengths:
@@ -143,7 +145,8 @@ def _lengths(header: laspy.LasHeader) -> _Lengths:
     height = heights[-1].unit_conversion_factor if heights else metres
     height = by_code.get(keys.get(_VERTICAL_UNIT, 0), height)
     differ = f"its heights are in units of {height:.6g} m, its positions of {metres:.6g} m"
-    return _Lengths(metres, height / metres, (differ,) if height != metres else ())
+    up = None if system is not None and system.is_geocentric else "z"
+    return _Lengths(metres, height / metres, (differ,) if height != metres else (), up=up)
 
 
 def _check_chunks(header: laspy.LasHeader) -> None:

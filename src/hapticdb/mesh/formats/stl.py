@@ -22,6 +22,7 @@ _STRANGE = re.compile(
     r"^[ \t]*(?!(?:end[ \t]*)?(?:solid|facet|loop)|outer\b|vertex\b|color\b)\S",
     re.MULTILINE | re.IGNORECASE,
 )
+_BEGINNING = re.compile(r"\b(facet|end[ \t]*solid)\b", re.IGNORECASE)
 _LOOP = re.compile(r"\bouter\s*loop\b", re.IGNORECASE)
 _CORNER = re.compile(r"\bvertex\b", re.IGNORECASE)
 _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
@@ -82,6 +83,8 @@ def _text(text: str, stem: str) -> Parsed:
     Triangles behind a line with 'endsolid' are a solid, too; a line with 'solid' may be doubled.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
+    if "\n" not in text.strip():
+        text = _BEGINNING.sub(r"\n\1", text)
     borders = list(_BORDER.finditer(text))
     ends = [*(border.start() for border in borders[1:]), len(text)]
     is_end = [border[1].lower() != "solid" for border in borders]

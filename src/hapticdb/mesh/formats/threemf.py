@@ -50,7 +50,8 @@ _MOST_KINDS = 3
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
 _SETTINGS = ("metadata/slic3r_pe_model.config", "metadata/model_settings.config")
 _MODIFIER = re.compile(
-    rb'"(NegativeVolume|ParameterModifier|Support\w+|(?:negative|modifier)_part|support_\w+)"'
+    rb'\b(?:value|subtype)="'
+    rb'(NegativeVolume|ParameterModifier|Support\w+|(?:negative|modifier)_part|support_\w+)"'
 )
 """Kinds of volumes that are no models, in the settings that slicers write beside the model."""
 _EXTENSION = re.compile(r"/([^/]+)/\d{4}/\d{2}$")

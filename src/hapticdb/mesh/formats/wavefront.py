@@ -21,11 +21,11 @@ from hapticdb.mesh.polygons import triangulated, triangulated_equal
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
 from hapticdb.mesh.text import text_of
 
-_COMMENT = re.compile(r"(?<!\.)#")  # 1.#IND is no comment
+_COMMENT = re.compile(r"(?<!\.)#|#(?!IND|INF|QNAN|SNAN)")  # 1.#IND is no comment
 _CONTINUED = re.compile(r"\\[ \t]*(?:\r\n|\n|\r)")
 _TEXTURE_AND_NORMAL = re.compile(r"/[^\s]*")
 _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
-_BLANKS = " \t\0"
+_BLANKS = " \t\0\xa0"
 _FACE = {"f", "fo"}
 _NUMBERS = {"v", *_FACE}
 # Lines that say how surfaces look, or belong to curves, which `_NO_SURFACE` counts.

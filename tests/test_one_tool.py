@@ -10,6 +10,7 @@ import pytest
 
 import hapticdb
 from command_line import Run, made, poses, run, scene  # noqa: F401 - fixtures
+from hapticdb.errors import UsageError
 from hapticdb.page.tools import from_files, middle_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import limit_text
@@ -53,8 +54,10 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
         felt = env.touch(tool, poses=path)
         touch = env.touch(tool, path[0])
         obj = env.object(2)
+        clashes = hapticdb.find_clashes(env)
     assert repr(obj) == "Object(2 'box1', 0.1 m long, 488 voxels)"
-    for result in (swept, felt, touch, obj):
+    checked, same = hapticdb.check_environment(scene), hapticdb.diff_environments(scene, scene)
+    for result in (swept, felt, touch, obj, clashes, checked, same):
         assert len(repr(result).splitlines()) == 1
         assert len(repr(result)) < 200
     assert "<td>box0</td>" in touch._repr_html_()
@@ -65,6 +68,8 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
     assert hapticdb.plot(felt).get_xlabel() == "pose"
     assert "mm" in hapticdb.plot(touch).get_ylabel()
     assert hapticdb.plot(swept).get_title() == swept.verdict
+    with pytest.raises(UsageError, match="no plot of Object"):
+        hapticdb.plot(obj)  # type: ignore[arg-type]
 
 
 def test_help_begins_with_the_names_that_matter() -> None:

@@ -17,6 +17,7 @@ from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
 from command_line import tool as stl
 from hapticdb.mesh import parse_in_process, read_file
 from hapticdb.store.base import scene_bounds
+from hapticdb.units import place_text
 from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
@@ -192,3 +193,9 @@ def test_an_unknown_unit_names_those_known(run: Run, tmp_path: Path) -> None:
     with pytest.raises(hapticdb.errors.UsageError, match=r"furlong.*ft"):
         read_file(stl(tmp_path / "a.stl"), unit="furlong")
     refused(run("import", "a.db", "a.stl", "--unit", "furlong"), "--unit")
+
+
+def test_places_are_told_as_fine_as_what_is_there() -> None:
+    assert place_text((5e5, 4649776.123456, 1.7e-17), 3e-6) == "(500000, 4649776.123456, 0)"
+    assert place_text((-0.25, 1000.0, 0.0), 10.0) == "(0, 1000, 0)"
+    assert place_text((-0.25, 1.0, 0.0), 0.0) == "(-0.25, 1, 0)"

@@ -84,6 +84,10 @@ class CheckReport:
     wrong: list[int] = field(default_factory=list)
     strays: list[int] = field(default_factory=list)
 
+    def __repr__(self) -> str:
+        found = f"{self.n_findings} faults" if self.n_findings else "sound"
+        return f"CheckReport({found}, {self.objects} objects, {self.voxels} voxels, {self.url!r})"
+
     @property
     def is_sound(self) -> bool:
         """Whether the check found no fault."""

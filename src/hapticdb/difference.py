@@ -108,6 +108,13 @@ class Difference:
     """Compared objects that have distances in a, and in b. An object that has them in one
     environment alone is no difference: its voxels are the same."""
 
+    def __repr__(self) -> str:
+        return (
+            f"Difference(only in a: {len(self.only_in_a)}, only in b: {len(self.only_in_b)}, "
+            f"changed: {len(self.changed)}, moved: {len(self.moved)}, "
+            f"other voxels: {len(self.voxels)})"
+        )
+
     @property
     def is_same_grid(self) -> bool:
         """Whether both divide space into the same voxels; their order may differ."""

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import GridError
 from hapticdb.kernels import curves
 from hapticdb.kernels.records import GRID
+from hapticdb.units import place_text
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
@@ -139,7 +140,7 @@ class Grid:
         """One line for people: voxels on each axis, voxel size, curve."""
         return (
             f"{self.side}^3 voxels of {self.voxel_size * 1000:.4g} mm, origin "
-            f"({', '.join(f'{x:.6g}' for x in self.origin)}) m, {self.curve} order"
+            f"{place_text(self.origin, self.voxel_size / 100)} m, {self.curve} order"
         )
 
 

@@ -1,5 +1,8 @@
 """Units of length, by the words that options and parameters take."""
 
+import math
+from collections.abc import Iterable
+
 from hapticdb.errors import UsageError
 
 UNITS = {
@@ -34,6 +37,13 @@ def length_text(length: float) -> str:
     """Put a length, metres, in the unit that reads best: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
     size, word = readable_unit(length)
     return f"{length / size:.4g} {word}"
+
+
+def place_text(place: Iterable[float], step: float) -> str:
+    """Put coordinates, metres, in words, to a step, metres: ``(515369.12, 4918340.5, 0)``."""
+    digits = min(max(math.ceil(-math.log10(step)), 0), 12) if step > 0.0 else 6
+    numbers = (f"{round(x, digits) + 0.0:.{digits}f}" for x in place)
+    return f"({', '.join(x.rstrip('0').rstrip('.') if '.' in x else x for x in numbers)})"
 
 
 def readable_unit(length: float) -> tuple[float, str]:

@@ -106,6 +106,10 @@ class Clashes:
     elapsed: float
     is_kept: bool
 
+    def __repr__(self) -> str:
+        found = ", ".join(f"{n} {kind}" for kind, n in self.counts().items() if n)
+        return f"Clashes({found or 'no pairs'}, {self.elapsed:.2f} s)"
+
     @cached_property
     def pairs(self) -> tuple[Clash, ...]:
         """All pairs, the gravest first, and the deepest or nearest of each kind."""

@@ -129,7 +129,10 @@ def bytes_text(n: float) -> str:
 
 def box(bounds: "NDArray[np.float64]") -> str:
     """Put a box (2, 3), metres, in words: ``4.28 x 1.9 x 1.4 m, from (0, 0, 0) to (4.28, ...)``."""
-    low, high = (f"({', '.join(f'{x:.6g}' for x in corner)})" for corner in bounds.tolist())
+    from hapticdb.units import place_text
+
+    step = float((bounds[1] - bounds[0]).max()) / 1e5
+    low, high = (place_text(corner, step) for corner in bounds.tolist())
     sides = " x ".join(f"{side:.4g}" for side in (bounds[1] - bounds[0]).tolist())
     return f"{sides} m, from {low} to {high} m"
 

@@ -127,7 +127,7 @@ class Extraction:
     def __repr__(self) -> str:
         way = "no way found" if self.way is None else f"{self.way.verdict}, by a {self.way.how}"
         names = ", ".join(part.name for part in self.parts[:3])
-        return f"Extraction({names}: {way}, {self.pulls} pulls tried, {self.seconds:.2f} s)"
+        return f"Extraction({names}: {way}, pulls tried: {self.pulls}, {self.seconds:.2f} s)"
 
     @property
     def verdict(self) -> WayOutVerdict:

@@ -77,7 +77,7 @@ class FileReport:
     """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
 
     def __repr__(self) -> str:
-        what = f"{len(self.added)} objects added, {self.present} there before"
+        what = f"objects added: {len(self.added)}, there before: {self.present}"
         return f"FileReport({self.link}: {self.status}, {self.error or what})"
 
 

@@ -19,8 +19,10 @@ def plot(result: TouchBatch | Touch | Swept, axes: "Axes | None" = None) -> "Axe
     Of touches, force and torque of each pose; of one touch, how deep each of its contacts is; of a
     sweep, the gap along its path (``profile=True``) and where it hits.
 
-    axes : to draw into; new ones unless given.
+    axes : to draw into; new ones unless given. UsageError for a result that has no plot.
     """
+    if not isinstance(result, TouchBatch | Touch | Swept):
+        raise UsageError(f"no plot of {type(result).__name__}: give touches or a sweep")
     import matplotlib.pyplot as plt  # noqa: PLC0415 - a second, which only plots need
 
     if isinstance(result, Swept) and result.profile is None and not result.hits:

@@ -204,11 +204,12 @@ def sweep(
             elif csv != STDOUT:
                 _show(told)
         finally:  # also when who reads, such as head, has enough
+            began = perf_counter()
             if picture is not None:
                 with render.bar("drawing", "pictures", lambda *now: now):
                     _draw(picture, env, told, up)
     if picture is not None and not json and csv != STDOUT:
-        render.say(f"picture: {picture}")
+        render.say(f"picture: {picture}, drawn in {perf_counter() - began:.2f} s")
     raise typer.Exit(told.code)
 
 

@@ -78,7 +78,8 @@ class Browser:
         self._shared: list[Any] = []
         self._shown = np.full(7, np.inf)
         self._plumbed_at = -np.inf
-        self.drawing = HandDrawing(client, site.facts.bounds, CAP)
+        middle = site.facts.bounds.mean(axis=0)
+        self.drawing = HandDrawing(client, site.facts.diagonal, middle, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
     # -- what a page with panels shows, too ------------------------------------------------------

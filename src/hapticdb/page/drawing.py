@@ -76,15 +76,15 @@ def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
 class HandDrawing:
     """Hand and tool of the person who looks, in their view alone.
 
-    bounds (2, 3) : the scene's box, metres: sizes of arrows and marks follow its diagonal, and
-    points are sent from its middle, since a browser has them in float32; cap : greatest force that
-    is sent, N.
+    diagonal : of the scene's box, metres, which sizes of arrows and marks follow; middle (3,) : of
+    that box, from which points are sent, since a browser has them in float32; cap : greatest force
+    that is sent, N.
     """
 
-    def __init__(self, client: "ClientHandle", bounds: Floats, cap: float) -> None:
+    def __init__(self, client: "ClientHandle", diagonal: float, middle: Floats, cap: float) -> None:
         self._client = client
-        self._diagonal = diagonal = max(float(np.linalg.norm(bounds[1] - bounds[0])), 1e-9)
-        self.middle = bounds.mean(axis=0)
+        self._diagonal = diagonal
+        self.middle = middle
         """Position of the nodes whose points are sent from it."""
         self.cap = cap
         self._ghost: MeshHandle | None = None

@@ -3,7 +3,7 @@
 import json
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from typing import NamedTuple
 
 import pytest
@@ -141,7 +141,8 @@ def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(
             until(lambda: bool(server.get_clients()))
             for number in range(MOST_FAILED):
                 sent(browser, wrong[number % len(wrong)])
-            sent(browser, update | {"updates": {"value": 0.7}})
+            with suppress(ConnectionClosed):  # the page may be quicker than this message
+                sent(browser, update | {"updates": {"value": 0.7}})
             assert close_code(browser) == BREAKS_RULES
         until(lambda: not server.get_clients())
         lines = [record.getMessage() for record in caplog.records if record.name != "websockets"]

@@ -113,10 +113,10 @@ def test_the_first_message_must_come_and_be_of_this_version(
 
         with reached() as silent:
             assert closed_by(silent).code == 4408
+        monkeypatch.undo()
         with reached() as talking:
             talking.send("text")
             assert closed_by(talking).code == 4400
-        monkeypatch.undo()
         last = reached()
     with last:
         assert closed_by(last).code in {1001, 1012}

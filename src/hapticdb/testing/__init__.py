@@ -18,13 +18,9 @@ capability is tested. docs/extending.md leads from the first line to a tested en
 Needs pytest.
 """
 
-from hapticdb.testing.capabilities import STORE_CAPABILITIES, CapabilitiesContract
 from hapticdb.testing.distances import DistancesContract
 from hapticdb.testing.engines import ENGINE_CAPABILITIES, EngineContract
-from hapticdb.testing.lifecycle import LifecycleContract
-from hapticdb.testing.objects import ObjectsContract
-from hapticdb.testing.pairs import PairsContract
-from hapticdb.testing.rows import RowsContract
+from hapticdb.testing.reading import STORE_CAPABILITIES, ReadingContract
 from hapticdb.testing.scenes import (
     KINDS,
     blob,
@@ -33,9 +29,8 @@ from hapticdb.testing.scenes import (
     with_distances,
     write_voxels,
 )
-from hapticdb.testing.statistics import StatisticsContract
-from hapticdb.testing.surfaces import SurfacesContract
-from hapticdb.testing.watching import WatchContract, is_noticed
+from hapticdb.testing.sharing import SharingContract, is_noticed
+from hapticdb.testing.writing import WritingContract
 
 __all__ = [
     "ENGINE_CAPABILITIES",
@@ -52,17 +47,7 @@ __all__ = [
 ]
 
 
-class StoreContract(
-    RowsContract,
-    ObjectsContract,
-    DistancesContract,
-    SurfacesContract,
-    PairsContract,
-    LifecycleContract,
-    StatisticsContract,
-    WatchContract,
-    CapabilitiesContract,
-):
+class StoreContract(ReadingContract, WritingContract, DistancesContract, SharingContract):
     """Tests of one engine's store, over every layout and curve.
 
     Subclass, override `make` and `reopen`, and name in `lacks` what the engine lacks.

@@ -125,7 +125,7 @@ class DistancesContract(StoreCase):
         band.remove(3, covering(band))
         assert band.size().band_rows == 0
 
-    def test_nothing_asked_is_nothing_found(self, band: Store) -> None:
+    def test_nothing_asked_has_no_distances(self, band: Store) -> None:
         """The answer still has distances, of no row."""
         for empty in (
             band.lookup(NO_KEYS, distances=True),

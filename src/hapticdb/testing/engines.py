@@ -6,26 +6,12 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hapticdb.errors import (
-    EnvironmentExistsError,
-    EnvironmentNotFoundError,
-    UsageError,
-)
+from hapticdb.errors import EnvironmentExistsError, EnvironmentNotFoundError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.connect import backup_environment, grant, open_store, restore_environment
-from hapticdb.store.engines import (
-    Engine,
-    SupportsBackup,
-    SupportsGrant,
-    engine_of,
-)
+from hapticdb.store.engines import Engine, SupportsBackup, SupportsGrant, engine_of
 from hapticdb.testing.case import Case
-from hapticdb.testing.scenes import (
-    blob,
-    everything,
-    floor_voxels,
-    write_voxels,
-)
+from hapticdb.testing.scenes import blob, everything, floor_voxels, write_voxels
 
 ENGINE_CAPABILITIES: dict[str, Any] = {
     "grant": SupportsGrant,

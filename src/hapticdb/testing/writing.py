@@ -1,0 +1,280 @@
+"""Tests of writing: objects, their surfaces, kept pairs; each write is one transaction."""
+
+import contextlib
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hapticdb.errors import (
+    ConflictError,
+    EnvironmentExistsError,
+    ObjectNotFoundError,
+    ReadOnlyError,
+)
+from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.query.grouping import covering
+from hapticdb.store.base import Object, Rows, Store
+from hapticdb.store.pairs import Mark, PairRow
+from hapticdb.testing.case import StoreCase
+from hapticdb.testing.scenes import EVERYWHERE, blob, kind, voxel_object, write_voxels
+
+BALL, CONE = bytes(range(256)) * 40, b"\0cone"
+"""Surfaces, made up: a store never unpacks them."""
+
+PLACE = (0.1, -0.2, 1 / 3, 0.1, -0.2, 0.5)
+FIRST = PairRow(1, 2, "apart", 0.1, 0.1 + 2**-50, PLACE, "new", 2, "a setting")
+SECOND = PairRow(1, 3, "overlapping", 1e-3, None, PLACE, "new", 2, "a setting")
+
+
+class WritingContract(StoreCase):
+    """Tests of the effect of a write, and of the state after a refused one."""
+
+    def test_objects_return_as_written(self, store: Store) -> None:
+        """Records come ordered by id, with the right revisions."""
+        first, second = store.objects()
+        assert (first.id, second.id) == (1, 2)
+        assert store.object(2).name == "two"
+        with pytest.raises(ObjectNotFoundError, match="no object 3"):
+            store.object(3)
+        assert (first.name, first.link, first.attributes) == ("one", "made", {"made": True})
+        assert (first.revision, second.revision, store.revision()) == (1, 2, 2)
+        np.testing.assert_array_equal(first.transform, np.eye(4))
+        np.testing.assert_array_equal(
+            first.bounds, voxel_object(store.grid, blob(1, (20, 20, 20))).bounds
+        )
+
+    def test_some_objects_and_outlines_are_those_of_all(self, store: Store) -> None:
+        """Ids that no object has are passed over; an empty environment has empty outlines."""
+        objects = store.objects()
+        assert [obj.name for obj in store.objects([7, 2])] == ["two"]
+        assert store.objects([]) == []
+        found = store.outlines()
+        assert list(found.names) == [obj.name for obj in objects]
+        assert list(found.digests) == [obj.digest for obj in objects]
+        assert found.ids.tolist() == [obj.id for obj in objects]
+        assert found.revisions.tolist() == [obj.revision for obj in objects]
+        np.testing.assert_array_equal(found.bounds, [obj.bounds for obj in objects])
+        none = self.make(store.grid, store.layout, "fresh").outlines()
+        assert (len(none.names), none.ids.shape, none.bounds.shape) == (0, (0,), (0, 2, 3))
+
+    def test_the_same_part_is_not_written_twice(self, store: Store) -> None:
+        """Link and name are a part's identity; the failed write leaves nothing."""
+        before = store.size().rows
+        with pytest.raises(EnvironmentExistsError):
+            write_voxels(store, blob(5, (40, 40, 40)), "one")
+        assert store.size().rows == before
+        assert store.revision() == 2
+
+    def test_loading_ends_as_single_writes_do(self, store: Store) -> None:
+        """Rows, ids and revisions are equal, also if an error ends the loading."""
+        fresh = self.make(store.grid, store.layout, "loaded")
+        with contextlib.suppress(ZeroDivisionError), fresh.loading(), fresh.loading():
+            write_voxels(fresh, blob(1, (20, 20, 20)), "one")
+            write_voxels(fresh, blob(2, (24, 20, 20)), "two")
+            raise ZeroDivisionError
+        for found, expected in zip(fresh.scan(*EVERYWHERE), store.scan(*EVERYWHERE), strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert [obj.id for obj in fresh.objects()] == [1, 2]
+        assert fresh.revision() == 2
+
+    def test_an_id_is_kept_where_it_is_free(self, store: Store) -> None:
+        """So objects that are copied to another store keep their ids."""
+        ijk = blob(5, (40, 40, 40))
+        rows = rows_of_voxels(ijk, *kind(store))
+        nine = replace(voxel_object(store.grid, ijk, "nine"), id=9)
+        assert store.add(nine, rows) == 9
+        assert store.add(replace(nine, name="again"), rows) == 10
+        assert write_voxels(store, ijk, "next") == 11
+
+    def test_an_object_written_meanwhile_is_not_replaced(self, store: Store) -> None:
+        """The writer with the old revision gets an error, and nothing is changed."""
+        rows = rows_of_voxels(blob(7, (44, 30, 10)), *kind(store))
+        seen = store.object(1)
+        store.replace(seen, rows, covering(store))
+        with pytest.raises(ConflictError, match="written by another meanwhile"):
+            store.replace(seen, rows, covering(store))
+        assert store.revision() == 3
+        with pytest.raises(ObjectNotFoundError):
+            store.replace(replace(seen, id=7), rows, covering(store))
+
+    def test_remove_takes_one_object_and_leaves_the_others(self, store: Store) -> None:
+        """Rows and record go, in one revision; the id is never used again."""
+        store.remove(1, covering(store))
+        assert [obj.id for obj in store.objects()] == [2]
+        rows = store.scan(*EVERYWHERE)
+        assert set(rows.ids.tolist()) == {2}
+        assert len(rows) == len(rows_of_voxels(blob(2, (24, 20, 20)), *kind(store)))
+        assert write_voxels(store, blob(1, (20, 20, 20)), "one") == 3
+        store.remove(2, covering(store))
+        with pytest.raises(ObjectNotFoundError):
+            store.remove(2, covering(store))
+
+    def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
+        """They are listed by their file; another file has none."""
+        link = store.object(1).link
+        assert store.removed(link) == set()
+        store.remove(1, covering(store))
+        store.remove(2, covering(store))
+        assert store.removed(link) == {"one", "two"}
+        assert store.removed(f"{link}.other") == set()
+        write_voxels(store, blob(1, (20, 20, 20)), "one")
+        assert store.removed(link) == {"two"}
+
+    def test_replace_moves_the_rows(self, store: Store) -> None:
+        """Old rows go, new ones come, the id stays."""
+        ijk = blob(7, (44, 30, 10))
+        new = voxel_object(store.grid, ijk, "one")
+        moved = Object(**{**vars(new), "id": 1})
+        rows = rows_of_voxels(ijk, *kind(store))
+        store.replace(moved, rows, covering(store))
+        found = store.scan(*EVERYWHERE)
+        np.testing.assert_array_equal(found.keys[found.ids == 1], rows.keys)
+        np.testing.assert_array_equal(store.objects()[0].bounds, new.bounds)
+        assert store.objects()[0].revision == 3
+
+    def test_changes_name_the_keys_touched(self, store: Store) -> None:
+        """Every voxel key written lies in a range of its change."""
+        changes = list(store.changes())
+        assert [(c.revision, c.action, c.id) for c in changes] == [(1, "add", 1), (2, "add", 2)]
+        keys = store.grid.encode(blob(2, (24, 20, 20)))
+        ranges = changes[1].ranges
+        inside = (keys[:, None] >= ranges[:, 0]) & (keys[:, None] <= ranges[:, 1])
+        assert inside.any(axis=1).all()
+        store.remove(1, covering(store))
+        assert [c.action for c in store.changes(since=2)] == ["remove"]
+
+    def part(self, store: Store, digest: str, name: str) -> tuple[Object, Rows]:
+        """Record and rows of an object of that shape."""
+        ijk = blob(3, (30, 30, 30))
+        record = replace(voxel_object(store.grid, ijk, name), digest=digest)
+        return record, rows_of_voxels(ijk, *kind(store))
+
+    @pytest.fixture
+    def shapes(self, store: Store) -> Store:
+        """The store with three more objects and two surfaces."""
+        for digest, name, surface in (
+            ("ball", "three", BALL), ("ball", "four", b"other bytes"), ("cone", "five", CONE),
+        ):  # fmt: skip
+            store.add(*self.part(store, digest, name), surface)
+        return store
+
+    def test_a_shape_is_written_once_however_many_objects_have_it(self, shapes: Store) -> None:
+        """The first object's surface stays; what was not written is left out of an answer."""
+        digests = ["ball", "cone", shapes.object(1).digest, "nothing"]
+        assert shapes.surfaces(digests) == {"ball": BALL, "cone": CONE}
+        assert shapes.surfaces(["cone"]) == {"cone": CONE}
+        assert shapes.surfaces([]) == {}
+        assert shapes.surface_digests() == {"ball", "cone"}
+        size = shapes.size()
+        assert (size.surfaces, size.surface_bytes) == (2, len(BALL) + len(CONE))
+
+    def test_a_move_leaves_the_surface(self, shapes: Store) -> None:
+        """A record with the same digest needs none."""
+        for object_id, name in ((3, "three"), (5, "five")):
+            record, rows = self.part(shapes, shapes.object(object_id).digest, name)
+            shapes.replace(replace(record, id=object_id), rows, covering(shapes))
+        assert shapes.surfaces(["ball", "cone"]) == {"ball": BALL, "cone": CONE}
+
+    def test_a_surface_goes_with_the_last_object_that_has_it(self, shapes: Store) -> None:
+        """By removal, or by another geometry, whose surface comes in the same write."""
+        shapes.remove(3, covering(shapes))
+        assert shapes.surface_digests() == {"ball", "cone"}
+        record, rows = self.part(shapes, "cube", "four")
+        shapes.replace(replace(record, id=4), rows, covering(shapes), b"cube")
+        assert shapes.surfaces(["ball", "cube"]) == {"cube": b"cube"}
+        shapes.remove(5, covering(shapes))
+        assert shapes.surface_digests() == {"cube"}
+        shapes.add(*self.part(shapes, "ball", "again"), BALL)
+        assert shapes.surfaces(["ball"]) == {"ball": BALL}
+
+    def test_a_refused_write_leaves_no_surface(self, shapes: Store) -> None:
+        """It is written in the object's transaction."""
+        with pytest.raises(EnvironmentExistsError):
+            shapes.add(*self.part(shapes, "cube", "five"), b"cube")
+        assert shapes.surface_digests() == {"ball", "cone"}
+
+    def test_a_snapshot_keeps_a_surface_that_goes(self, shapes: Store) -> None:
+        """Its readers see the surfaces of the objects that they see."""
+        reader = self.reopen(shapes)
+        with reader.snapshot():
+            assert reader.object(5).digest == "cone"
+            shapes.remove(5, covering(shapes))
+            assert reader.surfaces(["cone"]) == {"cone": CONE}
+        assert reader.surfaces(["cone"]) == {}
+        reader.close()
+
+    def test_a_missing_surface_is_added_without_a_revision(self, shapes: Store) -> None:
+        """An object must have its digest; one that is there stays."""
+        bare, revision = shapes.object(1).digest, shapes.revision()
+        for digest in (bare, "cone", "nothing"):
+            shapes.add_surface(digest, b"later")
+        assert shapes.surfaces([bare, "cone", "nothing"]) == {bare: b"later", "cone": CONE}
+        assert shapes.revision() == revision
+        reader = self.reopen(shapes)
+        if reader.is_read_only:
+            with pytest.raises(ReadOnlyError):
+                reader.add_surface(shapes.object(2).digest, b"later")
+        reader.close()
+
+    def test_rows_come_back_in_order(self, store: Store) -> None:
+        """All values return as they were, and no revision is made."""
+        revision = store.revision()
+        assert list(store.pairs()) == []
+        store.put_pairs([SECOND, FIRST])
+        assert list(store.pairs()) == [FIRST, SECOND]
+        changed = SECOND._replace(kind="touching", at_most=0.0, status="changed", revision=3)
+        store.put_pairs([changed], [(1, 2), (7, 8)])
+        assert list(store.pairs()) == [changed]
+        store.put_pairs([], [(1, 3)])
+        assert list(store.pairs()) == []
+        assert store.revision() == revision
+
+    def test_a_later_revision_stays(self, store: Store) -> None:
+        """Of two that look at once, the one that has read the newer objects is right."""
+        store.put_pairs([FIRST])
+        store.put_pairs([FIRST._replace(kind="touching", revision=1)])
+        assert list(store.pairs()) == [FIRST]
+
+    def test_the_mark_is_that_of_who_wrote_last(self, store: Store) -> None:
+        """Who has read the mark learns whether another has written since; it is no row."""
+        assert store.pairs().mark == Mark()
+        mine = store.put_pairs([FIRST], was=Mark())
+        assert mine is not None
+        assert store.pairs().mark == mine
+        assert store.put_pairs([SECOND], [(7, 8)], Mark(), Mark("a setting", 9)) is None
+        theirs = store.pairs().mark
+        assert theirs not in {mine, Mark(), Mark("a setting", 9)}
+        assert store.put_pairs([], was=theirs, now=Mark("a setting", 9)) == Mark("a setting", 9)
+        assert store.put_pairs([], was=Mark("a setting", 9), now=Mark("another", 2)) is not None
+        assert store.pairs().mark == Mark("another", 2)
+        store.accept_pair(1, 2, "a press fit", "ball cone")
+        kept = store.pairs()
+        assert kept.mark == Mark("another", 2)
+        assert [row[:2] for row in kept] == [(1, 2), (1, 3)]
+        assert [[row[:2] for row in part] for part in kept.parted({3})] == [[(1, 3)], [(1, 2)]]
+
+    def test_an_acceptance_outlasts_a_new_measurement(self, store: Store) -> None:
+        """A pair without a row cannot be accepted."""
+        store.put_pairs([FIRST])
+        store.accept_pair(1, 2, "a press fit", "ball cone")
+        store.accept_pair(4, 5, "nothing", "at all")
+        store.put_pairs([FIRST._replace(at_least=0.2)])
+        accepted = FIRST._replace(at_least=0.2, because="a press fit", shapes="ball cone")
+        assert list(store.pairs()) == [accepted]
+        store.accept_pair(1, 2, None, None)
+        assert list(store.pairs()) == [FIRST._replace(at_least=0.2)]
+
+    def test_a_reader_sees_pairs_and_writes_none(self, store: Store) -> None:
+        """A snapshot keeps what it sees."""
+        store.put_pairs([FIRST])
+        reader = self.reopen(store)
+        with reader.snapshot():
+            assert list(reader.pairs()) == [FIRST]
+            store.put_pairs([SECOND])
+            assert list(reader.pairs()) == [FIRST]
+        assert list(reader.pairs()) == [FIRST, SECOND]
+        if reader.is_read_only:
+            with pytest.raises(ReadOnlyError):
+                reader.put_pairs([FIRST])
+        reader.close()

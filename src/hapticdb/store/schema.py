@@ -7,49 +7,25 @@ no step to run. docs/format.md explains the tables.
 """
 
 from collections.abc import Mapping
-from typing import NamedTuple
-
-
-class Step(NamedTuple):
-    """One step of the format, by name.
-
-    readers_need_it : whether a reader, who cannot run the step, refuses an environment without it.
-    """
-
-    name: str
-    readers_need_it: bool = True
-
 
 STEPS = (
-    Step("tables"),
+    "tables",
     # a mark of each commit, and of the commit before: store/sqlite/log.py
-    Step("lineage", readers_need_it=False),
-    Step("removed parts", readers_need_it=False),
-    # without it no object has distances
-    Step("distances", readers_need_it=False),
+    "lineage",
+    "removed parts",
+    "distances",
     # changes no table; earlier versions could place rows on several servers
-    Step("shards", readers_need_it=False),
-    # without it no object has a surface
-    Step("surfaces", readers_need_it=False),
-    # without it no pair is kept
-    Step("pairs", readers_need_it=False),
+    "shards",
+    "surfaces",
+    "pairs",
 )
+"""Steps by name. A reader, who cannot run steps, needs only the first one: without the others
+no object has distances or a surface, and no pair is kept."""
 FORMAT_VERSION = len(STEPS)
 Dialect = Mapping[str, tuple[str, ...]]
 """Statements of each step of `STEPS` by its name; empty where an engine needs none."""
 
 
-class _Migration(NamedTuple):
-    """A step in the words of one engine: the version that it leads to, and its statements."""
-
-    version: int
-    statements: tuple[str, ...]
-    readers_need_it: bool
-
-
-def migrations_after(version: int, dialect: Dialect) -> list[_Migration]:
-    """Steps that an environment of that format lacks, in their order."""
-    return [
-        _Migration(number, dialect[step.name], step.readers_need_it)
-        for number, step in enumerate(STEPS[version:], start=version + 1)
-    ]
+def migrations_after(version: int, dialect: Dialect) -> list[tuple[int, tuple[str, ...]]]:
+    """Steps that an environment of that format lacks: the version of each, and its statements."""
+    return [(n, dialect[step]) for n, step in enumerate(STEPS[version:], start=version + 1)]

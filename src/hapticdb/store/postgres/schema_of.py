@@ -133,14 +133,8 @@ def check(connection: ServerConnection) -> None:
             f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
             "install a newer hapticdb"
         )
-    missing = [step for step in migrations_after(version, MIGRATIONS) if step.statements]
-    if missing and not connection.is_read_only and connection.is_owner():
+    if version < FORMAT_VERSION and not connection.is_read_only and connection.is_owner():
         connection.write(lambda: _migrate_once(connection))
-    elif any(step.readers_need_it for step in missing):
-        raise ReadOnlyError(
-            f"{shown} has the older format {version}: its owner has to open it once to "
-            "write, and it is brought up to date"
-        )
 
 
 def _check_writable(connection: ServerConnection) -> None:
@@ -259,8 +253,8 @@ def _migrate_once(connection: ServerConnection) -> None:
 def _migrate(connection: ServerConnection, version: int) -> None:
     """Run the migrations after `version`, inside a transaction."""
     schema = sql.Identifier(connection.address.environment)
-    for migration in migrations_after(version, MIGRATIONS):
-        for statement in migration.statements:
+    for _, statements in migrations_after(version, MIGRATIONS):
+        for statement in statements:
             connection.execute(sql.SQL(statement).format(schema=schema))
     if version:
         connection.execute("UPDATE environment SET format = %s", (FORMAT_VERSION,))

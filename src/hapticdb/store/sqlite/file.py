@@ -133,7 +133,9 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
             version = _version(connection, path)
             connection.execute("SELECT id FROM environment").fetchall()  # a page of every log
             file.settle(connection, is_immutable=is_immutable)
-            _bring_up_to_date(connection, path, version, read_only=read_only)
+            if not read_only:
+                migrate(connection, version)
+                leave_checksums(connection)
         except BaseException as error:
             connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
             connection.close()
@@ -222,7 +224,7 @@ def _sweep_unfinished(path: Path) -> None:
 
 def migrate(connection: apsw.Connection, version: int) -> None:
     """Run the migrations after `version`, each in one transaction with the number it leads to."""
-    for number, statements, _ in migrations_after(version, MIGRATIONS):
+    for number, statements in migrations_after(version, MIGRATIONS):
         connection.execute("BEGIN IMMEDIATE")
         try:
             marked, done = divmod(_pragma(connection, "user_version"), VERSION_UNIT)
@@ -309,20 +311,6 @@ def _version(connection: apsw.Connection, path: Path) -> int:
     if version < 1:
         raise damaged(str(path), f"format {version}")
     return version
-
-
-def _bring_up_to_date(
-    connection: apsw.Connection, path: Path, version: int, *, read_only: bool
-) -> None:
-    """Run the migrations that an older file lacks; a reader does not need all of them."""
-    if not read_only:
-        migrate(connection, version)
-        leave_checksums(connection)
-    elif any(step.readers_need_it for step in migrations_after(version, MIGRATIONS)):
-        raise ReadOnlyError(
-            f"{path} has the older format {version}: open it once to write, "
-            "and it is brought up to date"
-        )
 
 
 def leave_checksums(connection: apsw.Connection) -> None:

@@ -8,27 +8,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.grid import BRICK_BITS, CELL_BITS, Grid
-from hapticdb.ingest.layout import Bricks, bricks_of_rows
-from hapticdb.kernels import curves
+from hapticdb.grid import Grid
+from hapticdb.ingest.layout import Bricks
+from hapticdb.ingest.stored import bricks_of_object
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.query.grouping import BAND_MARGIN, box_ranges
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Store
 from hapticdb.store.connect import open_store
-from hapticdb.transfer import (
-    CopyCallback,
-    CopyProgress,
-    Url,
-    are_few_rows,
-    is_same_grid,
-    is_same_kind,
-    part_of,
-)
+from hapticdb.transfer import CopyCallback, CopyProgress, Url, is_same_grid, part_of
 
-Corner = NDArray[np.int64]
 Pair = tuple[Object, Object]
-BRICK_EDGE = 1 << BRICK_BITS
 
 
 class VoxelDifference(NamedTuple):
@@ -199,112 +188,30 @@ def _compared(
 ) -> list[VoxelDifference]:
     found = []
     n_voxels = 0
-    stores = (a, b)
-    vectors = [QuantileVector.of(store) for store in stores] if pairs else []
+    stores = [(store, QuantileVector.of(store)) for store in (a, b)] if pairs else []
     for done, pair in enumerate(pairs, start=1):
-        found.append(_compare_voxels(stores, vectors, pair))
+        of_a, of_b = (bricks_of_object(s, obj, q) for (s, q), obj in zip(stores, pair, strict=True))
+        found.append(VoxelDifference(*pair, *_count_apart(of_a, of_b)))
         n_voxels += pair[0].voxels
         if progress is not None:
             progress(CopyProgress(done, len(pairs), n_voxels))
     return found
 
 
-def _compare_voxels(
-    stores: tuple[Store, Store], vectors: Sequence[QuantileVector], pair: Pair
-) -> VoxelDifference:
-    """Compare two objects voxel by voxel, box by box."""
-    grid = stores[0].grid
-    low, high = _box_of(grid, pair, 1)
-    counts = np.zeros(3, dtype=np.int64)
-    for box in _boxes(stores, vectors, low, high):
-        rows_a, rows_b = (
-            store.rows_of(obj.id, *box_ranges(store.grid, store.layout, *box))
-            for store, obj in zip(stores, pair, strict=True)
-        )
-        if (
-            is_same_kind(*stores)
-            and np.array_equal(rows_a.keys, rows_b.keys)
-            and np.array_equal(rows_a.occupancy, rows_b.occupancy)
-        ):
-            alike = _inside(bricks_of_rows(rows_a, grid, stores[0].layout), grid, *box)
-            counts[2] += voxelize.count_voxels(alike.occupancy)
-            continue
-        counts += _count_apart(
-            *(
-                _inside(bricks_of_rows(rows, store.grid, store.layout), grid, *box)
-                for rows, store in zip((rows_a, rows_b), stores, strict=True)
-            )
-        )
-    return VoxelDifference(*pair, *counts.tolist())
-
-
 def _distances_apart(a: Store, b: Store, pairs: Sequence[Pair]) -> Iterator[DistanceDifference]:
     """Objects whose distances differ, of those that have some in both environments."""
-    stores = (a, b)
     both = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
-    vectors = [QuantileVector.of(store) for store in stores] if both else []
+    stores = [(store, QuantileVector.of(store)) for store in (a, b)] if both else []
     for pair in both:
-        n_rows = sum(
-            _count_rows_apart(stores, pair, box)
-            for box in _boxes(stores, vectors, *_box_of(a.grid, pair, BAND_MARGIN))
-        )
-        if n_rows:
+        packed = []
+        for (store, quantiles), obj in zip(stores, pair, strict=True):
+            bricks = bricks_of_object(store, obj, quantiles, distances=True)
+            assert bricks.distances is not None  # noqa: S101 - read with distances
+            data, ends = bricks.distances.data.tobytes(), bricks.distances.ends.tolist()
+            pieces = zip(bricks.keys.tolist(), [0, *ends[:-1]], ends, strict=True)
+            packed.append({(key, data[start:end]) for key, start, end in pieces})
+        if n_rows := len({key for key, _ in packed[0] ^ packed[1]}):
             yield DistanceDifference(*pair, n_rows)
-
-
-def _count_rows_apart(stores: tuple[Store, Store], pair: Pair, box: tuple[Corner, Corner]) -> int:
-    """Bricks of a box whose packed distances differ, or that only one of the two objects has."""
-    packed = []
-    for store, obj in zip(stores, pair, strict=True):
-        ranges = box_ranges(store.grid, store.layout, *box)
-        rows = store.rows_of(obj.id, *ranges, distances=True)
-        bricks = _inside(bricks_of_rows(rows, store.grid, store.layout), store.grid, *box)
-        assert bricks.distances is not None  # noqa: S101 - read with distances
-        data, ends = bricks.distances.data.tobytes(), bricks.distances.ends.tolist()
-        pieces = zip(bricks.keys.tolist(), [0, *ends[:-1]], ends, strict=True)
-        packed.append({(key, data[start:end]) for key, start, end in pieces})
-    return len({key for key, _ in packed[0] ^ packed[1]})
-
-
-def _box_of(grid: Grid, pair: Pair, margin: int) -> tuple[Corner, Corner]:
-    """Whole bricks around the bounds of both objects and a margin, voxels, cut to the grid."""
-    corners = np.concatenate([grid.voxels_of(obj.bounds) for obj in pair])
-    low = np.clip(corners.min(axis=0) - margin, 0, grid.side - 1) & -BRICK_EDGE
-    high = np.clip(corners.max(axis=0) + margin, 0, grid.side - 1) | (BRICK_EDGE - 1)
-    return low, high
-
-
-def _boxes(
-    stores: Sequence[Store], vectors: Sequence[QuantileVector], low: Corner, high: Corner
-) -> Iterator[tuple[Corner, Corner]]:
-    """Boxes of whole bricks that together are low .. high (3,), each of few enough rows."""
-    edges = high - low + 1
-    if edges.max() <= 1 << CELL_BITS or all(
-        are_few_rows(box_ranges(store.grid, store.layout, low, high), quantiles)
-        for store, quantiles in zip(stores, vectors, strict=True)
-    ):
-        yield low, high
-        return
-    # in lexicographic order only slabs of i are ranges with few rows outside the box
-    is_sliced = edges[0] > BRICK_EDGE and not all(store.grid.is_hierarchical for store in stores)
-    axis = 0 if is_sliced else int(edges.argmax())
-    middle = low[axis] + (edges[axis] // 2 & -BRICK_EDGE)
-    first_high, second_low = high.copy(), low.copy()
-    first_high[axis], second_low[axis] = middle - 1, middle
-    yield from _boxes(stores, vectors, low, first_high)
-    yield from _boxes(stores, vectors, second_low, high)
-
-
-def _inside(bricks: Bricks, grid: Grid, low: Corner, high: Corner) -> Bricks:
-    """Bricks that lie in the box: the ranges of keys that cover it also hold others."""
-    corners = (
-        curves.decode(bricks.keys, max(grid.bits - BRICK_BITS, 0), curves.Z_ORDER) << BRICK_BITS
-    )
-    mine = ((corners >= low) & (corners <= high)).all(axis=1)
-    distances = bricks.distances
-    if distances is not None:
-        distances = distances.picked(np.flatnonzero(mine))
-    return Bricks(bricks.keys[mine], bricks.occupancy[mine], distances)
 
 
 def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int, int]:

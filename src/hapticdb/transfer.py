@@ -1,7 +1,7 @@
 """Copies environments between engines, layouts and curves."""
 
 import os
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
@@ -16,19 +16,14 @@ from hapticdb.errors import (
     GridError,
     UsageError,
 )
-from hapticdb.grid import BRICK_BITS, CurveName, Grid
-from hapticdb.ingest.layout import bricks_of_rows, merged, rows_of_bricks
-from hapticdb.kernels import curves
+from hapticdb.grid import CurveName, Grid
+from hapticdb.ingest.layout import rows_of_bricks
+from hapticdb.ingest.stored import bricks_of_batches, rows_of_object
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.query.grouping import Ranges, object_ranges
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Rows, Store, joined
 from hapticdb.store.connect import create_store, exists, open_store
-from hapticdb.store.parsing import distances_crc
-
-MOST_ROWS = 1 << 19
-"""Rows of the index that one statement may read, whatever objects they belong to. It takes far less
-than a second. A larger value needs fewer statements and more memory."""
+from hapticdb.store.parsing import Checksum
 
 Url = str | os.PathLike[str]
 
@@ -236,18 +231,20 @@ def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVect
 
     With distances if the object has them and the target wants them.
     """
-    ranges = object_ranges(source.grid, source.layout, obj)
     distances = obj.has_distances and target.wants_distances
-    batches = _batches(source, obj, ranges, quantiles, distances=distances)
-    if distances or is_same_kind(source, target):
-        rows = joined(list(batches), distances=distances)
-        n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
-        if distances and distances_crc(rows) != obj.distances_crc:
+    batches = list(rows_of_object(source, obj, quantiles, distances=distances))
+    if distances:
+        checksum = Checksum()
+        for batch in batches:
+            checksum.add(batch)
+        if checksum.value() != obj.distances_crc:
             raise _damaged(source, obj, "distances other than those that were written")
-        rows = _on_curve(rows, source.grid, target.grid)
+    if is_same_kind(source, target):
+        rows = joined(batches, distances=distances)
+        n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
     else:
-        parts = [bricks_of_rows(batch, source.grid, source.layout) for batch in batches]
-        rows, n_voxels = rows_of_bricks(merged(parts), target.grid, target.layout)
+        bricks = bricks_of_batches(source, batches, distances=distances)
+        rows, n_voxels = rows_of_bricks(bricks, target.grid, target.layout)
     if n_voxels != obj.voxels:
         raise _damaged(source, obj, f"{n_voxels} voxels instead of {obj.voxels}")
     return rows
@@ -258,39 +255,3 @@ def _damaged(source: Store, obj: Object, what: str) -> DamagedError:
         f"{source.url} is damaged (object {obj.id}, {obj.name}, has {what}): remove that object "
         "and import its file again, or restore a copy"
     )
-
-
-def _on_curve(rows: Rows, grid: Grid, onto: Grid) -> Rows:
-    """Rows of bricks with the keys of another curve, ascending; the same rows on the same curve."""
-    if grid.curve == onto.curve:
-        return rows
-    level = max(grid.bits - BRICK_BITS, 0)
-    places = curves.decode(rows.keys, level, grid.curve_code)
-    keys = curves.encode(places, level, onto.curve_code)
-    anew = Rows(keys, rows.ids, rows.occupancy, rows.distances)
-    return anew.picked(np.argsort(keys))
-
-
-def are_few_rows(ranges: Ranges, quantiles: QuantileVector) -> bool:
-    """Whether one statement may read these ranges: they hold at most `MOST_ROWS` rows."""
-    pairs = zip(*(bounds.tolist() for bounds in ranges), strict=True)
-    return sum(quantiles.rows_between(low, high) for low, high in pairs) <= MOST_ROWS
-
-
-def _batches(
-    store: Store, obj: Object, ranges: Ranges, quantiles: QuantileVector, *, distances: bool
-) -> Iterator[Rows]:
-    """Rows of an object in batches, ascending by key; one statement reads one batch."""
-    lows, highs = ranges
-    is_one_key = len(lows) == 1 and lows[0] == highs[0]
-    if is_one_key or are_few_rows(ranges, quantiles):
-        yield store.rows_of(obj.id, lows, highs, distances=distances)
-        return
-    half = len(lows) // 2
-    if half:
-        halves = (lows[:half], highs[:half]), (lows[half:], highs[half:])
-    else:
-        middle = (lows + highs) // 2
-        halves = (lows, middle), (middle + 1, highs)
-    for part in halves:
-        yield from _batches(store, obj, Ranges(*part), quantiles, distances=distances)

@@ -4,7 +4,6 @@ Bricks in Z-order are the common form: the voxelizer makes them, and rows of any
 are converted from and to them.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -92,31 +91,19 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
     return ijk[np.argsort(grid.encode(ijk))]
 
 
-def merged(parts: Sequence[Bricks]) -> Bricks:
-    """Bricks of one or more parts together; a brick in several parts gets the bits of all.
+def merged(pieces: list[Bricks]) -> Bricks:
+    """Merge bricks without distances; a brick in several pieces gets the bits of all.
 
-    Parts with distances have no brick in common.
+    Empties the list meanwhile, so no piece is stored twice.
     """
-    if len(parts) == 1:
-        return parts[0]
-    keys = np.concatenate([part.keys for part in parts])
-    order = np.argsort(keys, kind="stable")
-    keys = keys[order]
-    starts = np.flatnonzero(np.diff(keys, prepend=-1))
-    if not len(starts):
-        return parts[0]
-    occupancy = np.concatenate([part.occupancy for part in parts])[order]
-    occupancy = np.bitwise_or.reduceat(occupancy, starts, axis=0)
-    bands = [part.distances for part in parts if part.distances is not None]
-    distances = joined(bands).picked(order) if len(bands) == len(parts) else None
-    return Bricks(keys[starts], occupancy, distances)
-
-
-def joined(bands: Sequence[Band]) -> Band:
-    """Distances of all rows of some batches, one batch after the other."""
-    starts = np.cumsum([0] + [len(band.data) for band in bands])
-    ends = [band.ends + start for band, start in zip(bands, starts, strict=False)]
-    return Band(np.concatenate([band.data for band in bands]), np.concatenate(ends))
+    if len(pieces) == 1:
+        return pieces.pop()
+    keys = np.unique(np.concatenate([piece.keys for piece in pieces]))
+    words = np.zeros((len(keys), BRICK_BYTES // 8), dtype=np.int64)
+    while pieces:
+        piece = pieces.pop()
+        words[np.searchsorted(keys, piece.keys)] |= piece.occupancy.view(np.int64)
+    return Bricks(keys, words.view(np.uint8))
 
 
 def _reordered(keys: Keys, bits: int, curve: int, onto: int) -> Keys:

@@ -15,17 +15,13 @@ import numpy as np
 from hapticdb.errors import ConflictError, FileError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.files import ImportCallback, ImportProgress
 from hapticdb.ingest.geometry import found_parts, packed_surface
+from hapticdb.ingest.stored import rows_of_object
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part, read_file
-from hapticdb.query.grouping import covering, object_ranges
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.base import Object, Rows, Store
+from hapticdb.query.grouping import covering
+from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.store.base import Object, Rows, Store, joined
 from hapticdb.store.connect import open_store
-
-ROWS_AT_ONCE = 1 << 18
-"""Rows that are read at a time, to compare them. A larger value takes more memory."""
-KEY_END = (1 << 63) - 1
-"""A key above all others."""
 
 
 class LeftOut(NamedTuple):
@@ -143,6 +139,7 @@ class _Run:
     def give_distances(self, objects: Sequence[Object], jobs: int) -> None:
         """Write the distances of objects."""
         grid = self._store.grid
+        self._quantiles = QuantileVector.of(self._store)
 
         def measured(
             pair: tuple[Object, Part], share: ShareCallback
@@ -181,7 +178,7 @@ class _Run:
     def _write(self, obj: Object, rows: Rows) -> HapticDBError | None:
         """Write the distances of an object, unless its voxels are not those that are stored."""
         try:
-            if not is_as_stored(self._store, obj, rows):
+            if not _is_as_stored(self._store, obj, rows, self._quantiles):
                 return FileError(
                     f"object {obj.id} ({obj.name}) cannot be upgraded: its voxels are not those "
                     f"that its surface gives now; 'hapticdb remove' it and import {obj.link} again"
@@ -241,20 +238,9 @@ def _parts_in_files(
             )
 
 
-def is_as_stored(store: Store, obj: Object, rows: Rows) -> bool:
+def _is_as_stored(store: Store, obj: Object, rows: Rows, quantiles: QuantileVector) -> bool:
     """Whether the stored bricks of an object are those of its new rows, bit for bit."""
     new = rows.occupied()
-    lows, highs = object_ranges(store.grid, store.layout, obj)
-    for at in range(0, max(len(new), 1), ROWS_AT_ONCE):
-        part, end = new.part(at, at + ROWS_AT_ONCE), at + ROWS_AT_ONCE
-        first = int(part.keys[0]) if at else 0
-        last = int(new.keys[end]) - 1 if end < len(new) else KEY_END
-        inside = (highs >= first) & (lows <= last)
-        ranges = np.maximum(lows[inside], first), np.minimum(highs[inside], last)
-        stored = store.rows_of(obj.id, *ranges)
-        if not (
-            np.array_equal(stored.keys, part.keys)
-            and np.array_equal(stored.occupancy, part.occupancy)
-        ):
-            return False
-    return True
+    stored = joined(list(rows_of_object(store, obj, quantiles)), distances=False)
+    is_same = np.array_equal(stored.keys, new.keys)
+    return is_same and np.array_equal(stored.occupancy, new.occupancy)

@@ -15,7 +15,7 @@ from hapticdb.cluster.workers import Cluster
 from hapticdb.errors import FileError
 from hapticdb.grid import Grid
 from hapticdb.ingest.geometry import packed_surface
-from hapticdb.ingest.layout import Bricks, rows_of_bricks
+from hapticdb.ingest.layout import Bricks, merged, rows_of_bricks
 from hapticdb.kernels.surfaces import distances as kernels
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.mesh import MeshFile, Part
@@ -157,23 +157,11 @@ def bricks_of_pieces(
         if progress is not None and share < 1.0:
             progress(share)
         if n_waiting > merge_from:
-            pieces = [merged_in_turn(pieces)]
+            pieces = [merged(pieces)]
             n_waiting = len(pieces[0].keys)
             merge_from = 2 * n_waiting + _MERGE_FROM
             check_room(2 * BYTES_A_BRICK * n_waiting, what)
-    return merged_in_turn(pieces)
-
-
-def merged_in_turn(pieces: list[Bricks]) -> Bricks:
-    """Merge the bricks of all pieces; empties the list meanwhile, so no piece is stored twice."""
-    if len(pieces) == 1:
-        return pieces.pop()
-    keys = np.unique(np.concatenate([piece.keys for piece in pieces]))
-    words = np.zeros((len(keys), BRICK_BYTES // 8), dtype=np.int64)
-    while pieces:
-        piece = pieces.pop()
-        words[np.searchsorted(keys, piece.keys)] |= piece.occupancy.view(np.int64)
-    return Bricks(keys, words.view(np.uint8))
+    return merged(pieces)
 
 
 def check_room(n_bytes: int, what: str) -> None:

@@ -1,10 +1,9 @@
 """Checks whether an environment is sound: structure, rows, objects, the log of changes."""
 
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +19,7 @@ from hapticdb.store.base import (
     Change,
     Keys,
     Object,
+    Progress,
     Rows,
     Store,
     row_shift,
@@ -36,16 +36,6 @@ MOST_FINDINGS = 1000
 """Most findings that a report keeps. The report counts all findings."""
 BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
 """Number of set bits of each byte."""
-
-
-class _CheckProgress(NamedTuple):
-    """Progress of a check: rows read, and all rows."""
-
-    done: int
-    total: int
-
-
-CheckCallback = Callable[[_CheckProgress], None]
 
 
 @dataclass
@@ -103,7 +93,7 @@ class CheckReport:
 
 
 def check_environment(
-    url: str | os.PathLike[str], *, progress: CheckCallback | None = None
+    url: str | os.PathLike[str], *, progress: Progress | None = None
 ) -> CheckReport:
     """Read all of an environment and say what is wrong with it.
 
@@ -120,7 +110,7 @@ def check_environment(
     url : str or path
         The environment; it is only read.
     progress : callable or None
-        Called after each batch of rows with a `_CheckProgress`.
+        Called after each batch of rows with how many were read, and how many there are.
 
     Raises
     ------
@@ -138,7 +128,7 @@ def check_environment(
 
 
 def repair_environment(
-    url: str | os.PathLike[str], report: CheckReport, *, progress: CheckCallback | None = None
+    url: str | os.PathLike[str], report: CheckReport, *, progress: Progress | None = None
 ) -> None:
     """Mend what a check has found about rows: a transaction an object.
 
@@ -156,14 +146,14 @@ def repair_environment(
             if isinstance(store, DropsRows):
                 store.drop_rows(object_id)
             if progress is not None:
-                progress(_CheckProgress(n + 1, total))
+                progress(n + 1, total)
         for n, object_id in enumerate(report.wrong, start=len(report.strays)):
             rewrite_object(store, store.object(object_id))
             if progress is not None:
-                progress(_CheckProgress(n + 1, total))
+                progress(n + 1, total)
 
 
-def _check(store: Store, report: CheckReport, progress: CheckCallback | None) -> None:
+def _check(store: Store, report: CheckReport, progress: Progress | None) -> None:
     with store.snapshot():
         try:
             for finding in store.findings():
@@ -265,14 +255,14 @@ def _row_findings(
     store: Store,
     objects: dict[int, Object],
     report: CheckReport,
-    progress: CheckCallback | None,
+    progress: Progress | None,
 ) -> Iterator[str]:
     sums, places, total = _Sums(store), _Places(store, objects), store.size().rows
     for rows in sums.batches(ROWS_AT_ONCE):
         report.rows += len(rows)
         yield from places.findings(rows)
         if progress is not None:
-            progress(_CheckProgress(min(report.rows, total), total))
+            progress(min(report.rows, total), total)
     if sums.disorder:
         yield f"rows {sums.disorder}"
         return

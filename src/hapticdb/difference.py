@@ -13,9 +13,9 @@ from hapticdb.ingest.layout import Bricks
 from hapticdb.ingest.stored import bricks_of_object
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.quantiles import QuantileVector
-from hapticdb.store.base import BRICK_BYTES, Object, Store
+from hapticdb.store.base import BRICK_BYTES, Object, Progress, Store
 from hapticdb.store.connect import open_store
-from hapticdb.transfer import CopyCallback, CopyProgress, Url, is_same_grid, part_of
+from hapticdb.transfer import Url, is_same_grid, part_of
 
 Pair = tuple[Object, Object]
 
@@ -130,9 +130,7 @@ class Difference:
         return self.is_same_grid and not any(parts) and not self.distances
 
 
-def diff_environments(
-    a_url: Url, b_url: Url, *, progress: CopyCallback | None = None
-) -> Difference:
+def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = None) -> Difference:
     """Compare two environments: their grids, their objects, and every voxel of each object.
 
     Distances to surfaces are compared where both environments have them for an object in the same
@@ -184,17 +182,15 @@ def _is_described_otherwise(a: Object, b: Object) -> bool:
 
 
 def _compared(
-    a: Store, b: Store, pairs: Sequence[Pair], progress: CopyCallback | None
+    a: Store, b: Store, pairs: Sequence[Pair], progress: Progress | None
 ) -> list[VoxelDifference]:
     found = []
-    n_voxels = 0
     stores = [(store, QuantileVector.of(store)) for store in (a, b)] if pairs else []
     for done, pair in enumerate(pairs, start=1):
         of_a, of_b = (bricks_of_object(s, obj, q) for (s, q), obj in zip(stores, pair, strict=True))
         found.append(VoxelDifference(*pair, *_count_apart(of_a, of_b)))
-        n_voxels += pair[0].voxels
         if progress is not None:
-            progress(CopyProgress(done, len(pairs), n_voxels))
+            progress(done, len(pairs))
     return found
 
 

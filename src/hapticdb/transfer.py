@@ -1,11 +1,10 @@
 """Copies environments between engines, layouts and curves."""
 
 import os
-from collections.abc import Callable, Iterable
+from collections.abc import Iterable
 from contextlib import ExitStack, closing, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 
@@ -21,25 +20,11 @@ from hapticdb.ingest.layout import rows_of_bricks
 from hapticdb.ingest.stored import bricks_of_batches, rows_of_object
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-from hapticdb.store.base import Layout, Object, Rows, Store, joined
+from hapticdb.store.base import Layout, Object, Progress, Rows, Store, joined
 from hapticdb.store.connect import create_store, exists, open_store
 from hapticdb.store.parsing import Checksum
 
 Url = str | os.PathLike[str]
-
-
-class CopyProgress(NamedTuple):
-    """Progress of a copy or a comparison, sent after each object.
-
-    voxels : number of voxels of the objects that were copied or compared so far.
-    """
-
-    objects_done: int
-    objects_total: int
-    voxels: int
-
-
-CopyCallback = Callable[[CopyProgress], None]
 
 
 @dataclass(frozen=True)
@@ -72,7 +57,7 @@ def copy_environment(
     *,
     layout: Layout | None = None,
     curve: CurveName | None = None,
-    progress: CopyCallback | None = None,
+    progress: Progress | None = None,
 ) -> CopyReport:
     """Copy an environment's objects into another, which is made if it does not exist.
 
@@ -169,7 +154,7 @@ def is_same_kind(a: Store, b: Store) -> bool:
     return (a.layout, a.grid.curve) == (b.layout, b.grid.curve)
 
 
-def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -> CopyReport:
+def _copy_objects(source: Store, target: Store, progress: Progress | None) -> CopyReport:
     copied = voxels = renumbered = 0
     # loading ends after the source's snapshot: an engine cannot vacuum tables that are being read
     with ExitStack() as loading, source.snapshot():
@@ -190,7 +175,7 @@ def _copy_objects(source: Store, target: Store, progress: CopyCallback | None) -
             copied += 1
             voxels += obj.voxels
             if progress is not None:
-                progress(CopyProgress(done, len(objects), voxels))
+                progress(done, len(objects))
     present = len(objects) - copied
     return CopyReport(source.url, target.url, copied, voxels, present, renumbered)
 

@@ -4,7 +4,7 @@ Where they do not meet is proved by the search that sweeps have. Within a meetin
 apart say where it ends, and a few poses say how deep it is.
 """
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +21,7 @@ from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.poses import rotation_of
 from hapticdb.ready import make_ready
+from hapticdb.store.base import Progress
 from hapticdb.store.finding import Words
 from hapticdb.store.pairs import Kind
 from hapticdb.sweeps.gap import Pair, box_gaps
@@ -65,7 +66,7 @@ def find_meetings(
     about: ArrayLike | None = None,
     against: Words = (),
     contact: float = CONTACT,
-    progress: Callable[[int, int], object] | None = None,
+    progress: Progress | None = None,
 ) -> list[Meeting]:
     """Find when parts that move together meet other objects, in the order of the motion.
 

@@ -24,14 +24,11 @@ from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
 
 Floats = NDArray[np.float64]
-ClashCallback = Callable[[int, int], object]
-"""Called with how many pairs are measured, and how many there are to measure."""
-
 WITHIN, CONTACT = 1e-3, 5e-5
 """Defaults of the greatest distance that is told, and of the contact tolerance, metres."""
 BUDGET = 256 << 20
@@ -57,7 +54,7 @@ def find_clashes(
     against: Words = (),
     seconds: float | None = None,
     budget: int = BUDGET,
-    progress: ClashCallback | None = None,
+    progress: Progress | None = None,
     on: str | None = None,
 ) -> Clashes:
     """Find every pair of objects that are near one another, and what they are.
@@ -145,7 +142,7 @@ class _Asked(NamedTuple):
     against: tuple[int | str, ...]
     until: float
     budget: int
-    progress: ClashCallback | None
+    progress: Progress | None
 
     @property
     def setting(self) -> str:

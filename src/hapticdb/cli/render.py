@@ -8,9 +8,9 @@ import shutil
 import sys
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from contextlib import AbstractContextManager, contextmanager
+from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ParamSpec
+from typing import TYPE_CHECKING, Any
 from unicodedata import category, east_asian_width
 
 if TYPE_CHECKING:
@@ -26,8 +26,6 @@ _UNPRINTABLE = re.compile(
 NEW_LINE = "\n"
 GAP, FACTS_GAP = 3, 2
 """Blanks between two columns of a table, and between a name and its value."""
-Progressed = ParamSpec("Progressed")
-"""What a callback of the library is called with."""
 
 
 def printable(text: str) -> str:
@@ -174,23 +172,23 @@ def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
 
     if not missing(entries_for(*purposes)):
         return 0
-    with bar("compiling, once", "kernels", lambda now: (now.done, now.total)) as progress:
-        return make_ready(*purposes, progress=progress)
-
-
-def import_bar() -> "AbstractContextManager[ImportCallback | None]":
-    """Show how many parts of a file are imported; see `bar`."""
-    return bar("importing", "parts", lambda now: (now.parts_done + now.share, now.parts_total))
+    with bar("compiling, once", "kernels") as tell:
+        return make_ready(*purposes, progress=tell and (lambda now: tell(now.done, now.total)))
 
 
 @contextmanager
-def bar(
-    doing: str, noun: str, measure: "Callable[Progressed, tuple[float, int]]"
-) -> "Iterator[Callable[Progressed, None] | None]":
-    """Show a bar with counts and the time left while standard error is a terminal.
+def import_bar() -> "Iterator[ImportCallback | None]":
+    """Show how many parts of a file are imported; see `bar`."""
+    with bar("importing", "parts") as tell:
+        yield tell and (lambda now: tell(now.parts_done + now.share, now.parts_total))
 
-    measure : of what the library's callback gets: how much is done, of how much. Yields the
-    callback; None where standard error is no terminal.
+
+@contextmanager
+def bar(doing: str, noun: str, *, of: int = 1) -> "Iterator[Callable[[float, int], None] | None]":
+    """Show a bar with counts, in multiples `of` so many, and the time left.
+
+    Yields a callback of the library, `store.base.Progress`; None where standard error is no
+    terminal.
     """
     if not sys.stderr.isatty():
         yield None
@@ -210,15 +208,14 @@ def bar(
     with shown:
         task = shown.add_task(doing, total=None, count="")
 
-        def advance(*now: Progressed.args, **more: Progressed.kwargs) -> None:
-            done, total = measure(*now, **more)
+        def advance(done: float, total: int) -> None:
             is_last = done == total
             shown.update(
                 task,
                 description="finishing" if is_last else doing,
                 total=None if is_last else total,
                 completed=done,
-                count=f"{int(done):,}/{total:,} {noun}",
+                count=f"{int(done // of):,}/{total // of:,} {noun}",
             )
 
         yield advance

@@ -34,7 +34,7 @@ def shell_of(
 
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
-    with render.bar("sampling the tool", "points", lambda *now: now):
+    with render.bar("sampling the tool", "points"):
         shell = PointShell.from_file(
             tool, points, spacing=spacing, unit=unit, seed=seed or 0, inset=inset
         )

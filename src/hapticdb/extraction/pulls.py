@@ -19,7 +19,7 @@ from hapticdb.extraction.free_space import STEP, FreeSpace
 from hapticdb.extraction.judge import judge
 from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.result import WayOut, ids_of
-from hapticdb.sweeps.run import SweepCallback
+from hapticdb.store.base import Progress
 
 Floats = NDArray[np.float64]
 
@@ -85,7 +85,7 @@ class Pulls:
         self._lengths = np.maximum(leaving.distances(self._directions), problem.voxel_size)
         self._opposed = opposed_shares(self._directions, normals)
 
-    def run(self, until: float, progress: SweepCallback | None) -> None:
+    def run(self, until: float, progress: Progress | None) -> None:
         """Try other directions by voxels, one at least; stops at a time of `time.monotonic`."""
         total = len(self._directions)
         for n in range(total):

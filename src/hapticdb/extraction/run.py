@@ -25,9 +25,9 @@ from hapticdb.extraction.result import Blocker, Extraction, WayOut, ids_of
 from hapticdb.extraction.screws import unscrewed
 from hapticdb.ready import make_ready
 from hapticdb.resident.table import DEFAULT_BUDGET
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import CONTACT, SweepCallback
+from hapticdb.sweeps.run import CONTACT
 from hapticdb.sweeps.way import checked_poses
 
 Floats = NDArray[np.float64]
@@ -63,7 +63,7 @@ def extract(
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SweepCallback | None = None,
+    progress: Progress | None = None,
 ) -> Extraction:
     """Search a path on which parts come out of what stands around them, or to a pose.
 
@@ -150,7 +150,7 @@ def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
     return goal
 
 
-def _searched(problem: Problem, asked: _Asked, progress: SweepCallback | None) -> Extraction:
+def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
     make_ready("extract")
     leaving = Exit(

@@ -27,6 +27,9 @@ LONGEST_BAND = 2048
 value believes longer rows of a database that means harm."""
 
 Keys = NDArray[np.int64]
+Progress = Callable[[int, int], object]
+"""Called with how much of some work is done, and with the total. May raise an error, which ends the
+work."""
 
 
 class Band(NamedTuple):

@@ -7,9 +7,8 @@ import os
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
-from hapticdb.store.base import LAYOUTS, Layout, Store
+from hapticdb.store.base import LAYOUTS, Layout, Progress, Store
 from hapticdb.store.engines import (
-    BackupCallback,
     BackupReport,
     Right,
     SupportsBackup,
@@ -75,7 +74,7 @@ def backup_environment(
     file: Url,
     *,
     replace: bool = False,
-    progress: BackupCallback | None = None,
+    progress: Progress | None = None,
 ) -> BackupReport:
     """Copy a whole SQLite environment as of one moment, while others read and write it.
 
@@ -88,7 +87,7 @@ def backup_environment(
     replace : bool
         Replace an environment that is there, unless somebody has it open.
     progress : callable or None
-        Called after each 4 MiB with `bytes_done` and `bytes_total`.
+        Called after each 4 MiB with the bytes done and in all.
 
     Raises
     ------
@@ -109,7 +108,7 @@ def restore_environment(
     file: Url,
     url: Url,
     *,
-    progress: BackupCallback | None = None,
+    progress: Progress | None = None,
 ) -> BackupReport:
     """Put a copy of an SQLite environment in its place, and remove the log of the former file.
 
@@ -122,7 +121,7 @@ def restore_environment(
     url : str or path
         Where it goes: a path or ``sqlite:///path``. An environment may be there already.
     progress : callable or None
-        Called after each 4 MiB with `bytes_done` and `bytes_total`.
+        Called after each 4 MiB with the bytes done and in all.
 
     Raises
     ------

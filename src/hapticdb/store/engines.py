@@ -10,7 +10,6 @@ of a server.
 """
 
 import os
-from collections.abc import Callable
 from functools import cache
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -18,7 +17,7 @@ from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.grid import Grid
-from hapticdb.store.base import Layout, Store
+from hapticdb.store.base import Layout, Progress, Store
 from hapticdb.store.urls import redact, scheme_of
 
 Url = str | os.PathLike[str]
@@ -26,13 +25,6 @@ Right = Literal["viewer", "toucher", "editor", "nobody"]
 """Rights of a role: read and touch; also keep cost figures; also edit; nothing."""
 GROUP = "hapticdb.engines"
 """Entry points of other distributions that name an engine."""
-
-
-class BackupProgress(NamedTuple):
-    """How far a copy is: sent after each step."""
-
-    bytes_done: int
-    bytes_total: int
 
 
 class BackupReport(NamedTuple):
@@ -46,9 +38,6 @@ class BackupReport(NamedTuple):
     revision: int
     objects: int
     bytes: int
-
-
-BackupCallback = Callable[[BackupProgress], object]
 
 
 class Engine(Protocol):
@@ -124,11 +113,11 @@ class SupportsBackup(Protocol):
     """An engine that copies a whole environment as of one moment, and puts a copy in its place."""
 
     def back_up(
-        self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None
+        self, url: str, copy: str, *, replace: bool, progress: Progress | None
     ) -> BackupReport:
         """Copy an environment while others read and write it; `copy` is an environment, too."""
 
-    def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
+    def restore(self, copy: str, url: str, *, progress: Progress | None) -> BackupReport:
         """Put a copy in an environment's place, whole or not at all."""
 
 

@@ -4,7 +4,6 @@ The objects' boxes say which of them may be near the path, never too few. Their 
 """
 
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from functools import cached_property
 from typing import NamedTuple
@@ -23,7 +22,7 @@ from hapticdb.pointshell.orientation import orient
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import FollowedContact, follow
 from hapticdb.sweeps.cut import Mesh
@@ -37,8 +36,6 @@ WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
 
 Floats = NDArray[np.float64]
-SweepCallback = Callable[[int, int], None]
-"""Called with how much is done and the total: of objects, or of straight pulls."""
 
 
 def sweep(
@@ -55,7 +52,7 @@ def sweep(
     profile: bool = False,
     until_hit: bool = False,
     proportions: Proportions | None = None,
-    progress: SweepCallback | None = None,
+    progress: Progress | None = None,
 ) -> Swept:
     """Move a tool along a path; say what it hits and where, or how near it comes.
 
@@ -111,7 +108,7 @@ class _Asked(NamedTuple):
     until: float
     profile: bool
     until_hit: bool
-    progress: SweepCallback | None
+    progress: Progress | None
 
 
 def _asked(
@@ -121,7 +118,7 @@ def _asked(
     *,
     profile: bool,
     until_hit: bool,
-    progress: SweepCallback | None,
+    progress: Progress | None,
 ) -> _Asked:
     """Check numbers; UsageError."""
     most = np.inf if limit is None else limit

@@ -170,7 +170,7 @@ def clashes(
         open_csv(csv, "--csv", COLUMNS) as table,
         nullcontext() if html is None else new_file(Path(html), "--html") as page,
         opened_to_keep(url) as env,
-        render.bar("measuring", "pairs", lambda *now: now) as progress,
+        render.bar("measuring", "pairs") as progress,
     ):
         found = find_clashes(
                 env, within=MM * within, contact=MM * contact, of=of or (), against=against or (),
@@ -232,7 +232,7 @@ def _meetings(
     render.compile_kernels("sweep", "clashes")
     with (
         hapticdb.open(url, read_only=True) as env,
-        render.bar("moving", "objects", lambda *now: now) as progress,
+        render.bar("moving", "objects") as progress,
     ):
         if poses is not None:
             placed = read_poses(poses)

@@ -178,7 +178,7 @@ def extract(
         felt = felt_objects(env, where, exclude, ids)
         kept = ids_of(env, keep, "--keep") if keep else []
         render.compile_kernels("extract")
-        with render.bar("pulling", "searches" if on else "pulls", lambda *now: now) as progress:
+        with render.bar("pulling", "searches" if on else "pulls") as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:
                 options |= {} if depth is None else {"depth": depth}

@@ -11,11 +11,10 @@ from hapticdb.cli.verbs.importing import JobsOption
 
 if TYPE_CHECKING:
     from collections.abc import Callable
-    from contextlib import AbstractContextManager
 
     from hapticdb.check import CheckReport
     from hapticdb.ingest.upgrading import UpgradeReport
-    from hapticdb.store.engines import BackupCallback, BackupReport
+    from hapticdb.store.engines import BackupReport
 
 CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
@@ -55,7 +54,7 @@ def check(
             f"mending rows: of {render.counted(len(report.wrong), 'object')} made anew, of "
             f"{len(report.strays)} that are not there removed"
         )
-        with render.bar("mending", "objects", lambda now: (now.done, now.total)) as progress:
+        with render.bar("mending", "objects") as progress:
             repair_environment(url, report, progress=progress)
         report = _read(url, check_environment)
     if json:
@@ -72,7 +71,7 @@ def check(
 
 
 def _read(url: str, check_environment: "Callable[..., CheckReport]") -> "CheckReport":
-    with render.bar("checking", "rows", lambda now: (now.done, now.total)) as progress:
+    with render.bar("checking", "rows") as progress:
         return check_environment(url, progress=progress)
 
 
@@ -115,7 +114,7 @@ def backup(
     """
     from hapticdb.store.connect import backup_environment
 
-    with left_at(f"there is no new {file}"), _bar() as progress:
+    with left_at(f"there is no new {file}"), render.bar("copying", "MB", of=10**6) as progress:
         report = backup_environment(url, file, replace=replace, progress=progress)
     _say_copied(report, json=json)
 
@@ -131,15 +130,9 @@ def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -
     """
     from hapticdb.store.connect import restore_environment
 
-    with left_at(f"{url} is as it was"), _bar() as progress:
+    with left_at(f"{url} is as it was"), render.bar("copying", "MB", of=10**6) as progress:
         report = restore_environment(file, url, progress=progress)
     _say_copied(report, json=json)
-
-
-def _bar() -> "AbstractContextManager[BackupCallback | None]":
-    return render.bar(
-        "copying", "MB", lambda now: (now.bytes_done // 10**6, now.bytes_total // 10**6)
-    )
 
 
 def _say_copied(report: "BackupReport", *, json: bool) -> None:

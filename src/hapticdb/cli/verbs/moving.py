@@ -1,6 +1,5 @@
 """The verbs that copy and compare environments: copy, diff."""
 
-from contextlib import AbstractContextManager
 from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
@@ -13,7 +12,7 @@ from hapticdb.units import length_text
 if TYPE_CHECKING:
     from hapticdb.difference import Difference
     from hapticdb.store.base import Object
-    from hapticdb.transfer import CopyCallback, CopyReport
+    from hapticdb.transfer import CopyReport
 
 SIDES = ("only_in_a", "only_in_b")
 KINDS = {
@@ -47,7 +46,7 @@ def copy(
 
     with left_at("what went over is whole, and the same command goes on from there"):
         render.compile_kernels("copy")
-        with _bar("copying") as progress:
+        with render.bar("copying", "objects") as progress:
             report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
     if json:
         render.say_json(vars(report))
@@ -55,10 +54,6 @@ def copy(
         render.say(_copied(report))
         if layout == "voxel":
             render.note("the layout voxel has no distances, so the smooth law cannot be felt there")
-
-
-def _bar(doing: str) -> "AbstractContextManager[CopyCallback | None]":
-    return render.bar(doing, "objects", lambda now: (now.objects_done, now.objects_total))
 
 
 def _copied(report: "CopyReport") -> str:
@@ -95,7 +90,7 @@ def diff(
     from hapticdb.difference import diff_environments
 
     render.compile_kernels("copy")
-    with _bar("comparing") as progress:
+    with render.bar("comparing", "objects") as progress:
         difference = diff_environments(a, b, progress=progress)
     record = _record(difference)
     if json:

@@ -206,7 +206,7 @@ def sweep(
         finally:  # also when who reads, such as head, has enough
             began = perf_counter()
             if picture is not None:
-                with render.bar("drawing", "pictures", lambda *now: now):
+                with render.bar("drawing", "pictures"):
                     _draw(picture, env, told, up)
     if picture is not None and not json and csv != STDOUT:
         render.say(f"picture: {picture}, drawn in {perf_counter() - began:.2f} s")
@@ -261,7 +261,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
     points = DRAWN_POINTS if options.is_drawn else None
     with naming(asked.line):
         if asked.tool is None:
-            with render.bar("sampling the parts", "points", lambda *now: now):
+            with render.bar("sampling the parts", "points"):
                 shell = env.shell(*job.parts, points=points or 1, inset=0.0)
         else:
             shell = shell_of(asked.tool, options.tool_unit, points, None)
@@ -269,7 +269,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
             env, shell, job.poses, exclude=felt.left_out, tool=asked.tool,
             tool_unit=options.tool_unit, path_unit=options.path_unit, is_moving=True,
         )  # fmt: skip
-        with render.bar("sweeping", "objects", lambda *now: now) as progress:
+        with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude, proportions=fit,
                 contact=MM * asked.contact, about=options.about, seconds=options.seconds,

@@ -19,9 +19,9 @@ from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch, Re
 from hapticdb.extraction.result import Extraction, ids_of
 from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import CONTACT, SweepCallback, sweep
+from hapticdb.sweeps.run import CONTACT, sweep
 
 DEFAULT_ORDER_SECONDS = 600.0
 """Default time of the search for an order."""
@@ -50,7 +50,7 @@ def disassemble(
     depth: int = DEFAULT_DEPTH,
     keep: Words = (),
     budget_bytes: int = DEFAULT_BUDGET,
-    progress: SweepCallback | None = None,
+    progress: Progress | None = None,
     on: str | None = None,
 ) -> Disassembly:
     """Search an order in which objects are taken off so that parts come out.

@@ -23,7 +23,8 @@ from hapticdb.errors import (
     ReadOnlyError,
     UsageError,
 )
-from hapticdb.store.engines import BackupCallback, BackupProgress, BackupReport
+from hapticdb.store.base import Progress
+from hapticdb.store.engines import BackupReport
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
@@ -38,7 +39,7 @@ SOURCE_CACHE_KIB = 4096
 
 
 def back_up(
-    source: Path, target: Path, *, replace: bool, progress: BackupCallback | None
+    source: Path, target: Path, *, replace: bool, progress: Progress | None
 ) -> BackupReport:
     """Copy an environment as of one moment into a file, which appears whole or not at all."""
     real = target.resolve()
@@ -84,7 +85,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
     sqlite_file.check_folder(target)
 
 
-def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> tuple[int, int]:
+def _copied(source: Path, unfinished: Path, progress: Progress | None) -> tuple[int, int]:
     """Copy all pages as of one moment; returns the revision and the number of objects."""
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(file), named_errors(str(source)):
@@ -107,9 +108,7 @@ def _copied(source: Path, unfinished: Path, progress: BackupCallback | None) -> 
     return int(str(revision)), int(str(objects))
 
 
-def _copy_pages(
-    source: apsw.Connection, made: apsw.Connection, progress: BackupCallback | None
-) -> None:
+def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progress | None) -> None:
     made.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     made.execute("PRAGMA journal_mode = OFF").fetchall()
     made.execute("PRAGMA synchronous = OFF")  # nobody uses the file yet; `_sync` comes later
@@ -118,7 +117,7 @@ def _copy_pages(
             copying.step(STEP_PAGES)
             if progress is not None:
                 done = copying.page_count - copying.remaining
-                progress(BackupProgress(done * PAGE_BYTES, copying.page_count * PAGE_BYTES))
+                progress(done * PAGE_BYTES, copying.page_count * PAGE_BYTES)
 
 
 def _finish(made: apsw.Connection) -> None:

@@ -5,8 +5,8 @@ from pathlib import Path
 
 from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
-from hapticdb.store.base import Layout, Store
-from hapticdb.store.engines import BackupCallback, BackupReport, unknown_scheme
+from hapticdb.store.base import Layout, Progress, Store
+from hapticdb.store.engines import BackupReport, unknown_scheme
 from hapticdb.store.sqlite.store import SQLiteStore
 
 PREFIX = "sqlite:///"
@@ -40,14 +40,14 @@ class _SQLiteEngine:
         return _path_of(url).stem
 
     def back_up(
-        self, url: str, copy: str, *, replace: bool, progress: BackupCallback | None
+        self, url: str, copy: str, *, replace: bool, progress: Progress | None
     ) -> BackupReport:
         """Copy a file whole, as of one moment."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
         return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
 
-    def restore(self, copy: str, url: str, *, progress: BackupCallback | None) -> BackupReport:
+    def restore(self, copy: str, url: str, *, progress: Progress | None) -> BackupReport:
         """Put a copy in a file's place, and remove the log of the former file."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 

@@ -1,21 +1,20 @@
 """The link to a server: psycopg's connection with our settings, waited for with a limit.
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
-statement. It waits by polling the socket. So Ctrl-C interrupts the wait, and a server that stops
-answering causes an error instead of a hang, also during statements that may take long
-(`hapticdb.store.postgres.connecting.answering`).
+statement. psycopg waits for the answer, in steps of a tenth of a second. So Ctrl-C interrupts the
+wait, and a server that stops answering causes an error instead of a hang, also during statements
+that may take long (`hapticdb.store.postgres.connecting.answering`).
 """
 
 import contextlib
 import math
 import re
-import select
 import time
 from collections.abc import Generator, Iterator, Sequence
 from typing import Any, TypeVar, cast
 
 import psycopg
-from psycopg import pq
+from psycopg import generators, pq
 from psycopg.errors import error_from_result
 
 from hapticdb.store.postgres.address import Address
@@ -114,8 +113,6 @@ class Link:
         self._pgconn = made.pgconn
         self._limit_ms: int | None = 1000 * CONNECT_SECONDS
         self._peer = Peer.of(made.pgconn)
-        self._poller = select.poll()
-        self._poller.register(self._pgconn.socket, select.POLLIN | select.POLLERR | select.POLLHUP)
         try:
             with failures.named_errors(self.shown):
                 self._settle()
@@ -220,7 +217,9 @@ class Link:
     def _result(self) -> pq.abc.PGresult:
         """Result of the statement that was sent. Closes the connection when no result comes."""
         try:
-            return self._receive()
+            found = self.driver.wait(generators.execute(self._pgconn))[-1]
+            if found.status not in _FINE:
+                raise error_from_result(found, encoding="utf-8")  # noqa: TRY301 - may be a loss, too
         except psycopg.Error as error:
             if failures.is_lost(error):
                 self.driver.close()
@@ -228,47 +227,12 @@ class Link:
         except BaseException:  # Ctrl-C or a timeout: the next statement would get a late result
             self.driver.close()
             raise
-
-    def _receive(self) -> pq.abc.PGresult:
-        pgconn = self._pgconn
-        while pgconn.flush():  # a shell of many points does not fit into the socket at once
-            self._poller.modify(pgconn.socket, select.POLLIN | select.POLLOUT)
-            self._wait()
-            pgconn.consume_input()
-        self._poller.modify(pgconn.socket, select.POLLIN)
-        found: pq.abc.PGresult | None = None
-        while True:
-            while pgconn.is_busy():
-                self._wait()
-                pgconn.consume_input()
-            result = pgconn.get_result()
-            if result is None:
-                break
-            found = result
-        if found is None:
-            raise psycopg.OperationalError("the server closed the connection")
-        if found.status not in _FINE:
-            raise error_from_result(found, encoding="utf-8")
         return found
-
-    def _wait(self) -> None:
-        """Wait until the socket can be read or written."""
-        left_ms = self._patience_ms
-        silence_ms = int(1000 * answering.SILENCE_S)
-        while True:
-            step_ms = silence_ms if left_ms is None else min(left_ms, silence_ms)
-            if self._poller.poll(step_ms):
-                return
-            if left_ms is not None:
-                left_ms -= step_ms
-                if left_ms <= 0:
-                    raise self._stuck()
-            self._check_answers()
 
     def until_out_of_patience(
         self, waiting: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
-        """Run psycopg's own waiting for a statement, but no longer than `_wait` would."""
+        """Run psycopg's own waiting for a statement; give up when the server is silent too long."""
         started = heard = time.monotonic()
         try:
             wanted = next(waiting)

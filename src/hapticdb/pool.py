@@ -2,9 +2,8 @@
 
 import contextlib
 import os
-import time
 from collections.abc import Iterator
-from threading import Condition
+from queue import Empty, LifoQueue
 
 from hapticdb.closing import Closes
 from hapticdb.environment import Environment
@@ -49,31 +48,27 @@ class Pool(Closes):
             raise UsageError(f"a pool of size {size}: give 1 or more")
         if not timeout >= 0:
             raise UsageError(f"timeout {timeout}: give seconds, 0 or more")
-        self._url = url
-        self._size = size
-        self._is_read_only = read_only
-        self._timeout = timeout
-        self._changed = Condition()
-        self._free: list[Environment] = []
-        self._n_members = 1
+        self._url, self._size = url, size
+        self._is_read_only, self._timeout = read_only, timeout
         self._is_closed = False
+        self._free: LifoQueue[Environment | None] = LifoQueue()
+        """Members that nobody has; None for each that may still be opened."""
+        for _ in range(size - 1):
+            self._free.put(None)
         first = self._opened()
         self._shown = first.url
-        first.store.give_to(NOBODY)
-        self._free.append(first)
+        self._take_back(first, is_sound=True)
 
     def __repr__(self) -> str:
         return f"Pool({self._shown!r}, size={self._size})"
 
     def close(self) -> None:
         """Close all members; lent members are closed when they are given back."""
-        with self._changed:
-            self._is_closed = True
-            left, self._free = self._free, []
-            self._n_members -= len(left)
-            self._changed.notify_all()
-        for env in left:
-            _close(env)
+        self._is_closed = True
+        with contextlib.suppress(Empty):
+            while True:
+                _close(self._free.get_nowait())
+        self._free.put(None)  # wakes who waits, who puts it back for the next one
 
     @contextlib.contextmanager
     def environment(self, timeout: float | None = None) -> Iterator[Environment]:
@@ -97,49 +92,42 @@ class Pool(Closes):
 
     def _taken(self, timeout: float) -> Environment:
         """Take a member that is free, or a new one; waits for one of the two."""
-        deadline = time.monotonic() + timeout
-        with self._changed:
-            while not self._is_closed:
-                if self._free:
-                    env = self._free.pop()
-                    env.store.give_to(this_thread())
-                    return env
-                if self._n_members < self._size:
-                    self._n_members += 1
-                    break
-                if not self._changed.wait(deadline - time.monotonic()):
-                    raise BusyError(
-                        f"all {self._size} environments of the pool of {self._shown} were in use "
-                        f"for {timeout:g} s: give them back sooner, or make the pool larger"
-                    )
-            else:
-                raise DatabaseError(f"the pool of {self._shown} has been closed: make a new one")
         try:
-            return self._opened()  # outside the lock, so that others can go on meanwhile
+            env = self._free.get(timeout=timeout)
+        except Empty:
+            raise BusyError(
+                f"all {self._size} environments of the pool of {self._shown} were in use "
+                f"for {timeout:g} s: give them back sooner, or make the pool larger"
+            ) from None
+        if self._is_closed:
+            _close(env)
+            self._free.put(None)
+            raise DatabaseError(f"the pool of {self._shown} has been closed: make a new one")
+        if env is not None:
+            env.store.give_to(this_thread())
+            return env
+        try:
+            return self._opened()
         except BaseException:
-            self._forget_one()
+            self._free.put(None)
             raise
 
     def _take_back(self, env: Environment, *, is_sound: bool) -> None:
         """Make a member free again. A broken or closed one is dropped: a new one may replace it."""
-        with self._changed:
-            if is_sound and not env.store.is_closed and not self._is_closed:
-                env.store.give_to(NOBODY)  # a borrower that still uses it gets an error
-                self._free.append(env)
-                self._changed.notify()
-                return
-        _close(env)
-        self._forget_one()
-
-    def _forget_one(self) -> None:
-        with self._changed:
-            self._n_members -= 1
-            self._changed.notify()
+        if is_sound and not env.store.is_closed:
+            env.store.give_to(NOBODY)  # a borrower that still uses it gets an error
+            self._free.put(env)
+        else:
+            _close(env)
+            self._free.put(None)
+        if self._is_closed:
+            self.close()
 
     def _opened(self) -> Environment:
         return open_environment(self._url, read_only=self._is_read_only)
 
 
-def _close(env: Environment) -> None:
-    env.store.give_to(this_thread())
-    env.close()
+def _close(env: Environment | None) -> None:
+    if env is not None:
+        env.store.give_to(this_thread())
+        env.close()

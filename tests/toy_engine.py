@@ -429,26 +429,22 @@ class MemoryEngine:
     title = "memory"
 
     def open(self, url: str, *, read_only: bool) -> Store:
-        contents = ENVIRONMENTS.get(self.name_of(url))
+        contents = ENVIRONMENTS.get(url)
         if contents is None:
             raise EnvironmentNotFoundError(f"no environment at {url} in this process")
         return MemoryStore(contents, url, read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        name = self.name_of(url)
-        contents = Contents(name, grid, layout, distances=distances)
-        if ENVIRONMENTS.setdefault(name, contents) is not contents:
+        contents = Contents(url, grid, layout, distances=distances)
+        if ENVIRONMENTS.setdefault(url, contents) is not contents:
             raise EnvironmentExistsError(f"{url} exists already; open it, or give another name")
         return MemoryStore(contents, url, read_only=False)
 
     def exists(self, url: str) -> bool:
-        return self.name_of(url) in ENVIRONMENTS
+        return url in ENVIRONMENTS
 
-    def beside(self, url: str, name: str) -> str:
-        return f"memory://{name}"
-
-    def name_of(self, url: str) -> str:
-        return url.partition("://")[2]
+    def beside(self, url: str, ending: str) -> str:
+        return f"{url}{ending}"
 
 
 ENGINE = MemoryEngine()

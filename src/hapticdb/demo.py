@@ -26,7 +26,7 @@ from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
-from hapticdb.store.connect import beside, name_of
+from hapticdb.store.connect import beside
 from hapticdb.store.urls import redact
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
@@ -135,11 +135,8 @@ def prepare(
     make_ready("demo")
     shell = PointShell.from_file(files.wrench, points)
     imported = []
-    first = beside(home / "demo", "car") if url is None else beside(url, f"{name_of(url)}_demo_car")
-    layouts: tuple[tuple[Layout, str], ...] = (
-        ("brick", first),
-        ("voxel", beside(first, f"{name_of(first)}_voxel")),
-    )
+    first = str(home / "car.db") if url is None else beside(url, "_demo_car")
+    layouts: tuple[tuple[Layout, str], ...] = (("brick", first), ("voxel", beside(first, "_voxel")))
     for layout, place in layouts:
         imported.append(_import(place, files.car, layout, options, progress))
     with open_environment(imported[0].url, read_only=True) as env:

@@ -44,9 +44,9 @@ def exists(url: Url) -> bool:
     return engine_of(url).exists(os.fspath(url))
 
 
-def beside(url: Url, name: str) -> str:
-    """URL of another environment in the same folder or database."""
-    return engine_of(url).beside(os.fspath(url), name)
+def beside(url: Url, ending: str) -> str:
+    """URL of another environment in the same folder or database, whose name has an ending more."""
+    return engine_of(url).beside(os.fspath(url), ending)
 
 
 def grant(url: Url, role: str, right: Right) -> None:
@@ -150,11 +150,6 @@ def _engine_of_both(url: Url, file: Url) -> SupportsBackup:
     if other is not engine:
         raise UsageError(f"{redact(os.fspath(file))} is on {other.title}, not a file: give a path")
     return engine
-
-
-def name_of(url: Url) -> str:
-    """Name of the environment that a URL means: a schema, or a file without its ending."""
-    return engine_of(url).name_of(os.fspath(url))
 
 
 def check_curve(curve: str, layout: Layout) -> None:

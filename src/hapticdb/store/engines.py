@@ -65,11 +65,8 @@ class Engine(Protocol):
     def exists(self, url: str) -> bool:
         """Whether something is there already, an environment or not. May connect."""
 
-    def beside(self, url: str, name: str) -> str:
-        """URL of another environment at the same place."""
-
-    def name_of(self, url: str) -> str:
-        """Name of the environment that a URL means, among others at the same place."""
+    def beside(self, url: str, ending: str) -> str:
+        """URL of another environment at the same place, whose name has an ending more."""
 
 
 @runtime_checkable

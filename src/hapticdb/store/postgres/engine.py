@@ -25,13 +25,9 @@ class _PostgresEngine:
         """Whether a schema of that name is there. Connects."""
         return schema_of.exists(url)
 
-    def beside(self, url: str, name: str) -> str:
+    def beside(self, url: str, ending: str) -> str:
         """URL of another schema in the same database."""
-        return with_environment(url, name)
-
-    def name_of(self, url: str) -> str:
-        """Name of the schema."""
-        return parse(url).environment
+        return with_environment(url, parse(url).environment + ending)
 
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""

@@ -31,13 +31,9 @@ class _SQLiteEngine:
         """Whether a file of that name is there."""
         return _path_of(url).exists()
 
-    def beside(self, url: str, name: str) -> str:
+    def beside(self, url: str, ending: str) -> str:
         """Path of another file in the same folder."""
-        return str(_path_of(url).with_name(f"{name}.db"))
-
-    def name_of(self, url: str) -> str:
-        """Name of a file without its ending."""
-        return _path_of(url).stem
+        return str(_path_of(url).with_name(f"{_path_of(url).stem}{ending}.db"))
 
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: Progress | None

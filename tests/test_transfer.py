@@ -27,7 +27,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
 from hapticdb.query.grouping import covering
 from hapticdb.store.base import Band, Layout, Rows
-from hapticdb.store.sqlite.tables.reading import SQLiteReader
+from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import blob, voxel_object, with_distances, write_voxels
 from hapticdb.transfer import CopyReport
 
@@ -118,14 +118,14 @@ def test_no_statement_brings_more_than_a_batch(
     source = make_blobs(tmp_path / "a.db")
     monkeypatch.setattr(stored, "MOST_ROWS", 8)
     brought: list[int] = []
-    rows_of_object = SQLiteReader.rows_of
+    rows_of_object = SQLiteStore.rows_of
 
-    def counting(reader: SQLiteReader, *asked: Any, distances: bool = False) -> Any:  # noqa: ANN401
+    def counting(reader: SQLiteStore, *asked: Any, distances: bool = False) -> Any:  # noqa: ANN401
         rows = rows_of_object(reader, *asked, distances=distances)
         brought.append(len(rows))
         return rows
 
-    monkeypatch.setattr(SQLiteReader, "rows_of", counting)
+    monkeypatch.setattr(SQLiteStore, "rows_of", counting)
     copy_environment(source, tmp_path / "b.db")
     assert max(brought) <= 8
     assert len(brought) > 12

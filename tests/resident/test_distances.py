@@ -52,7 +52,7 @@ def check(residency: Residency, objects: dict[int, Points]) -> int:
     table = residency.table
     assert table.cells.payload is not None
     assert (table.cells.payload[0] == BEYOND).all()
-    cells, slots = residency.writer.directory.entries()
+    cells, slots = residency.writer.entries()
     points = np.concatenate([np.empty((0, 3)), *objects.values()])
     # in a grid smaller than a cell, no point needs the centres farther out
     inside = (slice(min(residency.grid.side, 32) + 2),) * 3

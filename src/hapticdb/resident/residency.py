@@ -196,7 +196,7 @@ class Residency:
 
     def slots_of(self, cells: Keys) -> Keys:
         """Slots (n,) of cells (n,): UNKNOWN, EMPTY_SLOT, or a slot."""
-        return self.writer.directory.slots_of(cells)
+        return self.writer.slots_of(cells)
 
     def want(self, cells: Keys, slots: Keys) -> None:
         """Protect cells (n,), most urgent first, in slots (n,), from eviction for a few rounds.

@@ -1,19 +1,29 @@
 """The only writer of a cell table: keeps slots, empty cells and the directory consistent.
 
-Every change is published as one version of the directory; a frame never reads a part of a change.
-Slots and copies of the directory are used again when no frame can read them any more.
+A table has several copies of its directory. A frame reads one copy, the published version, from its
+start to its end, so it never reads a part of a change. The writer changes the oldest copy after all
+frames have left it, and publishes it as the next version in one step. Slots are used again when no
+frame can read them any more.
 """
 
-from collections.abc import Iterable
+import time
+from collections import deque
 from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.kernels.resident.cells import EMPTY_SLOT
-from hapticdb.resident.directory import CellDirectory, DirectoryChange
+from hapticdb.kernels.resident import cell_table as kernels
+from hapticdb.kernels.resident.cells import BUFFERS, EMPTY_SLOT
 from hapticdb.resident.slots import CellSlots
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS, Keys
+
+PATIENCE = 0.02
+"""Seconds that the writer waits for frames of old versions before it checks whether the processes
+of these readers still run. A larger value delays the writer longer after a reader has died."""
+PAUSE = 5e-5
+"""Seconds between two checks of the readers. A larger value delays each eviction; a smaller one
+takes processor time from the frames that the writer waits for."""
 
 
 class UnpublishedCells(NamedTuple):
@@ -28,55 +38,6 @@ class UnpublishedCells(NamedTuple):
     n_ranges: int = 0
 
 
-class EmptyCells:
-    """Cells known to be empty, oldest first.
-
-    Parameters
-    ----------
-    limit : int
-        Greatest number of cells.
-    """
-
-    def __init__(self, limit: int) -> None:
-        self._limit = limit
-        self._cells: dict[int, None] = {}
-
-    def __len__(self) -> int:
-        """Count the cells."""
-        return len(self._cells)
-
-    def keys(self) -> Keys:
-        """All cells, (n,) int64, oldest first."""
-        return np.fromiter(self._cells, np.int64, len(self._cells))
-
-    def add(self, cells: Iterable[int]) -> None:
-        """Add cells, after `forget_for` has made room for them."""
-        self._cells.update(dict.fromkeys(cells))
-
-    def discard(self, cells: Iterable[int]) -> None:
-        """Remove cells; unknown ones are ignored."""
-        for cell in cells:
-            self._cells.pop(cell, None)
-
-    def forget_for(self, n_new: int, urgent: Keys) -> Keys:
-        """Remove cells so that `n_new` others have room; returns the removed ones.
-
-        If there is room, no cell is removed. Otherwise the oldest leave, and an eighth of the limit
-        more than necessary, so that this happens seldom. Urgent cells (U,), most urgent first,
-        leave only if the other cells are not enough; the least urgent ones leave first.
-        """
-        surplus = len(self._cells) + n_new - self._limit
-        if surplus <= 0:
-            return NO_KEYS
-        known = self.keys()
-        others = known[~np.isin(known, urgent)]
-        kept_longest = urgent[::-1][np.isin(urgent[::-1], known)]
-        n_leaving = max(surplus, min(surplus + self._limit // 8, len(others)))
-        leaving = np.concatenate([others, kept_longest])[:n_leaving]
-        self.discard(leaving.tolist())
-        return leaving
-
-
 class CellWriter:
     """The only writer of a table's cells.
 
@@ -89,19 +50,19 @@ class CellWriter:
     ----------
     slots : CellSlots
         Cells with voxels or distances.
-    empty : EmptyCells
-        Cells without any.
-    directory : CellDirectory
-        Published map of both, for frames.
     n_evicted : int
         Number of cells evicted so far.
     """
 
     def __init__(self, table: CellTable) -> None:
-        self._filled = table.filled
+        self._table = table
         self.slots = CellSlots(table)
-        self.empty = EmptyCells(table.capacity // 2 - table.n_slots)
-        self.directory = CellDirectory(table)
+        self._empty: dict[int, None] = {}
+        """Cells known to be empty, oldest first."""
+        self._most_empty = table.capacity // 2 - table.n_slots
+        self._changes: deque[tuple[Keys, UnpublishedCells]] = deque(maxlen=BUFFERS - 1)
+        """Cells that left, and that came, with the last versions."""
+        self._n_unknown_copies = 0
         self.n_evicted = 0
 
     @property
@@ -112,34 +73,50 @@ class CellWriter:
     @property
     def n_empty(self) -> int:
         """Number of cells known to be empty."""
-        return len(self.empty)
+        return len(self._empty)
 
     def known(self) -> Keys:
         """All resident and empty cells, (n,)."""
-        return np.concatenate([self.slots.cells(), self.empty.keys()])
+        return np.concatenate([self.slots.cells(), self._known_empty()])
+
+    def _known_empty(self) -> Keys:
+        return np.fromiter(self._empty, np.int64, len(self._empty))
+
+    def slots_of(self, cells: Keys) -> Keys:
+        """Slots (n,) of cells (n,) in the published version: UNKNOWN, EMPTY_SLOT, or a slot."""
+        slots = np.empty(len(cells), dtype=np.int64)
+        table, which = self._table.cells, self._table.version % BUFFERS
+        kernels.slots_of_cells(table.keys, table.slots, which, cells, slots)
+        return slots
+
+    def entries(self) -> tuple[Keys, Keys]:
+        """All cells (n,) of the published version, and their slots (n,)."""
+        table, which = self._table.cells, self._table.version % BUFFERS
+        filled = np.flatnonzero(table.keys[which] >= 0)
+        return table.keys[which][filled], table.slots[which][filled].astype(np.int64)
 
     def take_over(self) -> None:
         """Continue with the cells that an earlier writer, which has ended, published last."""
-        cells, slots = self.directory.entries()
+        cells, slots = self.entries()
         is_filled = slots > EMPTY_SLOT
         self.slots.take_over(cells[is_filled], slots[is_filled])
-        self.empty.add(cells[~is_filled].tolist())
-        self.directory.take_over()
+        self._empty.update(dict.fromkeys(cells[~is_filled].tolist()))
+        self._n_unknown_copies = BUFFERS - 1  # only the published copy is complete
         # slots of older versions are free when no frame reads these versions
-        self.directory.wait_for_readers(self.directory.version)
+        self._wait_for_readers(self._table.version)
 
     def evict_for(self, n_free: int, surplus: int, urgent: Keys, revision: int) -> None:
         """Evict cells until `n_free` slots are free, but keep cells that are still wanted.
 
         surplus : as for `CellSlots.cells_to_evict`; urgent, revision : as for `publish`.
         """
-        self.slots.free_retired(self.directory.oldest_version_read())
+        self.slots.free_retired(self._oldest_version_read())
         leaving = self.slots.cells_to_evict(n_free, surplus)
         if len(leaving):
             self.n_evicted += len(leaving)
             self.publish(leaving, UnpublishedCells(), urgent, revision)
-            self.directory.wait_for_readers(self.directory.version)
-            self.slots.free_retired(self.directory.oldest_version_read())
+            self._wait_for_readers(self._table.version)
+            self.slots.free_retired(self._oldest_version_read())
 
     def publish(self, leaving: Keys, read: UnpublishedCells, urgent: Keys, revision: int) -> None:
         """Remove cells and add others in one version; cells in both get new slots.
@@ -147,16 +124,65 @@ class CellWriter:
         urgent : cells that are forgotten last if too many are empty; revision : of the database,
         the same for all cells.
         """
-        slots = self.directory.slots_of(leaving)
-        self.empty.discard(leaving[slots == EMPTY_SLOT].tolist())
+        slots = self.slots_of(leaving)
+        for cell in leaving[slots == EMPTY_SLOT].tolist():
+            self._empty.pop(cell, None)
         cleared: list[int] = slots[slots > EMPTY_SLOT].tolist()
         self.slots.clear(cleared)
         is_filled = read.slots > EMPTY_SLOT
         new_empty = read.cells[~is_filled].tolist()
-        forgotten = self.empty.forget_for(len(new_empty), urgent)
+        forgotten = self._forget_for(len(new_empty), urgent)
         self.slots.fill(read.slots[is_filled], read.cells[is_filled])
-        self._filled[read.slots[is_filled]] = self.directory.version + 1
-        self.empty.add(new_empty)
-        change = DirectoryChange(np.concatenate([leaving, forgotten]), read.cells, read.slots)
-        self.directory.publish(change, revision)
-        self.slots.retire(cleared, self.directory.version)
+        self._table.filled[read.slots[is_filled]] = self._table.version + 1
+        self._empty.update(dict.fromkeys(new_empty))
+        self._publish(np.concatenate([leaving, forgotten]), read, revision)
+        self.slots.retire(cleared, self._table.version)
+
+    def _publish(self, leaving: Keys, read: UnpublishedCells, revision: int) -> None:
+        """Publish the next version of the directory."""
+        version = self._table.version + 1
+        self._wait_for_readers(version - BUFFERS + 1)
+        table, which = self._table.cells, version % BUFFERS
+        changes = (*self._changes, (leaving, read))
+        if self._n_unknown_copies:
+            self._n_unknown_copies -= 1
+            table.keys[which] = table.keys[(version - 1) % BUFFERS]
+            table.slots[which] = table.slots[(version - 1) % BUFFERS]
+            changes = changes[-1:]
+        for gone, new in changes:
+            kernels.remove_cells(table.keys, table.slots, which, gone)
+            kernels.insert_cells(table.keys, table.slots, which, new.cells, new.slots)
+        self._changes.append((leaving, read))
+        kernels.publish(table.control, version, revision)
+
+    def _forget_for(self, n_new: int, urgent: Keys) -> Keys:
+        """Forget empty cells so that `n_new` others have room; returns them.
+
+        If there is room, no cell is removed. Otherwise the oldest leave, and an eighth of the limit
+        more than necessary, so that this happens seldom. Urgent cells (U,), most urgent first,
+        leave only if the other cells are not enough; the least urgent ones leave first.
+        """
+        surplus = len(self._empty) + n_new - self._most_empty
+        if surplus <= 0:
+            return NO_KEYS
+        known = self._known_empty()
+        others = known[~np.isin(known, urgent)]
+        kept_longest = urgent[::-1][np.isin(urgent[::-1], known)]
+        n_leaving = max(surplus, min(surplus + self._most_empty // 8, len(others)))
+        leaving = np.concatenate([others, kept_longest])[:n_leaving]
+        for cell in leaving.tolist():
+            self._empty.pop(cell, None)
+        return leaving
+
+    def _oldest_version_read(self) -> int:
+        """Oldest version that a frame is reading; a very large number if no frame runs."""
+        return int(kernels.oldest_version_read(self._table.cells.readers))
+
+    def _wait_for_readers(self, version: int) -> None:
+        """Wait until no frame reads a version older than `version`; a frame takes microseconds."""
+        waited_since = time.monotonic()
+        while self._oldest_version_read() < version:
+            time.sleep(PAUSE)
+            if time.monotonic() - waited_since > PATIENCE:
+                self._table.release_dead()
+                waited_since = time.monotonic()

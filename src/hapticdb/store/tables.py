@@ -98,6 +98,8 @@ class Tables(ABC):
     """Statement that finds a row if there is a table of that name."""
     AMONG: ClassVar[str]
     """Condition that an id is in a JSON list."""
+    LISTED: ClassVar[str]
+    """Query of the texts in a JSON list."""
     AS_TEXT: ClassVar[str]
     """What makes text of a column of JSON."""
     TAKEN: ClassVar[type[Exception]]
@@ -266,6 +268,14 @@ class Tables(ABC):
         text = "SELECT revision, action, id, ranges FROM change WHERE revision > %s"
         for row in self._rows(f"{text} ORDER BY revision", (since,)):
             yield parsing.change_of(self.url, row)
+
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        """Packed surfaces of the digests that have one, in one statement."""
+        if not self.has_table(parsing.SURFACE):
+            return {}
+        text = f"SELECT digest, geometry FROM surface WHERE digest IN ({self.LISTED})"
+        found = self._rows(text, (json.dumps(list(digests)),), binary=True)
+        return parsing.surfaces_of(self.url, found)
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""

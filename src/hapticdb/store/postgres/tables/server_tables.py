@@ -69,6 +69,7 @@ class ServerTables(Tables):
 
     HAS_TABLE = "SELECT 1 WHERE to_regclass(%s) IS NOT NULL"
     AMONG = "id = ANY (ARRAY(SELECT json_array_elements_text(%s::json)::bigint))"
+    LISTED = "SELECT json_array_elements_text(%s::json)"
     AS_TEXT = "::text"
     TAKEN = errors.UniqueViolation
     _connection: ServerConnection

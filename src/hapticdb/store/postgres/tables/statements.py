@@ -1,7 +1,7 @@
 """The SQL of the haptic query on PostgreSQL: one statement, which returns one row of packed arrays.
 
 Every statement also returns the revision that it has seen. So a reader learns without another round
-trip whether the environment has changed. Rows come in the order of the index; `PostgresReader`
+trip whether the environment has changed. Rows come in the order of the index; `PostgresStore`
 checks that.
 """
 

@@ -23,10 +23,12 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.sqlite.connection import FileConnection
-from hapticdb.store.sqlite.tables import rows as sqlite_rows
 from hapticdb.store.tables import LAST_REVISION, Tables
 
 Result = TypeVar("Result")
+KINDS = """
+SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END
+  FROM sqlite_master"""
 
 # whole arrays are bound at once: 8 times faster than executemany, without the interpreter lock
 INSERT = {
@@ -54,7 +56,7 @@ SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(length(geometry)), 0) FROM sur
 
 def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
     """Grid and layout of an environment, and whether it wants distances, all checked."""
-    kinds = dict(connection.fetch(sqlite_rows.KINDS))
+    kinds = dict(connection.fetch(KINDS))
     parsing.check_tables(connection.url, kinds)
     # a reader may have opened a file of an older format
     wish = "wants_distances" if parsing.BAND in kinds else "0"
@@ -71,6 +73,7 @@ class FileTables(Tables):
 
     HAS_TABLE = "SELECT 1 FROM sqlite_master WHERE name = %s AND type = 'table'"
     AMONG = "id IN (SELECT value FROM json_each(%s))"
+    LISTED = "SELECT value FROM json_each(%s)"
     AS_TEXT = ""
     TAKEN = apsw.ConstraintError
     _connection: FileConnection

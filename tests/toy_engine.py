@@ -36,7 +36,6 @@ from hapticdb.store.base import (
     Size,
     Store,
     joined,
-    touched_ranges,
 )
 from hapticdb.store.pairs import MARK, KeptPairs, Mark, Outlines, PairRow
 from hapticdb.store.parsing import distances_crc, rows_crc
@@ -46,6 +45,7 @@ from hapticdb.store.refusals import (
     no_object,
     present_already,
 )
+from hapticdb.store.tables import touched_ranges
 from hapticdb.store.threads import check_thread, this_thread
 
 

@@ -36,7 +36,7 @@ from crashes import (  # noqa: F401 - fixtures among them
 from hapticdb import Environment, PointShell
 from hapticdb.errors import StuckError
 from hapticdb.query.frame import STRATEGIES, Strategy
-from hapticdb.store.postgres.connecting import answering
+from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer
 from servers import Place
@@ -163,8 +163,8 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
     server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server and its children are stopped: the connection stays, and nothing answers."""
-    monkeypatch.setattr(answering, "SILENCE_S", 0.3)
-    monkeypatch.setattr(answering, "ANSWER_S", 1.0)
+    monkeypatch.setattr(link, "SILENCE_S", 0.3)
+    monkeypatch.setattr(link, "ANSWER_S", 1.0)
     with small(url, file) as env:
         pid = server._postmaster()
         assert pid is not None

@@ -24,8 +24,7 @@ from hapticdb.errors import (
 )
 from hapticdb.grid import Grid, GridOptions
 from hapticdb.ingest.checking import check_inside, check_names
-from hapticdb.ingest.known_parts import KnownParts, added_or_present
-from hapticdb.ingest.planning import Plan, planned
+from hapticdb.ingest.planning import KnownParts, Plan, added_or_present, planned
 from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, read_file
 from hapticdb.query.grouping import covering

@@ -14,8 +14,7 @@ import numpy as np
 from hapticdb.errors import GridError, ObjectNotFoundError, UsageError
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import EMPTY_SLOT, UNKNOWN, Place
-from hapticdb.resident.changes import known_cells_touched, writes_since
-from hapticdb.resident.left_out import LeftOutObjects
+from hapticdb.resident.changes import LeftOutObjects, known_cells_touched, writes_since
 from hapticdb.resident.source import CellSource
 from hapticdb.resident.table import FIRST_VERSION, CellTable
 from hapticdb.resident.writer import CellWriter, UnpublishedCells

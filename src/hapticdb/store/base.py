@@ -28,8 +28,7 @@ value believes longer rows of a database that means harm."""
 
 Keys = NDArray[np.int64]
 Progress = Callable[[int, int], object]
-"""Called with how much of some work is done, and with the total. May raise an error, which ends the
-work."""
+"""Called with how much of a work is done, and with the total. May raise an error, which ends it."""
 
 
 class Band(NamedTuple):
@@ -138,19 +137,6 @@ def joined(parts: Sequence[Rows], *, distances: bool) -> Rows:
 def row_shift(layout: Layout) -> int:
     """Bits of a voxel's key below the key of its row."""
     return BRICK_SHIFT if layout == "brick" else 0
-
-
-def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
-    """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
-
-    Ranges are rounded outwards to cells. In lexicographic order a cell is not a range of keys:
-    there the ranges are rounded to slabs, each of all voxels of one i.
-    """
-    shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
-    cubes = np.unique(row_keys >> (shift - row_shift(layout)))
-    starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
-    ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
-    return np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
 
 
 @dataclass(frozen=True)

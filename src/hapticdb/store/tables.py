@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import (
+    CELL_SHIFT,
     NO_KEYS,
     Change,
     Covering,
@@ -27,7 +28,7 @@ from hapticdb.store.base import (
     Rows,
     Table,
     no_rows,
-    touched_ranges,
+    row_shift,
 )
 from hapticdb.store.pairs import (
     ALL,
@@ -74,6 +75,19 @@ INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
  WHERE quantile.revision <= excluded.revision"""
 KEEP_COSTS = """
 INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = excluded.figures"""
+
+
+def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
+    """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
+
+    Ranges are rounded outwards to cells. In lexicographic order a cell is not a range of keys:
+    there the ranges are rounded to slabs, each of all voxels of one i.
+    """
+    shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
+    cubes = np.unique(row_keys >> (shift - row_shift(layout)))
+    starts = np.flatnonzero(np.diff(cubes, prepend=-2) > 1)
+    ends = np.append(starts[1:], len(cubes))[: len(starts)] - 1
+    return np.stack([cubes[starts] << shift, ((cubes[ends] + 1) << shift) - 1], axis=1)
 
 
 class _Connection(Protocol):

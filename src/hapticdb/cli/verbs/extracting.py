@@ -252,7 +252,7 @@ def _check_animation(animation: str | None) -> None:
 
 def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: _Outputs) -> None:
     """Print the verdict; write path, picture and animation of a path that was found."""
-    from hapticdb.extraction.record import extraction_record
+    from hapticdb.extraction.verdict import extraction_record
 
     ways = [] if found.way is None else [_Way(found, left_out, asked)]
     _write_paths(ways)
@@ -265,7 +265,7 @@ def _report(env: "Environment", found: "Extraction", left_out: list[int], asked:
 
 def _report_order(env: "Environment", found: "Disassembly", asked: _Outputs) -> None:
     """Print an order or why there is none; write a path and a picture a step, and an animation."""
-    from hapticdb.extraction.record import disassembly_record
+    from hapticdb.extraction.verdict import disassembly_record
 
     steps = found.steps if found.is_found else ()
     ways = [_Way(step.found, step.excluded, asked.of_step(n)) for n, step in enumerate(steps)]

@@ -305,7 +305,7 @@ def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, j
 
 
 def _say_json(told: _Told) -> None:
-    from hapticdb.sweeps.record import sweep_record
+    from hapticdb.sweeps.verdict import sweep_record
 
     job = told.job
     record = sweep_record(told.found, told.shell, job.parts, job.felt.left_out)

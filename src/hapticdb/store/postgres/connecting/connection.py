@@ -12,8 +12,7 @@ from hapticdb.closing import Closes
 from hapticdb.errors import ConnectionLostError, DatabaseError
 from hapticdb.store.postgres.address import Address
 from hapticdb.store.postgres.connecting import failures
-from hapticdb.store.postgres.connecting.answering import SilentServerError
-from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS, Link
+from hapticdb.store.postgres.connecting.link import CONNECT_SECONDS, Link, SilentServerError
 from hapticdb.store.postgres.connecting.wire import Parameter
 from hapticdb.store.refusals import check_outside
 from hapticdb.store.threads import check_thread, this_thread

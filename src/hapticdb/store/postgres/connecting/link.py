@@ -3,23 +3,31 @@
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
 statement. psycopg waits for the answer, in steps of a tenth of a second. So Ctrl-C interrupts the
 wait, and a server that stops answering causes an error instead of a hang, also during statements
-that may take long (`hapticdb.store.postgres.connecting.answering`).
+that may take long.
+
+Such a statement may be silent for minutes because the server works on it. A server that works also
+answers a new client; one that hangs, or whose network is cut, does not. The question is
+PostgreSQL's SSLRequest ("SSL Session Encryption" in its manual): it needs no password and takes
+none of the server's connections.
 """
 
 import contextlib
 import math
+import os
 import re
+import socket
+import struct
 import time
 from collections.abc import Generator, Iterator, Sequence
-from typing import Any, TypeVar, cast
+from typing import Any, NamedTuple, TypeVar, cast
 
 import psycopg
 from psycopg import generators, pq
 from psycopg.errors import error_from_result
 
+from hapticdb.errors import StuckError
 from hapticdb.store.postgres.address import Address
-from hapticdb.store.postgres.connecting import answering, failures
-from hapticdb.store.postgres.connecting.answering import Peer, SilentServerError
+from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.wire import Parameter
 
 Result = TypeVar("Result")
@@ -48,6 +56,50 @@ CONNECT_SECONDS = 10
 """Seconds that a server may take to accept a connection, unless the URL says otherwise."""
 GRACE_MS = 3000
 """Milliseconds that the network and a busy server may add to the server's own time limit."""
+SILENCE_S = 5.0
+"""Seconds without a byte from a server, after which it is asked whether it answers at all. A larger
+value asks a busy server less often, and notices later that it hangs."""
+ANSWER_S = 5.0
+"""Seconds that a server has to accept such a question, and again to answer it. A larger value bears
+slower servers, and notices later that one hangs."""
+SSL_REQUEST = struct.pack("!ii", 8, 80877103)
+
+
+class SilentServerError(StuckError):
+    """A server that sent nothing for longer than it may take, or that does not answer at all."""
+
+
+class Peer(NamedTuple):
+    """Where a connected server listens, as `socket.connect` takes it."""
+
+    family: socket.AddressFamily
+    address: str | tuple[str | int, ...]
+
+    @classmethod
+    def of(cls, pgconn: pq.abc.PGconn) -> "Peer | None":
+        """The server of a connection; None if its address cannot be told."""
+        try:
+            with socket.socket(fileno=os.dup(pgconn.socket)) as connected:
+                family = socket.AddressFamily(connected.family)
+                if family != socket.AF_UNIX:
+                    return cls(family, connected.getpeername())
+        except OSError:
+            return None
+        # the server may know its socket by another path
+        folder, port = pgconn.host.decode(), pgconn.port.decode()
+        path = f"{folder}/.s.PGSQL.{port}"
+        return cls(family, "\0" + path[1:] if path.startswith("@") else path)
+
+    def answers(self) -> bool:
+        """Whether the server answers a new client."""
+        try:
+            with socket.socket(self.family) as asking:
+                asking.settimeout(ANSWER_S)
+                asking.connect(self.address)
+                asking.sendall(SSL_REQUEST)
+                return bool(asking.recv(1))
+        except OSError:
+            return False
 
 
 class _Connection(psycopg.Connection[tuple[Any, ...]]):
@@ -243,7 +295,7 @@ class Link:
                     heard = now
                 elif most is not None and 1000 * (now - started) > most:
                     raise self._stuck()
-                elif now - heard > answering.SILENCE_S:
+                elif now - heard > SILENCE_S:
                     self._check_answers()
                     heard = time.monotonic()
                 wanted = waiting.send(ready)
@@ -255,7 +307,7 @@ class Link:
         if self._peer is not None and not self._peer.answers():
             raise SilentServerError(
                 f"{self.shown} sends nothing and did not answer a new client within "
-                f"{answering.ANSWER_S:.3g} s: the server, or the way to it, hangs; try again when "
+                f"{ANSWER_S:.3g} s: the server, or the way to it, hangs; try again when "
                 "it answers"
             )
 

@@ -38,8 +38,8 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment as Environment
     from hapticdb.environment import create as create
     from hapticdb.environment import open as open  # noqa: A004 - as in tarfile.open
-    from hapticdb.extraction.disassembly.result import Disassembly as Disassembly
-    from hapticdb.extraction.disassembly.run import disassemble as disassemble
+    from hapticdb.extraction.disassembly import Disassembly as Disassembly
+    from hapticdb.extraction.disassembly import disassemble as disassemble
     from hapticdb.extraction.result import Extraction as Extraction
     from hapticdb.extraction.run import extract as extract
     from hapticdb.grid import Grid as Grid

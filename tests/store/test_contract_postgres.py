@@ -19,7 +19,7 @@ from hapticdb.store.base import Layout, Store
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.histogram import SERVER_RESOLUTION
+from hapticdb.store.postgres.tables.server_tables import SERVER_RESOLUTION
 from hapticdb.testing import (
     EngineContract,
     StoreContract,

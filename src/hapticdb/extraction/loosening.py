@@ -1,4 +1,4 @@
-"""Small motions, shifts and turns, by which a part leaves what it touches at its start.
+"""Motions with turns: small ones by which a part leaves what it touches, and screws out of a thread.
 
 Voxels of two surfaces that touch are shared, so a part that touches something is not free at its
 start. A sweep says how far each motion out of contact goes: sliding along a surface, not cutting
@@ -12,11 +12,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.extraction.directions import AGAINST, candidate_directions, likely_directions
+from hapticdb.extraction.directions import (
+    AGAINST,
+    AXES,
+    candidate_directions,
+    distinct,
+    likely_directions,
+)
 from hapticdb.extraction.free_space import FreeSpace
-from hapticdb.extraction.judge import passed
-from hapticdb.extraction.problem import Problem
+from hapticdb.extraction.judge import judge, passed
+from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.pulls import MOST_OPPOSED, first_run
+from hapticdb.extraction.result import WayOut
+from hapticdb.grid import corners_of
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -34,6 +42,7 @@ MOST_TURNED = 12
 """Greatest number of turns about a centre, to the right or to the left."""
 APART = 2.0
 """Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
+
 
 
 class Loosened(NamedTuple):
@@ -177,3 +186,34 @@ def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals
     speeds = shift + np.cross(turn, points - about)
     along = (speeds * normals).sum(axis=1)
     return float((along < AGAINST * np.linalg.norm(speeds, axis=1).max()).mean())
+
+
+def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> WayOut | None:
+    """First screw motion that is not refuted, along the part's axes and the world's, of both hands.
+
+    pitch : metres a turn. The axis goes through the middle of the part. A bolt turns for its own
+    length, a nut until it is past what its box meets; then either goes straight.
+    """
+    low, high = problem.corners.min(axis=0), problem.corners.max(axis=0)
+    boxes = [obj.bounds for obj in problem.standing]
+    met = [corners_of(box) for box in boxes if (box[0] <= high).all() and (box[1] >= low).all()]
+    axes = distinct(np.concatenate([problem.own_axes, -problem.own_axes, AXES]))
+    for direction, way_out in zip(axes, leaving.distances(axes).tolist(), strict=True):
+        heights = problem.corners @ direction
+        past = max((one @ direction).max() for one in [*met, problem.corners]) - heights.min()
+        for hand in (1.0, -1.0):
+            for length in (np.ptp(heights), past):
+                if time.monotonic() > until:
+                    return None
+                turn = hand * 2.0 * np.pi / pitch * direction
+                twist = Twist(direction, turn, problem.center, 0.0)
+                poses = twist.along(np.eye(4), min(float(length), way_out), np.inf)
+                last = poses[-1].copy()
+                last[:3, 3] += max(way_out - float(length), 0.0) * direction
+                poses = np.concatenate([poses, last[None]])
+                way = judge(problem, poses, "screw", until)
+                if not way.in_way:
+                    return way
+                if way.free_share * way.length < way.swept.path.ways[-2]:
+                    break  # it is not this thread's
+    return None

@@ -18,11 +18,11 @@ from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.goals import GoalPose, Goals, GoalsOutside
 from hapticdb.extraction.judge import judge
+from hapticdb.extraction.loosening import unscrewed
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Exit, Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut, ids_of
-from hapticdb.extraction.screws import unscrewed
 from hapticdb.ready import make_ready
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress

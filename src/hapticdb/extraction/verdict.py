@@ -2,7 +2,7 @@
 
 from typing import Any
 
-from hapticdb.extraction.disassembly.result import Disassembly, FailedSearch
+from hapticdb.extraction.disassembly import Disassembly, FailedSearch
 from hapticdb.extraction.result import Extraction, WayOut
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object

@@ -23,8 +23,14 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import Grid, GridOptions
-from hapticdb.ingest.checking import check_inside, check_names
-from hapticdb.ingest.planning import KnownParts, Plan, added_or_present, planned
+from hapticdb.ingest.planning import (
+    KnownParts,
+    Plan,
+    added_or_present,
+    check_inside,
+    check_names,
+    planned,
+)
 from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, read_file
 from hapticdb.query.grouping import covering

@@ -7,8 +7,8 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ConflictError, NoSurfaceError, UsageError
-from hapticdb.ingest.checking import bounds_inside
 from hapticdb.ingest.geometry import parts_of, unpacked_part
+from hapticdb.ingest.planning import bounds_inside
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
 from hapticdb.poses import as_floats

@@ -132,9 +132,9 @@ class _BuiltIn(NamedTuple):
 
 FILE_SCHEME = "sqlite"
 """The engine of paths, which have no scheme."""
-POSTGRES = _BuiltIn("hapticdb.store.postgres.engine", "psycopg", "postgres")
+POSTGRES = _BuiltIn("hapticdb.store.postgres.store", "psycopg", "postgres")
 BUILT_IN = {
-    FILE_SCHEME: _BuiltIn("hapticdb.store.sqlite.engine"),
+    FILE_SCHEME: _BuiltIn("hapticdb.store.sqlite.store"),
     "postgresql": POSTGRES,
     "postgres": POSTGRES,
 }

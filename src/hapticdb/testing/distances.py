@@ -11,8 +11,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.grouping import covering
 from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
-from hapticdb.testing.case import StoreCase
-from hapticdb.testing.scenes import EVERYWHERE, blob, voxel_object, with_distances
+from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, voxel_object, with_distances
 
 GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)
 CURVES: list[CurveName] = ["z", "hilbert"]

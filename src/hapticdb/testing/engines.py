@@ -10,8 +10,7 @@ from hapticdb.errors import EnvironmentExistsError, EnvironmentNotFoundError, Us
 from hapticdb.grid import Grid
 from hapticdb.store.connect import backup_environment, grant, open_store, restore_environment
 from hapticdb.store.engines import Engine, SupportsBackup, SupportsGrant, engine_of
-from hapticdb.testing.case import Case
-from hapticdb.testing.scenes import blob, everything, floor_voxels, write_voxels
+from hapticdb.testing.scenes import Case, blob, everything, floor_voxels, write_voxels
 
 ENGINE_CAPABILITIES: dict[str, Any] = {
     "grant": SupportsGrant,

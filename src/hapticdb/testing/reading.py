@@ -15,8 +15,7 @@ from hapticdb.store.base import (
     SupportsStatement,
     SupportsWatch,
 )
-from hapticdb.testing.case import StoreCase
-from hapticdb.testing.scenes import EVERYWHERE, blob, everything, kind
+from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, everything, kind
 
 STORE_CAPABILITIES: dict[str, Any] = {
     "statement": SupportsStatement,

@@ -13,8 +13,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.grouping import covering
 from hapticdb.store.base import Rows, Store, SupportsWatch
 from hapticdb.store.threads import NOBODY, this_thread
-from hapticdb.testing.case import StoreCase
-from hapticdb.testing.scenes import EVERYWHERE, blob, everything, kind, write_voxels
+from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, everything, kind, write_voxels
 
 ANSWER_S = 60.0
 """Seconds to wait for another thread. A larger value only delays the failure of a test."""

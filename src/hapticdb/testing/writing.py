@@ -16,8 +16,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.query.grouping import covering
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.pairs import Mark, PairRow
-from hapticdb.testing.case import StoreCase
-from hapticdb.testing.scenes import EVERYWHERE, blob, kind, voxel_object, write_voxels
+from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, kind, voxel_object, write_voxels
 
 BALL, CONE = bytes(range(256)) * 40, b"\0cone"
 """Surfaces, made up: a store never unpacks them."""

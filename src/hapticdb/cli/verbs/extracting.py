@@ -33,7 +33,7 @@ if TYPE_CHECKING:
     from numpy.typing import NDArray
 
     from hapticdb.environment import Environment
-    from hapticdb.extraction.disassembly.result import Disassembly
+    from hapticdb.extraction.disassembly import Disassembly
     from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {
@@ -157,8 +157,8 @@ def extract(
 ) -> None:
     """Search a path on which parts come out; the help text is `HELP`."""
     import hapticdb
+    from hapticdb.extraction import disassembly as orders
     from hapticdb.extraction import run
-    from hapticdb.extraction.disassembly import run as orders
 
     check_picture(picture)
     _check_animation(animation)

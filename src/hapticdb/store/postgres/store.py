@@ -1,4 +1,4 @@
-"""An environment in a schema of a PostgreSQL database."""
+"""PostgreSQL as an engine: ``postgresql://...``, an environment in a schema of a database."""
 
 import contextlib
 from collections.abc import Iterator, Sequence
@@ -16,13 +16,15 @@ from hapticdb.store.base import (
     Layout,
     LocatedShell,
     Rows,
+    Store,
     Table,
     joined,
     no_rows,
     row_shift,
 )
-from hapticdb.store.engines import Lag
-from hapticdb.store.postgres import schema_of
+from hapticdb.store.engines import Lag, Right
+from hapticdb.store.postgres import rights, schema_of
+from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
@@ -43,6 +45,7 @@ SELECT pg_last_wal_replay_lsn()::text,
 MOST_BITS = 1 << 20
 """Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
 larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
+
 
 
 class PostgresStore(ServerTables):
@@ -196,3 +199,34 @@ def _is_in_order(rows: Rows) -> bool:
     if len(keys) < 2:
         return True
     return bool(((keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))).all())
+
+
+class _PostgresEngine:
+    """Environments on servers."""
+
+    title = "PostgreSQL"
+
+    def open(self, url: str, *, read_only: bool) -> Store:
+        """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""
+        return PostgresStore.open(url, read_only=read_only)
+
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
+        """Make a schema, which appears whole or not at all; ``?data=FOLDER`` makes the server."""
+        return PostgresStore.create(url, grid, layout, distances=distances)
+
+    def exists(self, url: str) -> bool:
+        """Whether a schema of that name is there. Connects."""
+        return schema_of.exists(url)
+
+    def beside(self, url: str, ending: str) -> str:
+        """URL of another schema in the same database."""
+        return with_environment(url, parse(url).environment + ending)
+
+    def grant(self, url: str, role: str, right: Right) -> None:
+        """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""
+        with schema_of.connected(url) as connection:
+            schema_of.check(connection)
+            rights.grant(connection, role, right)
+
+
+ENGINE = _PostgresEngine()

@@ -1,4 +1,4 @@
-"""SQLite through apsw: the embedded engine, one file; its reads by key, by range, by Figure 3.
+"""SQLite through apsw: the embedded engine, paths and ``sqlite:///path``, one file an environment.
 
 Three traps of the binding, each covered by a test: an ``np.int64`` binds as an eight-byte blob, a
 bare array to ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
@@ -7,6 +7,7 @@ Python's own.
 """
 
 import contextlib
+import re
 from collections.abc import Iterator, Sequence
 from itertools import accumulate
 from pathlib import Path
@@ -16,6 +17,7 @@ import apsw
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import (
@@ -26,10 +28,13 @@ from hapticdb.store.base import (
     Keys,
     Layout,
     LocatedShell,
+    Progress,
     Rows,
+    Store,
     Table,
     no_rows,
 )
+from hapticdb.store.engines import BackupReport, unknown_scheme
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
@@ -62,6 +67,9 @@ SELECT {columns} FROM {TABLES[table]}
 }
 NO_VOXEL = bytes(BRICK_BYTES)
 """Occupancy of a brick that holds no voxel of the object."""
+PREFIX = "sqlite:///"
+# libpq's other form of an address, and a URL without its slashes: either may hold a password
+KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 
 class SQLiteStore(FileTables):
@@ -203,3 +211,58 @@ def _pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
     except (TypeError, ValueError, OverflowError) as error:
         raise parsing.damaged(url, f"a row of another kind: {error}") from error
+
+
+class _SQLiteEngine:
+    """Environments in files."""
+
+    title = "SQLite"
+
+    def open(self, url: str, *, read_only: bool) -> Store:
+        """Open an existing file."""
+        return SQLiteStore.open(_path_of(url), read_only=read_only)
+
+    def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
+        """Make a new file, which appears whole or not at all."""
+        return SQLiteStore.create(_path_of(url), grid, layout, distances=distances)
+
+    def exists(self, url: str) -> bool:
+        """Whether a file of that name is there."""
+        return _path_of(url).exists()
+
+    def beside(self, url: str, ending: str) -> str:
+        """Path of another file in the same folder."""
+        return str(_path_of(url).with_name(f"{_path_of(url).stem}{ending}.db"))
+
+    def back_up(
+        self, url: str, copy: str, *, replace: bool, progress: Progress | None
+    ) -> BackupReport:
+        """Copy a file whole, as of one moment."""
+        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
+
+        return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
+
+    def restore(self, copy: str, url: str, *, progress: Progress | None) -> BackupReport:
+        """Put a copy in a file's place, and remove the log of the former file."""
+        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
+
+        return back_up(_path_of(copy), _path_of(url), replace=True, progress=progress)
+
+
+ENGINE = _SQLiteEngine()
+
+
+def _path_of(url: str) -> Path:
+    """Path of the file that a URL or a path means."""
+    text = url
+    if text.startswith(PREFIX):
+        text = text.removeprefix(PREFIX)
+    elif "://" in text:
+        raise unknown_scheme(text.split("://", 1)[0])
+    if KEYWORDS.search(text):  # not shown: it holds a password
+        raise UsageError("libpq's keywords are not read here: give postgresql://user@host/database")
+    if not text:
+        raise UsageError("an empty path: name the environment's file")
+    if text.startswith((":memory:", "file:")):
+        raise UsageError(f"{text!r}: an environment is a file; give its path")
+    return Path(text)

@@ -1,1 +1,0 @@
-"""Disassembly: in which order parts come out, so that others can."""

@@ -4,6 +4,7 @@ import os
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field
+from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
@@ -164,13 +165,12 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
             return
         report.objects = len(objects)
         report.without_row_checksums = sum(obj.rows_crc is None for obj in objects.values())
-        for finding in _log_findings(store, objects):
-            report.add(finding)
-        for finding in _row_findings(store, objects, report, progress):
-            report.add(finding)
-        for finding in _band_findings(store, objects, report):
-            report.add(finding)
-        for finding in _surface_findings(store, objects, report):
+        for finding in chain(
+            _log_findings(store, objects),
+            _row_findings(store, objects, report, progress),
+            _band_findings(store, objects, report),
+            _surface_findings(store, objects, report),
+        ):
             report.add(finding)
         try:
             list(store.pairs())

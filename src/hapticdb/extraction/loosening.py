@@ -1,4 +1,4 @@
-"""Motions with turns: small ones by which a part leaves what it touches, and screws out of a thread.
+"""Motions with turns: small ones by which a part leaves what it touches, and screws.
 
 Voxels of two surfaces that touch are shared, so a part that touches something is not free at its
 start. A sweep says how far each motion out of contact goes: sliding along a surface, not cutting
@@ -42,7 +42,6 @@ MOST_TURNED = 12
 """Greatest number of turns about a centre, to the right or to the left."""
 APART = 2.0
 """Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
-
 
 
 class Loosened(NamedTuple):

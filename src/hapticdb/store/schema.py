@@ -25,6 +25,40 @@ FORMAT_VERSION = len(STEPS)
 Dialect = Mapping[str, tuple[str, ...]]
 """Statements of each step of `STEPS` by its name; empty where an engine needs none."""
 
+# tables that are the same in all dialects, but for the names of the types
+CHANGE = """
+CREATE TABLE change (
+  revision {count} PRIMARY KEY,
+  action   {text} NOT NULL,
+  id       {count} NOT NULL,
+  ranges   {keys} NOT NULL
+)"""
+COST = """
+CREATE TABLE cost (
+  machine {text} PRIMARY KEY,
+  figures {json} NOT NULL
+)"""
+PAIR = """
+CREATE TABLE pair (
+  a        {count} NOT NULL,
+  b        {count} NOT NULL,
+  kind     {text} NOT NULL,
+  at_least {number} NOT NULL,
+  at_most  {number},
+  a_x      {number} NOT NULL,
+  a_y      {number} NOT NULL,
+  a_z      {number} NOT NULL,
+  b_x      {number} NOT NULL,
+  b_y      {number} NOT NULL,
+  b_z      {number} NOT NULL,
+  status   {text} NOT NULL,
+  revision {count} NOT NULL,
+  setting  {text} NOT NULL,
+  because  {text},
+  shapes   {text},
+  PRIMARY KEY (a, b)
+)"""
+
 
 def migrations_after(version: int, dialect: Dialect) -> list[tuple[int, tuple[str, ...]]]:
     """Steps that an environment of that format lacks: the version of each, and its statements."""

@@ -20,7 +20,6 @@ EVERYWHERE = [np.array([bound], dtype=np.int64) for bound in (0, 2**62)]
 """Lows and highs of one range that holds every key."""
 
 
-
 def write_voxels(store: Store, ijk: NDArray[np.int64], name: str = "voxels") -> int:
     """Write voxels (n, 3) as an object of no file; returns its id."""
     return store.add(voxel_object(store.grid, ijk, name), rows_of_voxels(ijk, *kind(store)))

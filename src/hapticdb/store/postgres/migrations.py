@@ -4,7 +4,7 @@ All missing steps run in one transaction, with the environment's schema as searc
 stands for the schema's name in functions, which are later called with other search paths.
 """
 
-from hapticdb.store.schema import Dialect
+from hapticdb.store.schema import CHANGE, COST, PAIR, Dialect
 
 ENVIRONMENT = """
 CREATE TABLE environment (
@@ -57,14 +57,6 @@ CREATE TABLE brick (
     "CREATE UNIQUE INDEX brick_key ON brick (z_val, id)",
 )
 
-CHANGE = """
-CREATE TABLE change (
-  revision bigint PRIMARY KEY,
-  action   text NOT NULL,
-  id       bigint NOT NULL,
-  ranges   bigint[] NOT NULL
-)"""
-
 # bounds NULL: the server's own statistics, made at that revision
 QUANTILE = """
 CREATE TABLE quantile (
@@ -72,12 +64,6 @@ CREATE TABLE quantile (
   revision   bigint NOT NULL,
   n_rows     bigint NOT NULL,
   bounds     bigint[]
-)"""
-
-COST = """
-CREATE TABLE cost (
-  machine text PRIMARY KEY,
-  figures json NOT NULL
 )"""
 
 # only a table's owner may ANALYZE; this function lets editors do so, too, and nobody else
@@ -232,29 +218,10 @@ SURFACES = (
     _granted_as_on_brick("surface"),
 )
 
-PAIRS = (
-    """
-CREATE TABLE pair (
-  a        bigint NOT NULL,
-  b        bigint NOT NULL,
-  kind     text NOT NULL,
-  at_least double precision NOT NULL,
-  at_most  double precision,
-  a_x      double precision NOT NULL,
-  a_y      double precision NOT NULL,
-  a_z      double precision NOT NULL,
-  b_x      double precision NOT NULL,
-  b_y      double precision NOT NULL,
-  b_z      double precision NOT NULL,
-  status   text NOT NULL,
-  revision bigint NOT NULL,
-  setting  text NOT NULL,
-  because  text,
-  shapes   text,
-  PRIMARY KEY (a, b)
-)""",
-    _granted_as_on_brick("pair"),
-)
+TYPES = {
+    "count": "bigint", "number": "double precision", "text": "text", "json": "json",
+    "keys": "bigint[]",
+}  # fmt: skip
 
 MIGRATIONS: Dialect = {
     "tables": (
@@ -263,9 +230,9 @@ MIGRATIONS: Dialect = {
         PART,
         *VOXEL,
         *BRICK,
-        CHANGE,
+        CHANGE.format(**TYPES),
         QUANTILE,
-        COST,
+        COST.format(**TYPES),
         *REFRESH,
         *FORCE,
     ),
@@ -274,5 +241,5 @@ MIGRATIONS: Dialect = {
     "distances": DISTANCES,
     "shards": (),
     "surfaces": SURFACES,
-    "pairs": PAIRS,
+    "pairs": (PAIR.format(**TYPES), _granted_as_on_brick("pair")),
 }

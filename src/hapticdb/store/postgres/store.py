@@ -47,7 +47,6 @@ MOST_BITS = 1 << 20
 larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
 
 
-
 class PostgresStore(ServerTables):
     """An environment on a PostgreSQL server. Open with `open`, make with `create`."""
 

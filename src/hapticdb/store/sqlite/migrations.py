@@ -3,7 +3,7 @@
 Each step runs in one transaction with the number that it leads to (`hapticdb.store.schema`).
 """
 
-from hapticdb.store.schema import Dialect
+from hapticdb.store.schema import CHANGE, COST, PAIR, Dialect
 
 APPLICATION_ID = 0x48415054  # "HAPT"
 """Number in the header of each hapticdb file. Another program's database does not have it."""
@@ -54,26 +54,12 @@ CREATE TABLE brick (
   PRIMARY KEY (z_val, id)
 ) STRICT, WITHOUT ROWID"""
 
-CHANGE = """
-CREATE TABLE change (
-  revision INTEGER PRIMARY KEY,
-  action   TEXT NOT NULL,
-  id       INTEGER NOT NULL,
-  ranges   BLOB NOT NULL
-) STRICT"""
-
 QUANTILE = """
 CREATE TABLE quantile (
   resolution INTEGER PRIMARY KEY,
   revision   INTEGER NOT NULL,
   n_rows     INTEGER NOT NULL,
   bounds     BLOB NOT NULL
-) STRICT"""
-
-COST = """
-CREATE TABLE cost (
-  machine TEXT PRIMARY KEY,
-  figures TEXT NOT NULL
 ) STRICT"""
 
 LINEAGE = (
@@ -121,35 +107,15 @@ CREATE TABLE surface (
     "CREATE INDEX object_digest ON object (digest)",
 )
 
-PAIRS = (
-    """
-CREATE TABLE pair (
-  a        INTEGER NOT NULL,
-  b        INTEGER NOT NULL,
-  kind     TEXT NOT NULL,
-  at_least REAL NOT NULL,
-  at_most  REAL,
-  a_x      REAL NOT NULL,
-  a_y      REAL NOT NULL,
-  a_z      REAL NOT NULL,
-  b_x      REAL NOT NULL,
-  b_y      REAL NOT NULL,
-  b_z      REAL NOT NULL,
-  status   TEXT NOT NULL,
-  revision INTEGER NOT NULL,
-  setting  TEXT NOT NULL,
-  because  TEXT,
-  shapes   TEXT,
-  PRIMARY KEY (a, b)
-) STRICT, WITHOUT ROWID""",
-)
+TYPES = {"count": "INTEGER", "number": "REAL", "text": "TEXT", "json": "TEXT", "keys": "BLOB"}
+SHARED = tuple(f"{table.format(**TYPES)} STRICT" for table in (CHANGE, COST))
 
 MIGRATIONS: Dialect = {
-    "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, CHANGE, QUANTILE, COST),
+    "tables": (ENVIRONMENT, OBJECT, VOXEL, BRICK, QUANTILE, *SHARED),
     "lineage": LINEAGE,
     "removed parts": REMOVED,
     "distances": DISTANCES,
     "shards": (),
     "surfaces": SURFACES,
-    "pairs": PAIRS,
+    "pairs": (f"{PAIR.format(**TYPES)} STRICT, WITHOUT ROWID",),
 }

@@ -15,7 +15,7 @@ from assemblies import PAIRS, Kind, make, placement, voxel_set
 from hapticdb import Environment, Grid, diff_environments
 from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
-from hapticdb.ingest import stored
+from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Band
 from hapticdb.testing import blob, voxel_object, with_distances
@@ -36,7 +36,7 @@ def test_every_voxel_that_differs_is_counted(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
 ) -> None:
     """Counts equal those of Python sets, in one batch and in many; another object shares voxels."""
-    monkeypatch.setattr(stored, "MOST_ROWS", most_rows)
+    monkeypatch.setattr(geometry, "MOST_ROWS", most_rows)
 
     @settings(max_examples=3, deadline=None)
     @given(bits=st.integers(1, 7), seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1))
@@ -136,7 +136,7 @@ def test_distances_are_compared_where_both_have_them(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: CurveName, most_rows: int
 ) -> None:
     """On any curve. Objects that have them on one side alone do not differ."""
-    monkeypatch.setattr(stored, "MOST_ROWS", most_rows)
+    monkeypatch.setattr(geometry, "MOST_ROWS", most_rows)
     ijk = blob(3, PLACE)
     rows = with_distances(ijk, Grid(0.01, (-0.1, 0.2, -0.3), 5), "brick", seed=1)
     assert rows.distances is not None

@@ -22,7 +22,7 @@ from children import child
 from hapticdb import Environment, Grid, copy_environment, diff_environments
 from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
-from hapticdb.ingest import stored
+from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
 from hapticdb.query.grouping import covering
@@ -71,7 +71,7 @@ def test_voxels_come_back_from_every_layout_and_curve(
     monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
 ) -> None:
     """A copy and a copy back, in one batch and in many, also on grids smaller than a brick."""
-    monkeypatch.setattr(stored, "MOST_ROWS", most_rows)
+    monkeypatch.setattr(geometry, "MOST_ROWS", most_rows)
 
     @settings(max_examples=3, deadline=None)
     @given(drawn=st.integers(1, 7).flatmap(lambda b: st.tuples(st.just(b), scattered(b))))
@@ -116,7 +116,7 @@ def test_no_statement_brings_more_than_a_batch(
 ) -> None:
     """No statement returns more rows than a batch, however large an object is."""
     source = make_blobs(tmp_path / "a.db")
-    monkeypatch.setattr(stored, "MOST_ROWS", 8)
+    monkeypatch.setattr(geometry, "MOST_ROWS", 8)
     brought: list[int] = []
     rows_of_object = SQLiteStore.rows_of
 

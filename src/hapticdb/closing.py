@@ -16,3 +16,8 @@ class Closes(ABC):
     @abstractmethod
     def close(self) -> None:
         """Close it."""
+
+    def __deepcopy__(self, _: object = None) -> Self:
+        raise TypeError(f"a {type(self).__name__} cannot be copied: a copy would close it, too")
+
+    __copy__ = __deepcopy__

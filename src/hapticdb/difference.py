@@ -9,8 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
+from hapticdb.ingest.geometry import bricks_of_object
 from hapticdb.ingest.layout import Bricks
-from hapticdb.ingest.stored import bricks_of_object
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Progress, Store

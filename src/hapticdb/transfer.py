@@ -16,8 +16,8 @@ from hapticdb.errors import (
     UsageError,
 )
 from hapticdb.grid import CurveName, Grid
+from hapticdb.ingest.geometry import bricks_of_batches, rows_of_object
 from hapticdb.ingest.layout import rows_of_bricks
-from hapticdb.ingest.stored import bricks_of_batches, rows_of_object
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Progress, Rows, Store, joined

@@ -53,7 +53,7 @@ def file(tmp_path: Path) -> Path:
 @pytest.fixture
 def plain(file: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     """An environment without distances, compared in pieces; its first object has been moved."""
-    monkeypatch.setattr("hapticdb.ingest.stored.MOST_ROWS", 3)
+    monkeypatch.setattr("hapticdb.ingest.geometry.MOST_ROWS", 3)
     hapticdb.import_files(tmp_path / "plain.db", [file], small_options(distances=False))
     with hapticdb.open(tmp_path / "plain.db") as env:
         placed = env.object(1).transform.copy()

@@ -21,8 +21,8 @@ from hapticdb.kernels.resident.cells import BUFFERS, READER_STRIDE, UNKNOWN, cel
 from hapticdb.resident import changes
 from hapticdb.resident import residency as module
 from hapticdb.resident.residency import Residency
-from hapticdb.resident.slots import ROUNDS_KEPT
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.resident.writer import ROUNDS_KEPT
 from hapticdb.store.connect import open_store
 from hapticdb.testing import voxel_object, write_voxels
 from naive import Voxel

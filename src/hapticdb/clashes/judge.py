@@ -54,8 +54,8 @@ class PlacedPair(NamedTuple):
 
 def judge_placed(shapes: Shapes, pair: PlacedPair, within: float, contact: float) -> Judged | None:
     """Judge a pair of objects; None if one was written meanwhile."""
-    a, b = shapes.placed(pair.one), shapes.placed(pair.other)
-    return None if a is None or b is None else judge(a[0], b[0], pair.pose, within, contact)
+    a, b = shapes.shape(pair.one), shapes.shape(pair.other)
+    return None if a is None or b is None else judge(a, b, pair.pose, within, contact)
 
 
 def judge(a: BuiltShape, b: BuiltShape, pose: Floats, within: float, contact: float) -> Judged:

@@ -80,12 +80,12 @@ class Shapes:
         self._bytes = 0
         self._placements: dict[int, tuple[tuple[str, bytes], Floats]] = {}
 
-    def placed(self, obj: Object) -> tuple[BuiltShape, Floats] | None:
-        """BuiltShape of an object and its rigid placement (4, 4); None if it was written meanwhile.
+    def shape(self, obj: Object) -> BuiltShape | None:
+        """Shape of an object; None if it was written meanwhile.
 
         Raises `NoSurfaceError` if the object's surface is not in the database.
         """
-        key, pose = self.placement(obj)
+        key, _ = self.placement(obj)
         shape = self._kept.get(key)
         if shape is None:
             shape = self._read(obj, np.frombuffer(key[1]).reshape(3, 3))
@@ -96,7 +96,7 @@ class Shapes:
             while self._bytes > self._budget and len(self._kept) > 2:
                 self._bytes -= _bytes_of(self._kept.popitem(last=False)[1])
         self._kept.move_to_end(key)
-        return shape, pose
+        return shape
 
     def placement(self, obj: Object) -> tuple[tuple[str, bytes], Floats]:
         """Key of an object's shape, equal for equal ones, and its rigid placement (4, 4)."""

@@ -14,8 +14,7 @@ import numpy as np
 
 from hapticdb.errors import ConflictError, FileError, HapticDBError, ObjectNotFoundError, UsageError
 from hapticdb.ingest.files import ImportCallback, ImportProgress
-from hapticdb.ingest.geometry import found_parts, packed_surface
-from hapticdb.ingest.stored import rows_of_object
+from hapticdb.ingest.geometry import found_parts, packed_surface, rows_of_object
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part, read_file
 from hapticdb.query.grouping import covering

@@ -13,7 +13,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb
 from matplotlib.figure import Figure
 from matplotlib.lines import Line2D
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
@@ -70,7 +70,9 @@ def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> 
     trace = comparison.trace
     palette = _palette(env, trace)
     figure, above = new_figure()
-    camera = _camera(env)
+    objects = env.objects()
+    boxes = np.array([obj.bounds for obj in objects])
+    camera = camera_of(boxes, WINDOW, up_axis(objects))
     _draw_scene(above, env, camera, palette)
     _draw_path(above, camera, scene, trace, palette)
     _draw_words(figure, scene, comparison)
@@ -99,17 +101,11 @@ def _palette(env: Environment, trace: "Trace") -> _Palette:
     return _Palette(dict(zip(most, COLORS, strict=False)), names)
 
 
-def _camera(env: Environment) -> Camera:
-    objects = env.objects()
-    boxes = np.array([obj.bounds for obj in objects])
-    window = SAMPLES * np.array(WINDOW, dtype=np.float64)
-    return Camera.looking_at(
-        boxes,
-        np.array(TOWARDS),
-        (SCENE[0] * SAMPLES, SCENE[1] * SAMPLES),
-        window,
-        up_axis(objects),
-    )
+def camera_of(boxes: NDArray[np.float64], window: ArrayLike, up: int) -> Camera:
+    """Camera that has boxes (B, 2, 3), metres, in a window of the scene, pixels."""
+    seen = SAMPLES * np.asarray(window, dtype=np.float64)
+    size = (SCENE[0] * SAMPLES, SCENE[1] * SAMPLES)
+    return Camera.looking_at(boxes, np.array(TOWARDS), size, seen, up)
 
 
 def _draw_scene(axes: Axes, env: Environment, camera: Camera, palette: _Palette) -> None:

@@ -24,7 +24,7 @@ from hapticdb.pictures.demo import (
     SAMPLES,
     SCENE,
     SIZE,
-    TOWARDS,
+    camera_of,
     mixed,
     new_figure,
     shortened,
@@ -160,15 +160,9 @@ def _camera(
     felt = [obj.bounds for obj in env.objects() if obj.id not in exclude]
     everything = np.concatenate([boxes, np.array(felt).reshape(-1, 2, 3)])
     extent = float((everything[:, 1].max(axis=0) - everything[:, 0].min(axis=0)).max())
-    window = SAMPLES * np.array(WINDOW, dtype=np.float64)
-    window[1, 0] = min(window[1, 0], SAMPLES * (legend - LINE))
-    return Camera.looking_at(
-        everything if extent <= CLOSE_UP * length else boxes,
-        np.array(TOWARDS),
-        (SCENE[0] * SAMPLES, SCENE[1] * SAMPLES),
-        window,
-        up,
-    )
+    (left, top), (right, bottom) = WINDOW
+    window = (left, top), (min(right, legend - LINE), bottom)
+    return camera_of(everything if extent <= CLOSE_UP * length else boxes, window, up)
 
 
 def _draw_scene(

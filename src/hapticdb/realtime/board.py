@@ -16,6 +16,7 @@ from typing import Self
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.closing import Closes
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.records import FRAME, MOST_SHOWN, SEAT
 from hapticdb.recording.frame import Frames
@@ -39,7 +40,7 @@ Seats = NDArray[np.void]
 """Rows of `kernels.records.SEAT`."""
 
 
-class Board:
+class Board(Closes):
     """Seats of sessions in shared memory.
 
     descriptor : of the memory of a board that `create` has made; owned from now on; seats (S,) of

@@ -321,11 +321,11 @@ class Residency:
         if not len(slots):
             return UnpublishedCells()
         cells = cells[: len(slots)]
-        read = self._source.read(cells, self.table, slots)
+        is_empty, n_rows, n_ranges = self._source.read(cells, self.table, slots)
         self.writer.slots.take(slots)
-        self.writer.slots.give_back(slots[read.is_empty])
-        slots[read.is_empty] = EMPTY_SLOT
-        return UnpublishedCells(cells, slots, read.n_rows, read.n_ranges)
+        self.writer.slots.give_back(slots[is_empty])
+        slots[is_empty] = EMPTY_SLOT
+        return UnpublishedCells(cells, slots, n_rows, n_ranges)
 
     def _make_room(self, n_cells: int) -> None:
         """Free slots for `n_cells` cells, but keep cells that are still wanted."""

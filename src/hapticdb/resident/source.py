@@ -1,7 +1,6 @@
 """Cells of an environment, read from its store into slots of a cell table."""
 
 from collections.abc import Callable
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -35,18 +34,6 @@ ASKED = 3
 """Number of timed round trips; the shortest counts."""
 
 
-class _CellsRead(NamedTuple):
-    """Result of one statement.
-
-    is_empty (n,) : whether each cell has no voxel and no distances; n_rows : rows read; n_ranges :
-    ranges queried.
-    """
-
-    is_empty: NDArray[np.bool_]
-    n_rows: int
-    n_ranges: int
-
-
 class CellSource:
     """Reads cells of one environment, a batch by one statement.
 
@@ -74,8 +61,13 @@ class CellSource:
         may_measure = may_measure and self._quantiles.n_rows > 0
         self._costs = costs_at_start(store, clock, may_measure=may_measure)
 
-    def read(self, cells: Keys, table: CellTable, slots: Keys) -> _CellsRead:
-        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read."""
+    def read(
+        self, cells: Keys, table: CellTable, slots: Keys
+    ) -> tuple[NDArray[np.bool_], int, int]:
+        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read.
+
+        Returns whether each has no voxel and no distances (n,), rows read, and ranges queried.
+        """
         grid, shift = self.store.grid, row_shift(self.store.layout)
         on_curve = kernels.curve_keys_of_cells(cells, grid.bits, grid.curve_code)
         order = np.argsort(on_curve)
@@ -98,7 +90,7 @@ class CellSource:
         if payload is not None:
             self._fill_distances(rows, row_slots, payload, masks)
             mark_near_voxels(slots, payload, masks, words, table.cells.near)
-        return _CellsRead(masks[slots] == 0, len(rows), len(ranges.lows))
+        return masks[slots] == 0, len(rows), len(ranges.lows)
 
     def _fill_distances(
         self,

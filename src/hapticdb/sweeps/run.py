@@ -91,7 +91,8 @@ def sweep(
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _asked(contact, limit, seconds, profile=profile, until_hit=until_hit, progress=progress)
+    most, time_left = (np.inf if number is None else number for number in (limit, seconds))
+    asked = _Asked(contact, most, time_left, profile, until_hit, progress).begun()
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, center_of(tool, about))
@@ -110,24 +111,15 @@ class _Asked(NamedTuple):
     until_hit: bool
     progress: Progress | None
 
-
-def _asked(
-    contact: float,
-    limit: float | None,
-    seconds: float | None,
-    *,
-    profile: bool,
-    until_hit: bool,
-    progress: Progress | None,
-) -> _Asked:
-    """Check numbers; UsageError."""
-    most = np.inf if limit is None else limit
-    if not (0.0 < contact < np.inf and most > 0.0):
-        raise UsageError(f"contact {contact} m, limit {limit} m: give lengths above 0")
-    if seconds is not None and not seconds > 0.0:
-        raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
-    until = np.inf if seconds is None else time.monotonic() + seconds
-    return _Asked(contact, most, until, profile, until_hit, progress)
+    def begun(self) -> "_Asked":
+        """Check numbers, with `until` in seconds from now; UsageError."""
+        if not (0.0 < self.contact < np.inf and self.limit > 0.0):
+            raise UsageError(
+                f"contact {self.contact} m, limit {self.limit} m: give lengths above 0"
+            )
+        if not self.until > 0.0:
+            raise UsageError(f"a sweep of {self.until} seconds: give more than 0")
+        return self._replace(until=time.monotonic() + self.until)
 
 
 def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:

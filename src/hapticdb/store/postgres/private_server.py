@@ -15,9 +15,9 @@ import shutil
 import signal
 import stat
 import tempfile
-import threading
 import time
 from collections.abc import Iterator, Mapping
+from functools import cache
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
@@ -54,8 +54,6 @@ ORPHANS_S = 10.0
 PARTING_S = 0.5
 """Seconds for the server to notice that a client has closed its connection."""
 POLL_S = 0.01
-_shared: "dict[Path, PrivateServer]" = {}
-_shared_lock = threading.Lock()
 
 
 class PrivateServer:
@@ -355,19 +353,12 @@ class PrivateServer:
             time.sleep(POLL_S)
 
 
-def shared_server(folder: Path, binaries: Binaries | None = None) -> PrivateServer:
+@cache
+def shared_server(folder: Path) -> PrivateServer:
     """The server in a folder, one object a process; released when the process ends."""
-    place = folder.expanduser().resolve()
-    with _shared_lock:
-        server = _shared.get(place)
-    if server is not None:
-        return server
-    server = PrivateServer.at(place, binaries)  # sets it up, which takes seconds
-    with _shared_lock:
-        if place not in _shared:
-            _shared[place] = server
-            atexit.register(server.release)
-        return _shared[place]
+    server = PrivateServer.at(folder)
+    atexit.register(server.release)
+    return server
 
 
 def _is_address(folder: Path) -> bool:

@@ -56,7 +56,7 @@ def conninfo(address: Address, *, making: bool) -> str:
         raise UsageError(
             f"{address.shown}: data= starts a server of its own: leave host, port and user out"
         )
-    folder = Path(address.data).expanduser().absolute()
+    folder = Path(address.data).expanduser().resolve()
     if not making and not folder.exists():
         raise _not_found(address)
     server = shared_server(folder)

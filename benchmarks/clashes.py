@@ -91,10 +91,10 @@ def measured(what: str, url: str) -> dict[str, Any]:
 def distance(shapes: Shapes, pair: PlacedPair, within: float, contact: float) -> Judged | None:
     """Measure the distance of a pair and leave out its kind: in the place of `judge_placed`."""
     del contact
-    a, b = shapes.placed(pair.one), shapes.placed(pair.other)
+    a, b = shapes.shape(pair.one), shapes.shape(pair.other)
     if a is None or b is None:
         return None
-    near = nearest(a[0].tree, b[0].tree, pair.pose[None], np.full(1, within))
+    near = nearest(a.tree, b.tree, pair.pose[None], np.full(1, within))
     at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
     kind: Kind = "apart" if np.isfinite(at_most) else "far"
     return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])

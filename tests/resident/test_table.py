@@ -1,5 +1,6 @@
 """A cell table keeps to its budget; readers of any process join and leave."""
 
+import copy
 import itertools
 import os
 import resource
@@ -120,3 +121,12 @@ def test_a_zombie_that_is_waited_for_at_that_moment_does_not_run(
         with monkeypatch.context() as patched:
             patched.setattr(Path, "read_text", read_text)
             assert not is_alive(gone.pid)
+
+
+def test_a_table_is_not_copied() -> None:
+    """A copy in the same process would share its descriptor, and close it twice."""
+    with CellTable.create(LEAST_BUDGET) as table:
+        for made in (copy.copy, copy.deepcopy):
+            with pytest.raises(TypeError, match="cannot be copied"):
+                made(table)
+        assert table.version == 1

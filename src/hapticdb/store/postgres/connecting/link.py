@@ -269,7 +269,7 @@ class Link:
     def _result(self) -> pq.abc.PGresult:
         """Result of the statement that was sent. Closes the connection when no result comes."""
         try:
-            found = self.driver.wait(generators.execute(self._pgconn))[-1]
+            found: pq.abc.PGresult = self.driver.wait(generators.execute(self._pgconn))[-1]
             if found.status not in _FINE:
                 raise error_from_result(found, encoding="utf-8")  # noqa: TRY301 - may be a loss, too
         except psycopg.Error as error:

@@ -91,8 +91,7 @@ def sweep(
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    most, time_left = (np.inf if number is None else number for number in (limit, seconds))
-    asked = _Asked(contact, most, time_left, profile, until_hit, progress).begun()
+    asked = _Asked(contact, profile, until_hit, progress).begun(limit, seconds)
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, center_of(tool, about))
@@ -105,21 +104,21 @@ class _Asked(NamedTuple):
     """What is asked, as for `sweep`; until : time of `time.monotonic`."""
 
     contact: float
-    limit: float
-    until: float
     profile: bool
     until_hit: bool
     progress: Progress | None
+    limit: float = np.inf
+    until: float = np.inf
 
-    def begun(self) -> "_Asked":
-        """Check numbers, with `until` in seconds from now; UsageError."""
-        if not (0.0 < self.contact < np.inf and self.limit > 0.0):
-            raise UsageError(
-                f"contact {self.contact} m, limit {self.limit} m: give lengths above 0"
-            )
-        if not self.until > 0.0:
-            raise UsageError(f"a sweep of {self.until} seconds: give more than 0")
-        return self._replace(until=time.monotonic() + self.until)
+    def begun(self, limit: float | None, seconds: float | None) -> "_Asked":
+        """Check numbers, and begin to count the seconds; UsageError."""
+        most = np.inf if limit is None else limit
+        if not (0.0 < self.contact < np.inf and most > 0.0):
+            raise UsageError(f"contact {self.contact} m, limit {limit} m: give lengths above 0")
+        if seconds is not None and not seconds > 0.0:
+            raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
+        until = np.inf if seconds is None else time.monotonic() + seconds
+        return self._replace(limit=most, until=until)
 
 
 def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:

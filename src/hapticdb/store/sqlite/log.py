@@ -18,9 +18,10 @@ import struct
 import time
 from collections.abc import Iterator
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError
 from hapticdb.store.sqlite import raw as sqlite_bytes
@@ -169,7 +170,7 @@ class _Log:
         self._order = ">u4" if magic & 1 else "<u4"
         self._salts = header[16:24]
         self._sums = SUMS.unpack_from(header, 24)
-        self._is_void = magic & ~1 != LOG_MAGIC or self._sums != _checksum(header[:24], self._order)
+        self._is_void = magic & ~1 != LOG_MAGIC or self._sums != _header_sums(header, self._order)
 
     @classmethod
     def at(cls, path: Path) -> "_Log":
@@ -222,8 +223,7 @@ class _Log:
             frame = self._read(FRAME_BYTES, at)
             if len(frame) < FRAME_BYTES:
                 return False
-            # the page's number and size, then its content: 0.4 ms a page, for a foreign log alone
-            sums = _checksum(frame[:8] + frame[FRAME_HEADER:], self._order, *sums)
+            sums = _log_checksum(np.frombuffer(frame, self._order), *sums)
             if sums != SUMS.unpack_from(frame, 16):
                 return False
             is_ours = is_ours or (number == LINEAGE_PAGE and self._lineage(at) is not None)
@@ -232,10 +232,42 @@ class _Log:
         return False
 
 
-def _checksum(text: bytes, order: str, s1: int = 0, s2: int = 0) -> tuple[int, int]:
-    """Both sums of SQLite's logs after an even number of words, from the sums before them."""
-    words = np.frombuffer(text, order).tolist()
+def _header_sums(header: bytes, order: str) -> tuple[int, int]:
+    """Checksum of a log's header."""
+    return _words_checksum(np.frombuffer(header[:24], order).tolist(), 0, 0)
+
+
+def _log_checksum(frame: NDArray[Any], s1: int, s2: int) -> tuple[int, int]:
+    """Both sums after a frame's words (2054,), from the sums before the frame, modulo 2^32.
+
+    SQLite adds the page's number and size and then its content, word after word: s1 += word + s2,
+    s2 += the next + s1. Both are linear in the words, with Fibonacci's numbers for weights.
+    """
+    s1, s2 = _words_checksum(frame[:2].tolist(), s1, s2)
+    page = frame[6:].astype(np.uint32, copy=False)
+    return (
+        (int(_WEIGHTS[0].dot(page)) + _PAST[0] * s1 + _PAST[1] * s2) & 0xFFFFFFFF,
+        (int(_WEIGHTS[1].dot(page)) + _PAST[1] * s1 + _PAST[2] * s2) & 0xFFFFFFFF,
+    )
+
+
+def _words_checksum(words: list[int], s1: int, s2: int) -> tuple[int, int]:
+    """Both sums after an even number of words, one by one."""
     for even, odd in zip(words[::2], words[1::2], strict=True):
         s1 = (s1 + even + s2) & 0xFFFFFFFF
         s2 = (s2 + odd + s1) & 0xFFFFFFFF
     return s1, s2
+
+
+def _weights() -> tuple[tuple[NDArray[np.uint32], NDArray[np.uint32]], list[int]]:
+    """Weights of a page's words in both sums, and of the sums before the page."""
+    n_words = PAGE_BYTES // 4
+    numbers = [0, 1]
+    while len(numbers) < n_words + 2:
+        numbers.append((numbers[-1] + numbers[-2]) & 0xFFFFFFFF)
+    fibonacci = np.array(numbers, np.uint32)
+    of_words = fibonacci[n_words - 1 :: -1].copy(), fibonacci[n_words:0:-1].copy()
+    return of_words, numbers[n_words - 1 :]
+
+
+_WEIGHTS, _PAST = _weights()

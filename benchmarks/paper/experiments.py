@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from dense_frame import dense_bitmap, dense_feel
 from hapticdb import Environment, Query
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
-from hapticdb.query.frame import Strategy
+from hapticdb.query.frame import Strategy, locate
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.resident.frames import ResidentFrames
@@ -93,7 +93,7 @@ def coarsened(finest: QuantileVector, resolution: int) -> QuantileVector:
 def _grouping_us(subject: Subject, vector: QuantileVector, task: Task) -> float:
     """Median time of grouping alone, over frames that differ as a hand's do."""
     query = subject.query(vector)
-    located = [query.locate(task.shell, pose).keys for pose in task.poses[:200]]
+    located = [locate(task.shell, pose, query.grid).keys for pose in task.poses[:200]]
     times = []
     for keys in located + located:
         start = time.perf_counter_ns()
@@ -191,7 +191,7 @@ def grouping(subject: Subject, budget: Budget) -> list[Cell]:
         shell = sphere_shell(grid.voxel_size, n_points, radius)
         pose = np.eye(4)
         pose[:3, 3] = np.array(grid.origin) + 0.5 * grid.edge
-        keys = query.locate(shell, pose).keys
+        keys = locate(shell, pose, query.grid).keys
         us: list[float] = []
         while len(us) < LEAST_GROUPED or sum(us) < 1e6 * budget.cell_s / 4:
             start = time.perf_counter_ns()

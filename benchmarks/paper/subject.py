@@ -83,8 +83,8 @@ class Subject:
 
     def asked_rows(self, task: Task) -> list[int]:
         """Rows under each pose's own keys."""
-        query = self.query()
-        return [query.run(task.shell, pose, "array").query.rows for pose in task.poses]
+        ask = asking(self.query(), task.shell, "array", "plane", None)
+        return [ask(pose).rows for pose in task.poses]
 
 
 def asking(
@@ -92,7 +92,7 @@ def asking(
 ) -> Callable[[Pose], Query]:
     """Frames of one shell by one strategy."""
     gap = DEFAULT_MAXGAP if gap is None else gap
-    return lambda pose: query.run(shell, pose, strategy, gap, law=LAWS[law]).query
+    return lambda pose: query.touch(shell, pose, strategy, gap, law=LAWS[law]).query
 
 
 def with_papers_cache(env: Environment) -> None:

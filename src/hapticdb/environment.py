@@ -87,8 +87,9 @@ class Environment(Queries, Closes):
         As of the revision that was read last, by a frame or a list; before, of the newest. It
         costs a statement only before the first frame and after an edit of this environment.
         """
-        self._touching.learn_first()
-        return self._touching.known.have_distances
+        if self._query.known.version is None:
+            self.objects()
+        return self._query.known.have_distances
 
     def size(self) -> Size:
         """Rows, bytes and leaf blocks of the database."""
@@ -98,7 +99,7 @@ class Environment(Queries, Closes):
 
     def objects(self) -> list[Object]:
         """All objects, ordered by id. Only those are read that were written since the last time."""
-        return self._touching.newest()
+        return self._query.known.newest()
 
     def object(self, object_id: int) -> Object:
         """Return one object.
@@ -369,7 +370,7 @@ class Environment(Queries, Closes):
     def _forget(self) -> None:
         """Drop cached values that an edit of this environment has made stale."""
         self._figures.rows_changed()
-        self._touching.known.forget()
+        self._query.known.forget()
 
     def _check_writable(self) -> None:
         if self._store.is_read_only:

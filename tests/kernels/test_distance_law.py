@@ -4,6 +4,7 @@ Bands are made by brute force from triangles (`bands`), without a database.
 """
 
 from functools import cache
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -16,11 +17,12 @@ from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field import law as field
 from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
-from hapticdb.kernels.query import contact, refining
+from hapticdb.kernels.query import refining
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cells as resident
 from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
+from hapticdb.query.frame import locate
 from hapticdb.resident.held import counts_of, held_tool
 from naive_frame import NaiveTouch, distance_at, touch_distances
 
@@ -124,16 +126,33 @@ def expected(scene: Merged, shell: PointShell, pose: Array, exclude: list[int]) 
 LAW = field.DistanceFieldLaw(1000.0)
 
 
+class Felt(NamedTuple):
+    """What `refining.refine` finds: of the hits, and of points that are felt apart from them."""
+
+    wrench: Array
+    hits: NDArray[np.int64]
+    depths: Array
+    ids: NDArray[np.int64]
+    apart: NDArray[np.int64]
+    apart_depths: Array
+
+
 def on_rows(
     scene: Merged, grid: Grid, shell: PointShell, pose: Array, exclude: list[int]
-) -> tuple[refining.Refined, NDArray[np.int64]]:
+) -> tuple[Felt, NDArray[np.int64]]:
     """A frame on rows, and the pairs of its contacts and the objects that they touch."""
     excluded = np.array(sorted(set(exclude)), dtype=np.int64)
     record = grid.for_kernels(9)
-    located = contact.locate(shell.points, shell.normals, shell.center, pose, record)
+    located = locate(shell, pose, record)
     rows = (scene.keys, scene.ids, scene.occupancy, scene.values, excluded, record, LAW)
-    felt = refining.refine(located, *rows)
-    contacts = np.sort(np.concatenate([felt[1][felt[2] > 0], felt[4]]))
+    total = len(shell)
+    out, met = np.empty(6 + 2 * total), np.empty(2 * total + len(scene.ids), dtype=np.int64)
+    hits, apart, ids = refining.refine(*located, *rows, out, met)
+    felt = Felt(
+        out[:6], met[:hits], out[6 : 6 + hits], met[2 * total : 2 * total + ids],
+        met[total : total + apart], out[6 + total : 6 + total + apart],
+    )  # fmt: skip
+    contacts = np.sort(np.concatenate([felt.hits[felt.depths > 0], felt.apart]))
     return felt, refining.pairs_of_points(*located, *rows, contacts)
 
 
@@ -343,9 +362,9 @@ def test_between_two_objects_the_nearest_one_is_told() -> None:
         [distance_at((x, y, z), [steps]) for steps in scene.fields.values()]
         for x, y, z in points.tolist()
     ]
-    between = [n for n in felt[4].tolist() if min(own[n]) >= 1.5]
+    between = [n for n in felt.apart.tolist() if min(own[n]) >= 1.5]
     assert between, "no point lies between"
-    assert sorted(set(pairs[:, 0].tolist())) == felt[4].tolist()
+    assert sorted(set(pairs[:, 0].tolist())) == felt.apart.tolist()
     for n in between:
         named = pairs[pairs[:, 0] == n, 1].tolist()
         assert len(named) == 1

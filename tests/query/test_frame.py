@@ -219,7 +219,7 @@ def test_a_frame_after_edits_reads_the_objects_that_they_wrote_and_no_others(
     env = make_scene(tmp_path / "e.db" if is_file else place(), "brick", "z")
     shell, pose = random_shell(5, 300), random_pose(5)
     env.touch(shell, pose)
-    known, listing = env._touching.known, env.store.objects
+    known, listing = env._query.known, env.store.objects
     monkeypatch.setattr(env.store, "objects", None)
     with hapticdb.open(env.url) as other:
         rows = other.store.rows_of(2, *EVERYWHERE)

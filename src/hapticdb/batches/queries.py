@@ -10,11 +10,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import Strategy, as_poses
+from hapticdb.query.frame import HapticQuery, Strategy, as_poses
 from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
 from hapticdb.query.touches import Touch
-from hapticdb.query.touching import Touching
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import ALL, NOTHING, Filter, FiltersOfWords
 from hapticdb.store.finding import Words
@@ -31,7 +30,7 @@ class Queries:
         self._store = store
         self.address = address
         """What opens it in another process: the URL as given, or a whole path."""
-        self._touching = Touching(store, figures)
+        self._query = HapticQuery(store, figures.both)
         self._filters = FiltersOfWords()
 
     @overload
@@ -115,7 +114,7 @@ class Queries:
         if pose is not None:
             felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
             chosen = as_law(law) if isinstance(law, str) else law
-            return self._touching.touch(shell, pose, strategy, maxgap, felt, chosen)
+            return self._query.touch(shell, pose, strategy, maxgap, felt, chosen)
         if strategy != "auto":
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
         with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
@@ -155,7 +154,7 @@ class Queries:
             with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:
                 yield from map(feeler.touch, pieces(feeling.PIECE))
             return
-        felt, chosen = self._filters.of(where, exclude), self._touching.law_now(as_law(law))
+        felt, chosen = self._filters.of(where, exclude), self._query.law_now(as_law(law))
         with connected(on) as workers:
             assert workers is not None  # noqa: S101 - there is an address
             work = partial(
@@ -278,5 +277,5 @@ class Queries:
         from hapticdb.batches.feeler import Feeler  # noqa: PLC0415 - loads numba
 
         felt = self._filters.of(where, exclude)
-        chosen = self._touching.law_now(as_law(law))
+        chosen = self._query.law_now(as_law(law))
         return Feeler(self._store, shell, felt, chosen, budget_bytes, jobs, device)

@@ -73,7 +73,7 @@ _VOXELIZE = (
     "field.packing.pack_kernel",
 )
 _RANGES = ("curves.encode_kernel", "surfaces.bricks.brick_voxels_kernel")
-_LOCATE = "query.contact.locate_kernel"
+_LOCATE = "query.contact.locate"
 _COST = (
     _LOCATE,
     "query.contact.spans_of_keys",
@@ -98,17 +98,17 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         *_VOXELIZE,
         *_SHELL,
         *_COST,
-        "query.refining.refine_kernel",
+        "query.refining.refine",
         "query.refining.pairs_of_points",
     ),
     "copy": ("surfaces.bricks.*", "curves.*", "query.grouping.gap_rows", *_RANGES),
     "shell": _SHELL,
     "calibrate": _COST,
-    "touch": (_LOCATE, "query.refining.refine_kernel"),
+    "touch": (_LOCATE, "query.refining.refine"),
     "touch by distance": (
         _LOCATE,
-        "query.refining.refine_kernel@distances",
-        "query.refining.unpack_asked_kernel",
+        "query.refining.refine@distances",
+        "query.refining.unpack_asked",
     ),
     "pairs": ("query.refining.pairs_of_points",),
     "pairs by distance": ("query.refining.pairs_of_points@distances",),

@@ -12,8 +12,9 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.query import contact, grouping
-from hapticdb.pointshell.shell import fibonacci_sphere
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.cost_model import CostModel
+from hapticdb.query.frame import locate
 from hapticdb.query.grouping import cbgroup
 from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Keys, Store, SupportsCaches, row_shift
@@ -238,21 +239,15 @@ def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
     places = rng.choice(quantiles.bounds, size=64)
     centers = grid.centers(grid.decode(places << shift))
     record = grid.for_kernels(shift)
-    middle = np.zeros(3)
-    middle.flags.writeable = False
     probes = []
     for n, surface in enumerate(centers):
         n_points = (300, 100, 30, 600)[n % 4]
         radius = min(grid.voxel_size * (12, 8, 4, 24)[n % 4], grid.edge / 4)
-        normals = -fibonacci_sphere(n_points)
-        points = -normals * radius
-        # Read-only like the arrays of a PointShell: writable arrays would compile a new signature.
-        points.flags.writeable = normals.flags.writeable = False
         pose = np.eye(4)
         # A tool lies on a surface or just below it; farther inside, gaps would hold more rows.
         away = rng.normal(size=3)
         pose[:3, 3] = surface + away / np.linalg.norm(away) * radius * rng.uniform(0.5, 1.0)
-        _, asked, keys = contact.locate(points, normals, middle, pose, record)
+        _, asked, keys = locate(PointShell.sphere(radius, n_points), pose, record)
         if not len(keys):
             continue
         first, last = contact.spans_of_keys(asked, keys, record)

@@ -24,7 +24,7 @@ class QueryFigures:
 
     def both(self) -> tuple[QuantileVector, CostModel]:
         """Quantile vector and cost model; a cost model is fitted in less than a second."""
-        if self._quantiles is None:
+        if self._quantiles is None or not self._quantiles.n_rows:  # others may have filled it
             self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
         if not self._quantiles.n_rows:
             return self._quantiles, CostModel.of_equal_parts()
@@ -60,8 +60,3 @@ class QueryFigures:
             if n_writes > STALE * self._n_objects:
                 self._store.analyze(DEFAULT_RESOLUTION)
                 self._n_objects = None
-
-    def drop_empty_statistics(self) -> None:
-        """Drop the statistics if they are those of an environment without rows."""
-        if self._quantiles is not None and not self._quantiles.n_rows:
-            self._quantiles = None

@@ -3,32 +3,26 @@
 import math
 import operator
 import time
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, Literal, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.kernels.field import lattice
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
+from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw, TangentPlane, frames_by
 from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
-from hapticdb.store.base import (
-    Keys,
-    LocatedShell,
-    Object,
-    Rows,
-    Store,
-    SupportsStatement,
-    row_shift,
-)
+from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
+from hapticdb.store.filtering import ALL, Filter
 from hapticdb.store.parsing import damaged
 
 if TYPE_CHECKING:
@@ -55,7 +49,6 @@ KEYS_PER_RANGE = 2
 """Mean keys of a range from which `auto` scans ranges. A larger value scans fewer frames: a range
 costs more than a key of a lookup, so ranges of one key each would be slower."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
-NO_OBJECTS: Mapping[int, Object] = {}
 
 
 _Asked = tuple[str, int, int, int]
@@ -72,6 +65,13 @@ class HapticQuery:
     quantiles_and_costs : callable
         Returns the quantile vector and the cost model; called for each frame that is grouped by
         cost.
+
+    Attributes
+    ----------
+    known : KnownObjects
+        Objects of the revision that the last frame has read.
+    grid : () of `hapticdb.kernels.records.GRID`
+        The environment's grid.
     """
 
     def __init__(
@@ -79,40 +79,83 @@ class HapticQuery:
     ) -> None:
         self._store = store
         self._quantiles_and_costs = quantiles_and_costs
+        self.known = KnownObjects(store)
         least = getattr(store, "grouping_threshold", LEAST_GROUPED)
         self._least_grouped = math.inf if least is None else least
         self._ready: dict[tuple[Strategy, type], bool] = {}
-        self._grid = store.grid.for_kernels(row_shift(store.layout))
+        self.grid = store.grid.for_kernels(row_shift(store.layout))
 
-    def run(
+    def touch(
         self,
         shell: "PointShell",
-        world_from_tool: ArrayLike,
+        pose: ArrayLike,
         strategy: Strategy = "auto",
         gap: int = DEFAULT_MAXGAP,
-        exclude: Keys = NOTHING_EXCLUDED,
-        law: ForceLaw = PLANE,
-        known: Mapping[int, Object] = NO_OBJECTS,
+        felt: Filter = ALL,
+        law: ForceLaw | None = None,
     ) -> Touch:
-        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`.
+        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        known, asked = self.known, (shell, pose, strategy, gap)
+        try:
+            touch = None
+            if known.version is not None and (law is None or known.fits(law)):
+                exclude = NOTHING_EXCLUDED if felt is ALL else known.left_out(felt)
+                touch = self._frame(*asked, exclude, law or known.own_law)
+            if touch is None or self._store.version() != known.version:
+                touch = self._touch_anew(*asked, felt, law)
+        except ConnectionLostError:
+            touch = self._touch_anew(*asked, felt, law)
+        for stray in set(touch.ids).difference(known.by_id):
+            raise damaged(self._store.url, f"rows of object {stray}, which is not there")
+        if not felt.is_empty:
+            known.check_words(felt)
+        return touch
 
-        known : the objects by id, as the result names them.
-        """
+    def _touch_anew(
+        self,
+        shell: "PointShell",
+        pose: ArrayLike,
+        strategy: Strategy,
+        gap: int,
+        felt: Filter,
+        law: ForceLaw | None,
+    ) -> Touch:
+        """Look a shell up in a snapshot, whose objects are loaded first."""
+        known = self.known
+        if known.version is None:  # the first frame: kernels may have to be compiled
+            self._get_ready(strategy, self.law_now(law))
+        with self._store.snapshot():
+            chosen = known.law_of_newest(law)
+            return self._frame(shell, pose, strategy, gap, known.left_out(felt), chosen)
+
+    def law_now(self, law: ForceLaw | None) -> ForceLaw:
+        """The law of a frame at the newest revision, whose objects are loaded."""
+        try:
+            with self._store.snapshot():
+                return self.known.law_of_newest(law)
+        except ConnectionLostError:  # inside a snapshot all is repeated, once
+            with self._store.snapshot():
+                return self.known.law_of_newest(law)
+
+    def _frame(
+        self,
+        shell: "PointShell",
+        pose: ArrayLike,
+        strategy: Strategy,
+        gap: int,
+        exclude: Keys,
+        law: ForceLaw,
+    ) -> Touch:
+        """Look a shell up; the result names the objects that are known."""
         reads = self._ready.get((strategy, type(law.for_kernels)))
         if reads is None:
-            reads = self.get_ready(strategy, law)
+            reads = self._get_ready(strategy, law)
         started = time.perf_counter_ns()
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
-        pose = as_floats(world_from_tool, "a pose")
-        if pose.shape != (4, 4):
-            raise UsageError(f"a pose of shape {pose.shape}: give a 4 x 4 matrix, world_from_tool")
-        try:
-            located = contact.locate(shell.points, shell.normals, shell.center, pose, self._grid)
-        except ValueError as error:
-            raise UsageError(f"{error}: give finite numbers and a rotation") from error
+        located = locate(shell, pose, self.grid)
         if strategy == "statement":
-            return self._by_statement(located, exclude, law, known, started)
+            return self._by_statement(located, exclude, law, started)
         store, keys, ranges = self._store, located.keys, None
         if strategy in GROUPING or (strategy == "auto" and len(keys) >= self._least_grouped):
             ranges = self._ranges_of(located, strategy, gap, distances=reads)
@@ -128,9 +171,9 @@ class HapticQuery:
             used = "maxgap" if strategy == "maxgap" else "cbgroup"
             asked = (used, 1, len(ranges.lows), len(rows.keys))
         payload = self._distances_of(rows, keys) if reads else None
-        return self._refined(located, rows, payload, exclude, law, known, asked, started)
+        return self._refined(located, rows, payload, exclude, law, asked, started)
 
-    def get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
+    def _get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
         """Compile and load what frames of a strategy and a law call.
 
         Returns whether they read distances.
@@ -159,17 +202,19 @@ class HapticQuery:
         UsageError
             If the rows have no distances.
         """
+        values = np.empty((len(rows.keys), lattice.ROW_VALUES), dtype=np.uint8)
         if not rows.keys.size:
-            return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
+            return values
         if rows.distances is None:
             raise UsageError(
                 f"{self._store.url} has no distances to surfaces, which this law reads: give "
                 "the law TangentPlane"
             )
-        try:
-            return refining.unpack_asked(keys, rows.keys, *rows.distances)
-        except ValueError as error:
-            raise damaged(self._store.url, str(error)) from error
+        row = refining.unpack_asked(keys, rows.keys, *rows.distances, values)
+        if row >= 0:
+            cause = f"row {row} of {len(values)} packed rows of distances is damaged"
+            raise damaged(self._store.url, cause)
+        return values
 
     def _refined(
         self,
@@ -178,18 +223,25 @@ class HapticQuery:
         payload: NDArray[np.uint8] | None,
         exclude: Keys,
         law: ForceLaw,
-        known: Mapping[int, Object],
         asked: _Asked,
         started: int,
     ) -> Touch:
         """Result of a frame from its rows; rows of other poses may lie among them."""
         row_keys, row_ids, occupancy, _ = rows
-        refined = refining.refine(
-            located, row_keys, row_ids, occupancy, payload, exclude, self._grid, law.for_kernels
-        )
+        total = located.asked.shape[1]
+        felt = np.empty(6 + 2 * total)
+        met = np.empty(2 * total + len(row_ids), dtype=np.int64)
+        n_hits, n_apart, n_ids = refining.refine(
+            *located, row_keys, row_ids, occupancy, payload, exclude, self.grid,
+            law.for_kernels, felt, met,
+        )  # fmt: skip
         query = Query(*asked, (time.perf_counter_ns() - started) / 1000)
-        pairs_of = partial(self._pairs_of, located, rows, exclude)
-        return Touch(refined, located.placed, law, query, pairs_of, known)
+        apart = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
+        return Touch(
+            felt[:6], met[:n_hits], felt[6 : 6 + n_hits], met[2 * total : 2 * total + n_ids],
+            apart, located.placed, law, query, partial(self._pairs_of, located, rows, exclude),
+            self.known.by_id,
+        )  # fmt: skip
 
     def _pairs_of(
         self,
@@ -206,7 +258,7 @@ class HapticQuery:
         payload = self._distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_points(  # type: ignore[no-any-return]
-            *located, keys, ids, occupancy, payload, exclude, self._grid, law.for_kernels, points
+            *located, keys, ids, occupancy, payload, exclude, self.grid, law.for_kernels, points
         )
 
     def run_many(
@@ -224,7 +276,7 @@ class HapticQuery:
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
         for pose in poses:
-            batch.append(self.locate(shell, pose))
+            batch.append(locate(shell, pose, self.grid))
             n_keys += len(batch[-1].keys)
             if n_keys >= MOST_KEYS or len(batch) >= most:
                 yield from self._look_up_together(batch, exclude, law)
@@ -251,12 +303,8 @@ class HapticQuery:
                 high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
             payload = None if distances is None else distances[low:high]
-            yield self._refined(located, rows, payload, exclude, law, NO_OBJECTS, asked, started)
+            yield self._refined(located, rows, payload, exclude, law, asked, started)
             asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
-
-    def locate(self, shell: "PointShell", pose: NDArray[np.float64]) -> "contact.Located":
-        """Place a shell at a rigid pose (4, 4), and compute the row keys to ask for."""
-        return contact.locate(shell.points, shell.normals, shell.center, pose, self._grid)
 
     def _ranges_of(
         self, located: "contact.Located", strategy: Strategy, gap: int, *, distances: bool
@@ -267,7 +315,7 @@ class HapticQuery:
         """
         _, asked, keys = located
         if strategy == "maxgap":
-            first, last = contact.spans_of_keys(asked, keys, self._grid)
+            first, last = contact.spans_of_keys(asked, keys, self.grid)
             return maxgap(keys, first, last, gap)
         if strategy == "auto":
             make_ready("calibrate")
@@ -281,7 +329,6 @@ class HapticQuery:
         located: "contact.Located",
         exclude: Keys,
         law: ForceLaw,
-        known: Mapping[int, Object],
         started: int,
     ) -> Touch:
         """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
@@ -301,9 +348,8 @@ class HapticQuery:
         hits = np.unique(ordinals)
         depths = np.empty(len(hits))
         refining.wrench_of_addresses(
-            placed, hits, addresses[hits], self._grid, law.for_kernels, depths
+            placed, hits, addresses[hits], self.grid, law.for_kernels, depths
         )
-        refined = (wrench, hits, depths, np.unique(ids), NOTHING_EXCLUDED, depths[:0])
         elapsed_us = (time.perf_counter_ns() - started) / 1000
         query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
         pairs = np.stack([ordinals, ids], axis=1)[np.lexsort((ids, ordinals))]
@@ -311,7 +357,34 @@ class HapticQuery:
         def pairs_of(_: ForceLaw, points: NDArray[np.int64]) -> NDArray[np.int64]:
             return pairs[np.isin(pairs[:, 0], points)]
 
-        return Touch(refined, placed, law, query, pairs_of, known)
+        apart = NOTHING_EXCLUDED, depths[:0]
+        return Touch(
+            wrench, hits, depths, np.unique(ids), apart, placed, law, query, pairs_of,
+            self.known.by_id,
+        )  # fmt: skip
+
+
+def locate(shell: "PointShell", pose: ArrayLike, grid: NDArray[np.void]) -> "contact.Located":
+    """Place a shell at a pose, and find the rows that it asks for; grid () of `records.GRID`.
+
+    Raises
+    ------
+    UsageError
+        If the pose is no rigid (4, 4) matrix.
+    """
+    given = as_floats(pose, "a pose")
+    if given.shape != (4, 4):
+        raise UsageError(f"a pose of shape {given.shape}: give a 4 x 4 matrix, world_from_tool")
+    total = len(shell.points)
+    # an array that a kernel returns costs twice as much as one that it is given
+    placed, asked = np.empty((total + 1, 6)), np.empty((2, total), dtype=np.int64)
+    keys = np.empty(total, dtype=np.int64)
+    count = contact.locate(
+        shell.points, shell.normals, shell.center, given, grid, placed, asked, keys
+    )
+    if count < 0:
+        raise UsageError("a pose that is no rigid transform: give finite numbers and a rotation")
+    return contact.Located(placed, asked, keys[:count])
 
 
 def as_poses(poses: ArrayLike) -> NDArray[np.float64]:

@@ -40,15 +40,32 @@ class KnownObjects:
         self._unfelt: dict[Filter, Unfelt] = {}
         self._last: Change | None = None
 
-    def learn(self) -> bool:
-        """List the objects, unless this revision is known already; returns whether it did."""
+    def newest(self) -> list[Object]:
+        """All objects, ordered by id; only those written since the last time are read."""
+        self.forget()
+        self._learn()  # in no snapshot, which asks servers that have rows alone, too
+        return [*self.by_id.values()]
+
+    def law_of_newest(self, law: ForceLaw | None) -> ForceLaw:
+        """The law of a frame in this snapshot: the given one, or its objects' own.
+
+        Raises
+        ------
+        UsageError
+            If the law reads distances, and an object has none.
+        """
+        self._learn()
+        if law is not None and not self.fits(law):
+            self._check_distances()
+        return law or self.own_law
+
+    def _learn(self) -> None:
+        """List the objects, unless this revision is known already."""
         revision = self._store.revision()  # `version` then tells of this read
         version = self._store.version()  # before they are read: another may write meanwhile
-        if version == self.version:
-            return False
-        self._list(revision)
-        self.version = version
-        return True
+        if version != self.version:
+            self._list(revision)
+            self.version = version
 
     def _list(self, revision: int) -> None:
         """Read the objects that were written since the last time; all if that is not known."""
@@ -116,14 +133,8 @@ class KnownObjects:
         """Whether the objects have what the law reads."""
         return self.have_distances or not laws.reads_distances(law.for_kernels)
 
-    def check_distances(self) -> None:
-        """Refuse a law that reads distances where an object has none.
-
-        Raises
-        ------
-        UsageError
-            It says what to do.
-        """
+    def _check_distances(self) -> None:
+        """Refuse a law that reads distances where an object has none."""
         url, layout = self._store.url, self._store.layout
         if layout != "brick":
             raise UsageError(

@@ -2,16 +2,13 @@
 
 from collections.abc import Callable, Mapping
 from html import escape
-from typing import TYPE_CHECKING, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.store.base import Object
-
-if TYPE_CHECKING:
-    from hapticdb.kernels.query.refining import Refined
 
 PairsOf = Callable[[ForceLaw, NDArray[np.int64]], NDArray[np.int64]]
 """Every (point, object id) pair (P, 2) of some points (C,) of a frame that a law has felt."""
@@ -61,19 +58,25 @@ class Touch:
 
     def __init__(
         self,
-        refined: "Refined",
+        wrench: NDArray[np.float64],
+        hits: NDArray[np.int64],
+        depths: NDArray[np.float64],
+        ids: NDArray[np.int64],
+        apart: tuple[NDArray[np.int64], NDArray[np.float64]],
         placed: NDArray[np.float64],
         law: ForceLaw,
         query: Query,
         pairs_of: PairsOf,
         known: Mapping[int, Object],
     ) -> None:
-        wrench, self.hits, self.depths, ids, *self._apart = refined
         self.force: NDArray[np.float64] = wrench[:3]
         self.torque: NDArray[np.float64] = wrench[3:]
+        self.hits = hits
+        self.depths = depths
         self.ids: list[int] = ids.tolist()
         self.law = law
         self.query = query
+        self._apart = apart  # points that are felt although they are no hits, and their depths
         self._placed = placed
         self._pairs_of = pairs_of
         self._known = known

@@ -26,8 +26,6 @@ from hapticdb.store.base import (
     Layout,
     Object,
     Rows,
-    Table,
-    no_rows,
     row_shift,
 )
 from hapticdb.store.pairs import (
@@ -138,8 +136,8 @@ class Tables(ABC):
         """Rows of a statement that reads; binary : whether as the engine holds them, if faster."""
 
     @abstractmethod
-    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
-        """Rows of a table, as a form of question finds them; what is asked is not empty."""
+    def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
+        """Rows, as a form of question finds them: none for no keys, or without their table."""
 
     @abstractmethod
     def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:
@@ -219,29 +217,23 @@ class Tables(ABC):
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in one statement."""
-        return self._found_rows("lookup", keys, distances=distances)
+        return self._read("lookup", keys, distances=distances)
 
     def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), one statement a key."""
-        return self._found_rows("lookup_one", keys, distances=distances)
+        return self._read("lookup_one", keys, distances=distances)
 
     def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows with a key in any of the closed ranges, ascending and disjoint."""
-        return self._found_rows("scan", lows, highs, distances=distances)
+        return self._read("scan", lows, highs, distances=distances)
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
-        return self._found_rows("rows_of", lows, highs, object_id, distances=distances)
+        return self._read("rows_of", lows, highs, object_id, distances=distances)
 
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
         """At most that many rows after (key, id), ascending by both."""
-        return self._found_rows("after", key, object_id, limit, distances=distances)
-
-    def _found_rows(self, form: Form, first: Keys | int, *more: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
-        is_nothing = not isinstance(first, int) and not first.size
-        if is_nothing or (distances and not self.has_table(parsing.BAND)):
-            return no_rows(distances=distances)
-        return self._read("band" if distances else self.layout, form, (first, *more))
+        return self._read("after", key, object_id, limit, distances=distances)
 
     # -- reads -----------------------------------------------------------------------------------
 

@@ -27,7 +27,14 @@ Ints = NDArray[np.int64]
 
 
 class Located(NamedTuple):
-    """A shell placed in the grid, as `locate` returns it."""
+    """A shell placed in the grid.
+
+    placed (N + 1, 6) : each point in metres and its normal, world frame, last the centre.
+    asked (2, N) : each point's address and slot, both -1 outside the grid. The address is the key
+        on voxel rows, the brick's key << 9 | bit number on brick rows; the slot is the row key's
+        place in `keys`.
+    keys (U,) : distinct row keys, ascending.
+    """
 
     placed: Floats
     asked: Ints
@@ -91,8 +98,13 @@ def sort_keys(found, count, asked, keys):
 @entry(
     READ_FLOATS2, READ_FLOATS2, READ_FLOATS, FLOATS2, record_of(GRID), FLOATS2, INTS2, INTS
 )  # fmt: skip
-def locate_kernel(points, normals, center, pose, grid, placed, asked, keys):
-    """`locate` into placed, asked and keys (N,); returns U, or -1 when the pose is not rigid."""
+def locate(points, normals, center, pose, grid, placed, asked, keys):
+    """Place a shell in the grid, and collect the distinct row keys that it asks for.
+
+    points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool. Fills the
+    arrays of `Located`, keys (N,) up to the number U of the keys. Returns U, or -1 if the pose is
+    not rigid.
+    """
     if not is_rigid(pose):
         return -1
     _place_shell(points, normals, center, transform_of(pose), placed)
@@ -129,42 +141,9 @@ def locate_kernel(points, normals, center, pose, grid, placed, asked, keys):
     return count
 
 
-def locate(
-    points: Floats,
-    normals: Floats,
-    center: Floats,
-    pose: Floats,
-    grid: NDArray[np.void],
-) -> Located:
-    """Place a shell in the grid and collect the distinct row keys that it asks for.
-
-    points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; grid () of
-    `records.GRID`.
-
-    Returns placed (N + 1, 6): each point in metres and its normal, world frame, last the centre;
-    asked (2, N): each point's address and slot, both -1 outside the grid; keys (U,): distinct row
-    keys, ascending. The address is the key on voxel rows, the brick's key << 9 | bit number on
-    brick rows; the slot is the row key's place in `keys`. An array that a kernel returns costs
-    twice as much as one that it is given, so all are made here.
-
-    Raises
-    ------
-    ValueError
-        When the pose is not rigid.
-    """
-    total = points.shape[0]
-    placed = np.empty((total + 1, 6))
-    asked = np.empty((2, total), dtype=np.int64)
-    keys = np.empty(total, dtype=np.int64)
-    count = locate_kernel(points, normals, center, pose, grid, placed, asked, keys)
-    if count < 0:
-        raise ValueError("a pose that is no rigid transform")
-    return Located(placed, asked, keys[:count])
-
-
 @leaf
 def voxel_at(address, bits, curve, shift):
-    """Voxel (i, j, k) of an address as `locate` gives it."""
+    """Voxel (i, j, k) of an address, as `Located` has it."""
     if shift == 0:
         return voxel_of(address, bits, curve)
     i, j, k = voxel_of(address >> 9, max(bits - 3, 0), curve)
@@ -179,7 +158,7 @@ def voxel_at(address, bits, curve, shift):
 def spans_of_keys(asked, keys, grid):
     """Lowest and highest voxel key (2, U) that a shell asks for under each row key.
 
-    asked, keys as `locate` returns them.
+    asked, keys: of `Located`.
     """
     bits, curve, shift = grid[()].bits, grid[()].curve, grid[()].shift
     spans = np.empty((2, keys.shape[0]), dtype=np.int64)

@@ -5,8 +5,6 @@ strategy, layout, curve and engine gives the same wrench bit for bit (numba cont
 multiplication and addition without fastmath, which this package never sets).
 """
 
-from typing import Any
-
 import numpy as np
 from numpy.typing import NDArray
 
@@ -23,7 +21,6 @@ from hapticdb.kernels._jit import (
     maker,
     record_of,
 )
-from hapticdb.kernels.field.lattice import ROW_VALUES
 from hapticdb.kernels.field.law import DISTANCE_FIELD
 from hapticdb.kernels.field.packing import unpack_rows
 from hapticdb.kernels.law import (
@@ -37,24 +34,12 @@ from hapticdb.kernels.law import (
     sample_rows,
     share_rows,
 )
-from hapticdb.kernels.query.contact import Located, center_of, voxel_at
+from hapticdb.kernels.query.contact import center_of, voxel_at
 from hapticdb.kernels.query.sorting import insert_distinct
 from hapticdb.kernels.records import GRID
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
-
-Refined = tuple[Floats, Ints, Floats, Ints, Ints, Floats]
-"""What `refine` returns.
-
-wrench (6,): N and N m about the centre, world frame; hits (H,): indices of the shell's points
-inside a voxel, ascending; depths (H,): depth of each hit in metres, 0 where the law feels nothing;
-ids (I,): objects that the hits are in, and those that felt points touch, ascending; apart (A,):
-points that the law feels although they are no hits, ascending; apart_depths (A,): their depths in
-metres, above 0.
-"""
-NO_POINTS = np.empty(0, dtype=np.int64)
-NO_DEPTHS = np.empty(0)
 
 
 @maker
@@ -184,14 +169,19 @@ def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size,
     FLOATS2, INTS2, INTS, INTS, INTS, READ_BYTES, NONE, INTS, record_of(GRID), TANGENT_PLANE,
     FLOATS, INTS, also=BY_DISTANCE,
 )  # fmt: skip
-def refine_kernel(
+def refine(
     placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
 ):
-    """`refine` into felt (6 + 2 N,) and met (2 N + R,) -> H, A and I.
+    """Drop the false hits of a frame's rows, sum the wrench of the points felt -> H, A and I.
 
-    felt takes the wrench, from 6 on the depths of the H hits, and from 6 + N on those of the A
-    points that are felt only. met takes the H indices, from N on the A indices, and from 2 N on
-    the I ids.
+    placed, asked, keys: of `Located`; row_keys (R,), ascending, and row_ids (R,); occupancy
+    (64 R,), or empty for voxel rows; payload (R, 1000), the rows' distances, or None for a law that
+    reads none; exclude (E,), ascending.
+
+    felt (6 + 2 N,) takes the wrench about the centre, world frame; from 6 on the depths of the H
+    hits, 0 where the law feels nothing; from 6 + N on those of the A points that are felt although
+    they are no hits. met (2 N + R,) takes the H indices, ascending; from N on the A indices; from
+    2 N on the I ids of the objects that the hits are in, and of those that felt points touch.
     """
     place, total = grid[()], asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
@@ -235,37 +225,6 @@ def refine_kernel(
             sums = accumulate(sums, point, center, depth, law.stiffness)
     average_into(felt, weight, sums)
     return n_hits, n_apart, _distinct_ids(touched, row_ids, met, 2 * total)
-
-
-def refine(
-    located: Located,
-    row_keys: Ints,
-    row_ids: Ints,
-    occupancy: NDArray[np.uint8],
-    payload: NDArray[np.uint8] | None,
-    exclude: Ints,
-    grid: NDArray[np.void],
-    law: Any,  # noqa: ANN401 - a NamedTuple that `kernels.law` knows
-) -> Refined:
-    """Drop the false hits of a frame's rows and sum the wrench of the points that are felt.
-
-    row_keys (R,) int64 ascending, row_ids (R,) int64; occupancy (64 R,) uint8, or empty for voxel
-    rows; payload (R, 1000) uint8, the rows' distances, or None for a law that reads none; exclude
-    (E,) int64, ascending; grid () of `records.GRID`.
-    """
-    placed, asked, keys = located
-    total = asked.shape[1]
-    felt = np.empty(6 + 2 * total)
-    met = np.empty(2 * total + row_ids.shape[0], dtype=np.int64)
-    n_hits, n_apart, n_ids = refine_kernel(
-        placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
-    )
-    wrench, hits, depths = felt[:6], met[:n_hits], felt[6 : 6 + n_hits]
-    ids = met[2 * total : 2 * total + n_ids]
-    if n_apart == 0:
-        return wrench, hits, depths, ids, NO_POINTS, NO_DEPTHS
-    apart, apart_depths = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
-    return wrench, hits, depths, ids, apart, apart_depths
 
 
 @entry(
@@ -312,37 +271,19 @@ def pairs_of_points(
 
 
 @entry(INTS, INTS, READ_BYTES, INTS, BYTES2)
-def unpack_asked_kernel(keys, row_keys, data, ends, out):
-    """`unpack_asked` into out (R, 1000); return the first row that is damaged, or -1."""
+def unpack_asked(keys, row_keys, data, ends, out):
+    """Unpack the distances of the rows under keys that are asked for, into out (R, 1000).
+
+    keys (U,) and row_keys (R,), both ascending; data and ends (R,) as `packing.pack` gives them.
+    Rows of other keys, the false hits, are left unset. Returns the first row that is damaged, or
+    -1.
+    """
     starts, after = _rows_of_keys(keys, row_keys)
     is_asked = np.zeros(row_keys.shape[0], dtype=np.bool_)
     for n in range(keys.shape[0]):
         for row in range(starts[n], after[n]):
             is_asked[row] = True
     return unpack_rows(data, ends, is_asked, out)
-
-
-def unpack_asked(
-    keys: Ints, row_keys: Ints, data: NDArray[np.uint8], ends: Ints
-) -> NDArray[np.uint8]:
-    """Unpack the distances of those rows whose keys a shell asks for: (R, 1000) uint8.
-
-    keys (U,) and row_keys (R,) int64, both ascending; data (n,) and ends (R,) as `packing.pack`
-    gives them. Rows of other keys, the false hits, are left unset.
-
-    Raises
-    ------
-    ValueError
-        If the bytes of a row that is asked for are no packed row.
-    """
-    if data.flags.writeable:
-        data = data.view()
-        data.flags.writeable = False
-    out = np.empty((row_keys.shape[0], ROW_VALUES), dtype=np.uint8)
-    damaged = unpack_asked_kernel(keys, row_keys, data, ends, out)
-    if damaged >= 0:
-        raise ValueError(f"row {damaged} of {len(ends)} packed rows of distances is damaged")
-    return out
 
 
 @entry(FLOATS2, INTS, INTS, record_of(GRID), TANGENT_PLANE, FLOATS)

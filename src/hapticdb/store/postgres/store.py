@@ -1,7 +1,7 @@
 """PostgreSQL as an engine: ``postgresql://...``, an environment in a schema of a database."""
 
 import contextlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
@@ -126,8 +126,11 @@ class PostgresStore(ServerTables):
             rows = rows.having(parsing.band_of(self.url, found[3] or b"", lengths))
         return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
 
-    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
-        text, distances = getattr(self._sql, form)[table], table == "band"
+    def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
+        table: Table = "band" if distances else self.layout
+        if (form != "after" and not asked[0].size) or (distances and not self.has_table(table)):
+            return no_rows(distances=distances)
+        text = getattr(self._sql, form)[table]
         if form == "lookup_one":
             each = (self._connection.fetch(text, wire.int8(key)) for key in asked[0].tolist())
             parts = [self._unpacked(found, distances=distances) for found in each]

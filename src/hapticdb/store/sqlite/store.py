@@ -8,7 +8,7 @@ Python's own.
 
 import contextlib
 import re
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator
 from itertools import accumulate
 from pathlib import Path
 from typing import Any
@@ -137,7 +137,10 @@ class SQLiteStore(FileTables):
 
     # -- reads -----------------------------------------------------------------------------------
 
-    def _read(self, table: Table, form: Form, asked: Sequence[Any]) -> Rows:
+    def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
+        table: Table = "band" if distances else self.layout
+        if (form != "after" and not asked[0].size) or (distances and not self.has_table(table)):
+            return no_rows(distances=distances)
         fetch = self._connection.fetch
         if form == "lookup_one":
             one = LOOKUP_ONE[table]

@@ -85,7 +85,6 @@ class Feeler(Closes):
         self._felt = felt
         self._is_torn = False
         self._is_closed = False
-        self._checked_revision: int | None = None
         self._known_revision: int | None = None
         self._query = HapticQuery(store, QueryFigures(store).both)
         self._gpu: GpuFrames | None = None
@@ -255,18 +254,12 @@ class Feeler(Closes):
         self._is_torn = True
         with self._store.snapshot():
             self._residency.refresh()
-            self._check_words()
+            if not self._felt.is_empty:
+                self._query.known.learn()
+                self._query.known.check_words(self._felt)
             answer = work()
         self._is_torn = False
         return answer
-
-    def _check_words(self) -> None:
-        """Refuse words that choose no object of the revision."""
-        if self._felt.is_empty or self._checked_revision == self._residency.revision:
-            return
-        for error in self._felt.left_out(self._store.objects(), self._store.url).missing:
-            raise error
-        self._checked_revision = self._residency.revision
 
     def _pieces(self, order: Ints, progress: PoseCallback | None) -> Iterator[Ints]:
         """Indices of the poses of each piece, in the order of computation."""
@@ -300,7 +293,8 @@ class Feeler(Closes):
         if objects:
             offsets = np.cumsum([0, *map(len, ids)])
             flat = np.array([one for found in ids for one in found], dtype=np.int64)
-            felt.named = Named(offsets, flat, {obj.id: obj for obj in self._store.objects()})
+            self._query.known.learn()
+            felt.named = Named(offsets, flat, self._query.known.by_id)
         return felt
 
     def _feel(self, poses: Floats) -> Floats:

@@ -238,9 +238,9 @@ class HapticQuery:
         query = Query(*asked, (time.perf_counter_ns() - started) / 1000)
         apart = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
         return Touch(
-            felt[:6], met[:n_hits], felt[6 : 6 + n_hits], met[2 * total : 2 * total + n_ids],
-            apart, located.placed, law, query, partial(self._pairs_of, located, rows, exclude),
-            self.known.by_id,
+            felt[:3], felt[3:6], met[:n_hits], felt[6 : 6 + n_hits],
+            met[2 * total : 2 * total + n_ids].tolist(), law, query, apart, located.placed,
+            partial(self._pairs_of, located, rows, exclude), self.known.by_id,
         )  # fmt: skip
 
     def _pairs_of(
@@ -359,8 +359,8 @@ class HapticQuery:
 
         apart = NOTHING_EXCLUDED, depths[:0]
         return Touch(
-            wrench, hits, depths, np.unique(ids), apart, placed, law, query, pairs_of,
-            self.known.by_id,
+            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, query, apart, placed,
+            pairs_of, self.known.by_id,
         )  # fmt: skip
 
 

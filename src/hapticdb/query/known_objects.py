@@ -43,7 +43,7 @@ class KnownObjects:
     def newest(self) -> list[Object]:
         """All objects, ordered by id; only those written since the last time are read."""
         self.forget()
-        self._learn()  # in no snapshot, which asks servers that have rows alone, too
+        self.learn()  # in no snapshot, which asks servers that have rows alone, too
         return [*self.by_id.values()]
 
     def law_of_newest(self, law: ForceLaw | None) -> ForceLaw:
@@ -54,12 +54,12 @@ class KnownObjects:
         UsageError
             If the law reads distances, and an object has none.
         """
-        self._learn()
+        self.learn()
         if law is not None and not self.fits(law):
             self._check_distances()
         return law or self.own_law
 
-    def _learn(self) -> None:
+    def learn(self) -> None:
         """List the objects, unless this revision is known already."""
         revision = self._store.revision()  # `version` then tells of this read
         version = self._store.version()  # before they are read: another may write meanwhile

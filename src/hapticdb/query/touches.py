@@ -1,6 +1,7 @@
 """Result of the haptic query: what a tool felt at one pose."""
 
 from collections.abc import Callable, Mapping
+from dataclasses import dataclass
 from html import escape
 from typing import NamedTuple
 
@@ -29,57 +30,30 @@ class Query(NamedTuple):
     elapsed_us: float
 
 
+@dataclass(eq=False, repr=False, slots=True)
 class Touch:
-    """What a tool felt in one frame.
+    """What a tool felt in one frame."""
 
-    Attributes
-    ----------
-    force : (3,) float64
-        N, world frame, on the tool.
-    torque : (3,) float64
-        N m about the tool's centre of mass, world frame.
-    hits : (H,) int64
-        Indices of the shell's points inside a voxel, ascending.
-    depths : (H,) float64
-        Depth of each hit in metres, 0 where the law does not feel it: above its tangent plane or,
-        under `DistanceField`, where the distance does not grow along the point's normal.
-    ids : list of int
-        Ids of `objects`.
-    law : ForceLaw
-        The force law that was felt.
-    query : Query
-        How the database was asked.
-    """
-
-    __slots__ = (
-        "_apart", "_known", "_pairs_of", "_placed", "depths", "force", "hits", "ids", "law",
-        "query", "torque",
-    )  # fmt: skip
-
-    def __init__(
-        self,
-        wrench: NDArray[np.float64],
-        hits: NDArray[np.int64],
-        depths: NDArray[np.float64],
-        ids: NDArray[np.int64],
-        apart: tuple[NDArray[np.int64], NDArray[np.float64]],
-        placed: NDArray[np.float64],
-        law: ForceLaw,
-        query: Query,
-        pairs_of: PairsOf,
-        known: Mapping[int, Object],
-    ) -> None:
-        self.force: NDArray[np.float64] = wrench[:3]
-        self.torque: NDArray[np.float64] = wrench[3:]
-        self.hits = hits
-        self.depths = depths
-        self.ids: list[int] = ids.tolist()
-        self.law = law
-        self.query = query
-        self._apart = apart  # points that are felt although they are no hits, and their depths
-        self._placed = placed
-        self._pairs_of = pairs_of
-        self._known = known
+    force: NDArray[np.float64]
+    """(3,) N, world frame, on the tool."""
+    torque: NDArray[np.float64]
+    """(3,) N m about the tool's centre of mass, world frame."""
+    hits: NDArray[np.int64]
+    """Indices (H,) of the shell's points inside a voxel, ascending."""
+    depths: NDArray[np.float64]
+    """Depth (H,) of each hit in metres, 0 where the law does not feel it: above its tangent plane
+    or, under `DistanceField`, where the distance does not grow along the point's normal."""
+    ids: list[int]
+    """Ids of `objects`."""
+    law: ForceLaw
+    """The force law that was felt."""
+    query: Query
+    """How the database was asked."""
+    _apart: tuple[NDArray[np.int64], NDArray[np.float64]]
+    """Points that are felt although they are no hits, and their depths, above 0."""
+    _placed: NDArray[np.float64]
+    _pairs_of: PairsOf
+    _known: Mapping[int, Object]
 
     @property
     def contacts(self) -> NDArray[np.int64]:

@@ -359,8 +359,8 @@ class HapticQuery:
 
         apart = NOTHING_EXCLUDED, depths[:0]
         return Touch(
-            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, query, apart, placed,
-            pairs_of, self.known.by_id,
+            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, query, apart,
+            placed, pairs_of, self.known.by_id,
         )  # fmt: skip
 
 

@@ -67,10 +67,10 @@ class FileConnection:
             if (seen := self.driver.data_version()) != self._seen:
                 self.file.look()
                 self._seen = seen
-            return found
         except (apsw.Error, UnicodeDecodeError):
             with sqlite_file.named_errors(self.url):
                 raise
+        return found
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:

@@ -7,8 +7,8 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.batches.queries import Queries
 from hapticdb.closing import Closes
+from hapticdb.environment.queries import Queries
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, ingest_file
@@ -24,10 +24,9 @@ from hapticdb.query.grouping import covering, object_ranges
 from hapticdb.query.law import inset_of
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Size, Store
-from hapticdb.store.connect import create_store, open_store
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
-from hapticdb.store.refusals import check_unwritten, wants_distances
+from hapticdb.store.refusals import check_unwritten
 from hapticdb.store.urls import scheme_of
 
 
@@ -375,48 +374,3 @@ class Environment(Queries, Closes):
     def _check_writable(self) -> None:
         if self._store.is_read_only:
             raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
-
-
-def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open
-    """Open an environment.
-
-    Parameters
-    ----------
-    url : str or path
-        A path, ``sqlite:///path``, or ``postgresql://user@host/database?environment=NAME``.
-    read_only : bool
-        Refuse every write; works on files and folders that cannot be written.
-
-    Raises
-    ------
-    EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError, DamagedError
-        If there is no environment, something else, or one that cannot be read.
-    """
-    return Environment(open_store(url, read_only=read_only), url)
-
-
-def create(
-    url: str | os.PathLike[str],
-    grid: Grid,
-    *,
-    layout: Layout = "brick",
-    distances: bool | None = None,
-) -> Environment:
-    """Make an environment with a given grid and open it.
-
-    Parameters
-    ----------
-    layout : {"brick", "voxel"}
-        Rows of its index table.
-    distances : bool or None
-        Whether parts get distances for the smooth force law; bricks do unless told otherwise.
-
-    Raises
-    ------
-    EnvironmentExistsError
-        If something exists there already.
-    UsageError
-        Bricks in lexicographic order, or distances on the layout voxel.
-    """
-    wish = wants_distances(layout, distances)
-    return Environment(create_store(url, grid, layout, distances=wish), url)

@@ -22,8 +22,9 @@ from assemblies import (
     write_obj,
 )
 from children import PIPE, child
-from hapticdb import Environment, PointShell, environment
+from hapticdb import Environment, PointShell
 from hapticdb.check import check_environment
+from hapticdb.environment import opened
 from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
@@ -62,7 +63,7 @@ def write_balls(path: Path, *placed: NDArray[np.float64]) -> Path:
 @pytest.fixture
 def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parse files in this process: the tests' own files are sound, and a child takes longer."""
-    for module in (environment, files):
+    for module in (opened, files):
         monkeypatch.setattr(module, "read_file", parse_in_process)
 
 
@@ -244,11 +245,11 @@ def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
     env, other = hapticdb.open(tmp_path / "e.db"), hapticdb.open(tmp_path / "e.db")
 
     def read_while_another_moves(link: str, *, unit: str | None = None) -> MeshFile:
-        monkeypatch.setattr(environment, "read_file", parse_in_process)
+        monkeypatch.setattr(opened, "read_file", parse_in_process)
         other.move(1, placement(0.1, 0, 0))
         return parse_in_process(link, unit=unit)
 
-    monkeypatch.setattr(environment, "read_file", read_while_another_moves)
+    monkeypatch.setattr(opened, "read_file", read_while_another_moves)
     moved = env.move(1, placement(0, 0.1, 0))
     np.testing.assert_array_equal(moved.transform, placement(0, 0.1, 0))
     once = index_rows(env)

@@ -55,22 +55,15 @@ class FileConnection:
         check_thread(self._thread, self.url)
 
     def fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
-        """Run one statement to its end, in the file to which the path leads."""
+        """Run one statement to its end."""
         check_thread(self._thread, self.url)
         try:
             if self.file.stamp is not None:
                 self.file.check_stamp()
-            if time.monotonic() >= self.file.due:
-                self.file.look()
-            found = self._cursor.execute(sql, bindings).fetchall()
-            # what was read is perhaps of another file: files that had one path share a log
-            if (seen := self.driver.data_version()) != self._seen:
-                self.file.look()
-                self._seen = seen
+            return self._cursor.execute(sql, bindings).fetchall()
         except (apsw.Error, UnicodeDecodeError):
             with sqlite_file.named_errors(self.url):
                 raise
-        return found
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
@@ -112,6 +105,15 @@ class FileConnection:
             self.driver.execute("VACUUM")
         self.driver.pragma("temp_store", "memory")
 
+    def version(self) -> int:
+        """SQLite's data version: changes when another connection's commit has been seen."""
+        seen = self.driver.data_version()
+        # a new one is perhaps of another file: files that had one path share a log
+        if seen != self._seen or time.monotonic() >= self.file.due:
+            self.file.look()
+            self._seen = seen
+        return seen
+
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
         self.has_changed()
@@ -127,6 +129,7 @@ class FileConnection:
         if self.file.stamp is not None:
             self.check_thread()
             return self.file.has_new_stamp()
+        self.file.check()
         before = self._noticed
         self._noticed = self.fetch("PRAGMA data_version")[0][0]
         return self._noticed != before

@@ -42,7 +42,6 @@ class OpenedFile:
         """The file itself, if the path is a link. SQLite keeps its log beside it."""
         self._log = f"{self._real}-wal"
         self.due = 0.0
-        """Time from which on the next statement calls `look`."""
         self._connection: apsw.Connection | None = None
         self._beside: dict[str, Identity] = {}
         self.stamp: Stamp | None = None
@@ -66,6 +65,11 @@ class OpenedFile:
                 if found:
                     self._beside[beside] = found
         self.look()
+
+    def check(self) -> None:
+        """Call `look` if the last one is `LOOK_SECONDS` ago: cheap enough for each read."""
+        if time.monotonic() >= self.due:
+            self.look()
 
     def look(self, *, has_committed: bool = False) -> None:
         """Refuse to go on when the path leads to another file or to other contents.

@@ -83,8 +83,7 @@ class SQLiteStore(FileTables):
         self.name = connection.path.name
         self.engine = f"SQLite {apsw.sqlite_lib_version()}"
         self.identity = connection.file.identity
-        self.version = connection.driver.data_version  # changes when a commit has been seen
-        self.watch = connection.watch
+        self.version, self.watch = connection.version, connection.watch
         self.has_changed = connection.has_changed
 
     @classmethod

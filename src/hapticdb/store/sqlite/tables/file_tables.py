@@ -90,6 +90,7 @@ class FileTables(Tables):
         *,
         binary: bool = False,  # noqa: ARG002 - a file gives values in one way
     ) -> list[Any]:
+        self._connection.file.check()
         return self._connection.fetch(text.replace("%s", "?"), parameters)
 
     def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:

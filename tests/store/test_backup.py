@@ -14,7 +14,7 @@ import apsw
 import pytest
 
 import hapticdb
-from children import child
+from children import child, finished
 from command_line import Run, refused, run  # noqa: F401 - a fixture
 from files_in_use import killed, make, write
 from hapticdb import backup_environment, restore_environment
@@ -222,6 +222,19 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         restore_environment(other, tmp_path / "q.db")
     assert files(tmp_path) == before
+
+
+@pytest.mark.usefixtures("path")
+def test_a_copy_without_room_names_the_file_that_was_asked_for(tmp_path: Path) -> None:
+    program = (
+        "import resource, hapticdb\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (40000, 40000))\n"
+        "try: hapticdb.backup_environment('q.db', 'copy.db')\n"
+        "except hapticdb.errors.DatabaseError as error: print(error)\n"
+    )
+    told = finished([sys.executable, "-c", program], cwd=tmp_path).stdout
+    assert told.startswith("copy.db cannot be read or written: look at the disk")
+    assert not list(tmp_path.glob("*copy*"))
 
 
 # --- the command line -----------------------------------------------------------------------------

@@ -45,7 +45,7 @@ def back_up(
     real = target.resolve()
     _check_target(source, real, replace=replace)
     with sqlite_file.unfinished_beside(real) as unfinished:
-        revision, objects = _copied(source, unfinished, progress)
+        revision, objects = _copied(source, unfinished, target, progress)
         if replace and real.exists():
             shutil.copymode(real, unfinished)
         _sync(unfinished)
@@ -85,8 +85,13 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
     sqlite_file.check_folder(target)
 
 
-def _copied(source: Path, unfinished: Path, progress: Progress | None) -> tuple[int, int]:
-    """Copy all pages as of one moment; returns the revision and the number of objects."""
+def _copied(
+    source: Path, unfinished: Path, target: Path, progress: Progress | None
+) -> tuple[int, int]:
+    """Copy all pages as of one moment; returns the revision and the number of objects.
+
+    target : what errors name: the file that was asked for.
+    """
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(file), named_errors(str(source)):
         connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
@@ -95,13 +100,13 @@ def _copied(source: Path, unfinished: Path, progress: Progress | None) -> tuple[
             "SELECT (SELECT coalesce(max(revision), 0) FROM change), (SELECT count(*) FROM object)"
         ).fetchall()
         with (
-            named_errors(str(unfinished)),
+            named_errors(str(target)),
             contextlib.closing(apsw.Connection(str(unfinished))) as made,
         ):
             _copy_pages(connection, made, progress)
             _finish(made)
         if Path(f"{unfinished}-wal").exists():
-            raise DatabaseError(f"{unfinished}-wal could not be folded into the copy: try again")
+            raise DatabaseError(f"the log of {target} could not be folded into it: try again")
         file.look()  # the path must still lead to the file that was copied
         if file.stamp is not None:
             file.check_stamp()

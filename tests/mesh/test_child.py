@@ -162,3 +162,15 @@ def test_a_missing_extra_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatc
     monkeypatch.setattr("importlib.util.find_spec", lambda _: None)
     with pytest.raises(MissingExtraError, match=r"pip install 'cascadio"):
         read_file(text(tmp_path / "a.STEP", "ISO-10303-21;"))
+
+
+def test_many_nodes_come_from_the_child_as_they_are(tmp_path: Path) -> None:
+    n = 3_000
+    nodes = [{"mesh": 0, "name": f"n{i}", "translation": [i, -i, 0.1 * i]} for i in range(n)]
+    tree = {"nodes": nodes, "scenes": [{"nodes": [*range(n)]}]}
+    path = gltf(tree, tmp_path / "a.gltf")
+    here, there = parse_in_process(path), read_file(path)
+    assert names(there) == names(here) == [f"n{i}" for i in range(n)]
+    for one, other in zip(here.parts, there.parts, strict=True):
+        np.testing.assert_array_equal(one.world_from_part, other.world_from_part)
+    assert len({id(part.vertices) for part in there.parts}) == 1

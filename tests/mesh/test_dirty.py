@@ -36,7 +36,7 @@ EXPECTED: dict[str, Reads | str] = {
     "assimp_BoxBadNormals.glb": Reads(1, 12, (1, 1, 1)),
     "assimp_ConcavePolygon.dae": Reads(1, 64, (0, 1.485, 1.485)),
     "assimp_OutOfMemory.off": "promises 353,535,235,358 vertices",
-    "assimp_badArray.gltf": "primitives of its mesh 0 are no list",
+    "assimp_badArray.gltf": "'primitives' is no list of objects",
     "assimp_crash_30d6.ply": "its header has no 'end_header'",
     "assimp_empty.obj": "it is empty",
     "assimp_invalid.off": "fewer corners than its first word says",

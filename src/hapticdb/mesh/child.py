@@ -66,9 +66,10 @@ def _die_with_parent(parent: int) -> None:
 
 
 def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
-    """Parse and write: a line of JSON that describes the arrays, then the arrays."""
+    """Parse and write: a line of JSON that describes the arrays, the placements, the arrays."""
     import numpy as np  # noqa: PLC0415 - after sys.path
 
+    from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415
     from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415
     from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
 
@@ -80,7 +81,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         _limit_time(request["time_limit"])
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
             # The files that it refers to are listed under the limit of this file alone.
-            _limit_memory(allowance(path, _bytes_beside(path)), None)
+            _limit_memory(allowance(path, bytes_beside(path)), None)
         file = parse(path, request["metres"])
     except (UnreadableError, MemoryError, ImportError) as error:
         if before is not None:
@@ -90,17 +91,13 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         return
     first = {id(part.shared): part for part in file.parts}  # one for each geometry
     number = {key: n for n, key in enumerate(first)}
+    geometries = [(part.vertices, part.faces, part.colours) for part in first.values()]
     head = {
         "geometries": [
-            [
-                len(part.vertices),
-                None if part.faces is None else len(part.faces),
-                part.colours is not None,
-            ]
-            for part in first.values()
+            [None if a is None else (a.shape, a.dtype.str) for a in arrays] for arrays in geometries
         ],
         "parts": [
-            [part.name, number[id(part.shared)], part.world_from_part.tolist(), vars(part.defects)]
+            [part.name, number[id(part.shared)], vars(part.defects) if part.defects else {}]
             for part in file.parts
         ],
         "defects": vars(file.defects),
@@ -108,14 +105,10 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         "up": file.up,
         "notes": file.notes,
     }
-    arrays = [
-        array
-        for part in first.values()
-        for array in (part.vertices, part.faces, part.colours)
-        if array is not None
-    ]
     out.write(json.dumps(head).encode() + b"\n")
-    out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in arrays)
+    out.write(np.array([part.world_from_part for part in file.parts]).data)
+    there = (array for arrays in geometries for array in arrays if array is not None)
+    out.writelines(array.data if array.flags.c_contiguous else array.tobytes() for array in there)
 
 
 def _memory_kind() -> int:
@@ -123,22 +116,18 @@ def _memory_kind() -> int:
     return resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
 
 
-def _bytes_now() -> int:
-    """Memory that this process holds, counted as the limit counts it."""
+def _bytes_in(file: str, key: str, otherwise: int) -> int:
+    """Memory that Linux tells under a key of a file; `otherwise` if it does not."""
     with contextlib.suppress(OSError):
-        for line in Path("/proc/self/status").read_text().splitlines():
-            if line.startswith("VmData:"):
+        for line in Path(file).read_text().splitlines():
+            if line.startswith(key):
                 return int(line.split()[1]) << 10
-    return 0
+    return otherwise
 
 
 def bytes_available() -> int:
     """Memory that the machine can give without swapping; 2^62 bytes if this is not known."""
-    with contextlib.suppress(OSError):
-        for line in Path("/proc/meminfo").read_text().splitlines():
-            if line.startswith("MemAvailable:"):
-                return int(line.split()[1]) << 10
-    return 1 << 62
+    return _bytes_in("/proc/meminfo", "MemAvailable:", 1 << 62)
 
 
 def allowance(path: Path, n_beside: int = 0) -> int:
@@ -151,22 +140,12 @@ def allowance(path: Path, n_beside: int = 0) -> int:
     return min(BASE_BYTES + factor * n_bytes, bytes_available() * 3 // 4)
 
 
-def _bytes_beside(path: Path) -> int:
-    """Bytes of the files that a glTF file refers to; 0 if parsing will fail with an error."""
-    from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415 - a reader
-    from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
-
-    try:
-        return bytes_beside(path)
-    except (UnreadableError, ValueError, RecursionError):
-        return 0
-
-
 def _limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
     """Limit the memory to what is held already plus a number of bytes; returns the former limit."""
     kind = _memory_kind()
     before = resource.getrlimit(kind)
-    wanted = _bytes_now() + (allowed if limit is None else limit)
+    held = _bytes_in("/proc/self/status", "VmData:", 0)  # counted as the limit counts it
+    wanted = held + (allowed if limit is None else limit)
     hard = before[1]
     resource.setrlimit(kind, (wanted if hard < 0 else min(wanted, hard), hard))
     return before

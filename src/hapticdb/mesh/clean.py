@@ -92,26 +92,25 @@ def _checked(
     vertices = np.asarray(shape.vertices)
     if vertices.ndim != 2 or vertices.shape[1] != 3:
         raise UnreadableError("its vertices do not have three coordinates each")
-    with np.errstate(over="ignore", invalid="ignore"):
-        if shape.faces is None:
-            points = _metric(vertices, scale)
-            finite = np.isfinite(points).all(axis=1)
-            lost = Defects(non_finite=int((~finite).sum()))
-            colours = _of_sound(shape.colours, finite)
-            return read_only(points[finite]), None, shape.defects + lost, colours
-        faces = np.asarray(shape.faces).astype(np.int64, copy=False).reshape(-1, 3)
-        inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
-        out_of_range = len(faces) - int(inside.sum())
-        colours = _of_sound(shape.colours, inside)
-        vertices, faces = _compact(vertices, faces[inside] if out_of_range else faces)
-        positions = _metric(vertices, scale)
-        finite = np.asarray(np.isfinite(positions).all(axis=1))
-        sound = finite[faces].all(axis=1)
-        non_finite = len(faces) - int(sound.sum())
-        if non_finite:
-            positions, faces = _compact(positions, faces[sound])
-            colours = _of_sound(colours, sound)
-        degenerate = _count_degenerate(positions, faces, np.eye(3))
+    if shape.faces is None:
+        points = _metric(vertices, scale)
+        finite = np.isfinite(points).all(axis=1)
+        lost = Defects(non_finite=int((~finite).sum()))
+        colours = _of_sound(shape.colours, finite)
+        return read_only(points[finite]), None, shape.defects + lost, colours
+    faces = np.asarray(shape.faces).astype(np.int64, copy=False).reshape(-1, 3)
+    inside = ((faces >= 0) & (faces < len(vertices))).all(axis=1)
+    out_of_range = len(faces) - int(inside.sum())
+    colours = _of_sound(shape.colours, inside)
+    vertices, faces = _compact(vertices, faces[inside] if out_of_range else faces)
+    positions = _metric(vertices, scale)
+    finite = np.asarray(np.isfinite(positions).all(axis=1))
+    sound = finite[faces].all(axis=1)
+    non_finite = len(faces) - int(sound.sum())
+    if non_finite:
+        positions, faces = _compact(positions, faces[sound])
+        colours = _of_sound(colours, sound)
+    degenerate = _count_degenerate(positions, faces, np.eye(3))
     lost = Defects(degenerate=degenerate, non_finite=non_finite, out_of_range=out_of_range)
     return read_only(positions), read_only(faces), shape.defects + lost, colours
 
@@ -183,21 +182,19 @@ def _worlds(
         raise UnreadableError(f"the transform of '{name}' is not affine")
     # Once for each geometry, also when many placements share it.
     farthest = np.array([np.abs(v).max(axis=0, initial=0.0) for v in geometries]).reshape(-1, 3)
-    with np.errstate(over="ignore", invalid="ignore"):
-        worlds[:, :3, 3] *= scale
-        corners = farthest[[placement.shape for placement in placements]]
-        reach = np.einsum("pij,pj->pi", np.abs(worlds[:, :3, :3]), corners)
-        reach += np.abs(worlds[:, :3, 3])
-        # Squares of lengths must be finite as well, for areas and separations.
-        return worlds, np.isfinite(_squares(reach))
+    worlds[:, :3, 3] *= scale
+    corners = farthest[[placement.shape for placement in placements]]
+    reach = np.einsum("pij,pj->pi", np.abs(worlds[:, :3, :3]), corners)
+    reach += np.abs(worlds[:, :3, 3])
+    # Squares of lengths must be finite as well, for areas and separations.
+    return worlds, np.isfinite(_squares(reach))
 
 
 def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
     """Whether a transform flattens geometry, so that triangles may lose their areas."""
     linear = worlds[:, :3, :3]
-    with np.errstate(over="ignore", invalid="ignore"):
-        lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
-        return np.asarray(np.abs(np.linalg.det(linear)) <= 1e-9 * lengths**3)
+    lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
+    return np.asarray(np.abs(np.linalg.det(linear)) <= 1e-9 * lengths**3)
 
 
 def _printable(name: str) -> str:

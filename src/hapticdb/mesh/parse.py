@@ -7,6 +7,8 @@ import zlib
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
+
 from hapticdb.mesh.clean import clean
 from hapticdb.mesh.part import MeshFile
 from hapticdb.mesh.raw import Parsed, UnreadableError
@@ -42,7 +44,8 @@ def parse(path: Path, metres: float | None) -> MeshFile:
     """
     read = reader_of(path)
     try:
-        return clean(read(path), metres, str(path))
+        with np.errstate(over="ignore", invalid="ignore"):  # `clean` counts what is not finite
+            return clean(read(path), metres, str(path))
     except (UnreadableError, KeyboardInterrupt):
         raise
     except BaseException as error:  # parsers raise errors of every kind; Rust parsers panic

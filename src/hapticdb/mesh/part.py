@@ -52,7 +52,7 @@ class Defects:
 _NONE = Defects()
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, slots=True)
 class Part:
     """One instance in a file: a triangle mesh or a point cloud, and its placement."""
 

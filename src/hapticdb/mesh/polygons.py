@@ -45,12 +45,12 @@ def triangulated(
 def triangulated_equal(vertices: NDArray[np.generic], polygons: Faces) -> Faces:
     """Triangles (F, 3) of polygons (P, k), k >= 3."""
     if polygons.shape[1] == 3 or not len(vertices):
-        return _fans(polygons)
+        return fan(polygons)
     folded = np.flatnonzero(_are_folded(vertices, polygons))
     if not len(folded):
-        return _fans(polygons)
+        return fan(polygons)
     return np.concatenate(
-        [_fans(np.delete(polygons, folded, axis=0))]
+        [fan(np.delete(polygons, folded, axis=0))]
         + [_cut(vertices, polygon, ()) for polygon in polygons[folded]]
     )
 
@@ -62,13 +62,9 @@ def strip(corners: Faces) -> Faces:
     return found
 
 
-def fan(corners: Faces) -> Faces:
-    """Triangles (k - 2, 3) of a fan of corners (k,), as the file means it."""
-    return _fans(corners[None])
-
-
-def _fans(polygons: Faces) -> Faces:
-    """Triangles (P (k - 2), 3) around the first corners of polygons (P, k)."""
+def fan(polygons: Faces) -> Faces:
+    """Triangles (P (k - 2), 3) around the first corners of polygons (P, k), or of one (k,)."""
+    polygons = np.atleast_2d(polygons)
     corners = np.arange(1, polygons.shape[1] - 1)
     first = np.broadcast_to(polygons[:, :1], (len(polygons), len(corners)))
     return np.stack([first, polygons[:, corners], polygons[:, corners + 1]], axis=2).reshape(-1, 3)
@@ -78,13 +74,12 @@ def _are_folded(vertices: NDArray[np.generic], polygons: Faces) -> NDArray[np.bo
     """Whether the fan of each polygon (P, k) leaves it; False for indices outside the vertices."""
     inside = ((polygons >= 0) & (polygons < len(vertices))).all(axis=1, keepdims=True)
     known = np.where(inside, polygons, 0)
-    with np.errstate(over="ignore", invalid="ignore"):
-        first = np.asarray(vertices[known[:, 0]], dtype=np.float64)
-        edges = [vertices[column] - first for column in known[:, 1:].T]
-        turns = [np.cross(a, b) for a, b in pairwise(edges)]
-        area = np.sum(turns, axis=0)
-        limit = -_FOLD * np.einsum("ij,ij->i", area, area)
-        against = [np.einsum("ij,ij->i", turn, area) < limit for turn in turns]
+    first = np.asarray(vertices[known[:, 0]], dtype=np.float64)
+    edges = [vertices[column] - first for column in known[:, 1:].T]
+    turns = [np.cross(a, b) for a, b in pairwise(edges)]
+    area = np.sum(turns, axis=0)
+    limit = -_FOLD * np.einsum("ij,ij->i", area, area)
+    against = [np.einsum("ij,ij->i", turn, area) < limit for turn in turns]
     return np.asarray(np.any(against, axis=0))
 
 
@@ -92,15 +87,14 @@ def _cut(vertices: NDArray[np.generic], polygon: Faces, starts: Sequence[int]) -
     """Triangles of one polygon (k,), whose holes begin at `starts`, in its mean plane."""
     import mapbox_earcut  # noqa: PLC0415 - few files need it
 
-    as_fan = _fans(polygon[None])
+    as_fan = fan(polygon)
     if not ((polygon >= 0) & (polygon < len(vertices))).all():
         return as_fan
     corners = np.asarray(vertices[polygon], dtype=np.float64)
     ends = [*starts, len(polygon)]
     outer = corners[: ends[0]] - corners[0]
-    with np.errstate(over="ignore", invalid="ignore"):
-        normal = np.cross(outer, np.roll(outer, -1, axis=0)).sum(axis=0)
-        flat = np.delete(corners - corners[0], np.abs(normal).argmax(), axis=1)
+    normal = np.cross(outer, np.roll(outer, -1, axis=0)).sum(axis=0)
+    flat = np.delete(corners - corners[0], np.abs(normal).argmax(), axis=1)
     if not np.isfinite(flat).all():
         return as_fan
     found = mapbox_earcut.triangulate_float64(flat, np.array(ends, dtype=np.uint32))

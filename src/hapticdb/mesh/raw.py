@@ -44,7 +44,7 @@ class Shape:
     colours: NDArray[np.uint8] | None = None
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, slots=True)
 class Placement:
     """One instance of a shape: its node path and its (4, 4) transform in the file's unit."""
 
@@ -158,8 +158,7 @@ def walk(
         n_nodes += 1
         if n_nodes > MAX_NODES:
             raise UnreadableError(f"it places more than {MAX_NODES:,} nodes")
-        with np.errstate(over="ignore", invalid="ignore"):
-            world_from_node = levels[-1][1] @ parent_from_node
+        world_from_node = levels[-1][1] @ parent_from_node
         path.append(node)
         on_path.add(node)
         yield path, world_from_node

@@ -221,39 +221,27 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
     """Answer of the child: parts from its head, arrays from the stream behind it."""
     if "error" in head:
         raise UnreadableError(head["error"])
-    geometries: list[tuple[NDArray[Any], NDArray[Any] | None, NDArray[Any] | None]] = []
-    for n_vertices, n_faces, is_coloured in head["geometries"]:
-        vertices = np.empty((n_vertices, 3), dtype=np.float64)
-        _fill(vertices, stream)
-        faces = None
-        if n_faces is not None:
-            faces = np.empty((n_faces, 3), dtype=np.int64)
-            _fill(faces, stream)
-        colours = None
-        if is_coloured:
-            n_colours = n_vertices if n_faces is None else n_faces
-            colours = np.empty((n_colours, 4), dtype=np.uint8)
-            _fill(colours, stream)
-        geometries.append((vertices, faces, colours))
+    worlds = _filled(((len(head["parts"]), 4, 4), "f8"), stream)
+    geometries = [
+        [None if one is None else _filled(one, stream) for one in arrays]
+        for arrays in head["geometries"]
+    ]
     shared: list[dict[str, str]] = [{} for _ in geometries]
     parts = []
-    for name, n, transform, defects in head["parts"]:
+    for (name, n, found), placed in zip(head["parts"], worlds, strict=True):
         vertices, faces, colours = geometries[n]
-        placed = np.array(transform)
-        parts.append(Part(name, vertices, faces, placed, Defects(**defects), shared[n], colours))
+        defects = Defects(**found)
+        parts.append(Part(name, vertices, faces, placed.copy(), defects, shared[n], colours))
     said = (head["names_unit"], head["up"], tuple(head["notes"]))
     return MeshFile(link, parts, Defects(**head["defects"]), *said)
 
 
-def _fill(array: NDArray[Any], stream: IO[bytes]) -> None:
-    """Read an array's bytes; nobody may write it afterwards."""
-    view = memoryview(array.data).cast("B")
-    while view.nbytes:
-        n_read = stream.readinto(view)  # type: ignore[attr-defined]
-        if not n_read:
-            raise EOFError
-        view = view[n_read:]
-    read_only(array)
+def _filled(described: tuple[tuple[int, ...], str], stream: IO[bytes]) -> NDArray[Any]:
+    """Array of a shape and type, with the next bytes; nobody may write it afterwards."""
+    array = np.empty(*described)
+    if stream.readinto(array.reshape(-1).view(np.uint8)) < array.nbytes:  # type: ignore[attr-defined]
+        raise EOFError
+    return read_only(array)
 
 
 def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:

@@ -70,15 +70,19 @@ def parsed(content: bytes, path: Path) -> Parsed:
     tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
-    _refuse_unreadable(tree, accessors)
+    _refuse_unreadable(tree)
     placements, poses, worlds, empty = _placements(tree, accessors)
     joints: dict[int | None, NDArray[np.float64]] = {
         pose.skin: joints_of(tree, pose.skin, worlds, accessors)
         for pose in poses
         if pose.skin is not None
     }
+    meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
     return Parsed(
-        shapes=_shapes(tree, poses, joints, accessors),
+        shapes=[
+            _shape(meshes[pose.mesh], pose, joints.get(pose.skin), accessors, materials)
+            for pose in poses
+        ],
         placements=placements,
         metres=1.0,
         defects=Defects(empty=empty),
@@ -153,42 +157,20 @@ def _load_tree(content: bytes, suffix: str) -> dict[str, Any]:
 
 
 def bytes_beside(path: Path) -> int:
-    """Size of the existing files that a glTF file refers to; each file counts once."""
-    return external_bytes(_load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
+    """Size of the existing files that a glTF file refers to; 0 if parsing will fail."""
+    with suppress(UnreadableError, ValueError, RecursionError):
+        return external_bytes(_load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
+    return 0
 
 
-def _refuse_unreadable(tree: dict[str, Any], accessors: Accessors) -> None:
-    """Refuse what would be read wrongly without an error: packed, sparse or scaled positions."""
+def _refuse_unreadable(tree: dict[str, Any]) -> None:
+    """Refuse what would be read wrongly without an error, such as packed positions."""
     required = tree.get("extensionsRequired", [])
     for extension in required if isinstance(required, list) else [required]:
         if not str(extension).startswith(_HARMLESS):
             raise UnreadableError(
                 f"it requires the glTF extension {extension}, which is not read: save it without"
             )
-    for number, mesh in enumerate(objects_of(tree, "meshes")):
-        pieces = mesh.get("primitives")
-        if not isinstance(pieces, list) or not all(isinstance(piece, dict) for piece in pieces):
-            raise UnreadableError(f"it is damaged: the primitives of its mesh {number} are no list")
-        for piece in pieces:
-            attributes = piece.get("attributes", {})
-            if not isinstance(attributes, dict):
-                raise UnreadableError(f"it is damaged: its mesh {number} has no 'attributes'")
-            if attributes.get("POSITION") is not None:
-                accessors.entry(attributes["POSITION"])
-
-
-def _shapes(
-    tree: dict[str, Any],
-    poses: list[Pose],
-    joints: dict[int | None, NDArray[np.float64]],
-    accessors: Accessors,
-) -> list[Shape]:
-    """Shapes of meshes in their poses."""
-    meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
-    return [
-        _shape(meshes[pose.mesh], pose, joints.get(pose.skin), accessors, materials)
-        for pose in poses
-    ]
 
 
 def _shape(
@@ -206,7 +188,7 @@ def _shape(
     painted: list[tuple[Colours | None, int]] = []
     dotted: list[tuple[Colours | None, int]] = []
     n_vertices = unsupported = 0
-    for number, piece in enumerate(mesh["primitives"]):
+    for number, piece in enumerate(objects_of(mesh, "primitives")):
         mode = piece.get("mode", _TRIANGLES)
         position = piece.get("attributes", {}).get("POSITION")
         if mode not in (_POINTS, _TRIANGLES, _STRIP, _FAN) or position is None:
@@ -306,17 +288,19 @@ def _placements(
 ) -> tuple[list[Placement], list[Pose], dict[int, NDArray[np.float64]], int]:
     """What the default scene places: shapes, their poses, its nodes, and how many hold nothing."""
     nodes, meshes = objects_of(tree, "nodes"), objects_of(tree, "meshes")
-    links = [parent_from_node(node) for node in nodes]
     budget = NameBudget()
     placements: list[Placement] = []
     poses: dict[Pose, int] = {}
     worlds: dict[int, NDArray[np.float64]] = {}
     empty = 0
 
-    def below(number: int) -> list[tuple[int, NDArray[np.float64]]]:
-        return [(child, links[child]) for child in _numbers(nodes[number], "children", len(nodes))]
+    def placed(numbers: list[int]) -> list[tuple[int, NDArray[np.float64]]]:
+        return [(number, parent_from_node(nodes[number])) for number in numbers]
 
-    for path, world_from_node in walk(((i, links[i]) for i in _roots(tree, nodes)), below):
+    def below(number: int) -> list[tuple[int, NDArray[np.float64]]]:
+        return placed(_numbers(nodes[number], "children", len(nodes)))
+
+    for path, world_from_node in walk(placed(_roots(tree, nodes)), below):
         node = nodes[path[-1]]
         worlds[path[-1]] = world_from_node
         if "mesh" in node:
@@ -328,10 +312,11 @@ def _placements(
                 names[-1] = str(meshes[mesh]["name"])
             pose = pose_of(node, mesh, meshes[mesh])
             shape = poses.setdefault(pose, len(poses))
+            # A skin's joints say where the mesh is, whatever its node says.
+            world = world_from_node if pose.skin is None else np.eye(4)
             for node_from_part in instances(node, accessors):
-                # A skin's joints say where the mesh is, whatever its node says.
-                world = np.eye(4) if pose.skin is not None else world_from_node @ node_from_part
-                placements.append(Placement(budget.joined(names), shape, world))
+                placed_at = world if node_from_part is None else world @ node_from_part
+                placements.append(Placement(budget.joined(names), shape, placed_at))
         elif not node.get("children") and "camera" not in node and "extensions" not in node:
             empty += 1
     return placements, [*poses], worlds, empty

@@ -46,11 +46,11 @@ def parent_from_node(node: dict[str, Any]) -> Floats:
     return transform
 
 
-def instances(node: dict[str, Any], accessors: Accessors) -> list[Floats]:
-    """Transforms (4, 4) of a node's instances in its frame; the identity alone if it has none."""
+def instances(node: dict[str, Any], accessors: Accessors) -> list[Floats | None]:
+    """Transforms (4, 4) of a node's instances in its frame; None alone if it has none."""
     attributes = (extension_of(node, INSTANCING) or {}).get("attributes")
     if not attributes:
-        return [np.eye(4)]
+        return [None]
     columns = {name.lower(): accessors.array(number) for name, number in attributes.items()}
     if len({len(column) for column in columns.values()}) > 1:
         raise UnreadableError("the attributes of its instances are not of one length")

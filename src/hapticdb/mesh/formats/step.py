@@ -9,11 +9,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.mesh.formats import gltf
-from hapticdb.mesh.raw import Parsed, Placement, UnreadableError
+from hapticdb.mesh.raw import Parsed, Placement, UnreadableError, told
 from hapticdb.mesh.text import text_of
 from hapticdb.units import UNITS
 
 _POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
+_WORDS = re.compile(r"('[^']*')|/\*.*?(?:\*/|\Z)", re.DOTALL)
+"""A string, group 1, or a comment, whose letters may stand in the other, too."""
+_LONGEST = 8_000
+"""Characters of strings that are kept: OpenCASCADE refuses a file for a longer word."""
 _END = "END-ISO-10303-21"
 _NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
@@ -28,12 +32,20 @@ def read(path: Path) -> Parsed:
     The chord error is cascadio's default: 0.01 of the file's unit, or 0.5 rad between neighbouring
     triangles, whichever is coarser on that face.
     """
-    text = text_of(path.read_bytes())
+    text = _WORDS.sub(_short, text_of(path.read_bytes()))
     if "ISO-10303-21" not in text[:1024]:
         raise UnreadableError("it is no STEP file: 'ISO-10303-21' does not stand at its start")
     found = _tessellated(text, path)
     found = _nearer(found, text, path) if _is_coarse(found) else found
-    return found if _END in text else replace(found, notes=[*found.notes, _NO_END])
+    others = len(re.findall(r"\bDOCUMENT_FILE\s*\(", text))
+    notes = told(others, "other file{s} {are} named in it, and {are} not read")
+    return replace(found, notes=[*found.notes, *notes, *([] if _END in text else [_NO_END])])
+
+
+def _short(found: re.Match[str]) -> str:
+    """String without its end if it is too long; a blank instead of a comment."""
+    word = found[1] or " "
+    return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}'"
 
 
 def _tessellated(text: str, path: Path) -> Parsed:

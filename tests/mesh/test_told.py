@@ -6,7 +6,10 @@ import numpy as np
 import pytest
 
 from hapticdb.mesh import parse_in_process
-from mesh_files import area_and_volume, cause
+from mesh_files import MESH_3MF, area_and_volume, cause, names, threemf
+
+ITEM = '<item objectid="1"/>'
+OBJECT = f'<object id="1" name="a">{MESH_3MF}</object>'
 
 
 def test_other_files_of_a_step_assembly_are_told(test_data: Path | None, tmp_path: Path) -> None:
@@ -37,3 +40,29 @@ def test_long_comments_and_names_of_a_step_file_do_no_harm(
         assert not [note for note in file.notes if "/" not in note]
     (tmp_path / "open.step").write_bytes(content.replace(b"DATA;", b"DATA; /*", 1))
     assert "it seems cut short" in cause(tmp_path / "open.step")
+
+
+# --- extensions that a 3MF requires, and meshes beside components -----------------------------
+
+
+@pytest.mark.parametrize(
+    ("required", "named"),
+    [("", ""), ("m b", ""), ("v", "http://v.example/solid/2022/01"), ("m zz", "zz")],
+)
+def test_a_3mf_that_requires_what_is_not_read_is_refused(
+    tmp_path: Path, required: str, named: str
+) -> None:
+    schemas = "http://schemas.microsoft.com/3dmanufacturing"
+    spaces = f'xmlns:v="http://v.example/solid/2022/01" xmlns:m="{schemas}/material/2015/02"'
+    spaces += f' xmlns:b="{schemas}/beamlattice/2017/02" requiredextensions="{required}"'
+    path = threemf(tmp_path / "a.3mf", OBJECT, ITEM, f'unit="meter" {spaces}')
+    if named:
+        assert f"it requires the 3MF extension {named}, which is not read" in cause(path)
+    else:
+        assert area_and_volume(parse_in_process(path))[0] == 0.5
+
+
+def test_an_object_of_a_3mf_with_a_mesh_and_components_keeps_both(tmp_path: Path) -> None:
+    both = f'<object id="2" name="b">{MESH_3MF}<components><component objectid="1"/></components>'
+    path = threemf(tmp_path / "a.3mf", f"{OBJECT}{both}</object>", '<item objectid="2"/>')
+    assert names(parse_in_process(path)) == ["b", "b/a"]

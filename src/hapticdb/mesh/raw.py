@@ -90,6 +90,12 @@ class NameBudget:
         return name
 
 
+def require(is_read: bool, what: str) -> None:  # noqa: FBT001 - what is asked
+    """Refuse a file that requires what is not read."""
+    if not is_read:
+        raise UnreadableError(f"it requires the {what}, which is not read: save it without")
+
+
 def told(n: int, words: str, **named: str) -> list[str]:
     """Note of so many things, in the singular for one; none of none.
 

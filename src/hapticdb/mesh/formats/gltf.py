@@ -43,6 +43,7 @@ from hapticdb.mesh.raw import (
     Placement,
     Shape,
     UnreadableError,
+    require,
     told,
     walk,
 )
@@ -70,7 +71,9 @@ def parsed(content: bytes, path: Path) -> Parsed:
     tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
-    _refuse_unreadable(tree)
+    required = tree.get("extensionsRequired", [])
+    for extension in required if isinstance(required, list) else [required]:
+        require(str(extension).startswith(_HARMLESS), f"glTF extension {extension}")
     placements, poses, worlds, empty = _placements(tree, accessors)
     joints: dict[int | None, NDArray[np.float64]] = {
         pose.skin: joints_of(tree, pose.skin, worlds, accessors)
@@ -161,16 +164,6 @@ def bytes_beside(path: Path) -> int:
     with suppress(UnreadableError, ValueError, RecursionError):
         return external_bytes(_load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
     return 0
-
-
-def _refuse_unreadable(tree: dict[str, Any]) -> None:
-    """Refuse what would be read wrongly without an error, such as packed positions."""
-    required = tree.get("extensionsRequired", [])
-    for extension in required if isinstance(required, list) else [required]:
-        if not str(extension).startswith(_HARMLESS):
-            raise UnreadableError(
-                f"it requires the glTF extension {extension}, which is not read: save it without"
-            )
 
 
 def _shape(

@@ -29,6 +29,7 @@ from hapticdb.mesh.raw import (
     Shape,
     UnreadableError,
     numbers,
+    require,
     told,
     walk,
 )
@@ -48,6 +49,9 @@ unpack to five to eight times their size. Larger values let a damaged file take 
 _MOST_KINDS = 3
 """Kinds of elements that are told of an extension."""
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
+_KNOWN = re.compile(f"{_HARMLESS.pattern}|/(beamlattice|slice)/")
+"""Also those beside meshes that are whole without them: told. A model that requires another is
+refused, as 3MF's core specification asks (3.4, Model)."""
 _SETTINGS = ("metadata/slic3r_pe_model.config", "metadata/model_settings.config")
 _MODIFIER = re.compile(
     rb'\b(?:value|subtype)="'
@@ -125,7 +129,7 @@ def read(path: Path) -> Parsed:
     for keys, world_from_object in walk(model.items, lambda key: model.objects[key].components):
         thing = model.objects[keys[-1]]
         model.placed.add(keys[-1])
-        if thing.components:
+        if thing.components and not thing.indices:
             continue
         names = [model.objects[key].name for key in keys]
         number = shapes.setdefault(keys[-1], len(shapes))
@@ -192,7 +196,6 @@ def _read_model(
 ) -> None:
     """Add one model file's objects, and the root's build items, to `model`."""
     parser = expat.ParserCreate(namespace_separator=" ")
-    parser.buffer_text = True
     thing, own, group, n_group = _Object(""), -1, "", 0
     core: str | None = None  # namespace of the first element
 
@@ -208,12 +211,8 @@ def _read_model(
             thing.corners.extend((float(x), float(y), float(z)))
         elif kind == "triangle":
             thing.indices.extend(_index(attributes[v]) for v in ("v1", "v2", "v3"))
-            of_group = attributes.get("pid", thing.group)
-            thing.paints.append(
-                model.number_of.get((member, of_group, attributes["p1"]), own)
-                if "p1" in attributes
-                else own
-            )
+            paint = member, attributes.get("pid", thing.group), attributes.get("p1", "")
+            thing.paints.append(model.number_of.get(paint, own))
         elif kind == "component":
             thing.components.append(_link(attributes, member))
         elif kind == "object":
@@ -232,10 +231,17 @@ def _read_model(
             n_group += 1
         elif kind == "item" and is_root:
             model.items.append(_link(attributes, member))
-        elif kind == "model" and is_root:
-            model.metres = _metres(attributes.get("unit", "millimeter"))
+            model.types["not printable"] += attributes.get("printable") == "0"
+        elif kind == "model":
+            for prefix in attributes.get("requiredextensions", "").split():
+                name = named.get(prefix, prefix)
+                require(_KNOWN.search(name) is not None, f"3MF extension {name}")
+            if is_root:
+                model.metres = _metres(attributes.get("unit", "millimeter"))
 
     parser.StartElementHandler = start
+    named: dict[str, str] = {}
+    parser.StartNamespaceDeclHandler = named.__setitem__
     # Entities can multiply without bound, and 3MF forbids a DOCTYPE, their only source.
     parser.StartDoctypeDeclHandler = _refuse_doctype
     if archive.getinfo(name).compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):

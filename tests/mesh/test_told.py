@@ -1,15 +1,79 @@
 """What a file names and does not bring, hides or moves is told, and its geometry is kept."""
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
 from hapticdb.mesh import parse_in_process
-from mesh_files import MESH_3MF, area_and_volume, cause, names, threemf
+from mesh_files import COLLADA, MESH_3MF, area_and_volume, cause, gltf, names, text, threemf
 
+TRIANGLE_OBJ = "v 0 0 0\nv 1 0 0\nv 0 1 0\nusemtl red\nf 1 2 3\n"
 ITEM = '<item objectid="1"/>'
 OBJECT = f'<object id="1" name="a">{MESH_3MF}</object>'
+
+
+def missing(which: str, n: int = 1) -> str:
+    files = "1 file with its colours or pictures is" if n == 1 else f"{n} files with its colours or"
+    return f"{files}{' pictures are' if n > 1 else ''} not readable beside it: {which}"
+
+
+# --- files that are not there -----------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("line", "which", "is_red"),
+    [
+        ("red.mtl", "", True),
+        ("./red.mtl", "", True),
+        ("gone.mtl", "gone.mtl", False),
+        ("red.mtl gone.mtl", "gone.mtl", True),
+        ("my gone.mtl", "my gone.mtl", False),
+        ("../red.mtl", "../red.mtl", False),
+        ("..\\red.mtl", "..\\red.mtl", False),
+        ("..%2Fred.mtl", "..%2Fred.mtl", False),
+        (f"{'x' * 300}.mtl", f"{'x' * 56}.mtl", False),
+    ],
+)
+def test_a_file_of_materials_that_cannot_be_read_is_told(
+    tmp_path: Path, line: str, which: str, is_red: bool
+) -> None:
+    folder = tmp_path / "in"
+    folder.mkdir()
+    for place in (tmp_path, folder):
+        text(place / "red.mtl", "newmtl red\nKd 1 0 0\n")
+    file = parse_in_process(text(folder / "a.obj", f"mtllib {line}\n{TRIANGLE_OBJ}"))
+    assert file.notes == ((missing(which),) if which else ())
+    assert area_and_volume(file)[0] == 0.5
+    assert (file.parts[0].colours is not None) == is_red
+
+
+def test_pictures_of_materials_that_are_not_there_are_told(tmp_path: Path) -> None:
+    (tmp_path / "in").mkdir()
+    text(tmp_path / "in" / "there it is.png", "x")
+    materials = (
+        "map_Kd in\\there it is.png\nmap_d -s 1 1 1 gone.png\nmap_Kd gone.png\nbump no.png\n"
+    )
+    text(tmp_path / "a.mtl", f"newmtl red\nKd 1 0 0\n{materials}")
+    file = parse_in_process(text(tmp_path / "a.obj", f"mtllib a.mtl\n{TRIANGLE_OBJ}"))
+    assert file.notes == (missing("gone.png"),)
+
+
+def test_pictures_of_a_gltf_and_a_dae_that_are_not_there_are_told(tmp_path: Path) -> None:
+    text(tmp_path / "there it is.png", "x")
+    uris = ["gone%20one.png", "there%20it%20is.png", "data:image/png;base64,aaaa", 3, "gone.png"]
+    images: list[Any] = [*({"uri": uri} for uri in uris), {"bufferView": 0}, 7]
+    path = gltf({"images": images}, tmp_path / "a.gltf")
+    assert parse_in_process(path).notes == (missing("gone.png, gone%20one.png", 2),)
+    library = (
+        '<library_images><image id="a"><init_from>file:///no/gone.png</init_from></image>'
+        '<image id="b"><init_from><ref>there%20it%20is.png</ref></init_from></image>'
+        "</library_images><library_effects><effect><newparam><surface><init_from>a</init_from></surface></newparam>"
+        "</effect></library_effects>"
+    )
+    path = text(tmp_path / "a.dae", COLLADA.replace("<library_g", f"{library}<library_g", 1))
+    assert parse_in_process(path).notes == (missing("/no/gone.png"),)
 
 
 def test_other_files_of_a_step_assembly_are_told(test_data: Path | None, tmp_path: Path) -> None:
@@ -26,20 +90,35 @@ def _step(test_data: Path | None) -> bytes:
     return (test_data / "reports" / "s04_latin1.step").read_bytes()
 
 
-def test_long_comments_and_names_of_a_step_file_do_no_harm(
-    test_data: Path | None, tmp_path: Path
+# --- what moves, and what is hidden -----------------------------------------------------------
+
+
+def test_nodes_that_animations_move_are_told(tmp_path: Path) -> None:
+    targets = [
+        {"node": n, "path": path} for n, path in ((0, "scale"), (0, "weights"), (7, "scale"))
+    ]
+    moving = {"animations": [{"channels": [{"sampler": 0, "target": one} for one in targets]}]}
+    told = ("1 node is moved by animations, which are not read",)
+    assert parse_in_process(gltf(moving, tmp_path / "a.gltf")).notes == told
+    for damaged in (3, [3], [{"channels": [{"target": {"node": [], "path": 1}}]}]):
+        assert not parse_in_process(gltf({"animations": damaged}, tmp_path / "b.gltf")).notes
+    names_of = ("a/translate.X", "a/translate.Y", "b/transform(3)(0)", "lamp/colour")
+    channels = "".join(f'<channel source="#s" target="{name}"/>' for name in names_of)
+    library = f"<library_animations><animation>{channels}</animation></library_animations>"
+    path = text(tmp_path / "a.dae", COLLADA.replace("<library_g", f"{library}<library_g", 1))
+    assert parse_in_process(path).notes == ("2 nodes are moved by animations, which are not read",)
+
+
+def test_hidden_nodes_of_a_dae_and_items_of_a_3mf_that_are_not_printed_are_told(
+    tmp_path: Path,
 ) -> None:
-    content = _step(test_data)
-    long = b"/* '" + b"x" * 3_000_000 + b" #1=; END-ISO-10303-21; */"
-    changed = [long + content, content.replace(b"DATA;", b"DATA;" + long, 1)]
-    changed += [content.replace("Träger".encode("latin-1"), b"/* no comment */" * 5_000)]
-    for n, one in enumerate(changed):
-        (tmp_path / f"{n}.step").write_bytes(one)
-        file = parse_in_process(tmp_path / f"{n}.step")
-        assert area_and_volume(file)[0] == pytest.approx(2 * np.pi * 5e-3 * 45e-3, rel=3e-3)
-        assert not [note for note in file.notes if "/" not in note]
-    (tmp_path / "open.step").write_bytes(content.replace(b"DATA;", b"DATA; /*", 1))
-    assert "it seems cut short" in cause(tmp_path / "open.step")
+    extra = "<extra><technique><visibility>0</visibility></technique></extra>"
+    path = text(tmp_path / "a.dae", COLLADA.replace("<scale>", f"{extra}<scale>", 1))
+    told = ("1 node is hidden in it, and comes in like any other",)
+    assert parse_in_process(path).notes == told
+    path = threemf(tmp_path / "a.3mf", OBJECT, '<item objectid="1" printable="0"/>')
+    told = ("1 object is of the type not printable, and comes in like any other",)
+    assert parse_in_process(path).notes == told
 
 
 # --- extensions that a 3MF requires, and meshes beside components -----------------------------
@@ -66,3 +145,65 @@ def test_an_object_of_a_3mf_with_a_mesh_and_components_keeps_both(tmp_path: Path
     both = f'<object id="2" name="b">{MESH_3MF}<components><component objectid="1"/></components>'
     path = threemf(tmp_path / "a.3mf", f"{OBJECT}{both}</object>", '<item objectid="2"/>')
     assert names(parse_in_process(path)) == ["b", "b/a"]
+
+
+# --- units that a comment names ---------------------------------------------------------------
+
+
+@pytest.mark.parametrize(
+    ("comment", "metres"),
+    [
+        ("This file uses centimeters as units for non-parametric coordinates.", 0.01),
+        ("The units used in this file are centimeters.", 0.01),
+        ("File units = inches", 0.0254),
+        ("units: mm", 0.001),
+        ("Unit = Foot", 0.3048),
+        ("units in metres", 1.0),
+        ("object foot unit", None),
+        ("unit = 0.001 m", None),
+        ("units: parsecs", None),
+    ],
+)
+def test_a_comment_names_the_unit_unless_an_option_does(
+    tmp_path: Path, comment: str, metres: float | None
+) -> None:
+    ply = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 3\n"
+    ply += "".join(f"property float {axis}\n" for axis in "xyz")
+    ply += "element face 1\nproperty list uchar int vertex_index\nend_header\n"
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4")
+    contents = {
+        "a.obj": f"# {comment}\n{TRIANGLE_OBJ}".encode(),
+        "a.off": f"OFF\n# {comment}\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".encode(),
+        "a.ply": f"{ply}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".encode(),
+        "a.stl": comment.encode().ljust(80)
+        + b"\1\0\0\0"
+        + bytes(12)
+        + corners.tobytes()
+        + bytes(2),
+    }
+    for name, content in contents.items():
+        (tmp_path / name).write_bytes(content)
+        file = parse_in_process(tmp_path / name)
+        assert file.names_unit == (metres is not None)
+        assert bool(file.notes) == file.names_unit
+        assert file.bounds[1, 0] == pytest.approx(metres or 1.0)
+        assert parse_in_process(tmp_path / name, unit="km").bounds[1, 0] == 1000.0
+
+
+# --- long words of STEP -----------------------------------------------------------------------
+
+
+def test_long_comments_and_names_of_a_step_file_do_no_harm(
+    test_data: Path | None, tmp_path: Path
+) -> None:
+    content = _step(test_data)
+    long = b"/* '" + b"x" * 3_000_000 + b" #1=; END-ISO-10303-21; */"
+    changed = [long + content, content.replace(b"DATA;", b"DATA;" + long, 1)]
+    changed += [content.replace("Träger".encode("latin-1"), b"/* no comment */" * 5_000)]
+    for n, one in enumerate(changed):
+        (tmp_path / f"{n}.step").write_bytes(one)
+        file = parse_in_process(tmp_path / f"{n}.step")
+        assert area_and_volume(file)[0] == pytest.approx(2 * np.pi * 5e-3 * 45e-3, rel=3e-3)
+        assert not [note for note in file.notes if "/" not in note]
+    (tmp_path / "open.step").write_bytes(content.replace(b"DATA;", b"DATA; /*", 1))
+    assert "it seems cut short" in cause(tmp_path / "open.step")

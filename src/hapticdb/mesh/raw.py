@@ -4,12 +4,15 @@ import re
 import warnings
 from collections.abc import Callable, Hashable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TypeVar
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.mesh.part import Defects
+from hapticdb.mesh.text import unit_in
 
 Node = TypeVar("Node", bound=Hashable)
 
@@ -17,6 +20,10 @@ _COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _ONE = {"s": "", "es": "", "ies": "y", "are": "is", "begin": "begins", "come": "comes",
         "hold": "holds", "refer": "refers"}  # fmt: skip
 """Endings and verbs, and what they are for one thing."""
+HIDDEN = "node{s} {are} hidden in it, and {come} in like any other"
+ANIMATED = "node{s} {are} moved by animations, which are not read"
+_MOST_NAMES, _LONGEST_NAME = 3, 60
+"""Missing files that are named, and their last characters."""
 MAX_NODES = 2_000_000
 """Most placements in a file: placements of nested assemblies multiply. A larger value lets a small
 file take more memory and time."""
@@ -105,11 +112,35 @@ def told(n: int, words: str, **named: str) -> list[str]:
     return [f"{n:,} {words.format(**forms, **named)}"] if n > 0 else []
 
 
-def placed_once(named: Iterable[tuple[str, Shape]], defects: Defects | None = None) -> Parsed:
-    """Contents of a file without placements: each shape once, with the identity as transform."""
+def beside(folder: Path, name: str) -> Path | None:
+    """File that another one names, as written or with percent-encoding such as %20 resolved."""
+    for candidate in (name, unquote(name), unquote(name).replace("\\", "/")):
+        try:
+            if (folder / candidate).is_file():
+                return folder / candidate
+        except (OSError, ValueError):  # a name too long, or with a null in it
+            continue
+    return None
+
+
+def told_missing(folder: Path, names: Iterable[str], *more: str) -> list[str]:
+    """Note of the files of colours and pictures, of `names`, that are not there; and of `more`."""
+    plain = (name.removeprefix("file://") for name in names if name[:5] != "data:")
+    missing = [*more, *(name for name in dict.fromkeys(plain) if beside(folder, name) is None)]
+    which = ", ".join(name[-_LONGEST_NAME:] for name in missing[:_MOST_NAMES])
+    words = "file{s} with its colours or pictures {are} not readable beside it: {which}"
+    return told(len(missing), words, which=which)
+
+
+def placed_once(
+    named: Iterable[tuple[str, Shape]], notes: Sequence[str] = (), comments: str = ""
+) -> Parsed:
+    """Contents of a file without placements: each shape once; comments may suggest a unit."""
     pairs = list(named)
     placements = [Placement(name, i, np.eye(4)) for i, (name, _) in enumerate(pairs)]
-    return Parsed([shape for _, shape in pairs], placements, None, defects or Defects())
+    unit, metres = unit_in(comments)
+    said = [*notes, *told(metres is not None, "comment names its unit: '{unit}'", unit=unit)]
+    return Parsed([shape for _, shape in pairs], placements, None, likely_metres=metres, notes=said)
 
 
 def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.generic]:
@@ -128,6 +159,25 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
             raise UnreadableError(
                 f"it holds '{word[:40]}' where a number should be{commas}"
             ) from None
+
+
+def indices(words: Iterable[str]) -> list[int]:
+    """Whole numbers of a face."""
+    try:
+        return [int(word) for word in words]
+    except ValueError:
+        raise UnreadableError("a face holds a word where an index should be") from None
+
+
+def positions(lines: Sequence[str]) -> NDArray[np.float64]:
+    """Positions (V, 3) that lines begin with; what follows the coordinates is left out."""
+    words = [line.split(None, 3)[:3] for line in lines]
+    if any(len(three) < 3 for three in words):
+        raise UnreadableError("a vertex has fewer than three coordinates")
+    flat = numbers(" ".join(" ".join(three) for three in words), np.float64)
+    if flat.size != 3 * len(lines):
+        raise UnreadableError("a vertex has fewer than three coordinates")
+    return np.asarray(flat, dtype=np.float64).reshape(-1, 3)
 
 
 def _is_number(word: str, dtype: type[np.float64] | type[np.int64]) -> bool:

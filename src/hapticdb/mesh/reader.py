@@ -63,8 +63,8 @@ def read_file(
         `pointcloud`). The suffix says which.
     unit : str, optional
         One of `hapticdb.mesh.UNITS`: the unit of a file that has none of its own (OBJ, STL, PLY,
-        OFF, LAS, LAZ). By default that of the reference system that a LAS or LAZ file names, else
-        metres.
+        OFF, LAS, LAZ). By default that of the reference system of a LAS or LAZ file, or the one
+        that a comment names, else metres.
     memory_limit : int, optional
         Bytes that parsing may take; by default in proportion to the file, see `child.allowance`.
     time_limit : float, optional

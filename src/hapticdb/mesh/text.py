@@ -4,6 +4,8 @@ import codecs
 import re
 from contextlib import suppress
 
+from hapticdb.units import NAMES, UNITS
+
 _MARKS = (
     (codecs.BOM_UTF8, "utf-8-sig"),
     (codecs.BOM_UTF32_LE, "utf-32"),
@@ -17,6 +19,24 @@ _SAMPLE = 64
 _NOT_ASCII = re.compile(rb"[\x80-\xff]+")
 _COMMON = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe])+")
 """Common Chinese characters in GB18030: in words of Latin-1 few such pairs of bytes stand alone."""
+
+_UNIT = re.compile(
+    r"\bunits?(?: used in this file)?\s*(?:[=:]|\bin\b|\bare\b)\s*([a-z]+)"
+    r"|\buses ([a-z]+) as units\b",
+    re.IGNORECASE,
+)
+"""As Maya, SketchUp and others name it in a comment; a name such as 'foot unit' is none."""
+_LENGTHS = UNITS | {name.rstrip("s"): UNITS[sign] for sign, name in NAMES.items()}
+_LENGTHS |= {"inch": UNITS["in"], "foot": UNITS["ft"]}
+
+
+def unit_in(text: str) -> tuple[str, float | None]:
+    """Words of a text that name a unit, and its length, metres; '' and None without."""
+    for found in _UNIT.finditer(text):
+        word = (found[1] or found[2]).lower().rstrip("s").replace("meter", "metre")
+        if word in _LENGTHS:
+            return found[0], _LENGTHS[word]
+    return "", None
 
 
 def recoded(content: bytes) -> bytes:

@@ -10,12 +10,11 @@ import os
 import struct
 from pathlib import Path
 from typing import Any
-from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.raw import UnreadableError
+from hapticdb.mesh.raw import UnreadableError, beside
 
 _TYPES = {5120: "<i1", 5121: "<u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT2": 4, "MAT3": 9, "MAT4": 16}
@@ -64,22 +63,11 @@ def external_bytes(tree: dict[str, Any], folder: Path) -> int:
     """Size of the existing files that a glTF file refers to; each file counts once."""
     sizes: dict[tuple[int, int], int] = {}
     for name in {_external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
-        file = _beside(folder, str(name))
+        file = beside(folder, str(name))
         if file is not None:
             status = file.stat()
             sizes[status.st_dev, status.st_ino] = status.st_size
     return sum(sizes.values())
-
-
-def _beside(folder: Path, name: str) -> Path | None:
-    """File that a glTF names, as written or with percent-encoding such as %20 resolved."""
-    for candidate in (name, unquote(name)):
-        try:
-            if (folder / candidate).is_file():
-                return folder / candidate
-        except (OSError, ValueError):  # a name too long, or with a null in it
-            continue
-    return None
 
 
 def chunks_of(content: bytes) -> list[memoryview]:
@@ -177,7 +165,7 @@ class Accessors:
     def _content(self, number: int, buffer: dict[str, Any]) -> memoryview:
         """Bytes of a buffer; buffers of one file share them."""
         name = _external_name(buffer)
-        file = None if name is None else _beside(self._folder, name)
+        file = None if name is None else beside(self._folder, name)
         if name is not None and file is None:
             raise UnreadableError(f"it refers to {name}, which is not beside it")
         key: object = number

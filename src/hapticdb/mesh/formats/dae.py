@@ -20,6 +20,8 @@ from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgb
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import fan, strip, triangulated
 from hapticdb.mesh.raw import (
+    ANIMATED,
+    HIDDEN,
     NameBudget,
     Parsed,
     Placement,
@@ -27,6 +29,7 @@ from hapticdb.mesh.raw import (
     UnreadableError,
     numbers,
     told,
+    told_missing,
     walk,
 )
 from hapticdb.mesh.text import xml_of
@@ -57,7 +60,7 @@ def read(path: Path) -> Parsed:
         root = ET.fromstring(xml_of(path.read_bytes()), parser)  # noqa: S314
     except ET.ParseError as error:
         raise UnreadableError(f"its XML is damaged or cut short: {error}") from None
-    document = _Document(root)
+    document = _Document(root, path.parent)
     if root.tag != "COLLADA":
         raise UnreadableError("it is no COLLADA file: its first element is not 'COLLADA'")
     scene = document.referred(root.find("scene/instance_visual_scene"), "visual_scene")
@@ -100,8 +103,8 @@ def _metres(root: ET.Element) -> float | None:
 class _Document:
     """Elements by kind and id; ids of different kinds may be equal."""
 
-    def __init__(self, root: ET.Element) -> None:
-        self._root = root
+    def __init__(self, root: ET.Element, folder: Path) -> None:
+        self._root, self._folder = root, folder
         self._known: dict[tuple[str, str | None], ET.Element] = {}
         self._damaged: set[ET.Element] = set()  # transforms
         for element in root.iter():
@@ -196,6 +199,11 @@ class _Document:
         outside = sum(
             one.get("id") not in targets and id(one) not in placed for one in root.iter("geometry")
         )
+        hidden = sum((one.text or "").strip() == "0" for one in root.iter("visibility"))
+        moved = {(one.get("target") or "").split("/")[0] for one in root.iter("channel")}
+        nodes = sum(("node", name) in self._known for name in moved)
+        images = root.iterfind(".//image/init_from")  # with an element 'ref' inside since 1.5
+        pictures = ("".join(one.itertext()).strip() for one in images)
         others = sum(1 for _ in root.iter("visual_scene")) - 1
         notes = [
             *(note for kind, n in strange.items() for note in told(n, _UNREAD, kind=kind)),
@@ -205,6 +213,8 @@ class _Document:
         ]
         for kind, n in posed.items():
             notes += told(n, "geometr{ies} with a {kind} {are} read in rest pose", kind=kind)
+        notes += [*told(hidden, HIDDEN), *told(nodes, ANIMATED)]
+        notes += told_missing(self._folder, filter(None, pictures))
         return [*notes, *told(others, "more scene{s} {are} not read")]
 
 

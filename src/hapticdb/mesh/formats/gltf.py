@@ -38,6 +38,8 @@ from hapticdb.mesh.formats.posing import (
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import fan, strip
 from hapticdb.mesh.raw import (
+    ANIMATED,
+    HIDDEN,
     NameBudget,
     Parsed,
     Placement,
@@ -45,6 +47,7 @@ from hapticdb.mesh.raw import (
     UnreadableError,
     require,
     told,
+    told_missing,
     walk,
 )
 from hapticdb.mesh.text import text_of
@@ -90,24 +93,32 @@ def parsed(content: bytes, path: Path) -> Parsed:
         metres=1.0,
         defects=Defects(empty=empty),
         up=_up_axis(tree),
-        notes=_notes(tree, worlds),
+        notes=_notes(tree, worlds, path.parent),
     )
 
 
-def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]]) -> list[str]:
+def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]], folder: Path) -> list[str]:
     """Say what is left out of the scene or not read, and what the file hides."""
     nodes = objects_of(tree, "nodes")
     outside = sum("mesh" in node for n, node in enumerate(nodes) if n not in worlds)
     found: Counter[str] = Counter()
     hidden = 0
+    pictures: list[str] = []
+    moved: set[int] = set()
     waiting: list[Any] = [tree]
     while waiting:
         one = waiting.pop()
-        if isinstance(one, dict) and isinstance(extensions := one.get("extensions"), dict):
+        if isinstance(one, list):
+            waiting += (inner for inner in one if isinstance(inner, (dict, list)))
+            continue
+        waiting += (inner for inner in one.values() if isinstance(inner, (dict, list)))
+        if isinstance(extensions := one.get("extensions"), dict):
             found.update(extensions.keys())
             hidden += (extension_of(one, "KHR_node_visibility") or {}).get("visible") is False
-        if isinstance(one, (dict, list)):
-            waiting += one.values() if isinstance(one, dict) else one
+        if isinstance(one.get("uri"), str) and "byteLength" not in one:
+            pictures.append(one["uri"])
+        if "path" in one and type(one.get("node")) is int:
+            moved.add(one["node"])  # the target of a channel of an animation
     slashed = sum("/" in _name(nodes[n], n) for n in worlds)
     unread = {name: n for name, n in found.items() if not name.startswith(_HARMLESS)}
     placed = {str(node.get("mesh")) for node in nodes}
@@ -116,7 +127,9 @@ def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]]) -> list
         *told(outside, "node{s} with a mesh {are} not in its scene and {are} left out"),
         *told(unplaced, "mesh{es} {are} in no node and {are} left out"),
         *told(slashed, "name{s} {hold} '/', which also separates a part's name from one above it"),
-        *told(hidden, "node{s} {are} hidden in it, and {come} in like any other"),
+        *told(len(moved & worlds.keys()), ANIMATED),
+        *told_missing(folder, pictures),
+        *told(hidden, HIDDEN),
         *(f"its extension {name} is not read ({n}x)" for name, n in unread.items()),
     ]
 

@@ -1,14 +1,22 @@
 """OFF, text: one part named after the file."""
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import triangulated
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
+from hapticdb.mesh.raw import (
+    Parsed,
+    Shape,
+    UnreadableError,
+    indices,
+    numbers,
+    placed_once,
+    positions,
+    told,
+)
 from hapticdb.mesh.text import text_of
 
 _KEYWORD = re.compile(r"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
@@ -36,27 +44,20 @@ def read(path: Path) -> Parsed:
             f"its header promises {n_vertices:,} vertices and {n_faces:,} faces, each a line, "
             f"and {len(body):,} lines follow"
         )
-    # Coordinates come after the position: normals, colours, texture.
-    coordinates = " ".join(" ".join(line.split()[:3]) for line in body[:n_vertices])
-    vertices = numbers(coordinates, np.float64)
-    if vertices.size != 3 * n_vertices:
-        raise UnreadableError("a vertex has fewer than three coordinates")
-    vertices = vertices.reshape(-1, 3)
+    vertices = positions(body[:n_vertices])
     polygons = [_polygon(line) for line in body[n_vertices : n_vertices + n_faces]]
     faces, incomplete = triangulated(vertices, polygons)
-    parsed = placed_once([(path.stem, Shape(vertices, faces, Defects(incomplete=incomplete)))])
+    shape = Shape(vertices, faces, Defects(incomplete=incomplete))
     extra = len(body) - n_vertices - n_faces
-    return replace(parsed, notes=told(extra, "line{s} behind the last face {are} passed over"))
+    notes = told(extra, "line{s} behind the last face {are} passed over")
+    return placed_once([(path.stem, shape)], notes, "\n".join(re.findall("#.*", text)))
 
 
 def _polygon(line: str) -> list[int]:
     """Corners of one face; its first word says how many."""
     words = line.split()
-    try:
-        size = int(words[0])
-        corners = [int(word) for word in words[1 : size + 1]]
-    except ValueError:
-        raise UnreadableError("a face holds a word where an index should be") from None
+    (size,) = indices(words[:1])
+    corners = indices(words[1 : size + 1])
     if size < 0 or len(corners) < size:
         raise UnreadableError("a face has fewer corners than its first word says")
     return [corner if 0 <= corner < 2**62 else -1 for corner in corners]

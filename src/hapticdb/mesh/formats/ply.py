@@ -6,7 +6,7 @@ polygons into fans; plyfile reads them, but is under the GPL.
 
 import re
 import struct
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -74,7 +74,8 @@ def read(path: Path) -> Parsed:
         if kind not in {"vertex", "face", "tristrips"} and table
         for note in told(len(next(iter(table.values()))), words, kind=kind)
     ]
-    return replace(placed_once([(path.stem, shape)]), notes=notes)
+    head = content[: content.find(b"end_header")].decode("latin-1")
+    return placed_once([(path.stem, shape)], notes, head)
 
 
 def tables_of(content: bytes) -> dict[str, dict[str, Column]]:

@@ -5,7 +5,6 @@ error, and takes the word 'solid' in the name after 'endsolid' for the start of 
 """
 
 import re
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -32,21 +31,21 @@ def read(path: Path) -> Parsed:
     """Solids of an STL file, named as in the file, or after the file."""
     content = path.read_bytes()
     n_facets = int.from_bytes(content[80:_HEADER], "little") if len(content) >= _HEADER else 0
+    head = content[:80].decode("latin-1")
     n_bytes = _HEADER + n_facets * _FACET.itemsize
     # A binary file's free header may start with 'solid', so its length decides first.
     if len(content) == n_bytes and len(content) >= _HEADER:
-        return placed_once([(path.stem, _binary(content, 0, n_facets))])
+        return placed_once([(path.stem, _binary(content, 0, n_facets))], (), head)
     plain = recoded(content)
-    head = plain[:512].lstrip().lower()
-    if head.startswith(b"solid") and b"\0" not in head:
+    start = plain[:512].lstrip().lower()
+    if start.startswith(b"solid") and b"\0" not in start:
         return _text(text_of(plain), path.stem)
     if len(content) < _HEADER:
         raise UnreadableError("it is no STL file: neither a 'solid' nor a binary header")
     n_behind, rest = divmod(len(content) - _HEADER, _FACET.itemsize)
     if n_facets in _NO_COUNT and n_behind and not rest:
-        parsed = placed_once([(path.stem, _binary(content, 0, n_behind))])
         note = f"its header counts {n_facets:,} triangles, and {n_behind:,} follow: all are read"
-        return replace(parsed, notes=[note])
+        return placed_once([(path.stem, _binary(content, 0, n_behind))], [note], head)
     if n_facets > 0 and n_bytes < len(content):
         return _joined(content, path.stem)
     raise UnreadableError(
@@ -67,7 +66,7 @@ def _joined(content: bytes, stem: str) -> Parsed:
         solids.append((stem, _binary(content, at, n_facets)))
         at = end
     words = "byte{s} behind the last triangle {are} passed over"
-    return replace(placed_once(solids), notes=told(len(content) - at, words))
+    return placed_once(solids, told(len(content) - at, words), content[:80].decode("latin-1"))
 
 
 def _binary(content: bytes, at: int, n_facets: int) -> Shape:
@@ -105,7 +104,7 @@ def _text(text: str, stem: str) -> Parsed:
             solids.append((name or stem, shape))
     n_strange = len(_STRANGE.findall(text))
     words = "line{s} {begin} with unknown words and {are} passed over"
-    return replace(placed_once(solids), notes=told(n_strange, words))
+    return placed_once(solids, told(n_strange, words))
 
 
 def _facets(chunk: str, name: str) -> Shape:

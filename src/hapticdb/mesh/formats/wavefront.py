@@ -5,12 +5,14 @@ end of the file instead of from the line that holds them, takes index 0 for the 
 refuses the whole file for one face out of range.
 """
 
+import posixpath
 import re
 from collections import Counter
 from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from urllib.parse import unquote
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,7 +20,18 @@ from numpy.typing import NDArray
 from hapticdb.mesh.formats.painting import Colours, joined, mean_of_corners, rgba
 from hapticdb.mesh.part import Defects
 from hapticdb.mesh.polygons import triangulated, triangulated_equal
-from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_once, told
+from hapticdb.mesh.raw import (
+    Parsed,
+    Shape,
+    UnreadableError,
+    beside,
+    indices,
+    numbers,
+    placed_once,
+    positions,
+    told,
+    told_missing,
+)
 from hapticdb.mesh.text import text_of
 
 _COMMENT = re.compile(r"(?<!\.)#|#(?!IND|INF|QNAN|SNAN)")  # 1.#IND is no comment
@@ -34,11 +47,12 @@ _NO_SHAPE = {
     "d_interp", "lod", "shadow_obj", "trace_obj", "cstype", "deg", "bmat", "step", "parm", "trim",
     "hole", "scrv", "sp", "end", "con", "ctech", "stech",
 }  # fmt: skip
+_PICTURES = {"map_kd", "map_d", "map_ka"}
 _OUTSIDE = -1
 _WITH_COLOUR = 6
 """Numbers of a vertex with a colour."""
 MOST_BYTES = 16 << 20
-"""Of a file of materials. A larger value reads larger ones, and takes more memory."""
+"""Of a file of materials: no more is read. A larger value may take more memory."""
 _MOST_WORDS, _LONGEST_WORD = 3, 20
 """Words of unknown lines that are told, and their characters."""
 
@@ -61,6 +75,7 @@ def read(path: Path) -> Parsed:
     groups: dict[tuple[str, str], _Group] = {}
     libraries: list[str] = []
     strange: Counter[str] = Counter()
+    comments: list[str] = []
     key, material = ("", ""), ""
     for line in _CONTINUED.sub(" ", text).splitlines():
         word, _, rest = line.strip(_BLANKS).replace("\t", " ").partition(" ")
@@ -80,30 +95,48 @@ def read(path: Path) -> Parsed:
         elif word == "usemtl":
             material = rest.strip()
         elif word == "mtllib":
-            libraries.append(rest.strip())
+            several = rest.lower().count(".mtl") > 1  # else spaces belong to the name
+            libraries += rest.split() if several else [rest.strip()]
         elif word in _NO_SURFACE:
             groups.setdefault(key, _Group()).unsupported += 1
-        elif word not in _NO_SHAPE and word[0] != "#":
+        elif word[:1] == "#":
+            comments.append(line)
+        elif word not in _NO_SHAPE:
             strange[word[:_LONGEST_WORD]] += 1
-    vertices = _vertices(vertex_lines)
-    palette = {name: colour for file in libraries for name, colour in _materials(path, file)}
+    vertices = positions(vertex_lines)
+    palette: dict[str, Colours] = {}
+    pictures: list[str] = []
+    unread: list[str] = []
+    for name in libraries:
+        content = _content(path.parent, name)
+        palette |= _materials(content or "", pictures)
+        unread += [name] if content is None else []
     painted = _painted(vertex_lines)
-    parsed = placed_once(
+    named = (
         ("/".join(filter(None, names)) or path.stem, _coloured(group, vertices, palette, painted))
         for names, group in groups.items()
     )
     most = ", ".join(f"'{word}' {n}" for word, n in strange.most_common(_MOST_WORDS))
     words = "line{s} {begin} with unknown words and {are} passed over: {most}"
-    return replace(parsed, notes=told(strange.total(), words, most=most))
+    missing = told_missing(path.parent, pictures, *unread)
+    return placed_once(
+        named, [*told(strange.total(), words, most=most), *missing], "\n".join(comments)
+    )
 
 
-def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:
-    """Names and colours (1, 4) of the materials in a plain file beside the OBJ file."""
-    file = path.parent / name
-    if "/" in name or not file.is_file() or file.stat().st_size > MOST_BYTES:
-        return
+def _content(folder: Path, name: str) -> str | None:
+    """Text of a file of materials in the OBJ file's own folder; None if it cannot be read."""
+    plain = posixpath.normpath(unquote(name).replace("\\", "/"))
+    file = None if "/" in plain else beside(folder, plain)
+    with suppress(OSError):
+        return None if file is None else text_of(file.read_bytes()[:MOST_BYTES])
+    return None
+
+
+def _materials(content: str, pictures: list[str]) -> Iterator[tuple[str, Colours]]:
+    """Names and colours (1, 4) of materials; `pictures` gets the files that they refer to."""
     material, values = None, np.ones(4)
-    for line in [*text_of(file.read_bytes()).splitlines(), "newmtl"]:
+    for line in [*content.splitlines(), "newmtl"]:
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
         with suppress(UnreadableError, ValueError):
             if word == "newmtl":
@@ -115,6 +148,8 @@ def _materials(path: Path, name: str) -> Iterator[tuple[str, Colours]]:
             elif word in {"d", "Tr"}:
                 opacity = float(rest.split()[-1])
                 values[3] = opacity if word == "d" else 1.0 - opacity
+            elif word.lower() in _PICTURES:
+                pictures.append(rest.split()[-1] if rest.startswith("-") else rest.strip())
 
 
 def _painted(lines: list[str]) -> Colours | None:
@@ -155,17 +190,6 @@ def _coloured(
     return Shape(vertices, np.concatenate(runs), defects, colours)
 
 
-def _vertices(lines: list[str]) -> NDArray[np.float64]:
-    """Vertices (V, 3); what follows the coordinates is left out."""
-    words = [line.split(None, 3)[:3] for line in lines]
-    if any(len(three) < 3 for three in words):
-        raise UnreadableError("a vertex has fewer than three coordinates")
-    flat = numbers(" ".join(" ".join(three) for three in words), np.float64)
-    if flat.size != 3 * len(lines):
-        raise UnreadableError("a vertex has fewer than three coordinates")
-    return np.asarray(flat, dtype=np.float64).reshape(-1, 3)
-
-
 def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
     """One group's triangles over the vertices of the whole file."""
     text = "\n".join(group.lines)
@@ -185,14 +209,6 @@ def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
 
 def _polygon(line: str, n_before: int) -> list[int]:
     """Corners of one face, counted from 0; a negative index counts back from its own line."""
-    corners = []
-    for word in line.split():
-        try:
-            index = int(word)
-        except ValueError:
-            raise UnreadableError("a face holds a word where an index should be") from None
-        if index < 0:
-            index += n_before + 1
-        # An index that is still not above 0 is out of range, whether it was absolute or relative.
-        corners.append(index - 1 if 0 < index < 2**62 else _OUTSIDE)
-    return corners
+    found = [n + n_before + 1 if n < 0 else n for n in indices(line.split())]
+    # An index that is still not above 0 is out of range, whether it was absolute or relative.
+    return [n - 1 if 0 < n < 2**62 else _OUTSIDE for n in found]

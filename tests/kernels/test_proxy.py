@@ -16,7 +16,7 @@ from closed_forms import (
     wedge,
 )
 from hapticdb.kernels.hand.device_spring import contact_stiffness
-from hapticdb.kernels.proxy.evaluate import ACTIVE, RESULTS, WAY, evaluate
+from hapticdb.kernels.proxy.evaluate import PUSHING, RESULTS, WAY, evaluate
 from hapticdb.kernels.proxy.linearize import linearize
 from hapticdb.kernels.proxy.planes import ROW_COLUMNS
 from hapticdb.kernels.records import CONTACT_MODEL, MOST_PLANES, pose_numbers
@@ -110,7 +110,7 @@ def test_a_contact_ends_where_the_hand_lifts_off() -> None:
     at[2] = ONSET + 1e-3
     result = evaluated(model, at)
     assert not result[:6].any()
-    assert result[ACTIVE] == 0
+    assert result[PUSHING] == 0
     assert result[WAY] == pytest.approx(3e-3)
 
 

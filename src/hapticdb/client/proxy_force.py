@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.hand.steadying import MOST_CHANGE, WINDOW
-from hapticdb.kernels.proxy.evaluate import ACTIVE, RESULTS, WAY, WRENCH, evaluate
+from hapticdb.kernels.proxy.evaluate import PUSHING, RESULTS, WAY, WRENCH, evaluate
 from hapticdb.kernels.records import CONTACT_MODEL
 from hapticdb.poses import rotation_of
 from hapticdb.protocol.contacts import FINE, IS_LOOSE, IS_WAITING, UNIT, ProxyState, ProxyTerms
@@ -102,7 +102,7 @@ class ProxyForce:
         self._plain = wrench
         trusted = bool(self._result[WAY] <= self._model["trust"])
         self.told = ForceState(
-            share == 1.0, trusted, int(self._result[ACTIVE]), share, now - self._answers
+            share == 1.0, trusted, int(self._result[PUSHING]), share, now - self._answers
         )
         return share * self._damped(wrench, velocity)
 

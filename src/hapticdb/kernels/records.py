@@ -154,6 +154,19 @@ SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
 MOST_TRAIL = 64
 """Places of the hand that the quasi-static coupling remembers for its damping. Larger: the same
 time is remembered at higher loop rates."""
+EQUATIONS: list[tuple[object, ...]] = [
+    ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
+    ("n_near", "<i8"),  # near points at the tool's pose
+    ("n_active", "<i8"),  # points in the contact set of the last step
+    ("n_bends", "<i8"),  # rows of curvature in its equations
+    ("is_bent", "?"),  # the surface is hollow: its curvature is computed
+    ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
+    ("right", "<f8", 6),  # their right-hand side: N, N m
+    ("step", "<f8", 6),  # of the tool's centre: m, rad
+    ("pull", "<f8", 6),  # from tool to hand: m, rad
+    ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
+]
+"""Fields of whoever solves for a step of a tool (`kernels.hand.step`)."""
 FOLLOWER: Layout = _record(
     [
         ("looked_at", "<f8", 7),  # pose of the tool that the near points belong to
@@ -162,22 +175,13 @@ FOLLOWER: Layout = _record(
         ("clearance", "<f8"),  # voxels: no point is nearer to a surface, at the tool's pose
         ("tried_clearance", "<f8"),  # the same at the pose looked at last
         ("least_clearance", "<f8"),  # least of a period
-        ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
-        ("n_near", "<i8"),  # near points at the tool's pose
+        *EQUATIONS,
         ("n_tried", "<i8"),  # near points at the pose looked at last, in the other half
         ("n_unknown", "<i8"),  # points in unknown cells there
         ("n_looks", "<i8"),  # poses looked at in this period
-        ("n_active", "<i8"),  # points in the contact set of the last step
-        ("n_bends", "<i8"),  # rows of curvature in its equations
         ("is_walking", "?"),  # whether the pose that is looked at may be forbidden
         ("is_loose", "?"),  # the tool lies in something and feels nothing yet
-        ("is_bent", "?"),  # the surface is hollow: looks compute its curvature
         ("is_braked", "?"),  # the last step was cut short: the next one is held back
-        ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
-        ("right", "<f8", 6),  # their right-hand side: N, N m
-        ("step", "<f8", 6),  # of the tool's centre: m, rad
-        ("pull", "<f8", 6),  # from tool to hand: m, rad
-        ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
         ("last_hand", "<f8", 3),  # the handle's place in the last period, m
         ("trail", "<f8", (MOST_TRAIL, 4)),  # time s and place m of the handle, in turns
         ("n_trail", "<i8"),  # places written since the handle was last lost
@@ -208,6 +212,8 @@ FOLLOWER: Layout = _record(
 MOST_PLANES = 16
 """Most contact planes of a contact proxy. Larger: tools that touch in many places are modelled more
 closely; messages are longer, and a client computes longer."""
+CONTACT_ROWS = 29
+"""Rows with numbers of near points at one pose; `kernels.hand.near_points` names them."""
 CONTACT_MODEL: Layout = _record(
     [
         ("hand", "<f8", 7),  # of the model: the tool's centre as the hand holds it, unit quaternion
@@ -233,13 +239,9 @@ CONTACT_MODEL: Layout = _record(
         # scratch of the client's solver
         ("position", "<f8", 3),  # of the tool's centre, m
         ("quaternion", "<f8", 4),
-        ("pull", "<f8", 6),  # from tool to hand: m, rad
-        ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad
-        ("rows", "<f8", (MOST_PLANES, 7)),  # gradient, its moment, depth
-        ("is_active", "<i8", MOST_PLANES),
-        ("matrix", "<f8", (6, 6)),
-        ("right", "<f8", 6),
-        ("step", "<f8", 6),
+        *EQUATIONS,
+        ("rows", "<f8", (CONTACT_ROWS, MOST_PLANES)),  # of the planes as near points
+        ("met", "<i8", (2, MOST_PLANES)),
     ]
 )
 """A contact proxy: the tool's contacts around one pose of the hand, in the scene's axes."""

@@ -182,6 +182,15 @@ def numbers_of(body):
     return at[0], at[1], at[2], turned[0], turned[1], turned[2], turned[3]
 
 
+@leaf
+def set_numbers(body, numbers):
+    """Write position and unit quaternion, seven numbers, into a record that has them."""
+    for n in range(3):
+        body.position[n] = numbers[n]
+    for n in range(4):
+        body.quaternion[n] = numbers[3 + n]
+
+
 @entry(FLOATS2, FLOATS3)
 def poses_of(states, out):
     """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""

@@ -108,12 +108,8 @@ def lever_in_hand(hand, center):
 
 
 @leaf
-def push_of(spring, hand, center, follower):
-    """Wrench of the spring on the hand, at the device: force and torque about the handle's origin.
-
-    The force is at most `cap`, and the torque about the tool's centre at most `turn_cap`.
-    """
-    fx, fy, fz, tx, ty, tz = wrench_of(follower, spring.cap, spring.turn_cap * spring.scale)
+def at_device(spring, hand, center, fx, fy, fz, tx, ty, tz):
+    """Wrench about the tool's centre (3,) in the hand: at the device, about the handle's origin."""
     rx, ry, rz = lever_in_hand(hand, center)
     mx, my, mz = moment(rx, ry, rz, fx, fy, fz)
     return (

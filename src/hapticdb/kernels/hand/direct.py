@@ -7,11 +7,11 @@ keeps it out of surfaces. The device's caps bound the wrench.
 import numpy as np
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.hand.device_spring import lever_in_hand, shortened
+from hapticdb.kernels.hand.device_spring import at_device, shortened
 from hapticdb.kernels.hand.holding import is_somewhere, send
 from hapticdb.kernels.records import RESULTS
 from hapticdb.kernels.resident.cells import UNKNOWNS, WRENCH
-from hapticdb.kernels.rigid import moment
+from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 
 @leaf
@@ -29,22 +29,15 @@ def render(terms, center, servo, frame, dt):
     unknown = 0 if is_lost else np.int64(frame[UNKNOWNS])
     is_held = is_lost or unknown > 0
     if not is_held:
-        for n in range(3):
-            tool.position[n] = hand.position[n]
-        for n in range(4):
-            tool.quaternion[n] = hand.quaternion[n]
+        set_numbers(tool, numbers_of(hand))
         for n in range(RESULTS):
             tool.felt[n] = frame[n]
-        fx, fy, fz = shortened(frame[WRENCH], frame[WRENCH + 1], frame[WRENCH + 2], terms.cap)
-        tx, ty, tz = shortened(
+        force = shortened(frame[WRENCH], frame[WRENCH + 1], frame[WRENCH + 2], terms.cap)
+        torque = shortened(
             frame[WRENCH + 3], frame[WRENCH + 4], frame[WRENCH + 5], terms.turn_cap * terms.scale
         )
-        rx, ry, rz = lever_in_hand(hand, center)
-        mx, my, mz = moment(rx, ry, rz, fx, fy, fz)
-        kept = tool.kept
-        kept[0], kept[1], kept[2] = fx, fy, fz
-        kept[3], kept[4], kept[5] = (
-            (tx + mx) / terms.scale, (ty + my) / terms.scale, (tz + mz) / terms.scale,
-        )  # fmt: skip
+        wrench = at_device(terms, hand, center, *force, *torque)
+        for n in range(6):
+            tool.kept[n] = wrench[n]
     send(terms, servo, is_held, 0, max(dt, 0.0))
     servo.sent.unknown = unknown

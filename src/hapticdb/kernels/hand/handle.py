@@ -4,7 +4,7 @@ import math
 
 from hapticdb.kernels._jit import FLOATS, FLOATS2, INT, entry, leaf, record_of
 from hapticdb.kernels.records import HAND, HANDLE
-from hapticdb.kernels.rigid import product, quaternion_in
+from hapticdb.kernels.rigid import product, quaternion_in, set_numbers
 
 FARTHEST = 1e9
 """Largest credible number in a hand's pose or velocity, in m, m/s or rad/s: places of surveys have
@@ -63,12 +63,9 @@ def _carry(handle, pose, velocity, hand):
 @leaf
 def _place(handle, pose, velocity, hand):
     """Put the handle where it starts, for the first reading that has a place."""
-    start, offset = handle.start, handle.quaternion
+    offset = handle.quaternion
     if handle.starts_elsewhere:
-        for axis in range(3):
-            hand.position[axis] = start[axis]
-        for part in range(4):
-            hand.quaternion[part] = start[3 + part]
+        set_numbers(hand, handle.start)
         _grip(handle, pose, hand)
     else:
         for axis in range(3):

@@ -7,6 +7,7 @@ import numpy as np
 from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.records import RESULTS
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS
+from hapticdb.kernels.rigid import numbers_of, set_numbers
 
 IS_HELD, IS_FADING, IS_DROPPED, IS_CUT = 1, 2, 8, 16
 """Marks of a period: the last wrench was kept; the kept wrench falls or is zero; part of the period
@@ -53,10 +54,7 @@ def place_lost(tool, hand, is_hand):
         return
     begin_anew(tool)
     if is_hand:
-        for n in range(3):
-            tool.position[n] = hand.position[n]
-        for n in range(4):
-            tool.quaternion[n] = hand.quaternion[n]
+        set_numbers(tool, numbers_of(hand))
 
 
 @leaf

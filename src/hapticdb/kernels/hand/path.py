@@ -17,6 +17,7 @@ from hapticdb.kernels.rigid import (
     pose_of_quaternion,
     product,
     quaternion_by,
+    set_numbers,
     transform_of,
     turned,
 )
@@ -35,14 +36,21 @@ period takes longer."""
 
 
 @leaf
-def place_on_way(tool, center, follower, done):
-    """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
-    step, before, pose = follower.step, tool.quaternion, tool.tried_pose
+def turned_on(step, share, before):
+    """Quaternion after a share of the step's turn, not normalised, and its length."""
     w, x, y, z = product(
-        *quaternion_by(done * step[3], done * step[4], done * step[5]),
+        *quaternion_by(share * step[3], share * step[4], share * step[5]),
         before[0], before[1], before[2], before[3],
     )  # fmt: skip
-    scale = 1.0 / math.sqrt(w * w + x * x + y * y + z * z)
+    return w, x, y, z, math.sqrt(w * w + x * x + y * y + z * z)
+
+
+@leaf
+def place_on_way(tool, center, follower, done):
+    """Tool's pose at a share of the step, into tool.tried_pose -> position and quaternion."""
+    step, pose = follower.step, tool.tried_pose
+    w, x, y, z, length = turned_on(step, done, tool.quaternion)
+    scale = 1.0 / length
     w, x, y, z = scale * w, scale * x, scale * y, scale * z
     pose_of_quaternion(0.0, 0.0, 0.0, w, x, y, z, pose)
     # position: the moved centre, minus the centre's lever in the turned frame
@@ -87,12 +95,9 @@ def _stride_on(grasp, way, done, tool):
 def keep_pose(tool, follower, at):
     """Make a pose of seven numbers the tool's, which the near points belong to."""
     pose_of_quaternion(*at, tool.pose)
+    set_numbers(tool, at)
     for n in range(7):
         follower.looked_at[n] = at[n]
-    for n in range(3):
-        tool.position[n] = at[n]
-    for n in range(4):
-        tool.quaternion[n] = at[3 + n]
 
 
 @leaf

@@ -16,10 +16,11 @@ from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.hand.device_spring import (
     BEYOND_CAP,
     STOPPING,
+    at_device,
     contact_stiffness,
     lever_in_hand,
     measure_pull,
-    push_of,
+    wrench_of,
 )
 from hapticdb.kernels.hand.holding import (
     IS_CUT,
@@ -73,6 +74,9 @@ guard has lowered the stiffness; the change of the force is softened."""
 STEPS = 3
 """Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the
 worst period takes longer."""
+ROUNDS = 6
+"""Most times that the equations of a step are solved until the contact set stays the same. Larger:
+the set is right more often in corners, and the worst period takes longer."""
 SETTLED = 5e-3
 """Voxels: a step in which no point moves farther is not walked, and the force is that at its end.
 Larger: fewer looks, and the tool's pose and the force's direction are less exact."""
@@ -89,11 +93,9 @@ that something was put upon the tool."""
 @leaf
 def has_moved(tool, follower):
     """Whether the tool is not at the pose that the near points belong to."""
-    count = 0
-    for n in range(3):
-        count += tool.position[n] != follower.looked_at[n]
-    for n in range(4):
-        count += tool.quaternion[n] != follower.looked_at[3 + n]
+    at, count = numbers_of(tool), 0
+    for n in range(7):
+        count += at[n] != follower.looked_at[n]
     return count > 0
 
 
@@ -190,7 +192,7 @@ def follow(grasp, spring, tool, hand):
         measure_pull(spring, tool, hand, tool.pose, grasp.shell.center, follower)
         brake = STOPPING * most / size if follower.is_braked else 0.0
         turn_brake = brake * spring.radius * spring.radius
-        solve_step(follower, grasp.field, grasp.met, size, stiffness, brake, turn_brake)
+        solve_step(follower, grasp.field, grasp.met, size, stiffness, brake, turn_brake, ROUNDS)
         way = way_of_step(follower, spring.radius, size)
         follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
         if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
@@ -243,8 +245,8 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
         wrench[axis] = 0.0
     force = 0.0
     if is_felt:
-        wrench[0], wrench[1], wrench[2], wrench[3], wrench[4], wrench[5] = push_of(
-            spring, hand, center, follower
+        wrench[0], wrench[1], wrench[2], wrench[3], wrench[4], wrench[5] = at_device(
+            spring, hand, center, *wrench_of(follower, spring.cap, spring.turn_cap * spring.scale)
         )
         x, y, z = wrench[0], wrench[1], wrench[2]
         force = math.sqrt(x * x + y * y + z * z)

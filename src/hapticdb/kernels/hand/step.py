@@ -18,12 +18,9 @@ from hapticdb.kernels.hand.near_points import (
     NEAR_POINTS,
     NEAR_ROWS,
     ONSETS,
+    WEIGHTS,
     U,
 )
-
-ROUNDS = 6
-"""Most times that the equations of a step are solved until the contact set stays the same. Larger:
-the set is right more often in corners, and the worst period takes longer."""
 
 
 @leaf
@@ -128,10 +125,12 @@ def _add_bends(follower, weight, field, rows, m):
 
 
 @leaf
-def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
+def solve_step(follower, field, met, size, stiffness, extra, turn_extra, rounds):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
-    stiffness: of a contact, N/m. follower.pull has e and theta, follower.pulls their stiffnesses.
+    follower: a record with `records.EQUATIONS`, of which pull has e and theta, and pulls their
+    stiffnesses; stiffness: of a contact, N/m; rounds: most times that the equations are solved
+    until the contact set stays the same.
     """
     step = follower.step
     base = NEAR + follower.side * NEAR_ROWS
@@ -140,19 +139,20 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra):
     for axis in range(6):
         step[axis] = 0.0
     _predict_contacts(follower, field, met, size)
-    for _ in range(ROUNDS):
+    for _ in range(rounds):
         begin_equations(follower, extra, turn_extra)
         for m in range(follower.n_near):
             if field[ACTIVE, m] == 0.0:
                 continue
             depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
+            weight = stiffness * field[WEIGHTS, m]
             add_row(
-                follower, stiffness, depth,
+                follower, weight, depth,
                 field[base + ALONG, m], field[base + ALONG + 1, m], field[base + ALONG + 2, m],
                 field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
             )  # fmt: skip
             if follower.is_bent and depth > 0.0:
-                _add_bends(follower, stiffness * depth / size, field, base, m)
+                _add_bends(follower, weight * depth / size, field, base, m)
         factor(follower)
         solve(follower)
         if not _predict_contacts(follower, field, met, size):

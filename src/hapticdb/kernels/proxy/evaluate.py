@@ -1,9 +1,9 @@
 """A contact proxy at a pose of the hand: the client's part, once a period of its loop.
 
 The tool rests where the spring to the hand and the proxy's contacts balance, as in the quasi-static
-coupling (`hand.step`, whose energy this is). Each contact is one point of the tool and the surface
-near it: a plane that may bend. A contact that the tool leaves ends, and one that it comes to
-begins, so a proxy stays right across the edge of a face, where a linear spring does not.
+coupling (`hand.step`, which solves for this, too). Each contact is one point of the tool and the
+surface near it: a plane that may bend. A contact that the tool leaves ends, and one that it comes
+to begins, so a proxy stays right across the edge of a face, where a linear spring does not.
 
 Unknown is the tool's pose. From the pose of the server's last message a few Gauss-Newton steps go
 to the balance, each over a predicted contact set. The result depends on the proxy and the hand
@@ -14,10 +14,24 @@ import math
 
 from hapticdb.kernels._jit import FLOATS, entry, leaf, record_of
 from hapticdb.kernels.hand.device_spring import BEYOND_CAP, pull_to, stretch, wrench_of
-from hapticdb.kernels.hand.path import way_of_step
-from hapticdb.kernels.hand.step import add_row, begin_equations, factor, solve
-from hapticdb.kernels.records import CONTACT_MODEL
-from hapticdb.kernels.rigid import moment, product, quaternion_by, turned_by
+from hapticdb.kernels.hand.near_points import (
+    ACTIVE,
+    ALONG,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    ONSETS,
+    WEIGHTS,
+    U,
+    write_along,
+    write_bends,
+)
+from hapticdb.kernels.hand.path import turned_on, way_of_step
+from hapticdb.kernels.hand.step import solve_step
+from hapticdb.kernels.records import CONTACT_MODEL, CONTACT_ROWS
+from hapticdb.kernels.rigid import moment, product, turned_by
+
+assert NEAR + NEAR_ROWS == CONTACT_ROWS  # noqa: S101 - rows that are written
 
 STEPS = 5
 """Most Gauss-Newton steps of an evaluation. Larger: nearer to the balance far from the proxy's pose
@@ -27,7 +41,7 @@ ROUNDS = 4
 corners."""
 SETTLED = 1e-7
 """Metres: a step in which no point moves farther is the last. Larger: fewer steps, less exact."""
-WRENCH, WAY, ACTIVE, RESULTS = 0, 6, 7, 8
+WRENCH, WAY, PUSHING, RESULTS = 0, 6, 7, 8
 """Indices into an evaluation's result (RESULTS,): wrench on the hand about the handle's origin, N
 and N m; way of the tool's farthest point in the hand since the proxy's pose, m; number of contacts
 that push."""
@@ -42,8 +56,21 @@ def measure_pull(model, hand, lever):
 
 
 @leaf
+def _begin_contacts(model):
+    """Make the planes near points, at no pose yet; what a hollow surface resists stays the same."""
+    rows, model.n_near, model.is_bent = model.rows, model.n_planes, True
+    for n in range(model.n_planes):
+        normal, along, bends = model.normals[n], model.along[n], model.bends[n]
+        wx, wy, wz = moment(normal[0], normal[1], normal[2], along[0], along[1], along[2])
+        model.met[NEAR_POINTS, n] = n
+        rows[ONSETS, n], rows[WEIGHTS, n], rows[ACTIVE, n] = model.onset, model.weights[n], 0.0
+        bends = -bends[0], along[0], along[1], along[2], -bends[1], wx, wy, wz
+        write_bends(rows, NEAR, n, model.levers[n], bends)
+
+
+@leaf
 def _place_contacts(model):
-    """Rows of the contacts at the tool's pose: gradient, its moment and depth, into model.rows.
+    """Distance of each contact at the tool's pose, its gradient and moment, into model.rows.
 
     A point that has moved by a along the normal and by p and q across it is at the distance
     sqrt((u + a)^2 + u (c p^2 + e q^2)) from a surface that bulges with curvatures c and e, u its
@@ -79,77 +106,17 @@ def _place_contacts(model):
         gx = slope * nx + sideways * (p * vx + q * wx)
         gy = slope * ny + sideways * (p * vy + q * wy)
         gz = slope * nz + sideways * (p * vz + q * wz)
-        row = model.rows[n]
-        row[0], row[1], row[2] = gx, gy, gz
-        row[3], row[4], row[5] = moment(rx, ry, rz, gx, gy, gz)
-        row[6] = model.onset - after
-
-
-@leaf
-def _predict(model):
-    """Put the contacts that the step leaves in depth into the set -> whether it changed."""
-    step, n_changed = model.step, 0
-    for n in range(model.n_planes):
-        row = model.rows[n]
-        depth = row[6]
-        for axis in range(6):
-            depth -= row[axis] * step[axis]
-        active = 1 if depth > 0.0 else 0
-        n_changed += active != model.is_active[n]
-        model.is_active[n] = active
-    return n_changed > 0
-
-
-@leaf
-def _add_hollow(model, n):
-    """Add what a hollow surface resists across the normal of contact n that is in depth."""
-    row, lever = model.rows[n], model.levers[n]
-    normal, along = model.normals[n], model.along[n]
-    wx, wy, wz = moment(normal[0], normal[1], normal[2], along[0], along[1], along[2])
-    for bend in range(2):
-        curvature = -model.bends[n, bend]
-        if curvature > 0.0:
-            vx = along[0] if bend == 0 else wx
-            vy = along[1] if bend == 0 else wy
-            vz = along[2] if bend == 0 else wz
-            ax, ay, az = moment(lever[0], lever[1], lever[2], vx, vy, vz)
-            weight = model.contact * model.weights[n] * row[6] * curvature
-            add_row(model, weight, 0.0, vx, vy, vz, ax, ay, az)
-
-
-@leaf
-def _solve_step(model):
-    """Solve for the step (6,), m and rad about the tool's centre, and its contact set."""
-    for axis in range(6):
-        model.step[axis] = 0.0
-    _predict(model)
-    for _ in range(ROUNDS):
-        begin_equations(model, 0.0, 0.0)
-        for n in range(model.n_planes):
-            if model.is_active[n] == 1:
-                row = model.rows[n]
-                add_row(
-                    model, model.contact * model.weights[n], row[6],
-                    row[0], row[1], row[2], row[3], row[4], row[5],
-                )  # fmt: skip
-                if row[6] > 0.0:
-                    _add_hollow(model, n)
-        factor(model)
-        solve(model)
-        if not _predict(model):
-            return
+        model.rows[NEAR + U, n] = after
+        write_along(model.rows, NEAR + ALONG, n, (rx, ry, rz), gx, gy, gz)
 
 
 @leaf
 def _take_step(model):
     """Move the tool by the step -> the way that no point of it exceeds, m."""
-    step, at, turned = model.step, model.position, model.quaternion
+    turned = model.quaternion
     for axis in range(3):
-        at[axis] += step[axis]
-    w, x, y, z = product(
-        *quaternion_by(step[3], step[4], step[5]), turned[0], turned[1], turned[2], turned[3]
-    )
-    length = math.sqrt(w * w + x * x + y * y + z * z)
+        model.position[axis] += model.step[axis]
+    w, x, y, z, length = turned_on(model.step, 1.0, turned)
     turned[0], turned[1], turned[2], turned[3] = w / length, x / length, y / length, z / length
     return way_of_step(model, model.radius, 1.0)
 
@@ -175,22 +142,18 @@ def evaluate(model_record, hand, result):
     result[WAY] = way_of_step(model, model.radius, 1.0)
     if model.n_planes == 0:
         return
-    for n in range(model.n_planes):
-        model.is_active[n] = 0
+    _begin_contacts(model)
     for _ in range(STEPS):
         measure_pull(model, hand, lever)
         _place_contacts(model)
-        _solve_step(model)
+        solve_step(model, model.rows, model.met, 1.0, model.contact, 0.0, 0.0, ROUNDS)
         if _take_step(model) < SETTLED:
             break
-    count = 0
-    for n in range(model.n_planes):
-        count += model.is_active[n]
-    if count == 0:
+    if model.n_active == 0:
         return
     measure_pull(model, hand, lever)
     x, y, z, a, b, c = wrench_of(model, model.cap, model.turn_cap)
     mx, my, mz = moment(*lever, x, y, z)
     result[WRENCH], result[WRENCH + 1], result[WRENCH + 2] = x, y, z
     result[WRENCH + 3], result[WRENCH + 4], result[WRENCH + 5] = a + mx, b + my, c + mz
-    result[ACTIVE] = count
+    result[PUSHING] = model.n_active

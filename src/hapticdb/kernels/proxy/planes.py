@@ -170,24 +170,18 @@ def group_rows(rows, count, radius, size):
 
 
 @leaf
-def _begin_planes(model, n_planes):
-    """Empty the planes."""
-    model.n_planes = n_planes
-    for p in range(n_planes):
-        model.depths[p], model.weights[p] = -1e30, 0.0
-        for axis in range(3):
-            model.normals[p, axis] = model.levers[p, axis] = 0.0
-
-
-@leaf
 def write_planes(model, rows, count, n_planes, size):
     """Merge the rows of each plane.
 
     Of rows in contact force and count are kept: normal and lever are means weighted by depth. Of
     others those count that are nearly as deep as the deepest.
     """
-    scratch = model.rows
-    _begin_planes(model, n_planes)
+    scratch, model.n_planes = model.rows, n_planes
+    for p in range(n_planes):
+        model.depths[p], model.weights[p] = -1e30, 0.0
+        scratch[p, 0] = scratch[p, 1] = 0.0
+        for axis in range(3):
+            model.normals[p, axis] = model.levers[p, axis] = 0.0
     for n in range(count):
         p = np.int64(rows[n, CLUSTER])
         if p >= 0 and rows[n, DEPTH] > model.depths[p]:
@@ -195,8 +189,6 @@ def write_planes(model, rows, count, n_planes, size):
             model.bends[p, 0], model.bends[p, 1] = rows[n, BEND], rows[n, BEND + 1]
             for axis in range(3):
                 model.along[p, axis] = rows[n, ALONG + axis]
-    for m in range(n_planes):
-        scratch[m, 0] = scratch[m, 1] = 0.0
     for n in range(count):
         p = np.int64(rows[n, CLUSTER])
         if p < 0:

@@ -9,7 +9,14 @@ import numpy as np
 from numba import types
 
 from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INT, entry, leaf
-from hapticdb.kernels.rigid import product, quaternion_by, quaternion_in, turn_of, write_pose
+from hapticdb.kernels.rigid import (
+    moment,
+    product,
+    quaternion_by,
+    quaternion_in,
+    turn_of,
+    write_pose,
+)
 
 PAIR = types.UniTuple(FLOAT, 2)
 
@@ -77,12 +84,9 @@ def _angular_velocity(x, y, z, dx, dy, dz):
         r = math.sqrt(square)
         a = (1.0 - math.cos(r)) / square
         b = (r - math.sin(r)) / (square * r)
-    cx, cy, cz = y * dz - z * dy, z * dx - x * dz, x * dy - y * dx
-    return (
-        dx + a * cx + b * (y * cz - z * cy),
-        dy + a * cy + b * (z * cx - x * cz),
-        dz + a * cz + b * (x * cy - y * cx),
-    )
+    cx, cy, cz = moment(x, y, z, dx, dy, dz)
+    ex, ey, ez = moment(x, y, z, cx, cy, cz)
+    return dx + a * cx + b * ex, dy + a * cy + b * ey, dz + a * cz + b * ez
 
 
 @leaf

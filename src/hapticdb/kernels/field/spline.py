@@ -149,14 +149,11 @@ def nearest_bound(payload, slot, x, y, z):
 
 
 @leaf
-def _depth_in_block(x, y, z, bits):
-    """Way from a point to the border of its block of (1 << bits)^3 voxels, voxels."""
+def bound_in_free_block(x, y, z, bits):
+    """Lower bound of the distance in a block of (1 << bits)^3 voxels, voxels.
+
+    Its centres, and those around it, are BEYOND.
+    """
     side = float(1 << bits)
     x, y, z = x % side, y % side, z % side
-    return min(x, side - x, y, side - y, z, side - z)
-
-
-@leaf
-def bound_in_free_block(x, y, z, bits):
-    """Lower bound of the distance in a block whose centres, and those around it, are BEYOND."""
-    return _depth_in_block(x, y, z, bits) + 0.5 + FREE_BEYOND
+    return min(x, side - x, y, side - y, z, side - z) + 0.5 + FREE_BEYOND

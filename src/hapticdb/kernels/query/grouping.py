@@ -50,31 +50,16 @@ def _rows_below_bound(x, low, bounds, rows_per_bucket):
 
 
 @leaf
-def _bound_after(x, bounds, start):
-    """Index of the first bound > x, at `start` or above it. x may be the largest int64."""
-    if x >= bounds[bounds.shape[0] - 1]:
-        return bounds.shape[0]
-    return first_bound(x + 1, bounds, start)
-
-
-@leaf
-def _rows_up_to(x, after, bounds, rows_per_bucket):
-    """Expected rows with a key <= x, given the first bound > x."""
-    if after == bounds.shape[0]:
-        return (after - 1) * rows_per_bucket
-    return _rows_below_bound(x + 1, after, bounds, rows_per_bucket)
-
-
-@leaf
 def _rows_between(left, right, bounds, rows_per_bucket, start):
     """Expected rows with a key in [left, right]; no bound below index `start` is >= left."""
     if right < left:
         return 0.0
-    at = first_bound(left, bounds, start)
-    after = _bound_after(right, bounds, at)
-    return _rows_up_to(right, after, bounds, rows_per_bucket) - _rows_below_bound(
-        left, at, bounds, rows_per_bucket
-    )
+    at, after = first_bound(left, bounds, start), bounds.shape[0]
+    if right < bounds[after - 1]:  # else no key is above it, and it may be the largest int64
+        right += 1
+        after = first_bound(right, bounds, at)
+    up_to = _rows_below_bound(right, after, bounds, rows_per_bucket)
+    return up_to - _rows_below_bound(left, at, bounds, rows_per_bucket)
 
 
 @entry(INT, INT, INTS, FLOAT)

@@ -266,12 +266,6 @@ def _bounded_by(x, y, z, square, voxel):
     return square, np.int64(-1)
 
 
-@leaf
-def length(x, y, z):
-    """Length of a vector."""
-    return math.sqrt(x * x + y * y + z * z)
-
-
 @inlined
 def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
     """Lower bound of the distance from (x, y, z) to an occupied voxel, and a voxel near it or -1.
@@ -296,7 +290,8 @@ def bound_at(cubes, seen, x, y, z, wanted, near, shift, side):
         cube.key = key
         cube.bound = math.sqrt(square)
         cube.nearest = voxel
-    return cube.bound - length(x - mx, y - my, z - mz) - CAUTION, cube.nearest
+    x, y, z = x - mx, y - my, z - mz
+    return cube.bound - math.sqrt(x * x + y * y + z * z) - CAUTION, cube.nearest
 
 
 @leaf

@@ -22,14 +22,16 @@ CROWD = 500
 """Candidates that a candidate may be compared with, on average; above it the reach is shortened.
 Several sheets at one place have half as many. A larger value makes folded surfaces slower to
 sample."""
+OPPOSITE = 0.35
+"""Reach across a sheet, as a part of the spacing. Larger: thin walls get fewer points an area."""
 
 
 @leaf
-def _pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
+def _pair_weight(points, face_of, normals, a, b, reach, nearest):
     """Weigh a and b on each other: (1 - d / reach)^8, d the distance, at least `nearest`.
 
     Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet have a weight only
-    within `opposite` times the reach: otherwise thin walls would get fewer points an area.
+    within `OPPOSITE` times the reach.
     """
     x = points[a, 0] - points[b, 0]
     y = points[a, 1] - points[b, 1]
@@ -42,7 +44,7 @@ def _pair_weight(points, face_of, normals, a, b, reach, nearest, opposite):
     facing = 0.0
     for axis in range(3):
         facing += normals[f, axis] * normals[g, axis]
-    scale = opposite if facing < -0.5 else 1.0
+    scale = OPPOSITE if facing < -0.5 else 1.0
     distance = max(np.sqrt(squared), nearest * scale)
     w = 1.0 - distance / (reach * scale)
     if w <= 0.0:
@@ -75,8 +77,8 @@ def _sift_down(heap, rank, weights, at, size):
     rank[item] = at
 
 
-@entry(FLOATS2, INTS32, FLOATS2, INTS32, INTS32_3, INT, FLOAT, FLOAT, FLOAT)
-def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, nearest, opposite):
+@entry(FLOATS2, INTS32, FLOATS2, INTS32, INTS32_3, INT, FLOAT, FLOAT)
+def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, nearest):
     """Drop the most crowded candidate, again and again, until `n_keep` are left.
 
     points (M, 3), sorted by cell; face_of (M,) int32; normals (F, 3); cell_of (M,) int32; ranges
@@ -93,7 +95,7 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
         for row in range(9):
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
                 if b != a:
-                    weight += _pair_weight(points, face_of, normals, a, b, reach, nearest, opposite)
+                    weight += _pair_weight(points, face_of, normals, a, b, reach, nearest)
         weights[a] = weight
         heap[a] = a
         rank[a] = a
@@ -113,7 +115,7 @@ def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, n
             for b in range(ranges[cell, row, 0], ranges[cell, row, 1]):
                 if rank[b] < 0:
                     continue
-                weight = _pair_weight(points, face_of, normals, item, b, reach, nearest, opposite)
+                weight = _pair_weight(points, face_of, normals, item, b, reach, nearest)
                 if weight > 0.0:
                     weights[b] -= weight
                     _sift_down(heap, rank, weights, np.int64(rank[b]), size)
@@ -156,13 +158,11 @@ def spread_points(
     normals: Floats,
     n_keep: int,
     spacing: float,
-    opposite: float = 0.35,
 ) -> NDArray[np.intp]:
     """Choose `n_keep` of M candidates, as far apart as elimination makes them: ascending indices.
 
     points (M, 3), uniform over the surface; face_of (M,); normals (F, 3) of the faces, unit, all to
-    the same side; spacing: distance of neighbours if the points kept were a hexagonal lattice;
-    opposite: reach across a sheet, as a part of the spacing.
+    the same side; spacing: distance of neighbours if the points kept were a hexagonal lattice.
     """
     cells = _sort_into_cells(points, spacing)
     while cells.crowd > CROWD:  # sheets folded upon one another
@@ -179,7 +179,6 @@ def spread_points(
         n_keep,
         spacing,
         nearest,
-        opposite,
     )
     return np.sort(cells.order[rank >= 0])
 

@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels._jit import FLOATS, FLOATS2, FLOATS3, INTS, entry, fields_of, leaf
+from hapticdb.kernels.rigid import moment
 
 Floats = NDArray[np.float64]
 
@@ -82,7 +83,7 @@ def _turn(rotation, turn, angle, share, pose):
     rest = 2.0 * half * half  # 1 - cos
     for k in range(3):
         px, py, pz = rotation[0, k], rotation[1, k], rotation[2, k]
-        qx, qy, qz = y * pz - z * py, z * px - x * pz, x * py - y * px
+        qx, qy, qz = moment(x, y, z, px, py, pz)
         pose[0, k] = px + sine * qx + rest * (y * qz - z * qy)
         pose[1, k] = py + sine * qy + rest * (z * qx - x * qz)
         pose[2, k] = pz + sine * qz + rest * (x * qy - y * qx)
@@ -95,9 +96,7 @@ def velocity(moved, x, y, z):
     Returns the shift along each axis, and the metres of the turn.
     """
     x, y, z = x - moved.center[0], y - moved.center[1], z - moved.center[2]
-    ux = moved.turn[1] * z - moved.turn[2] * y
-    uy = moved.turn[2] * x - moved.turn[0] * z
-    uz = moved.turn[0] * y - moved.turn[1] * x
+    ux, uy, uz = moment(moved.turn[0], moved.turn[1], moved.turn[2], x, y, z)
     turned = math.sqrt(ux * ux + uy * uy + uz * uz)
     return moved.shift[0] + ux, moved.shift[1] + uy, moved.shift[2] + uz, turned
 

@@ -33,19 +33,18 @@ def _try_edge(found, px, py, pz, ax, ay, az, bx, by, bz, is_first):
     if length > 0.0:
         share = ((px - ax) * ux + (py - ay) * uy + (pz - az) * uz) / length
         share = min(max(share, 0.0), 1.0)
-    qx, qy, qz = ax + share * ux, ay + share * uy, az + share * uz
-    square = (px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2
-    if square < found[0]:
-        _note(found, square, px, py, pz, qx, qy, qz, is_first)
+    _note(found, px, py, pz, ax + share * ux, ay + share * uy, az + share * uz, is_first)
 
 
 @leaf
-def _note(found, square, px, py, pz, qx, qy, qz, is_first):
-    """Write the squared distance and both places, that of the first triangle first."""
-    found[0] = square
-    first, second = (1, 4) if is_first else (4, 1)
-    found[first], found[first + 1], found[first + 2] = px, py, pz
-    found[second], found[second + 1], found[second + 2] = qx, qy, qz
+def _note(found, px, py, pz, qx, qy, qz, is_first):
+    """Note places p and q, if they are nearer than `found`: that of the first triangle first."""
+    square = (px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2
+    if square < found[0]:
+        found[0] = square
+        first, second = (1, 4) if is_first else (4, 1)
+        found[first], found[first + 1], found[first + 2] = px, py, pz
+        found[second], found[second + 1], found[second + 2] = qx, qy, qz
 
 
 @leaf
@@ -58,9 +57,7 @@ def _try_inside(found, px, py, pz, other, m, is_first):
         return
     s, t = along / area, across / area
     qx, qy, qz = ax + s * ux + t * vx, ay + s * uy + t * vy, az + s * uz + t * vz
-    square = (px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2
-    if square < found[0]:
-        _note(found, square, px, py, pz, qx, qy, qz, is_first)
+    _note(found, px, py, pz, qx, qy, qz, is_first)
 
 
 @leaf
@@ -91,9 +88,7 @@ def _try_edges(found, one, n, i, other, m, j):
         return
     px, py, pz = px + s * ux, py + s * uy, pz + s * uz
     qx, qy, qz = qx + t * vx, qy + t * vy, qz + t * vz
-    square = (px - qx) ** 2 + (py - qy) ** 2 + (pz - qz) ** 2
-    if square < found[0]:
-        _note(found, square, px, py, pz, qx, qy, qz, True)
+    _note(found, px, py, pz, qx, qy, qz, True)
 
 
 @leaf
@@ -147,7 +142,7 @@ def _goes_through(found, one, n, other, m, is_first):
             x = one[n, i, 0] + share * (one[n, k, 0] - one[n, i, 0])
             y = one[n, i, 1] + share * (one[n, k, 1] - one[n, i, 1])
             z = one[n, i, 2] + share * (one[n, k, 2] - one[n, i, 2])
-            _note(found, 0.0, x, y, z, x, y, z, is_first)
+            _note(found, x, y, z, x, y, z, is_first)
             return True
     return False
 

@@ -108,7 +108,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "touch by distance": (
         _LOCATE,
         "query.refining.refine@distances",
-        "query.refining.unpack_asked",
+        "query.refining.asked_rows",
+        "field.packing.unpack_kernel",
     ),
     "pairs": ("query.refining.pairs_of_points",),
     "pairs by distance": ("query.refining.pairs_of_points@distances",),

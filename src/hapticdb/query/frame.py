@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.compiling import entries_for, load
-from hapticdb.kernels.field import lattice
+from hapticdb.kernels.field import lattice, packing
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
@@ -202,19 +202,17 @@ class HapticQuery:
         UsageError
             If the rows have no distances.
         """
-        values = np.empty((len(rows.keys), lattice.ROW_VALUES), dtype=np.uint8)
         if not rows.keys.size:
-            return values
+            return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
         if rows.distances is None:
             raise UsageError(
                 f"{self._store.url} has no distances to surfaces, which this law reads: give "
                 "the law TangentPlane"
             )
-        row = refining.unpack_asked(keys, rows.keys, *rows.distances, values)
-        if row >= 0:
-            cause = f"row {row} of {len(values)} packed rows of distances is damaged"
-            raise damaged(self._store.url, cause)
-        return values
+        try:
+            return packing.unpack(*rows.distances, refining.asked_rows(keys, rows.keys))
+        except ValueError as error:
+            raise damaged(self._store.url, str(error)) from error
 
     def _refined(
         self,

@@ -30,7 +30,7 @@ array. A row with more or fewer bytes than its bits need is damaged.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf, maker
+from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf
 from hapticdb.kernels.bits import lowest_bit
 from hapticdb.kernels.field.lattice import BEYOND, ROW_SIDE, ROW_VALUES
 
@@ -284,9 +284,13 @@ def _unpack_row(row, masks, lines, out, n):
     return np.int64(at)
 
 
-@maker
-def unpack_rows(data, ends, wanted, out):
-    """Unpack the wanted rows; return the first row that is damaged, or -1."""
+@entry(READ_BYTES, INTS, BOOLS, BYTES2)
+def unpack_kernel(data, ends, wanted, out):
+    """Unpack the wanted rows; return the first row that is damaged, or -1.
+
+    data (n,), ends (R,) as `pack` gives them; wanted (R,) bool; out (R, 1000), left as it is in
+    rows that are not wanted.
+    """
     row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
     masks = np.empty(ROW_SIDE, np.uint64)
     lines = np.empty(2 * ROW_SIDE, np.uint64)
@@ -303,16 +307,6 @@ def unpack_rows(data, ends, wanted, out):
         if (n_bits + 7) >> 3 != size or np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1):
             return n
     return -1
-
-
-@entry(READ_BYTES, INTS, BOOLS, BYTES2)
-def unpack_kernel(data, ends, wanted, out):
-    """Unpack the wanted rows; return the first row that is damaged, or -1.
-
-    data (n,), ends (R,) as `pack` gives them; wanted (R,) bool; out (R, 1000), left as it is in
-    rows that are not wanted.
-    """
-    return unpack_rows(data, ends, wanted, out)
 
 
 def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:

@@ -22,7 +22,6 @@ from hapticdb.kernels._jit import (
     record_of,
 )
 from hapticdb.kernels.field.law import DISTANCE_FIELD
-from hapticdb.kernels.field.packing import unpack_rows
 from hapticdb.kernels.law import (
     NO_WRENCH,
     NOTHING_NEAR,
@@ -35,6 +34,7 @@ from hapticdb.kernels.law import (
     share_rows,
 )
 from hapticdb.kernels.query.contact import center_of, voxel_at
+from hapticdb.kernels.query.grouping import first_bound
 from hapticdb.kernels.query.sorting import insert_distinct
 from hapticdb.kernels.records import GRID
 
@@ -69,7 +69,7 @@ def _counting_rows(row_ids, exclude):
     """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct.
 
     An excluded id has id - exclude[0] smaller ids before it, less the ids in between that are not
-    excluded: the search begins between these bounds, which are close where almost all are excluded.
+    excluded: the search begins there, which is close where almost all are excluded.
     """
     counts = np.empty(row_ids.shape[0], dtype=np.bool_)
     for row in range(row_ids.shape[0]):
@@ -82,14 +82,8 @@ def _counting_rows(row_ids, exclude):
             before = row_ids[row] - first
             if before < 0 or row_ids[row] > last:
                 continue
-            low, high = max(before - n_between, np.int64(0)), min(before, np.int64(total - 1))
-            while low < high:
-                middle = (low + high) >> 1
-                if exclude[middle] < row_ids[row]:
-                    low = middle + 1
-                else:
-                    high = middle
-            counts[row] = exclude[low] != row_ids[row]
+            at = first_bound(row_ids[row], exclude, max(before - n_between, np.int64(0)))
+            counts[row] = exclude[at] != row_ids[row]
     return counts
 
 
@@ -270,20 +264,18 @@ def pairs_of_points(
     return pairs[:count]
 
 
-@entry(INTS, INTS, READ_BYTES, INTS, BYTES2)
-def unpack_asked(keys, row_keys, data, ends, out):
-    """Unpack the distances of the rows under keys that are asked for, into out (R, 1000).
+@entry(INTS, INTS)
+def asked_rows(keys, row_keys):
+    """Mask (R,) of the rows whose keys a shell asks for; the others are the false hits.
 
-    keys (U,) and row_keys (R,), both ascending; data and ends (R,) as `packing.pack` gives them.
-    Rows of other keys, the false hits, are left unset. Returns the first row that is damaged, or
-    -1.
+    keys (U,) and row_keys (R,) int64, both ascending.
     """
-    starts, after = _rows_of_keys(keys, row_keys)
+    starts, ends = _rows_of_keys(keys, row_keys)
     is_asked = np.zeros(row_keys.shape[0], dtype=np.bool_)
     for n in range(keys.shape[0]):
-        for row in range(starts[n], after[n]):
+        for row in range(starts[n], ends[n]):
             is_asked[row] = True
-    return unpack_rows(data, ends, is_asked, out)
+    return is_asked
 
 
 @entry(FLOATS2, INTS, INTS, record_of(GRID), TANGENT_PLANE, FLOATS)

@@ -49,7 +49,7 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.rigid import length_at, moment, moved, transform_of
 
 MOST_BULGE = 0.5
-"""Share of the spring's stiffness up to which bulging surfaces lower K6. There the force turns with
+"""Share of what the springs resist up to which bulging surfaces lower K6. There the force turns with
 the hand; beyond 1 the tool snaps off, which no linear model can tell. Larger: nearer to that."""
 MOST_TRUST = 1.0
 """Voxels: greatest trust radius with contacts near, because faces end. Larger: clients rely longer
@@ -90,7 +90,7 @@ def _write_hand(spring, shell, tool, hand, follower, flags, model):
 def _add_spring(model, start, stiffness, cap):
     """Add the tangent stiffness of three axes from `start` on to model.stiffness (6, 6).
 
-    A spring at its cap gives way along its pull and turns across it.
+    A spring at its cap gives way along its pull and turns across it: returns whether it is there.
     """
     wrench = model.wrench
     size = length_at(wrench, start)
@@ -104,17 +104,23 @@ def _add_spring(model, start, stiffness, cap):
             if is_capped:
                 value -= across * wrench[start + row] * wrench[start + column] / (size * size)
             model.stiffness[start + row, start + column] = value
+    return is_capped
 
 
 @leaf
-def _add_contacts(model, rows, count):
-    """Add the stiffness of the rows in contact to the lower triangle of model.matrix."""
+def _add_contacts(model, rows, count, is_capped):
+    """Add the stiffness of the rows in contact to the lower triangle of model.matrix.
+
+    A bulge b at a lever r takes at most b (1 / k + r^2 / k_R) of what the springs resist; they
+    resist nothing along a pull at its cap, where bulges are left out.
+    """
     bulge = 0.0
     for n in range(count):
         if rows[n, DEPTH] > 0.0:
-            force = model.contact * rows[n, DEPTH]
-            bulge += force * (max(rows[n, BEND], 0.0) + max(rows[n, BEND + 1], 0.0))
-    share = min(1.0, MOST_BULGE * model.spring / max(bulge, 1e-12))
+            force, lever = model.contact * rows[n, DEPTH], length_at(rows[n], LEVER)
+            gives = 1.0 / model.spring + lever * lever / model.turn_spring
+            bulge += force * gives * (max(rows[n, BEND], 0.0) + max(rows[n, BEND + 1], 0.0))
+    share = 0.0 if is_capped else min(1.0, MOST_BULGE / max(bulge, 1e-12))
     for n in range(count):
         depth = rows[n, DEPTH]
         if depth <= 0.0:
@@ -134,15 +140,15 @@ def _add_contacts(model, rows, count):
 @leaf
 def _write_stiffness(model, rows, count):
     """Write K6 into model.stiffness, which is zero, from the rows in contact and the springs."""
-    _add_spring(model, 0, model.spring, model.cap)
-    _add_spring(model, 3, model.turn_spring, model.turn_cap)
+    is_capped = _add_spring(model, 0, model.spring, model.cap)
+    is_capped |= _add_spring(model, 3, model.turn_spring, model.turn_cap)
     spring = model.rows
     for row in range(6):
         for column in range(6):
             spring[row, column] = model.stiffness[row, column]
             model.matrix[row, column] = spring[row, column]
         model.matrix[row, row] += 1e-9 * (model.spring if row < 3 else model.turn_spring)
-    _add_contacts(model, rows, count)
+    _add_contacts(model, rows, count, is_capped)
     factor(model)
     for column in range(6):
         for row in range(6):

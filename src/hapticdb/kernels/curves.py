@@ -46,28 +46,32 @@ def z_encode(i, j, k):
 
 
 @leaf
-def _exchange(i, other, bit):
-    """Where `other` has the bit, invert the bits of i below it; else exchange those of both."""
-    if other & bit:
-        return i ^ (bit - 1), other
-    changed = (i ^ other) & (bit - 1)
-    return i ^ changed, other ^ changed
-
-
-@leaf
 def _hilbert_encode(i, j, k, bits):
     """Hilbert key of (i, j, k) on the curve of `bits` bits an axis."""
     for level in range(bits - 1, 0, -1):
-        bit = 1 << level
-        i, _ = _exchange(i, i, bit)
-        i, j = _exchange(i, j, bit)
-        i, k = _exchange(i, k, bit)
+        q = 1 << level
+        p = q - 1
+        if i & q:
+            i ^= p
+        if j & q:
+            i ^= p
+        else:
+            t = (i ^ j) & p
+            i ^= t
+            j ^= t
+        if k & q:
+            i ^= p
+        else:
+            t = (i ^ k) & p
+            i ^= t
+            k ^= t
     j ^= i
     k ^= j
     t = 0
     for level in range(bits - 1, 0, -1):
-        if k & (1 << level):
-            t ^= (1 << level) - 1
+        q = 1 << level
+        if k & q:
+            t ^= q - 1
     return z_encode(i ^ t, j ^ t, k ^ t)
 
 
@@ -82,10 +86,22 @@ def _hilbert_decode(key, bits):
     j ^= i
     i ^= t
     for level in range(1, bits):
-        bit = 1 << level
-        i, k = _exchange(i, k, bit)
-        i, j = _exchange(i, j, bit)
-        i, _ = _exchange(i, i, bit)
+        q = 1 << level
+        p = q - 1
+        if k & q:
+            i ^= p
+        else:
+            t = (i ^ k) & p
+            i ^= t
+            k ^= t
+        if j & q:
+            i ^= p
+        else:
+            t = (i ^ j) & p
+            i ^= t
+            j ^= t
+        if i & q:
+            i ^= p
     return i, j, k
 
 

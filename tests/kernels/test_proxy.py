@@ -255,9 +255,9 @@ def test_the_stiffness_stays_the_springs_where_a_tool_bulges_away(turn_stiffness
     """Below the cap and at it, on a round rod as thin as a voxel, at a lever."""
     field, points = field_of(cylinder(SIZE), SIZE), np.array([[0.0, 0.0, -0.03], [0.0, 0.0, 0.03]])
     at = np.array([0.0, 0.0, SIZE + ONSET + 0.03])
-    hand = Hand(field, points, at + [0.0, 0.0, 2e-3], turn_stiffness=turn_stiffness, cap=2.0)
+    hand = Hand(field, points, at + 2e-3 * np.eye(3)[2], turn_stiffness=turn_stiffness, cap=2.0)
     for down in np.linspace(-2e-3, 20e-3, 120):
-        hand.move(at - [0.0, 0.0, down])
+        hand.move(at - down * np.eye(3)[2])
         spring = np.repeat([STIFFNESS, turn_stiffness], 3)
         shares = model_of(hand)["stiffness"] / np.sqrt(np.outer(spring, spring))
         assert np.abs(np.linalg.eigvalsh(shares)).max() < 1.0 + 1e-6

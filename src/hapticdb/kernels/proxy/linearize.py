@@ -49,8 +49,9 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.rigid import length_at, moment, moved, transform_of
 
 MOST_BULGE = 0.5
-"""Share of what the springs resist up to which bulging surfaces lower K6. There the force turns with
-the hand; beyond 1 the tool snaps off, which no linear model can tell. Larger: nearer to that."""
+"""Share of what the springs resist up to which bulging surfaces lower K6. There the force turns
+with the hand; beyond 1 the tool snaps off, which no linear model can tell. Larger: nearer to that.
+"""
 MOST_TRUST = 1.0
 """Voxels: greatest trust radius with contacts near, because faces end. Larger: clients rely longer
 on planes that may have ended."""

@@ -177,11 +177,11 @@ def write_planes(model, rows, count, n_planes, size):
     others those count that are nearly as deep as the deepest.
     """
     scratch, model.n_planes = model.rows, n_planes
-    for p in range(n_planes):
-        model.depths[p], model.weights[p] = -1e30, 0.0
-        scratch[p, 0] = scratch[p, 1] = 0.0
+    for m in range(n_planes):
+        model.depths[m], model.weights[m] = -1e30, 0.0
+        scratch[m, 0] = scratch[m, 1] = 0.0
         for axis in range(3):
-            model.normals[p, axis] = model.levers[p, axis] = 0.0
+            model.normals[m, axis] = model.levers[m, axis] = 0.0
     for n in range(count):
         p = np.int64(rows[n, CLUSTER])
         if p >= 0 and rows[n, DEPTH] > model.depths[p]:

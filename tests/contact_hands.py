@@ -107,8 +107,14 @@ def pressed(served: Served, proxy: ContactProxy) -> Floats:
         proxy.wrench(served.pose(depth), STILL)
         time.sleep(2e-3)
     full = pytest.approx(1000.0 * DEPTH, rel=0.06)
-    until(lambda: proxy.wrench(served.pose(DEPTH), STILL)[2] == full, every=1e-3)
-    return proxy.wrench(served.pose(DEPTH), STILL)
+    felt = np.zeros(6)
+
+    def is_full() -> bool:
+        felt[:] = proxy.wrench(served.pose(DEPTH), STILL)
+        return bool(felt[2] == full)
+
+    until(is_full, every=1e-3)
+    return felt
 
 
 def falls_to_zero(served: Served, proxy: ContactProxy) -> list[float]:
@@ -127,10 +133,10 @@ def granted(served: Served) -> ClientConnection:
     """A connection to which the server has granted its tool."""
     connection = connect(
         f"ws://127.0.0.1:{served.port}/device/contacts", compression=None, proxy=None,
-        additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=30,
+        additional_headers={"Authorization": f"Bearer {TOKEN}"}, open_timeout=PATIENCE,
     )  # fmt: skip
     connection.send(pack_wish(ProxyWish()))
-    assert unpack_terms(connection.recv(30)).tool == "plate"  # type: ignore[arg-type]
+    assert unpack_terms(connection.recv(PATIENCE)).tool == "plate"  # type: ignore[arg-type]
     return connection
 
 

@@ -123,7 +123,11 @@ class Killer:
         if progress.parts_done == self._n_parts:
             self._timer.start()
         elif progress.parts_done == self._n_parts + 4:
-            joined(self._timer)
+            self.wait()
+
+    def wait(self) -> None:
+        """Wait until the function has returned."""
+        joined(self._timer)
 
 
 def crash(server: PrivateServer) -> None:

@@ -20,7 +20,7 @@ from psycopg import conninfo, sql
 
 import hapticdb
 from assemblies import row_of_boxes
-from children import finished
+from children import finished, joined
 from hapticdb import Environment, accept_clash, find_clashes
 from hapticdb.clashes.result import Clashes
 from hapticdb.errors import UsageError
@@ -286,7 +286,7 @@ def test_two_at_once_make_one_table(place: Place, path: Path) -> None:
     for one in searching:
         one.start()
     for one in searching:
-        one.join(60.0)
+        joined(one)
     assert not errors
     with hapticdb.open(url) as env, hapticdb.open(path) as alone:
         find_clashes(alone)

@@ -79,7 +79,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert report["hit_frames"] > 0
     assert report["objects"]
     assert report["cache"]["budget_bytes"] <= 8 << 20
-    assert report["loop"]["seconds"] == pytest.approx(recording.poses()[0][-1], rel=0.1)
+    loop, end = report["loop"], recording.poses()[0][-1]
+    assert 0.9 * end <= loop["seconds"] <= 1.1 * end + loop["lateness"]["worst"]
 
     assert run("move", "scene.db", 1, "--translate", "0,0,0.05")[0] == 0
     code, out, err = run("replay", "felt.hdbrec")
@@ -122,7 +123,8 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
     code, out, err = run(*feel(*args, "--rate", 200, "--json"))
     assert (code, err) == (0, "")
     report = json.loads(out)
-    assert report["unknown_frames"] == report["held_frames"] == 0
+    assert report["unknown_frames"] == 0
+    assert report["held_frames"] == report["stale_frames"]
 
 
 @pytest.mark.usefixtures("scene")
@@ -180,16 +182,17 @@ def test_a_recording_is_gone_on_with_or_replaced(run: Run, scene: Path) -> None:
     path = scene.with_name("felt.hdbrec")
     args = (*feel(*PLAY, "--seconds", 0.2), "--record", path)
     assert run(*args)[0] == 0
-    first = len(Recording(path))
+    first = recorded(path)
     refused(run(*args), "is there already", "--append", "--replace")
     assert run(*args, "--append")[0] == 0
-    both = len(Recording(path))
-    assert both > first > 0
+    both = recorded(path)
+    assert 0 < len(first) < len(both)
+    assert both[: len(first)].tobytes() == first.tobytes()
     assert run("replay", path)[0] == 0
     refused(run(*args, "--replace", "--processor", 4095), "processor 4095")
-    assert len(Recording(path)) == both
+    assert recorded(path).tobytes() == both.tobytes()
     assert run(*args, "--replace")[0] == 0
-    assert 0 < len(Recording(path)) < both
+    assert recorded(path)[:1].tobytes() != first[:1].tobytes()
 
 
 def test_a_database_that_is_gone_is_told_while_the_session_runs(scene: Path) -> None:
@@ -302,8 +305,10 @@ def test_ctrl_c_before_the_first_frame_is_one_line(scene: Path) -> None:
         process.send_signal(signal.SIGINT)
         out, err = process.communicate(timeout=PATIENCE)
     assert process.returncode == 130
-    assert out == ""
-    assert "hapticdb: interrupted" in err.splitlines()
+    if out:  # it was quicker than the signal
+        assert "hapticdb: ended by Ctrl-C" in err
+    else:
+        assert "hapticdb: interrupted" in err.splitlines()
     until(lambda: not any(map(is_alive, started)))
 
 
@@ -314,5 +319,8 @@ def test_sigterm_before_the_first_frame_leaves_nothing(scene: Path) -> None:
         until(path.exists, every=0.002)
         process.send_signal(signal.SIGTERM)
         out, err = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, out, err) == (143, "", "")
-    assert not path.exists()
+    assert process.returncode == 143
+    if out:  # it was quicker than the signal
+        assert len(recorded(path))
+    else:
+        assert (err, path.exists()) == ("", False)

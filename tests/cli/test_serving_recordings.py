@@ -10,7 +10,7 @@ import pytest
 
 import hapticdb
 from banded import write_points
-from children import child, until
+from children import PATIENCE, child, until
 from hapticdb import Grid
 from hapticdb.cli.root import TERMINATED
 from hapticdb.recording.file import Recording
@@ -42,10 +42,11 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
         (token,) = parse_qs(address.query)["token"]
         with browser_at(address.netloc, Authorization=f"Bearer {token}") as browser:
             person = PagePerson(browser)
-            until(lambda: _is_recording(person))
+            until(lambda: (person.look(), "Touches nothing" in "".join(person.received))[1])
+            person.press("Record")
             until(lambda: (person.look(), _size(folder) > 20_000)[1])
             server.send_signal(signal.SIGTERM)
-            assert server.wait(60.0) == TERMINATED
+            assert server.wait(PATIENCE) == TERMINATED
     (path,) = _recorded(folder)
     recording = Recording(path)
     assert recording.damaged_at is None
@@ -54,14 +55,6 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
         found = replay(recording, env)
     assert found.is_equal
     assert found.n_compared > 100
-
-
-def _is_recording(person: PagePerson) -> bool:
-    """Press the button until it says that it records: the session begins some time later."""
-    person.find("Record")
-    person.press("Record")
-    person.look(1.0)
-    return "Stop" in person.labels()
 
 
 def _size(folder: Path) -> int:

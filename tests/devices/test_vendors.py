@@ -17,7 +17,8 @@ from devices.fake_haply import IDENTITY, FakeHaply, vector
 from devices.fake_hd import INVALID_HANDLE, FakeHd
 from devices.fake_hd import install as install_hd
 from hapticdb.devices.protocol import Device, SupportsClose, SupportsOpen
-from hapticdb.devices.vendors import VelocityWindow, load
+from hapticdb.devices.vendors import VelocityWindow, load, openhaptics
+from hapticdb.devices.vendors import haply as haply_module
 from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
 from hapticdb.devices.vendors.haply import HaplyDevice
 from hapticdb.devices.vendors.openhaptics import OpenHapticsDevice
@@ -33,13 +34,15 @@ def dhd(monkeypatch: pytest.MonkeyPatch) -> FakeDhd:
 
 @pytest.fixture
 def hd(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHd]:
+    monkeypatch.setattr(openhaptics, "SILENCE", PATIENCE)  # a busy machine is no silent device
     fake = install_hd(monkeypatch)
     yield fake
     fake.stop_scheduler()
 
 
 @pytest.fixture
-def haply() -> Iterator[FakeHaply]:
+def haply(monkeypatch: pytest.MonkeyPatch) -> Iterator[FakeHaply]:
+    monkeypatch.setattr(haply_module, "SILENCE", PATIENCE)
     with FakeHaply() as fake:
         yield fake
 
@@ -247,17 +250,13 @@ def test_openhaptics_that_fails_to_start_is_let_go(hd: FakeHd, code: int) -> Non
 
 
 def test_openhaptics_that_goes_silent_is_told(hd: FakeHd) -> None:
-    device = opened(OpenHapticsDevice())
-    hd.is_plugged = False
-
-    def is_told() -> bool:
-        try:
-            device.read()
-        except DeviceError as error:
-            return "silent" in str(error)
-        return False
-
-    until(is_told)
+    now = [0.0]
+    device = opened(OpenHapticsDevice(clock=lambda: now[0]))
+    hd.unplug()
+    device.read()
+    now[0] = PATIENCE + 0.1
+    with pytest.raises(DeviceError, match="silent"):
+        device.read()
     device.close()
 
 
@@ -342,13 +341,14 @@ def test_haply_without_the_service_is_told(haply: FakeHaply) -> None:
 
 @pytest.mark.parametrize("stops", [False, True])
 def test_haply_that_goes_silent_or_whose_service_stops_is_told(
-    haply: FakeHaply, stops: bool
+    haply: FakeHaply, stops: bool, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     device = opened(HaplyDevice(url=haply.url))
     device.read()
     if stops:
         haply.unplug()
     haply.answers = False
+    monkeypatch.setattr(haply_module, "SILENCE", 0.1)
     with pytest.raises(DeviceError, match="is gone"):
         device.read()
     if stops:

@@ -12,7 +12,7 @@ from typing import NoReturn
 
 import pytest
 
-from children import joined, until
+from children import PATIENCE, joined, until
 from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.hosting.attached import serve_attached
@@ -25,8 +25,6 @@ from realtime.hands import at
 
 ABOVE = at(0.0, 0.0, 0.02)
 """A pose of the ball of 12 mm over the floor at z = 0."""
-PATIENCE = 30.0
-"""Seconds in which the host must do what takes it milliseconds."""
 
 
 @pytest.fixture(scope="module")
@@ -53,7 +51,7 @@ def is_recorded_further(host: SessionHost, session: HostedSession) -> None:
     """Wait until frames are added to the recording."""
     recording = recording_of(host, session)
     before = len(recording)
-    until(lambda: len(recording) > before, patience=PATIENCE)
+    until(lambda: len(recording) > before)
 
 
 def full(*_: object, **__: object) -> NoReturn:
@@ -125,7 +123,7 @@ def test_looking_after_sessions_survives_errors_and_logs_each_once(
         with monkeypatch.context() as patch:
             patch.setattr(host.cells[0], "supervise", fail)
             patch.setattr(host._running[session.id], "take_frames", fail)
-            until(lambda: len(rounds) > 10, patience=PATIENCE)
+            until(lambda: len(rounds) > 10)
             is_recorded_further(host, other)
     finally:
         other.end()
@@ -165,7 +163,7 @@ def test_a_slow_begin_keeps_no_recording_waiting_and_hides_no_death(
             is_recorded_further(host, session)
             assert len(host.cells) == 1
             os.kill(host.pids[0], signal.SIGKILL)
-            until(lambda: session.is_over, patience=PATIENCE)
+            until(lambda: session.is_over)
         finally:
             may_go_on.set()
             joined(thread)

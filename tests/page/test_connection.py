@@ -3,17 +3,16 @@
 import json
 import socket
 from collections.abc import Iterator
-from contextlib import contextmanager, suppress
+from contextlib import suppress
 from typing import NamedTuple
 
 import pytest
 import viser
-from websockets.datastructures import Headers
+from websockets.datastructures import Headers, HeadersLike
 from websockets.exceptions import ConnectionClosed
-from websockets.sync.client import connect
-from websockets.sync.connection import Connection
+from websockets.sync.client import ClientConnection, connect
 
-from children import until
+from children import PATIENCE, until
 from hapticdb.page.connection import (
     BREAKS_RULES,
     LATE,
@@ -44,7 +43,7 @@ class Page(NamedTuple):
 @pytest.fixture
 def page() -> Iterator[Page]:
     ours, theirs = socket.socketpair()
-    ours.settimeout(20.0)
+    ours.settimeout(PATIENCE)
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     link = PageConnection(theirs.detach(), "the secret")
     link.guard(server)
@@ -53,12 +52,16 @@ def page() -> Iterator[Page]:
     ours.close()
 
 
-@contextmanager
-def entered(page: Page, role: str) -> Iterator[Connection]:
+def reached(page: Page, headers: HeadersLike) -> ClientConnection:
+    """A connection to the page with these headers."""
+    return connect(
+        page.address, additional_headers=headers, subprotocols=PROTOCOL, open_timeout=PATIENCE
+    )
+
+
+def entered(page: Page, role: str) -> ClientConnection:
     """A browser that is connected as the server connects it."""
-    headers = {SECRET: "the secret", NAME: "Guest 1", ROLE: role}
-    with connect(page.address, additional_headers=headers, subprotocols=PROTOCOL) as browser:
-        yield browser
+    return reached(page, {SECRET: "the secret", NAME: "Guest 1", ROLE: role})
 
 
 def said(ours: socket.socket) -> dict[str, object]:
@@ -71,7 +74,7 @@ def said(ours: socket.socket) -> dict[str, object]:
 
 def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> None:
     with entered(page, "toucher") as browser:
-        assert browser.recv(timeout=20.0)
+        assert browser.recv(timeout=PATIENCE)
         assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
     until(lambda: _is_gone(page.link))
 
@@ -100,9 +103,9 @@ def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
     page.server.scene.add_label("/secret", "secret")
     named = Headers(shown)
     named.update({NAME: "Guest 1", ROLE: "editor"})
-    with connect(page.address, additional_headers=named, subprotocols=PROTOCOL) as browser:
+    with reached(page, named) as browser:
         with pytest.raises(ConnectionClosed) as closed:
-            browser.recv(timeout=20.0)
+            browser.recv(timeout=PATIENCE)
         assert closed.value.rcvd is not None
         assert closed.value.rcvd.code == LATE
     assert said(page.ours)["word"] == "refused"

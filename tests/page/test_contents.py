@@ -1,5 +1,6 @@
 """What browsers draw is what the files hold, less what they hide, at the places of now."""
 
+from functools import cache
 from pathlib import Path
 from typing import Any, cast
 
@@ -115,6 +116,10 @@ def test_equal_parts_are_one_node_and_a_mirrored_one_is_drawn_too(shown: Shown) 
     assert len(shown.scene.nodes) < 10
 
 
+shown_once = cache(Shown)
+"""Contents that the examples of a test share."""
+
+
 @settings(max_examples=15, deadline=None)
 @given(
     st.sets(st.integers(1, 34)),
@@ -125,7 +130,7 @@ def test_equal_parts_are_one_node_and_a_mirrored_one_is_drawn_too(shown: Shown) 
 def test_one_browser_hides_marks_and_fades_for_itself(
     path: Path, hidden: set[int], marked: set[int], shade: Colour | Rgba, rounds: int
 ) -> None:
-    shown, own = _SHOWN.setdefault(path, Shown(path)), RecordedScene()
+    shown, own = shown_once(path), RecordedScene()
     state: dict[str, set[int]] = {"hidden": set(), "marked": set()}
 
     def sight(member: Member) -> Colour | Rgba | None:
@@ -148,9 +153,6 @@ def test_one_browser_hides_marks_and_fades_for_itself(
         assert own.nodes == {}  # it sees the shared nodes again
     shown.contents.leave("one")
     assert are_same(drawn(shown.scene), shown.of(everything))
-
-
-_SHOWN: dict[Path, Shown] = {}
 
 
 def placed(obj: Object, seed: int) -> NDArray[np.float64]:

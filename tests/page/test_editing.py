@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from children import until
+from children import PATIENCE, until
 from hapticdb.errors import ConflictError, HapticDBError, UsageError
 from hapticdb.page import database
 from hapticdb.page.editing import Edits
@@ -34,7 +34,7 @@ def done(edits: Edits, person: int, job: Any) -> Any:  # noqa: ANN401 - a job's 
         is_done.set()
 
     edits.ask(person, job, keep, keep)
-    assert is_done.wait(60.0)
+    assert is_done.wait(PATIENCE)
     return found[0]
 
 
@@ -61,7 +61,7 @@ def test_no_caller_waits_for_the_database_and_one_connection_serves_all(
     answers: list[object] = []
 
     def wait_and_open(*args: Any, **options: Any) -> Any:  # noqa: ANN401
-        assert may_go_on.wait(60.0)
+        assert may_go_on.wait(PATIENCE)
         opened.append(threading.current_thread())
         if len(opened) == 1:
             raise HapticDBError("the server is away")

@@ -9,13 +9,10 @@ from typing import Any
 import numpy as np
 import pytest
 
-from children import until
+from children import PATIENCE, until
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
-
-PATIENCE = 30.0
-"""Seconds in which workers must do what takes them microseconds."""
 
 
 class FakeSession:
@@ -109,8 +106,8 @@ def person(host: FakeHost) -> Iterator[Person]:
     with ThreadPoolExecutor(4) as workers:
         made = Person(host, workers)
         made.begin_anew()
-        until(lambda: made.session is not None, patience=PATIENCE)
-        until(lambda: made.is_idle, patience=PATIENCE)
+        until(lambda: made.session is not None)
+        until(lambda: made.is_idle)
         made.said.clear()
         yield made
         host.may_begin.set()
@@ -122,7 +119,7 @@ def test_a_lost_session_is_ended_in_the_host_and_the_panel_knows(
     host.begun[0].is_over = True
     for n in range(3):
         person.tick(float(n))
-    until(lambda: len(host.begun) == 2 and person.is_idle, patience=PATIENCE)
+    until(lambda: len(host.begun) == 2 and person.is_idle)
     assert host.begun[0].n_ends == 1
     assert person.session is host.begun[1]  # type: ignore[comparison-overlap]
     assert person.said.count("session_ended") == person.said.count("rest") == 1
@@ -149,7 +146,7 @@ def test_a_tool_that_is_taken_six_times_at_once_is_drawn_once_at_a_time(
     person.drawing = SimpleNamespace(hold=hold, rest=lambda: None)  # type: ignore[assignment]
     with ThreadPoolExecutor(6) as viser:
         list(viser.map(press, range(6)))
-    until(lambda: person.is_idle, patience=PATIENCE)
+    until(lambda: person.is_idle)
     assert together == [1] * 6
     assert sum(not session.is_over for session in host.begun) == 1
 
@@ -158,10 +155,10 @@ def test_a_lost_session_of_a_browser_that_goes_is_ended(host: FakeHost, person: 
     host.may_begin.clear()
     host.begun[0].is_over = True
     person.tick(0.0)
-    until(lambda: host.n_asked == 2, patience=PATIENCE)
+    until(lambda: host.n_asked == 2)
     person.close()
     host.may_begin.set()
-    until(lambda: person.is_idle and len(host.begun) == 2, patience=PATIENCE)
+    until(lambda: person.is_idle and len(host.begun) == 2)
     assert [one.n_ends for one in host.begun] == [1, 1]
     assert person.session is None
     assert person.said[-2:] == ["unshare", "rest"]
@@ -172,7 +169,7 @@ def test_a_begin_that_fails_takes_force_and_tool_out_of_view(
 ) -> None:
     host.is_failing = True
     person.begin_anew()
-    until(lambda: person.told, patience=PATIENCE)
+    until(lambda: person.told)
     assert person.told == ["Not done: no seat is free"]
     assert person.said == ["session_ended", "unshare", "rest"]
     assert person.session is None
@@ -184,14 +181,14 @@ def test_many_quick_wishes_take_one_worker_and_the_newest_is_done(
 ) -> None:
     host.may_begin.clear()
     person.begin_anew()
-    until(lambda: host.n_asked == 2, patience=PATIENCE)
+    until(lambda: host.n_asked == 2)
     for _ in range(8):
         person.begin_anew()
     person.hand = np.array([0.0, 0.0, 0.5, 1.0, 0.0, 0.0, 0.0])
     free = person.site.workers.submit(lambda: "free")
     assert free.result(PATIENCE) == "free"  # other browsers' workers
     host.may_begin.set()
-    until(lambda: person.is_idle, patience=PATIENCE)
+    until(lambda: person.is_idle)
     assert len(host.begun) == 3  # the first, the slow one, and one for the eight
     assert host.begun[-1].start[2, 3] == 0.5
     assert [one.n_ends for one in host.begun] == [1, 1, 0]
@@ -204,7 +201,7 @@ def test_a_recording_that_lost_frames_tells_so_at_its_end(host: FakeHost, person
     person.tick(0.1)
     host.begun[0].lost_at_end = 7
     person.begin_anew()
-    until(lambda: len(host.begun) == 2 and person.is_idle, patience=PATIENCE)
+    until(lambda: len(host.begun) == 2 and person.is_idle)
     assert [one.partition(" were lost")[0] for one in person.told] == [
         "Recording incomplete: 1,200 frames", "Recording incomplete: 7 frames"
     ]  # fmt: skip

@@ -50,7 +50,12 @@ class Slow:
 
     def __init__(self, hand: Player, every: int, seconds: float) -> None:
         self.hand, self.every, self.seconds = hand, every, seconds
-        self.reads = 0
+        self.reads, self.over_after = 0, 1 << 30
+
+    @property
+    def is_over(self) -> bool:
+        """Whether it was read so often that it ends, however long that took."""
+        return self.reads >= self.over_after
 
     def read(self) -> Reading:
         self.reads += 1
@@ -63,7 +68,11 @@ class Slow:
 
 
 class Clutched(Slow):
-    """A hand whose first button changes between down and up every 100 reads."""
+    """A hand whose first button changes between down and up every 100 reads; it ends after 500."""
+
+    def __init__(self, hand: Player) -> None:
+        super().__init__(hand, 1 << 30, 0.0)
+        self.over_after = 500
 
     def read(self) -> Reading:
         reading = super().read()

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from hapticdb import PointShell, TangentPlane
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Device
+from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
@@ -22,7 +23,7 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.timing import Timing
 from hapticdb.recording.frame import State
 from hapticdb.testing import floor_voxels, write_voxels
-from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, still, stroking
+from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, at, still, stroking
 from realtime.worlds import make
 
 N_RING = 4096
@@ -77,7 +78,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
 
 def test_a_loop_ends_with_its_device_and_leaves_no_force(run: Run) -> None:
     applied: list[Floats] = []
-    hand = stroking(0.010, 0.2)
+    hand = Player([0.0, 0.2], [at(0.0, 0.0, 0.010)] * 2)
     hand.apply = applied.append  # type: ignore[assignment]
     answer, counts, frames = run(hand, seconds=1e9)
     # a frame's time is its deadline; a late frame reads the device later than that, and whether
@@ -100,8 +101,8 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 
 def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:
-    hand = Clutched(stroking(0.010, 0.5), 1 << 30, 0.0)
-    _, _, frames = run(hand, handle=Handle(clutch=0), seconds=1.0)
+    hand = Clutched(stroking(0.010, 0.5))
+    _, _, frames = run(hand, handle=Handle(clutch=0), seconds=60.0)
     is_open = frames["state"] & State.CLUTCH_OPEN > 0
     assert is_open.any()
     assert not is_open.all()
@@ -137,7 +138,8 @@ def test_a_hand_that_never_knows_its_place_is_an_error(
 def test_while_a_reading_is_no_place_the_force_falls_and_the_loop_goes_on(run: Run) -> None:
     nowhere = np.full(6, np.nan)
     hand = Odd(still(0.010), lambda r: r._replace(velocity=nowhere), first=60, n_reads=50)
-    answer, counts, frames = run(hand, seconds=0.5)
+    hand.over_after = 250
+    answer, counts, frames = run(hand, seconds=60.0)
     assert counts["nowhere_frames"] == 50
     assert str(answer.bad_reading).startswith("Odd.read() returned numbers that are not finite")
     assert np.isfinite(frames["tool"]).all()

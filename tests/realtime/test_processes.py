@@ -160,7 +160,7 @@ def test_it_ends_with_a_session_that_was_killed(forks: bool) -> None:
         session.kill()
         session.wait(PATIENCE)
         try:
-            until(lambda: not Path(f"/proc/{pid}").exists())
+            until(lambda: not is_alive(pid))
         finally:
             if forks:
                 os.kill(forked, signal.SIGKILL)

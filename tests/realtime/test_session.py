@@ -22,7 +22,7 @@ from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
-from hapticdb.recording.file import Recorder, Recording
+from hapticdb.recording.file import CHUNK, Recorder, Recording
 from hapticdb.recording.frame import State
 from hapticdb.recording.replay import replay
 from hapticdb.resident.table import is_alive
@@ -93,7 +93,8 @@ def play(cells: ResidentCells, shell: PointShell, path: Path, law: LawName) -> P
 
 
 def test_a_session_ends_with_its_device(by_law: Played) -> None:
-    assert by_law.report.loop.seconds == pytest.approx(1.0, abs=0.1)
+    loop = by_law.report.loop
+    assert 0.9 <= loop.seconds <= 1.1 + loop.lateness.worst  # its last frame may be late
     assert not is_alive(by_law.loop_pid)
 
 
@@ -150,7 +151,9 @@ def test_wrenches_are_those_of_a_touch_bit_for_bit(by_law: Played) -> None:
 def test_a_session_is_waited_for_in_steps_and_stopped(
     cells: ResidentCells, sphere: PointShell
 ) -> None:
-    with Session(cells, sphere, still(0.010), law="plane", rate=RATE) as session:
+    with Session(
+        cells, sphere, still(0.010), law="plane", rate=RATE, staleness=NEVER_STALE
+    ) as session:
         until(lambda: session.n_frames > 100, session)
         last = session.last()
         assert last is not None
@@ -191,7 +194,9 @@ def test_a_loop_that_is_killed_is_one_clear_error(
     assert "\n" not in str(raised.value)
     n_frames = sum(map(len, Recording(path).frames()))
     assert n_frames > 50
-    with Session(cells, sphere, still(0.010), law="plane", rate=RATE, seconds=0.1) as session:
+    with Session(
+        cells, sphere, still(0.010), law="plane", rate=RATE, seconds=0.1, staleness=NEVER_STALE
+    ) as session:
         report = session.wait(PATIENCE)  # the cells are still usable
     assert report is not None
     assert report.hit_frames == report.loop.frames
@@ -207,13 +212,13 @@ def test_a_session_that_is_closed_without_waiting_has_recorded_all(
     assert len(recorded(path)) >= n_frames
 
 
-def test_what_is_recorded_reaches_the_file_within_a_second(
+def test_what_is_recorded_reaches_the_file_long_before_a_chunk_is_full(
     cells: ResidentCells, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "slow.hdbrec"
     with Session(cells, sphere, still(0.010), law="plane", rate=50.0, record=path) as session:
-        assert session.wait(1.5) is None
-        assert sum(map(len, Recording(path).frames())) > 10
+        until(lambda: sum(map(len, Recording(path).frames())) > 10, session)
+        assert session.n_frames < CHUNK // 2
 
 
 @pytest.mark.parametrize(

@@ -21,7 +21,7 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
 from hapticdb.recording.replay import replay
-from realtime.hands import at, still
+from realtime.hands import Beckoned, at, still
 from realtime.sessions import NEVER_STALE, RATE, floor_points, floored, recorded, until
 from realtime.worlds import SIZE, make
 
@@ -157,16 +157,18 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
 ) -> None:
     inside = SIZE * (HEIGHT - 32.0)
     low = inside + ONSET + RADIUS - 0.004
-    hand = Player(
-        np.array([0.0, 0.5, 0.7, 0.9, 1.9, 2.1]),
-        [at(0.0, 0.0, z) for z in (inside, inside, 0.03, low, low, 0.03)],
+    path = Player(
+        np.array([0.0, 0.2, 0.4, 1.4, 1.6]),
+        [at(0.0, 0.0, z) for z in (inside, 0.03, low, low, 0.03)],
     )
+    hand = Beckoned(path, tmp_path / "come")
     with Session(
         cells, ball, hand, rate=RATE, staleness=NEVER_STALE, record=tmp_path / "s.hdbrec"
     ) as session:
         until(lambda: session.is_loose and session.loose_objects == (1,), session)
-        until(lambda: not session.is_loose, session)
+        hand.path.touch()
         report = session.wait(PATIENCE)
+        assert not session.is_loose
     assert report is not None
     frames = recorded(tmp_path / "s.hdbrec")
     is_loose = frames["state"] & State.IN_OBJECT > 0

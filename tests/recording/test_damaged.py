@@ -14,7 +14,7 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from children import exit_code
+from children import exit_code, until
 from draws import drawn
 from hapticdb.errors import FileError
 from hapticdb.recording.chunks import HEAD, MOST_FRAMES, Chunk
@@ -60,6 +60,7 @@ def test_a_killed_recorder_leaves_whole_chunks(tmp_path: Path) -> None:
     Recorder(path, HEADER).close()
     n_before = 0
     for _ in range(8):
+        before = path.stat().st_size
         child = os.fork()
         if child == 0:
             try:
@@ -69,7 +70,8 @@ def test_a_killed_recorder_leaves_whole_chunks(tmp_path: Path) -> None:
                     recorder.flush()
             finally:
                 os._exit(1)
-        time.sleep(rng.uniform(0.02, 0.1))
+        until(lambda b=before: path.stat().st_size > b, every=0.001)  # type: ignore[misc]
+        time.sleep(rng.uniform(0.0, 0.08))
         os.kill(child, signal.SIGKILL)
         assert exit_code(child) == -signal.SIGKILL
         n_frames = len(Recording(path))

@@ -78,10 +78,10 @@ def stalling(answer: Callable[[ServerConnection], None], port: int = 0) -> Itera
 
     def work(connection: ServerConnection) -> None:
         with suppress(ConnectionClosed):
-            connection.recv(30)
+            connection.recv(PATIENCE)
             answer(connection)
             while True:
-                connection.recv(30)
+                connection.recv(PATIENCE)
 
     with serve(work, "127.0.0.1", port, compression=None) as server:
         thread = threading.Thread(target=server.serve_forever, daemon=True)

@@ -9,6 +9,7 @@ import pytest
 
 from children import PATIENCE, child, until
 from hapticdb.kernels._cache import IN_WORKER, LENT
+from hapticdb.resident.table import is_alive
 from page_person import PagePerson
 from serving import browser_at
 
@@ -42,5 +43,5 @@ def test_the_page_is_there_before_the_kernels_and_a_closed_server_compiles_no_mo
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=PATIENCE)
     assert told in said
-    compiling = [Path("/proc", file.stem) for file in tmp_path.glob("*.pid")]
-    until(lambda: not any(file.exists() for file in compiling))
+    compiling = [int(file.stem) for file in tmp_path.glob("*.pid")]
+    until(lambda: not any(map(is_alive, compiling)))

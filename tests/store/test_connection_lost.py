@@ -163,8 +163,6 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
     server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server and its children are stopped: the connection stays, and nothing answers."""
-    monkeypatch.setattr(link, "SILENCE_S", 0.3)
-    monkeypatch.setattr(link, "ANSWER_S", 1.0)
     with small(url, file) as env:
         pid = server._postmaster()
         assert pid is not None
@@ -172,8 +170,11 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
         try:
             for member in family:
                 os.kill(member, signal.SIGSTOP)
-            with pytest.raises(StuckError, match="did not answer a new client") as told:
-                env.move(7, PLACE)
+            with monkeypatch.context() as patch:
+                patch.setattr(link, "SILENCE_S", 0.3)
+                patch.setattr(link, "ANSWER_S", 1.0)
+                with pytest.raises(StuckError, match="did not answer a new client") as told:
+                    env.move(7, PLACE)
         finally:
             for member in family:
                 os.kill(member, signal.SIGCONT)

@@ -7,6 +7,7 @@ import shutil
 import signal
 import sys
 import tempfile
+import threading
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
@@ -199,20 +200,17 @@ def test_what_was_written_outlives_a_kill(server: PrivateServer) -> None:
 def test_a_start_waits_for_the_children_of_a_killed_server(server: PrivateServer) -> None:
     server.start()
     write(server)
-    busy = psycopg.connect(server.conninfo())
-    # this backend is too busy to notice that its parent has ended
-    loop = b"DO 'DECLARE t timestamptz := clock_timestamp(); BEGIN WHILE clock_timestamp() < t +"
-    loop += b" interval ''1 s'' LOOP NULL; END LOOP; END'"
-    busy.pgconn.send_query(loop)
-    backend = busy.info.backend_pid
-    parent = pid_of(server)
-    os.kill(parent, signal.SIGKILL)
-    until(lambda: private_server._parent_of(backend) != parent, every=0.001)
-    assert private_server._parent_of(backend) is not None
-    server.start()
-    assert private_server._parent_of(backend) is None
-    assert holds(server)
-    busy.close()
+    with psycopg.connect(server.conninfo()) as client:
+        backend, parent = client.info.backend_pid, pid_of(server)
+        os.kill(backend, signal.SIGSTOP)  # it does not notice that its parent has ended
+        os.kill(parent, signal.SIGKILL)
+        until(lambda: private_server._parent_of(backend) != parent, every=0.001)
+        assert private_server._parent_of(backend) is not None
+        threading.Timer(0.5, os.kill, (backend, signal.SIGCONT)).start()
+        server.start()
+        assert private_server._parent_of(backend) is None
+        assert holds(server)
+        client.close()
 
 
 @pytest.mark.long

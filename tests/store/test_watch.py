@@ -12,6 +12,7 @@ import pytest
 from psycopg import sql
 
 import hapticdb
+from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.store.connect import create_store
 from hapticdb.store.postgres import watching
@@ -178,7 +179,7 @@ def test_the_channel_and_its_payload_are_as_documented(url: str, admin: psycopg.
     admin.execute(sql.SQL("LISTEN {}").format(sql.Identifier(channel)))
     write(url)
     write(url)
-    heard = admin.notifies(timeout=10, stop_after=2)
+    heard = admin.notifies(timeout=PATIENCE, stop_after=2)
     assert [(n.channel, n.payload) for n in heard] == [(channel, "1"), (channel, "2")]
 
 

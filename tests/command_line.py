@@ -68,6 +68,13 @@ def refused(result: tuple[int, str, str], *words: str) -> str:
     return lines[0]
 
 
+def succeeded(result: tuple[int, str, str]) -> str:
+    """Check that a command ended well and complained of nothing; returns its standard output."""
+    code, out, err = result
+    assert (code, err) == (0, ""), result
+    return out
+
+
 def boxes(path: Path, count: int = 3, side: float = 0.1, subdivisions: int = 0) -> Path:
     """A file of boxes in a row along x, 0.2 m apart."""
     scene = trimesh.Scene()

@@ -114,6 +114,13 @@ def test_data() -> Path | None:
 
 
 @pytest.fixture(scope="session")
+def real_files(test_data: Path | None) -> Path:
+    if test_data is None:
+        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no real files to read")
+    return test_data
+
+
+@pytest.fixture(scope="session")
 def sphere() -> PointShell:
     """300 points on a sphere of 12 mm about the tool's origin, normals inward."""
     out = fibonacci_sphere(300)

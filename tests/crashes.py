@@ -123,9 +123,9 @@ class Killer:
         if progress.parts_done == self._n_parts:
             self._timer.start()
         elif progress.parts_done == self._n_parts + 4:
-            self.wait()
+            self.joined()
 
-    def wait(self) -> None:
+    def joined(self) -> None:
         """Wait until the function has returned."""
         joined(self._timer)
 

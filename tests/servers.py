@@ -15,10 +15,12 @@ import os
 import signal
 from collections.abc import Callable, Iterator
 from functools import cache
+from pathlib import Path
+from urllib.parse import quote, urlencode
 
 import psycopg
 import pytest
-from psycopg import sql
+from psycopg import conninfo, sql
 
 import children
 from hapticdb.resident.table import is_alive
@@ -44,10 +46,14 @@ def _found() -> list[Binaries | str]:
 
 
 FOUND = _found()
+ENGINES: list[Binaries | str | None] = [None, *FOUND]
+"""SQLite, and every server: `url_on` gives an environment's URL there."""
 
 
-def named(found: Binaries | str) -> str:
-    """Name of a server, as tests show it."""
+def named(found: Binaries | str | None) -> str:
+    """Name of an engine, as tests show it."""
+    if found is None:
+        return "sqlite"
     return "postgres" if isinstance(found, str) else f"postgres{found.major}"
 
 
@@ -92,20 +98,39 @@ def database(request: pytest.FixtureRequest) -> str:
     return base_url(request.param)
 
 
-@pytest.fixture
-def place(database: str) -> Iterator[Place]:
+@contextlib.contextmanager
+def places(database: str) -> Iterator[Place]:
+    """Places of a database."""
     given: list[str] = []
 
     def new() -> str:
         given.append(f"test_{os.getpid()}_{next(_numbers)}")
         return with_environment(database, given[-1])
 
-    yield new
-    with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
-        for name in given:
-            drop = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(sql.Identifier(name))
-            connection.execute("SET client_min_messages = warning")
-            connection.execute(drop)
+    try:
+        yield new
+    finally:
+        with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
+            for name in given:
+                drop = sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(sql.Identifier(name))
+                connection.execute("SET client_min_messages = warning")
+                connection.execute(drop)
+
+
+@pytest.fixture
+def place(database: str) -> Iterator[Place]:
+    with places(database) as new:
+        yield new
+
+
+@contextlib.contextmanager
+def url_on(engine: Binaries | str | None, folder: Path) -> Iterator[str]:
+    """URL of an environment that does not exist yet; a server drops it at the end."""
+    if engine is None:
+        yield str(folder / "e.db")
+        return
+    with places(base_url(engine)) as new:
+        yield new()
 
 
 @pytest.fixture
@@ -113,3 +138,28 @@ def admin(database: str) -> Iterator[psycopg.Connection]:
     """A plain connection as the owner, to ask the server itself."""
     with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
         yield connection
+
+
+PASSWORD = "of-a-test"  # noqa: S105 - of roles that live as long as a test
+
+
+@contextlib.contextmanager
+def roles(admin: psycopg.Connection, *names: str, password: str = PASSWORD) -> Iterator[None]:
+    """Roles of the server that may log in."""
+    quoted = [sql.Identifier(name) for name in names]
+    for name in quoted:
+        admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(name, password))
+    try:
+        yield
+    finally:
+        for name in quoted:
+            admin.execute(sql.SQL("DROP OWNED BY {}").format(name))
+            admin.execute(sql.SQL("DROP ROLE {}").format(name))
+
+
+def url_as(url: str, role: str, password: str = PASSWORD) -> str:
+    """URL of the same environment for another user."""
+    address = parse(url)
+    known = conninfo.conninfo_to_dict(address.conninfo)
+    wanted = {**known, "user": role, "password": password, "environment": address.environment}
+    return f"postgresql:///?{urlencode(wanted, quote_via=quote)}"

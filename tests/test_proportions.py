@@ -13,7 +13,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
-from command_line import Run, made, poses, refused, run, scene, tool  # noqa: F401 - fixtures
+from command_line import Run, made, poses, refused, run, scene, succeeded, tool  # noqa: F401 - fixtures
 from hapticdb import Object, PointShell, Proportions, compare_proportions
 from hapticdb.errors import UsageError
 from hapticdb.poses import rotation_of
@@ -212,8 +212,7 @@ def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
     record = json.loads(out)["proportions"]
     assert [(m["what"], m["unit"]) for m in record["misfits"]] == [("path", "mm")]
     assert run(*args, "--as-given")[0] == 0
-    code, out, err = run(*args, "--path-unit", "mm")
-    assert (code, err) == (0, "")
+    succeeded(run(*args, "--path-unit", "mm"))
 
 
 def test_touch_says_that_no_pose_is_near(run: Run, scene: Path) -> None:

@@ -29,7 +29,7 @@ from hapticdb.resident import mirror
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.testing import blob, write_voxels
 from query import test_second_law as second
-from realtime.worlds import cloud, make, poses_in
+from realtime.worlds import cloud, make, poses_in, random_shell
 
 BOUND = 1e-12
 """Largest difference from the processor's sum, relative to it."""
@@ -104,7 +104,7 @@ def a_law_that_no_kernel_knows_is_felt(folder: Path) -> None:
     with hapticdb.create(folder / "e.db", Grid(second.SIZE, second.ORIGIN, second.BITS)) as env:
         for seed, center in ((1, (20, 20, 20)), (2, (26, 22, 20))):
             write_voxels(env.store, blob(seed, center), f"blob {seed}")
-        shell = second.shell_of(60)
+        shell = random_shell(60, 60, 8.0, second.SIZE)
         found = env.touch(shell, poses=second.poses(), law=second.Penalty(), device="cuda")
     assert found.hits.any()
     for n, pose in enumerate(second.poses()):

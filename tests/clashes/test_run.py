@@ -10,13 +10,12 @@ import time
 from collections.abc import Callable, Collection
 from contextlib import closing
 from pathlib import Path
-from urllib.parse import urlencode
 
 import numpy as np
 import psycopg
 import pytest
 import trimesh
-from psycopg import conninfo, sql
+from psycopg import sql
 
 import hapticdb
 from assemblies import row_of_boxes
@@ -28,7 +27,7 @@ from hapticdb.store.connect import grant
 from hapticdb.store.pairs import PairRow
 from hapticdb.store.postgres.address import parse
 from hapticdb.transfer import copy_environment
-from servers import Place
+from servers import Place, roles, url_as
 
 MM = 1e-3
 Found = list[tuple[object, ...]]
@@ -347,12 +346,8 @@ def test_a_viewer_reads_and_an_editor_keeps(
 ) -> None:
     url = on_server(place, path)
     role = f"clashes_{os.getpid()}"
-    admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(sql.Identifier(role), role))
-    address = parse(url)
-    known = conninfo.conninfo_to_dict(address.conninfo)
-    theirs = {**known, "user": role, "password": role, "environment": address.environment}
-    their_url = f"postgresql:///?{urlencode(theirs)}"
-    try:
+    their_url = url_as(url, role)
+    with roles(admin, role):
         grant(url, role, "toucher")
         with hapticdb.open(their_url) as env:
             found = find_clashes(env)
@@ -363,6 +358,3 @@ def test_a_viewer_reads_and_an_editor_keeps(
         grant(url, role, "viewer")
         with hapticdb.open(their_url, read_only=True) as env:
             assert find_clashes(env).kept == 3
-    finally:
-        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(role)))
-        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(role)))

@@ -8,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import hapticdb
-from command_line import Run, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
 
 TOUCH = ("--tool", "tool.npz", "--poses", "path.csv")
 
@@ -58,15 +58,13 @@ def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...
 
 
 def test_move_and_remove_take_several(run: Run, scene: Path) -> None:
-    code, out, err = run("move", scene, "box[01]", 3, "--translate", "0,0,0.01", "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("move", scene, "box[01]", 3, "--translate", "0,0,0.01", "--json"))
     assert [json.loads(line)["id"] for line in out.splitlines()] == [1, 2, 3]
     placed = ("--matrix", "1,0,0,0,0,1,0,0,0,0,1,0,0,0,0,1")
     refused(run("move", scene, "box*", *placed), "3 are chosen")
     refused(run("remove", scene, "box1", "cone*"), "no object 'cone*'")
     assert ids_in(scene) == [1, 2, 3]
-    code, out, err = run("remove", scene, "box1", "2,3", "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("remove", scene, "box1", "2,3", "--json"))
     assert [json.loads(line)["name"] for line in out.splitlines()] == ["box1", "box2"]
     assert ids_in(scene) == [1]
 

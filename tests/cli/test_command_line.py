@@ -22,6 +22,7 @@ from command_line import (  # noqa: F401 - fixtures among them
     refused,
     run,
     scene,
+    succeeded,
 )
 from hapticdb import cli
 from hapticdb.store import connect
@@ -34,8 +35,7 @@ HIDDEN = ("sample", "warm")
 
 
 def test_alone_it_shows_the_verbs(run: Run) -> None:
-    code, out, err = run()
-    assert (code, err) == (0, "")
+    out = succeeded(run())
     for verb in VERBS:
         assert re.search(rf"^\W*{verb}\s", out, re.MULTILINE), verb
     for verb in HIDDEN:
@@ -44,8 +44,7 @@ def test_alone_it_shows_the_verbs(run: Run) -> None:
 
 @pytest.mark.parametrize("verb", [*VERBS, *HIDDEN])
 def test_every_verb_has_help_with_an_example(run: Run, verb: str) -> None:
-    code, out, err = run(verb, "--help")
-    assert (code, err) == (0, "")
+    out = succeeded(run(verb, "--help"))
     assert max(map(len, out.splitlines())) <= 80
     assert f"Example: hapticdb {verb}" in " ".join(out.split())
 
@@ -131,8 +130,7 @@ def test_what_answers_at_once_loads_nothing_that_is_slow(
 
 def test_an_import_says_what_went_in(run: Run, tmp_path: Path) -> None:
     file = boxes(tmp_path / "boxes.glb")
-    code, out, err = run("import", "a.db", file, "--bits", 6)
-    assert (code, err) == (0, "")
+    out = succeeded(run("import", "a.db", file, "--bits", 6))
     assert "3 objects imported" in out
     assert "64^3 voxels" in out
 
@@ -154,16 +152,14 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
 
 def test_defects_are_counted_in_the_summary(run: Run, tmp_path: Path) -> None:
     (tmp_path / "nan.obj").write_text("v 0 0 0\nv 1 0 0\nv 0 1 0\nv nan 0 0\nf 1 2 3\nf 1 2 4\n")
-    code, out, err = run("import", "a.db", "nan.obj", "--bits", 4)
-    assert (code, err) == (0, "")
+    out = succeeded(run("import", "a.db", "nan.obj", "--bits", 4))
     assert "1 non-finite" in out
 
 
 @pytest.mark.parametrize("form", [["--origin", "-1,-2,-0.5"], ["--origin=-1,-2,-0.5"]])
 def test_a_negative_origin_is_read(run: Run, tmp_path: Path, form: list[str]) -> None:
     file = boxes(tmp_path / "boxes.glb")
-    code, _, err = run("import", "a.db", file, *form, "--voxel-size", 0.05, "--bits", 7)
-    assert (code, err) == (0, "")
+    succeeded(run("import", "a.db", file, *form, "--voxel-size", 0.05, "--bits", 7))
     assert json.loads(run("info", "a.db", "--json")[1])["origin"] == [-1, -2, -0.5]
 
 

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
 from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, CsvWriter, text_cell
 from hapticdb.recording.file import Header, Recorder, Recording
 from hapticdb.recording.frame import FRAME
@@ -32,8 +32,7 @@ def touches(folder: Path) -> list[hapticdb.Touch]:
 
 
 def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> None:
-    code, out, err = run(*TOUCH, "--csv", "felt.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run(*TOUCH, "--csv", "felt.csv"))
     assert "peak force" in out
     header, rows = table(scene.with_name("felt.csv").read_text())
     assert header == list(TOUCHED)
@@ -52,8 +51,7 @@ def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> Non
 
 
 def test_contacts_are_written_with_their_objects(run: Run, scene: Path) -> None:
-    code, out, err = run(*TOUCH, "--contacts-csv", "-")
-    assert (code, err) == (0, "")
+    out = succeeded(run(*TOUCH, "--contacts-csv", "-"))
     header, rows = table(out)
     assert header == list(CONTACTS)
     poses = hapticdb.read_poses(scene.with_name("path.csv"))
@@ -91,8 +89,7 @@ def test_names_are_text_to_a_spreadsheet_and_to_a_terminal(run: Run, scene: Path
         center = np.array(env.grid.origin) + env.grid.voxel_size * env.grid.side / 2
     x, y, z = center.tolist()
     scene.with_name("path.csv").write_text(f"x,y,z,qw,qx,qy,qz\n{x},{y},{z},1,0,0,0\n")
-    code, out, err = run(*TOUCH, "--contacts-csv", "-")
-    assert (code, err) == (0, "")
+    out = succeeded(run(*TOUCH, "--contacts-csv", "-"))
     assert "\x1b" not in out
     _, rows = table(out)
     shown = [

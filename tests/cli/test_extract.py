@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
 from disassembly_scenes import CHAIN, STACK
 from disassembly_scenes import made as made_of
 from extraction_scenes import enclosed, lid
@@ -19,8 +19,7 @@ from hapticdb.poses import write_poses
 def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
     """Three boxes in a row, 0.1 m apart: the middle one comes out to the side."""
     words = ("--motions", 0, "--out", 100)
-    code, out, err = run("extract", scene, "box1", *words, "--path", "out.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run("extract", scene, "box1", *words, "--path", "out.csv"))
     lines = out.splitlines()
     assert lines[0].startswith("comes out straight, 0.1 m, surfaces ")
     assert lines[-1].split() == ["path", "out.csv"]
@@ -32,8 +31,7 @@ def test_the_path_is_written_and_a_sweep_agrees(run: Run, scene: Path) -> None:
 
 
 def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
-    code, out, err = run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json"))
     found = json.loads(out)
     assert list(found) == [
         "verdict", "line", "parts", "way", "to", "near", "blockers", "pulls", "motions", "poses",
@@ -47,8 +45,7 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> None:
-    code, out, err = run("extract", scene, "box1", "--to", "0,0,300,1,0,0,0", "--path", "to.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run("extract", scene, "box1", "--to", "0,0,300,1,0,0,0", "--path", "to.csv"))
     assert out.startswith("reaches the pose straight, 0.3 m, ")
     goal = hapticdb.read_poses("to.csv")[-1:]
     assert np.allclose(goal[0, :3, 3], [0.0, 0.0, 0.3])
@@ -90,8 +87,7 @@ def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:
 def test_an_order_is_printed_and_each_step_is_written(run: Run, tmp_path: Path) -> None:
     url = made_of(tmp_path, STACK)
     words = ("--disassemble", "--keep", "pot", "--motions", 0)
-    code, out, err = run("extract", url, "lid", *words, "--path", "off.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run("extract", url, "lid", *words, "--path", "off.csv"))
     lines = out.splitlines()
     assert lines[0].startswith("after weight: comes out straight, ")
     assert [line.partition(":")[0] for line in lines[1:3]] == ["1. weight", "2. lid"]

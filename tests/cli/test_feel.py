@@ -14,7 +14,7 @@ import pytest
 
 import hapticdb
 from children import PATIENCE, child, descendants, named, until
-from command_line import Run, command, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
 from hapticdb.cli.values import size_bytes
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
@@ -39,8 +39,7 @@ def feel(*args: object) -> tuple[object, ...]:
 @pytest.mark.usefixtures("scene")
 def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
     wish = feel("--device", "path.csv", "--seconds", 0.2)
-    code, out, err = run(*wish)
-    assert (code, err) == (0, "")
+    out = succeeded(run(*wish))
     assert re.search(r"^ *played at +0\.1 m/s: the path has no times", out, re.MULTILINE)
     assert json.loads(run(*wish, "--json")[1])["path_speed"] == 0.1
     assert json.loads(run(*wish, "--json", "--speed", 0.2)[1])["path_speed"] is None
@@ -48,8 +47,7 @@ def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
 
 def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
     """A replay reports a difference once an object has moved."""
-    code, out, err = run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec"))
-    assert (code, err) == (0, "")
+    out = succeeded(run(*feel(*PLAY, "--speed", 0.5, "--record", "felt.hdbrec")))
     lines = [line.strip() for line in out.splitlines()]
     rows = dict(re.split(r"  +", line, maxsplit=1) for line in lines if "  " in line)
     recording = Recording(scene.with_name("felt.hdbrec"))
@@ -71,11 +69,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, replayed["differing"], replayed["parts_at"]) == (0, 0, None)
     assert replayed["compared"] + replayed["skipped"] == n_frames
 
-    code, out, err = run(
-        *feel("--device", "felt.hdbrec", "--rate", 500, "--json", "--budget", 8, "--scale", 1.0)
-    )
-    assert (code, err) == (0, "")
-    report = json.loads(out)
+    again = feel("--device", "felt.hdbrec", "--rate", 500, "--json", "--budget", 8, "--scale", 1.0)
+    report = json.loads(succeeded(run(*again)))
     assert report["hit_frames"] > 0
     assert report["objects"]
     assert report["cache"]["budget_bytes"] <= 8 << 20
@@ -95,8 +90,7 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
 
 def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path) -> None:
     wish = feel(*PLAY, "--speed", 0.5, "--no-baseline", "--budget-points", 40)
-    code, out, err = run(*wish, "--record", "felt.hdbrec")
-    assert (code, err) == (0, "")
+    out = succeeded(run(*wish, "--record", "felt.hdbrec"))
     assert re.search(
         r"^ *budget +40 points a frame; [\d,]+ frames? left out [\d,]+ points at most$", out,
         re.MULTILINE,
@@ -111,8 +105,7 @@ def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path)
 @pytest.mark.usefixtures("scene")
 def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
     wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
-    code, out, err = run(*wish, "--no-baseline")
-    assert (code, err) == (0, "")
+    out = succeeded(run(*wish, "--no-baseline"))
     assert out.splitlines()[0].split() == ["session"]
     assert re.search(r"^ *empty loop +not measured", out, re.MULTILINE)
 
@@ -120,9 +113,7 @@ def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
 @pytest.mark.usefixtures("scene")
 def test_a_simulated_device_is_pushed_back(run: Run) -> None:
     args = ("--device", "random", "--at", "0,0,0.05", "--seconds", 0.5, "--simulate", "--seed", 2)
-    code, out, err = run(*feel(*args, "--rate", 200, "--json"))
-    assert (code, err) == (0, "")
-    report = json.loads(out)
+    report = json.loads(succeeded(run(*feel(*args, "--rate", 200, "--json"))))
     assert report["unknown_frames"] == 0
     assert report["held_frames"] == report["stale_frames"]
 

@@ -11,7 +11,7 @@ import pytest
 
 import hapticdb
 from bands import band_rows
-from command_line import Run, poses, run, tool  # noqa: F401 - fixtures
+from command_line import Run, poses, run, succeeded, tool  # noqa: F401 - fixtures
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
 from hapticdb.testing import voxel_object
@@ -42,8 +42,7 @@ def floor(run: Run, tmp_path: Path) -> Path:
 
 def touched(run: Run, floor: Path, *more: object) -> list[dict[str, object]]:
     args = ("touch", floor, "--tool", "tool.stl", "--poses", "path.csv", "--json", *more)
-    code, out, err = run(*args)
-    assert (code, err) == (0, "")
+    out = succeeded(run(*args))
     return [json.loads(line) for line in out.splitlines()]
 
 

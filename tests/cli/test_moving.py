@@ -19,6 +19,7 @@ from command_line import (  # noqa: F401 - fixtures among them
     rows_of,
     run,
     scene,
+    succeeded,
 )
 from hapticdb import Grid
 from hapticdb.cli.verbs import moving
@@ -38,8 +39,7 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
     assert out.startswith("b.db: 3 objects copied, ")
     found = json.loads(run("info", "b.db", "--json")[1])
     assert (found["layout"], found["curve"], found["objects"]) == ("voxel", "hilbert", 3)
-    code, out, err = run("diff", scene, "b.db")
-    assert (code, err) == (0, "")
+    out = succeeded(run("diff", scene, "b.db"))
     size = f"{found['voxel_size'] * 1000:.4g} mm"
     assert out == (
         f"{scene} and b.db hold the same: 3 objects, {found['voxels']:,} voxels, "
@@ -48,8 +48,7 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
 
 
 def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
-    code, out, err = run("copy", scene, "b.db", "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("copy", scene, "b.db", "--json"))
     with hapticdb.open(scene, read_only=True) as env:
         voxels = sum(obj.voxels for obj in env.objects())
     assert json.loads(out) == {

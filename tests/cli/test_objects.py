@@ -6,9 +6,9 @@ import json
 from pathlib import Path
 
 import pytest
-import trimesh
 
-from command_line import Run, on_terminal, refused, run  # noqa: F401 - fixtures
+from assemblies import box, write_obj
+from command_line import Run, on_terminal, refused, run, succeeded  # noqa: F401 - fixtures
 from hapticdb.cli import main, render
 from hapticdb.cli.verbs.listing import PAGE
 
@@ -19,20 +19,17 @@ N_BOLTS = 60
 def bolts(tmp_path_factory: pytest.TempPathFactory) -> Path:
     """60 bolts along x, 0.1 m apart, and a plate."""
     folder = tmp_path_factory.mktemp("bolts")
-    lines: list[str] = []
-    for n, name in enumerate([*(f"frame/bolt_{n}" for n in range(N_BOLTS)), "plate"]):
-        box = trimesh.creation.box((0.05, 0.01, 0.01))
-        lines.append(f"o {name}")
-        lines += [f"v {x + 0.1 * n} {y} {z}" for x, y, z in box.vertices]
-        lines += ["f " + " ".join(str(v + 8 * n + 1) for v in face) for face in box.faces]
-    (folder / "bolts.obj").write_text("\n".join([*lines, ""]))
-    assert main(["import", str(folder / "b.db"), str(folder / "bolts.obj"), "--bits", "7"]) == 0
+    names = [*(f"frame/bolt_{n}" for n in range(N_BOLTS)), "plate"]
+    parts = {
+        name: box((0.1 * n, 0, 0), (0.1 * n + 0.05, 0.01, 0.01)) for n, name in enumerate(names)
+    }
+    file = write_obj(folder / "bolts.obj", parts)
+    assert main(["import", str(folder / "b.db"), str(file), "--bits", "7"]) == 0
     return folder / "b.db"
 
 
 def listed(run: Run, url: Path, *words: object) -> list[str]:
-    code, out, err = run("objects", url, "--json", *words)
-    assert (code, err) == (0, "")
+    out = succeeded(run("objects", url, "--json", *words))
     return [json.loads(line)["name"] for line in out.splitlines()]
 
 
@@ -54,8 +51,7 @@ def test_a_limit_cuts_and_says_so(run: Run, bolts: Path) -> None:
 
 
 def test_a_pipe_has_every_object_in_whole_lines(run: Run, bolts: Path) -> None:
-    code, out, err = run("objects", bolts)
-    assert (code, err) == (0, "")
+    out = succeeded(run("objects", bolts))
     assert len(out.splitlines()) == 2 + N_BOLTS + 1
     assert "\x1b" not in out
 

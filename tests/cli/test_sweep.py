@@ -12,7 +12,7 @@ import pytest
 
 import hapticdb
 from children import finished
-from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
 from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping
 
@@ -41,8 +41,7 @@ def along(scene: Path) -> Path:
 
 @pytest.mark.usefixtures("free")
 def test_what_is_clear_is_said_with_its_gap(run: Run, scene: Path) -> None:
-    code, out, err = run("sweep", scene, *TOOL, "--path", "free.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run("sweep", scene, *TOOL, "--path", "free.csv"))
     found = json.loads(run("sweep", scene, *TOOL, "--path", "free.csv", "--json")[1])
     assert found["verdict"] == "clear"
     assert 0.0396 <= found["gap"] <= 0.04
@@ -66,8 +65,7 @@ def test_what_is_hit_is_said_with_where(run: Run, scene: Path) -> None:
 @pytest.mark.usefixtures("along")
 def test_what_slides_at_its_start_is_no_hit(run: Run, scene: Path) -> None:
     sweep = ("sweep", scene, *TOOL, "--path", "along.csv")
-    code, out, err = run(*sweep)
-    assert (code, err) == (0, "")
+    out = succeeded(run(*sweep))
     assert out.startswith("slides along box0 until 12.6 % of the path, otherwise clear by ")
     refused(run(*sweep, "--contact", 0), "contact")
 
@@ -111,8 +109,7 @@ def test_many_sweeps_are_one_command(run: Run, scene: Path) -> None:
         "tool.stl,,free.csv,box0; box1,\n"
         ",box2,free.csv,,0.1\n"
     )
-    code, out, err = run("sweep", scene, "--batch", "many.csv")
-    assert (code, err) == (0, "")
+    out = succeeded(run("sweep", scene, "--batch", "many.csv"))
     assert [line.split()[0] for line in out.splitlines()[2:]] == ["tool.stl", "tool.stl", "box2"]
     many.write_text(many.read_text() + "tool.stl,,through.csv,,\n")
     code, out, err = run("sweep", scene, "--batch", "many.csv", "--json")

@@ -12,7 +12,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import Run, boxes, made, poses, refused, rows_of, run, scene, tool  # noqa: F401 - fixtures
+from command_line import Run, boxes, made, poses, refused, rows_of, run, scene, succeeded, tool  # noqa: F401 - fixtures
 from hapticdb.query.frame import STRATEGIES
 
 Scene = Path | str
@@ -22,9 +22,7 @@ Scene = Path | str
 
 
 def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
-    code, out, err = run("info", scene, "--json")
-    assert (code, err) == (0, "")
-    found = json.loads(out)
+    found = json.loads(succeeded(run("info", scene, "--json")))
     assert list(found) == [
         *("name", "engine", "voxel_size", "bits", "origin", "curve", "layout"),
         *("objects", "scene", "voxels", "rows", "bytes", "distances"),
@@ -40,8 +38,7 @@ def test_info_json_has_the_documented_keys(run: Run, scene: Scene) -> None:
 
 
 def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
-    code, out, err = run("info", scene)
-    assert (code, err) == (0, "")
+    out = succeeded(run("info", scene))
     assert "262,144 cells" in out
     assert "a voxel)" in out
     assert re.search(r"^engine +(SQLite|PostgreSQL) \d+\.\d+", out, re.MULTILINE)
@@ -59,8 +56,7 @@ def test_statistics_are_renewed_after_many_edits(run: Run, scene: Scene) -> None
 
 
 def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
-    code, out, err = run("objects", scene, "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("objects", scene, "--json"))
     found = [json.loads(line) for line in out.splitlines()]
     assert [(obj["id"], obj["name"]) for obj in found] == [(1, "box0"), (2, "box1"), (3, "box2")]
     assert np.allclose(np.diff(found[0]["bounds"], axis=0), 0.1)
@@ -80,9 +76,7 @@ def test_a_name_in_brackets_is_printed_as_it_is(run: Run, tmp_path: Path) -> Non
 def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
     with hapticdb.open(scene) as env:
         env.store.remove(2, lambda _: ((0, 2**62),))
-    code, out, err = run("info", scene, "--calibrate", "--json")
-    assert (code, err) == (0, "")
-    found = json.loads(out)
+    found = json.loads(succeeded(run("info", scene, "--calibrate", "--json")))
     assert found["statistics"]["changes"] == 0
     assert found["costs"]["kept"] is True
     costs = [found["costs"]["figures"][name] for name in ("statement", "descent", "block", "row")]
@@ -103,8 +97,7 @@ def bounds_of(scene: Scene, object_id: int) -> Any:  # noqa: ANN401 - an array
 def test_a_translation_counts_from_where_the_object_is(run: Run, scene: Scene) -> None:
     before = bounds_of(scene, 2)
     for n in (1, 2):
-        code, out, err = run("move", scene, 2, "--translate", "-0.01,0,0.02")
-        assert (code, err) == (0, "")
+        out = succeeded(run("move", scene, 2, "--translate", "-0.01,0,0.02"))
         assert "box1" in out
         assert np.allclose(bounds_of(scene, 2), before + n * np.array([-0.01, 0, 0.02]))
 
@@ -139,8 +132,7 @@ def test_a_move_that_cannot_be_changes_nothing(
 def test_remove_takes_all_or_nothing(run: Run, scene: Scene) -> None:
     refused(run("remove", scene, 1, 9), "no object 9")
     refused(run("remove", scene, "first"), "first")
-    code, out, err = run("remove", scene, 1, "3,1")
-    assert (code, err) == (0, "")
+    out = succeeded(run("remove", scene, 1, "3,1"))
     assert out == "removed 1 (box0)\nremoved 3 (box2)\n"
     with hapticdb.open(scene, read_only=True) as env:
         assert [obj.id for obj in env.objects()] == [2]

@@ -1,6 +1,5 @@
 """Contact proxies, through their bytes, against the coupling on this machine."""
 
-import time
 from collections import deque
 from contextlib import closing
 from pathlib import Path
@@ -9,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from children import until
 from feel.couplings import SmoothHand, Terms, posed, straight
 from feel.ground import Ground
 from feel.scenes import convex_edge, plane, slope_axes
@@ -60,13 +60,9 @@ def round_the_edge(folder: Path) -> tuple[str, Floats, Floats]:
 
 def first_proxy(source: ContactSource, place: Floats) -> ProxyState:
     """Proxy of a hand at rest (3,), as soon as the cells there are in memory."""
-    until = time.monotonic() + 60.0
-    while True:
-        proxy = source.proxy(HandState(1, 0.0, place, UPRIGHT, np.zeros(6)))
-        if not proxy.flags & IS_WAITING:
-            return proxy
-        assert time.monotonic() < until
-        time.sleep(0.01)
+    hand = HandState(1, 0.0, place, UPRIGHT, np.zeros(6))
+    until(lambda: not source.proxy(hand).flags & IS_WAITING)
+    return source.proxy(hand)
 
 
 def felt(source: ContactSource, places: Floats, delay: int) -> Floats:

@@ -11,7 +11,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import Run, boxes, made, refused, rows_of, run, scene  # noqa: F401 - fixtures
+from command_line import Run, boxes, made, refused, rows_of, run, scene, succeeded  # noqa: F401 - fixtures
 from hapticdb.store.sqlite.tables.file_tables import FileTables
 
 
@@ -27,12 +27,11 @@ def file(made: Path) -> Path:
 
 def test_what_was_removed_comes_back_and_is_told(run: Run, scene: Path, file: Path) -> None:
     assert run("remove", scene, "box0", "box2")[0] == 0
-    code, out, err = run("import", scene, file)
-    assert (code, err) == (0, "")
+    out = succeeded(run("import", scene, file))
     assert "2 objects imported" in out
     assert "2 of them had been removed and are back: --keep-removed" in out
     assert sorted(names(scene)) == ["box0", "box1", "box2"]
-    code, out, _ = run("import", scene, file)
+    out = succeeded(run("import", scene, file))
     assert "complete already (3 objects), nothing to do" in out
     assert "removed" not in out
 
@@ -40,8 +39,7 @@ def test_what_was_removed_comes_back_and_is_told(run: Run, scene: Path, file: Pa
 def test_what_was_removed_stays_so_when_asked(run: Run, scene: Path, file: Path) -> None:
     assert run("remove", scene, "box0", "box2")[0] == 0
     keep = ("import", scene, file, "--keep-removed")
-    code, out, err = run(*keep)
-    assert (code, err) == (0, "")
+    out = succeeded(run(*keep))
     assert "complete already (1 object), nothing to do; 2 removed parts left out" in out
     found = json.loads(run(*keep, "--json")[1])
     assert (found["present"], found["restored"], found["kept_removed"]) == (1, 0, 2)
@@ -89,8 +87,7 @@ def test_a_changed_file_is_replaced_when_asked(run: Run, tmp_path: Path) -> None
     changed_file(tmp_path)
     refused(run("import", "a.db", file), "has changed since it was imported", "--replace")
     assert rows_of(tmp_path / "a.db") == before
-    code, out, err = run("import", "a.db", file, "--replace")
-    assert (code, err) == (0, "")
+    out = succeeded(run("import", "a.db", file, "--replace"))
     assert "1 object imported" in out
     assert "; 1 were there already; 1 replaced; 1 removed, which the file has no more" in out
     with hapticdb.open("a.db") as env:

@@ -25,6 +25,7 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.frame import locate
 from hapticdb.resident.held import counts_of, held_tool
 from naive_frame import NaiveTouch, distance_at, touch_distances
+from realtime import worlds
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -87,21 +88,12 @@ def merged(curve: CurveName = "z") -> Merged:
 
 
 def random_shell(seed: int, n_points: int, reach: float = 12.0) -> PointShell:
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(n_points, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    points = rng.uniform(-reach, reach, (n_points, 3)) * SIZE
-    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * SIZE)
+    return worlds.random_shell(seed, n_points, reach, SIZE)
 
 
 def random_pose(seed: int) -> Array:
     rng = np.random.default_rng(seed)
-    q, r = np.linalg.qr(rng.normal(size=(3, 3)))
-    q *= np.sign(np.diag(r))
-    if np.linalg.det(q) < 0:
-        q[:, 0] *= -1
-    pose = np.eye(4)
-    pose[:3, :3] = q
+    pose = worlds.turned(rng, np.zeros(3))
     place = np.array(PLACES[rng.integers(len(PLACES))]) + rng.normal(size=3) * 3
     pose[:3, 3] = np.array(ORIGIN) + SIZE * place
     return pose

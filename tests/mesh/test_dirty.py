@@ -86,13 +86,6 @@ EXPECTED: dict[str, Reads | str] = {
 }
 
 
-@pytest.fixture
-def folder(test_data: Path | None) -> Path:
-    if test_data is None:
-        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no real files to read")
-    return test_data
-
-
 def n_pieces(file: MeshFile) -> int:
     return sum(len(part.vertices if part.faces is None else part.faces) for part in file.parts)
 
@@ -112,33 +105,33 @@ def check(path: Path, expected: Reads | str, read: Callable[..., MeshFile]) -> N
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_dirty_file_reads_with_its_counts_or_is_refused(folder: Path, name: str) -> None:
-    check(folder / "dirty" / name, EXPECTED[name], parse_in_process)
+def test_a_dirty_file_reads_with_its_counts_or_is_refused(real_files: Path, name: str) -> None:
+    check(real_files / "dirty" / name, EXPECTED[name], parse_in_process)
 
 
-def test_every_dirty_file_has_its_expectation(folder: Path) -> None:
-    assert sorted(path.name for path in (folder / "dirty").iterdir()) == sorted(EXPECTED)
+def test_every_dirty_file_has_its_expectation(real_files: Path) -> None:
+    assert sorted(path.name for path in (real_files / "dirty").iterdir()) == sorted(EXPECTED)
 
 
 @pytest.mark.parametrize(
     "name", ["assimp_malformed.obj", "trimesh_featuretype.STEP", "assimp_AllIndicesOutOfRange.gltf"]
 )
-def test_the_child_reads_dirty_files_alike(folder: Path, name: str) -> None:
-    check(folder / "dirty" / name, EXPECTED[name], read_file)
+def test_the_child_reads_dirty_files_alike(real_files: Path, name: str) -> None:
+    check(real_files / "dirty" / name, EXPECTED[name], read_file)
 
 
-def test_assemblies_keep_every_instance_and_share_geometry(folder: Path) -> None:
+def test_assemblies_keep_every_instance_and_share_geometry(real_files: Path) -> None:
     for name, n_parts, n_shapes in (
         ("demo_vintage_car/vintage_car.glb", 200, 66),
         ("robot_lekiwi/lekiwi.glb", 42, 42),
     ):
-        file = parse_in_process(folder / name)
+        file = parse_in_process(real_files / name)
         assert len(file.parts) == n_parts
         assert len({id(part.vertices) for part in file.parts}) == n_shapes
 
 
-def test_a_laz_file_reads_as_one_cloud(folder: Path) -> None:
-    file = parse_in_process(folder / "pointcloud" / "lone-star.laz")
+def test_a_laz_file_reads_as_one_cloud(real_files: Path) -> None:
+    file = parse_in_process(real_files / "pointcloud" / "lone-star.laz")
     assert file.parts[0].is_cloud
     assert n_pieces(file) == 518_862
     np.testing.assert_allclose(file.bounds[1] - file.bounds[0], (32.44, 40.76, 15.68), atol=0.01)

@@ -118,10 +118,8 @@ EXPECTED: dict[str, Reads | str] = {
 
 
 @pytest.mark.parametrize("name", EXPECTED)
-def test_a_reported_file_reads_rightly_or_is_told(test_data: Path | None, name: str) -> None:
-    if test_data is None:
-        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no reported files to read")
-    path, expected = test_data / "reports" / name, EXPECTED[name]
+def test_a_reported_file_reads_rightly_or_is_told(real_files: Path, name: str) -> None:
+    path, expected = real_files / "reports" / name, EXPECTED[name]
     if isinstance(expected, str):
         assert expected in cause(path)
         return
@@ -308,17 +306,13 @@ def test_a_binary_off_file_is_refused_as_one(tmp_path: Path) -> None:
     assert "it is a binary OFF file" in cause(text(tmp_path / "a.off", "OFF BINARY\n\0\0\0\3"))
 
 
-def test_every_reported_file_has_its_expectation(test_data: Path | None) -> None:
-    if test_data is None:
-        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no reported files to read")
-    there = {path.name for path in (test_data / "reports").iterdir()}
+def test_every_reported_file_has_its_expectation(real_files: Path) -> None:
+    there = {path.name for path in (real_files / "reports").iterdir()}
     assert there == {*EXPECTED, "README", "q01_semicolon_decimal_comma.csv"}
 
 
-def test_a_step_file_in_gb18030_keeps_its_names(test_data: Path | None, tmp_path: Path) -> None:
-    if test_data is None:
-        pytest.skip("HAPTICDB_TEST_DATA names no folder: there are no reported files to read")
-    content = (test_data / "reports" / "s04_latin1.step").read_bytes()
+def test_a_step_file_in_gb18030_keeps_its_names(real_files: Path, tmp_path: Path) -> None:
+    content = (real_files / "reports" / "s04_latin1.step").read_bytes()
     for name, encoding in (("左前轮", "gb18030"), ("Öse", "utf-8")):
         path = tmp_path / f"{encoding}.step"
         path.write_bytes(content.replace("Träger".encode("latin-1"), name.encode(encoding)))

@@ -1,10 +1,8 @@
 """One person's edits beside another's: each step is one write, nothing of another is lost."""
 
 import contextlib
-import os
 from collections.abc import Callable, Iterator
 from functools import partial
-from itertools import count
 from pathlib import Path
 
 import numpy as np
@@ -19,16 +17,9 @@ from hapticdb import Environment
 from hapticdb.errors import ConflictError, ObjectNotFoundError, UsageError
 from hapticdb.page.editing import PersonsEdits
 from hapticdb.store.base import Object
-from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.store import PostgresStore
-from servers import FOUND, base_url, named
+from servers import ENGINES, named, url_on
 
 N_BOXES = 3
-
-
-NUMBERS = count()
-"""Distinct names of environments on servers."""
 
 
 @pytest.fixture(scope="module")
@@ -47,19 +38,11 @@ def file(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return made
 
 
-@pytest.fixture(
-    params=[None, *FOUND], ids=lambda found: "sqlite" if found is None else named(found)
-)
+@pytest.fixture(params=ENGINES, ids=named)
 def url(request: pytest.FixtureRequest, file: Path, tmp_path: Path) -> Iterator[str]:
-    where = str(tmp_path / "e.db")
-    if request.param is not None:
-        where = with_environment(base_url(request.param), f"edits_{os.getpid()}_{next(NUMBERS)}")
-    hapticdb.copy_environment(file.with_name("e.db"), where)
-    yield where
-    if request.param is not None:
-        with hapticdb.open(where) as env:
-            assert isinstance(env.store, PostgresStore)
-            drop(env.store._connection)
+    with url_on(request.param, tmp_path) as where:
+        hapticdb.copy_environment(file.with_name("e.db"), where)
+        yield where
 
 
 @pytest.fixture

@@ -1,6 +1,7 @@
 """`where` and `exclude` say what is felt: by every strategy, and as others write."""
 
-import os
+# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
+
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -21,23 +22,20 @@ from hapticdb.query.frame import STRATEGIES
 from hapticdb.query.grouping import covering
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import Binaries
-from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import voxel_object
 from naive import Voxel
-from query.test_frame import (
+from query.test_frame import (  # noqa: F401 - a fixture among them
     BITS,
     ORIGIN,
     SIZE,
     assert_same,
     expected,
+    plain,
     random_pose,
     random_shell,
     scene_voxels,
 )
-from servers import FOUND, base_url, named
+from servers import ENGINES, named, url_on
 
 OBJECTS: tuple[tuple[str, dict[str, object]], ...] = (
     ("body/door", {"material": "steel", "mass": 12.5}),
@@ -67,7 +65,6 @@ CHOSEN: dict[int | str, set[int]] = {
 }
 """What each word chooses."""
 WORDS = st.lists(st.sampled_from(list(CHOSEN)), max_size=3)
-KINDS: list[tuple[Layout, CurveName]] = [("brick", "z"), ("voxel", "hilbert")]
 
 
 def ids_of(words: list[int | str]) -> set[int]:
@@ -94,41 +91,23 @@ def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment
     return env
 
 
-@pytest.fixture(scope="module", params=KINDS, ids="-".join)
+@pytest.fixture(scope="module", params=[("brick", "z"), ("voxel", "hilbert")], ids="-".join)
 def kind(request: pytest.FixtureRequest) -> tuple[Layout, CurveName]:
     layout, curve = request.param
     return layout, curve
 
 
-@pytest.fixture(
-    scope="module",
-    params=[None, *FOUND],
-    ids=lambda found: "sqlite" if found is None else named(found),
-)
+@pytest.fixture(scope="module", params=ENGINES, ids=named)
 def env(
     request: pytest.FixtureRequest,
     kind: tuple[Layout, CurveName],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Environment]:
-    server: Binaries | str | None = request.param
-    if server is None:
-        with make_scene(tmp_path_factory.mktemp("filter") / "e.db", *kind) as made:
-            yield made
-        return
-    made = make_scene(with_environment(base_url(server), f"filter_{os.getpid()}"), *kind)
-    yield made
-    assert isinstance(made.store, PostgresStore)
-    drop(made.store._connection)
-    made.close()
-
-
-@pytest.fixture(scope="module")
-def plain() -> dict[Voxel, set[int]]:
-    found: dict[Voxel, set[int]] = {}
-    for n, voxels in enumerate(scene_voxels()):
-        for i, j, k in voxels.tolist():
-            found.setdefault((i, j, k), set()).add(n + 1)
-    return found
+    with (
+        url_on(request.param, tmp_path_factory.mktemp("filter")) as url,
+        make_scene(url, *kind) as made,
+    ):
+        yield made
 
 
 @settings(

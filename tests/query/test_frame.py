@@ -1,6 +1,5 @@
 """Case 9: every strategy, layout, curve and engine finds what a plain set finds, bit for bit."""
 
-import os
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -18,15 +17,11 @@ from hapticdb.grid import CurveName
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.query.grouping import covering
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import Binaries
-from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.testing import KINDS, blob, write_voxels
 from hapticdb.testing.scenes import EVERYWHERE
 from naive_frame import NaiveTouch, touch_of_shell
-from realtime.worlds import turned
-from servers import FOUND, Place, base_url, named
+from realtime import worlds
+from servers import ENGINES, Place, named, url_on
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -49,32 +44,23 @@ def plain() -> dict[tuple[int, int, int], set[int]]:
     return found
 
 
-ENGINES: list[Binaries | str | None] = [None, *FOUND]
-"""SQLite, and every PostgreSQL server."""
-
-
 @pytest.fixture(scope="module", params=KINDS, ids="-".join)
 def kind(request: pytest.FixtureRequest) -> tuple[Layout, CurveName]:
     layout, curve = request.param
     return layout, curve
 
 
-@pytest.fixture(
-    scope="module", params=ENGINES, ids=lambda found: "sqlite" if found is None else named(found)
-)
+@pytest.fixture(scope="module", params=ENGINES, ids=named)
 def env(
     request: pytest.FixtureRequest,
     kind: tuple[Layout, CurveName],
     tmp_path_factory: pytest.TempPathFactory,
 ) -> Iterator[Environment]:
-    if request.param is None:
-        yield make_scene(tmp_path_factory.mktemp("scene") / "e.db", *kind)
-        return
-    env = make_scene(with_environment(base_url(request.param), f"scene_{os.getpid()}"), *kind)
-    yield env
-    assert isinstance(env.store, PostgresStore)
-    drop(env.store._connection)
-    env.close()
+    with (
+        url_on(request.param, tmp_path_factory.mktemp("scene")) as url,
+        make_scene(url, *kind) as made,
+    ):
+        yield made
 
 
 def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment:
@@ -85,17 +71,16 @@ def make_scene(url: Path | str, layout: Layout, curve: CurveName) -> Environment
 
 
 def random_shell(seed: int, n_points: int) -> PointShell:
-    rng = np.random.default_rng(seed)
-    normals = rng.normal(size=(n_points, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    points = rng.uniform(-12, 12, (n_points, 3)) * SIZE
-    points[n_points // 2 :] = points[: n_points - n_points // 2]  # points that share a key
-    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * SIZE)
+    """A shell whose second half of points share keys with the first."""
+    shell = worlds.random_shell(seed, n_points, 12.0, SIZE)
+    points = shell.points.copy()
+    points[n_points // 2 :] = points[: n_points - n_points // 2]
+    return replace(shell, points=points)
 
 
 def random_pose(seed: int) -> NDArray[np.float64]:
     rng = np.random.default_rng(seed)
-    pose = turned(rng, np.zeros(3))
+    pose = worlds.turned(rng, np.zeros(3))
     center = np.array(BLOBS[rng.integers(len(BLOBS))][0]) + rng.normal(size=3) * 4
     pose[:3, 3] = np.array(ORIGIN) + SIZE * center
     return pose

@@ -19,6 +19,7 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.query.frame import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import blob, floor_voxels, write_voxels
+from realtime.worlds import random_shell
 
 K = 1000.0
 SIZE = 0.005
@@ -90,12 +91,6 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
 def unit(vectors: Array) -> Array:
     lengths: Array = np.linalg.norm(vectors, axis=-1, keepdims=True)
     return vectors / lengths
-
-
-def random_shell(seed: int, n_points: int, reach: float) -> PointShell:
-    rng = np.random.default_rng(seed)
-    normals = unit(rng.normal(size=(n_points, 3)))
-    return shell_of(rng.uniform(-reach, reach, (n_points, 3)), normals, rng.normal(size=3) * SIZE)
 
 
 # --- case 1 -------------------------------------------------------------------------------------
@@ -304,7 +299,7 @@ def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int) -> None:
     whole = np.eye(4)
     whole[:3, :3] = turn
     for seed, n_points in ((1, 6), (2, 200)):
-        shell, pose = random_shell(seed, n_points, 8 * SIZE), tilted(seed)
+        shell, pose = random_shell(seed, n_points, 8.0, SIZE), tilted(seed)
         assert off_borders(shell.points @ pose[:3, :3].T + pose[:3, 3])
         plain = before.touch(shell, pose, "maxgap")
         moved = after.touch(shell, whole @ pose, "maxgap")

@@ -19,6 +19,7 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.testing import blob, write_voxels
 from naive_frame import NaiveTouch, touch_of_shell
+from realtime.worlds import random_shell
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013
@@ -56,14 +57,6 @@ def env(tmp_path: Path) -> Environment:
     return env
 
 
-def shell_of(n_points: int) -> PointShell:
-    rng = np.random.default_rng(n_points)
-    normals = rng.normal(size=(n_points, 3))
-    normals /= np.linalg.norm(normals, axis=1)[:, None]
-    points = rng.uniform(-8, 8, (n_points, 3)) * SIZE
-    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * SIZE)
-
-
 def poses() -> Array:
     found = np.tile(np.eye(4), (4, 1, 1))
     found[:, :3, 3] = np.array(ORIGIN) + SIZE * (np.array([22.0, 21.0, 20.0]))
@@ -84,7 +77,7 @@ def expected(shell: PointShell, pose: Array) -> NaiveTouch:
 
 @pytest.mark.long
 def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) -> None:
-    shell = shell_of(300)
+    shell = random_shell(300, 300, 8.0, SIZE)
     n_felt = 0
     with CellTable.create(LEAST_BUDGET) as table:
         frames = ResidentFrames(Residency(env.store, table), shell, Penalty())

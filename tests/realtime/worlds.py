@@ -98,6 +98,15 @@ def cloud(n_points: int, seed: int = 0, extent: float = 0.02) -> PointShell:
     return PointShell(points[np.argsort(points[:, 0])], normals, np.array([0.001, 0.002, -0.003]))
 
 
+def random_shell(seed: int, n_points: int, reach: float, size: float) -> PointShell:
+    """A shell of random points within a reach, in voxels of a size, with random normals."""
+    rng = np.random.default_rng(seed)
+    normals = rng.normal(size=(n_points, 3))
+    normals /= np.linalg.norm(normals, axis=1)[:, None]
+    points = rng.uniform(-reach, reach, (n_points, 3)) * size
+    return PointShell(points=points, normals=normals, center=rng.normal(size=3) * size)
+
+
 def turned(rng: np.random.Generator, place: NDArray[np.float64]) -> NDArray[np.float64]:
     """A pose (4, 4) at a place (3,), with a random rotation."""
     q, r = np.linalg.qr(rng.normal(size=(3, 3)))

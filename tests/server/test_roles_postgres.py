@@ -4,11 +4,10 @@ import contextlib
 import os
 from collections.abc import Iterator
 from pathlib import Path
-from urllib.parse import quote, urlencode
 
 import psycopg
 import pytest
-from psycopg import conninfo, sql
+from psycopg import sql
 
 import hapticdb
 from assemblies import row_of_boxes
@@ -20,10 +19,9 @@ from hapticdb.store.connect import grant
 from hapticdb.store.postgres.address import parse
 from hapticdb.testing import blob, write_voxels
 from page_person import PagePerson
-from servers import Place
+from servers import PASSWORD, Place, roles, url_as
 from serving import TOKENS, running
 
-PASSWORD = "of-a-test"  # noqa: S105 - of roles that live as long as a test
 GRID = Grid(0.01, (-0.1, -0.1, -0.1), 6)
 
 
@@ -35,19 +33,10 @@ def urls(place: Place, admin: psycopg.Connection) -> Iterator[dict[Role, str]]:
         write_voxels(env.store, blob(1, (20, 20, 20)), "wheel")
         write_voxels(env.store, blob(2, (40, 40, 40)), "door")
     names = {role: f"hapticdb_test_{role.word}_{os.getpid()}" for role in Role}
-    address = parse(url)
-    known = conninfo.conninfo_to_dict(address.conninfo)
-    found = {}
-    for role, name in names.items():
-        user = sql.Identifier(name)
-        admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(user, PASSWORD))
-        grant(url, name, role.word)  # type: ignore[arg-type]
-        wanted = {**known, "user": name, "password": PASSWORD, "environment": address.environment}
-        found[role] = f"postgresql:///?{urlencode(wanted, quote_via=quote)}"
-    yield found
-    for name in names.values():
-        admin.execute(sql.SQL("DROP OWNED BY {}").format(sql.Identifier(name)))
-        admin.execute(sql.SQL("DROP ROLE {}").format(sql.Identifier(name)))
+    with roles(admin, *names.values()):
+        for role, name in names.items():
+            grant(url, name, role.word)  # type: ignore[arg-type]
+        yield {role: url_as(url, name) for role, name in names.items()}
 
 
 def stored(admin: psycopg.Connection, url: str) -> list[object]:

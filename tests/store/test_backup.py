@@ -15,7 +15,7 @@ import pytest
 
 import hapticdb
 from children import child, finished
-from command_line import Run, refused, run  # noqa: F401 - a fixture
+from command_line import Run, refused, run, succeeded  # noqa: F401 - a fixture
 from files_in_use import killed, make, write
 from hapticdb import backup_environment, restore_environment
 from hapticdb.store.sqlite.store import SQLiteStore
@@ -241,11 +241,9 @@ def test_a_copy_without_room_names_the_file_that_was_asked_for(tmp_path: Path) -
 
 
 def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
-    code, out, err = run("backup", path, "copy.db")
-    assert (code, err) == (0, "")
+    out = succeeded(run("backup", path, "copy.db"))
     assert out.startswith(f"copy.db: {path} at revision 2, 2 objects, 0.")
-    code, out, err = run("restore", "copy.db", path, "--json")
-    assert (code, err) == (0, "")
+    out = succeeded(run("restore", "copy.db", path, "--json"))
     size = path.stat().st_size
     assert json.loads(out) == {
         "source": "copy.db",

@@ -8,6 +8,7 @@ import pytest
 import trimesh
 
 import hapticdb
+from assemblies import box, write_obj
 from hapticdb import Environment
 from hapticdb.errors import ObjectNotFoundError, UsageError
 
@@ -31,13 +32,11 @@ NAMES = (
 def car(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
     """Cubes of 10 cm in a row along x, 20 cm apart; the name of one is the id of another."""
     folder = tmp_path_factory.mktemp("car")
-    lines = []
-    for n, name in enumerate(NAMES):
-        box = trimesh.creation.box((0.1, 0.1, 0.1))
-        lines.append(f"o {name}")
-        lines += [f"v {x + 0.2 * n} {y} {z}" for x, y, z in box.vertices]
-        lines += ["f " + " ".join(str(v + 8 * n + 1) for v in face) for face in box.faces]
-    (folder / "car.obj").write_text("\n".join([*lines, ""]))
+    cubes = {
+        name: box((0.2 * n - 0.05, -0.05, -0.05), (0.2 * n + 0.05, 0.05, 0.05))
+        for n, name in enumerate(NAMES)
+    }
+    write_obj(folder / "car.obj", cubes)
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
     (report,) = hapticdb.import_files(folder / "car.db", [folder / "car.obj"], options)
     assert tuple(obj.name for obj in report.added) == NAMES

@@ -299,13 +299,13 @@ def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) 
 
 def hits_at(url: str) -> list[int]:
     with hapticdb.open(url, read_only=True) as env:
-        return env.touch(two_tools(), np.eye(4)).hits.tolist()
+        return list(env.touch(two_tools(), np.eye(4)).hits)
 
 
 def answers(env: Environment, shell: PointShell, wanted: list[int], **how: Any) -> bool:  # noqa: ANN401 - of `touch`
     """Whether a touch hits these points; not where a busy machine takes more than its time."""
     try:
-        return env.touch(shell, np.eye(4), **how).hits.tolist() == wanted
+        return list(env.touch(shell, np.eye(4), **how).hits) == wanted
     except StuckError:
         return False
 

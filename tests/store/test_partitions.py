@@ -221,7 +221,7 @@ def test_an_import_goes_on_after_a_crash_of_each_server(
         progress = Killer(3 + n * (N_PARTS // 5), 0.01 * n, partial(crash, server))
         with contextlib.suppress(ConnectionLostError):
             hapticdb.import_files(url, [file], options("brick"), progress)
-        progress.wait()
+        progress.joined()
     hapticdb.import_files(url, [file], options("brick"))
     assert run("check", url, "--repair")[0] == 0
     rows = [(key, packed) for key, _, packed in sorted(valid_contents(url)[2])]

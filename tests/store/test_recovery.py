@@ -64,7 +64,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
         with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
             hapticdb.import_files(url, [file], options(layout), killer)
         assert "\n" not in str(told.value)
-        killer.wait()
+        killer.joined()
         server.start()
         objects, _, _ = valid_contents(url)
         # all reported parts are stored: a commit waits for the disk

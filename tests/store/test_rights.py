@@ -9,18 +9,20 @@ import socket
 import threading
 import traceback
 from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
-from urllib.parse import quote, urlencode
+from urllib.parse import quote
 
 import numpy as np
 import psycopg
 import pytest
 from hypothesis import example, given
 from hypothesis import strategies as st
-from psycopg import conninfo, sql
+from psycopg import sql
 from psycopg.errors import InsufficientPrivilege
 
 import hapticdb
+import servers
 from command_line import PLACES, Run, boxes, poses, refused, run, tool  # noqa: F401 - fixtures
 from hapticdb import Grid, PointShell
 from hapticdb.cli import app
@@ -52,12 +54,8 @@ NAMES: dict[Right, str] = {
 def roles(admin: psycopg.Connection) -> Iterator[dict[Right, str]]:
     """One role for each right, with a name that needs quotes; dropped after the test."""
     names = {right: f"{os.getpid()} {name}" for right, name in NAMES.items()}
-    for role in map(sql.Identifier, names.values()):
-        admin.execute(sql.SQL("CREATE ROLE {} LOGIN PASSWORD {}").format(role, PASSWORD))
-    yield names
-    for role in map(sql.Identifier, names.values()):
-        admin.execute(sql.SQL("DROP OWNED BY {}").format(role))
-        admin.execute(sql.SQL("DROP ROLE {}").format(role))
+    with servers.roles(admin, *names.values(), password=PASSWORD):
+        yield names
 
 
 @pytest.fixture
@@ -79,12 +77,7 @@ def granted(url: str, roles: dict[Right, str]) -> dict[Right, str]:
     return {right: url_as(url, role) for right, role in roles.items()}
 
 
-def url_as(url: str, role: str) -> str:
-    """URL of the same environment for another user."""
-    address = parse(url)
-    known = conninfo.conninfo_to_dict(address.conninfo)
-    wanted = {**known, "user": role, "password": PASSWORD, "environment": address.environment}
-    return f"postgresql:///?{urlencode(wanted, quote_via=quote)}"
+url_as = partial(servers.url_as, password=PASSWORD)
 
 
 # -- what the server lets a role do: @ stands for the schema --------------------------------------

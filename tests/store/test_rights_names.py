@@ -6,14 +6,13 @@ from urllib.parse import quote
 
 import psycopg
 import pytest
-from psycopg import sql
 
 from hapticdb import Grid
 from hapticdb.errors import UsageError
 from hapticdb.store.connect import create_store, grant, open_store
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
-from servers import Place
+from servers import Place, roles
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 LONG = "r" * 64
@@ -28,11 +27,8 @@ def of_bytes(start: str, letter: str) -> str:
 def role(request: pytest.FixtureRequest, admin: psycopg.Connection) -> Iterator[str]:
     """A role with a name of the greatest length."""
     name = of_bytes(f"{os.getpid()}", request.param)
-    quoted = sql.Identifier(name)
-    admin.execute(sql.SQL("CREATE ROLE {}").format(quoted))
-    yield name
-    admin.execute(sql.SQL("DROP OWNED BY {}").format(quoted))
-    admin.execute(sql.SQL("DROP ROLE {}").format(quoted))
+    with roles(admin, name):
+        yield name
 
 
 def may_read(admin: psycopg.Connection, role: str, url: str) -> bool:

@@ -24,7 +24,7 @@ from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.sqlite import place as sqlite_place
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import is_noticed, write_voxels
-from servers import Place
+from servers import Place, roles
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 VOXEL = np.array([[1, 2, 3]])
@@ -209,12 +209,13 @@ FORGED = [
 @pytest.fixture
 def stranger(database: str, admin: psycopg.Connection) -> Iterator[psycopg.Connection]:
     """A connection of a role that has no right on any environment."""
-    role = sql.Identifier(f"stranger {os.getpid()} {next(numbers)}")
-    admin.execute(sql.SQL("CREATE ROLE {} LOGIN").format(role))
-    with psycopg.connect(parse(database).conninfo, autocommit=True) as connection:
-        connection.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(role))
+    role = f"stranger {os.getpid()} {next(numbers)}"
+    with (
+        roles(admin, role),
+        psycopg.connect(parse(database).conninfo, autocommit=True) as connection,
+    ):
+        connection.execute(sql.SQL("SET SESSION AUTHORIZATION {}").format(sql.Identifier(role)))
         yield connection
-    admin.execute(sql.SQL("DROP ROLE {}").format(role))
 
 
 def test_words_of_strangers_on_the_channel_hide_no_edit(

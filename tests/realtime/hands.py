@@ -23,6 +23,19 @@ def at(x: float, y: float, z: float) -> Floats:
     return pose
 
 
+class Steady:
+    """A clock that goes on by at most 4 ms a call: a hand waits for a loop that stands still."""
+
+    def __init__(self) -> None:
+        self._now = self._seen = 0.0
+
+    def __call__(self) -> float:
+        seen = time.perf_counter()
+        self._now += min(seen - self._seen, 0.004)
+        self._seen = seen
+        return self._now
+
+
 def still(z: float) -> Player:
     """A hand that rests at a pose for ever."""
     return Player([0.0, 3600.0], [at(0.0, 0.0, z)] * 2)
@@ -116,6 +129,8 @@ class Noted(Slow):
 
 class Beckoned(Slow):
     """A hand that rests at the start of its path until a file exists."""
+
+    profile = Player.profile
 
     def __init__(self, hand: Player, path: Path) -> None:
         super().__init__(hand, 1 << 30, 0.0)

@@ -21,7 +21,7 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
 from hapticdb.recording.replay import replay
-from realtime.hands import Beckoned, at, still
+from realtime.hands import Beckoned, Steady, at, still
 from realtime.sessions import NEVER_STALE, RATE, floor_points, floored, recorded, until
 from realtime.worlds import SIZE, make
 
@@ -50,7 +50,7 @@ def pressing(depth: float, seconds: float = 1.0) -> Player:
     """A hand that comes down until the sphere's lowest point would be so deep below the floor."""
     low = SIZE * (HEIGHT - 32.0) + ONSET + RADIUS - depth
     times = np.array([0.0, 0.3, 0.8, 0.9]) * seconds
-    return Player(times, [at(0.0, 0.0, z) for z in (0.03, low, low, 0.03)])
+    return Player(times, [at(0.0, 0.0, z) for z in (0.03, low, low, 0.03)], clock=Steady())
 
 
 def felt(
@@ -160,6 +160,7 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
     path = Player(
         np.array([0.0, 0.2, 0.4, 1.4, 1.6]),
         [at(0.0, 0.0, z) for z in (inside, 0.03, low, low, 0.03)],
+        clock=Steady(),
     )
     hand = Beckoned(path, tmp_path / "come")
     with Session(

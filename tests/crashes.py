@@ -126,8 +126,9 @@ class Killer:
             self.joined()
 
     def joined(self) -> None:
-        """Wait until the function has returned."""
-        joined(self._timer)
+        """Wait until the function has returned, if it was called."""
+        if self._timer.ident is not None:
+            joined(self._timer)
 
 
 def crash(server: PrivateServer) -> None:

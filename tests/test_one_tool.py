@@ -62,6 +62,8 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
         assert len(repr(result)) < 200
     assert "<td>box0</td>" in touch._repr_html_()
     assert swept.verdict in swept._repr_html_()
+    assert "<td>box, m</td><td>(0.15, -0.05, -0.05) to (0.25, 0.05, 0.05)</td>" in obj._repr_html_()
+    assert f"<b>{clashes!r}</b>" in clashes._repr_html_()
     most = float(np.linalg.norm(felt.forces, axis=1).max())
     assert f"at most {most:.4g} N" in repr(felt)
     assert f"<td>{most:.4g}</td>" in felt._repr_html_()

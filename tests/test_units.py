@@ -16,7 +16,7 @@ import hapticdb
 from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
 from command_line import tool as stl
 from hapticdb.mesh import parse_in_process, read_file
-from hapticdb.store.base import scene_bounds
+from hapticdb.store.attributes import scene_bounds
 from hapticdb.units import place_text
 from mesh_files import COLLADA
 

@@ -15,7 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
-from hapticdb.store.base import Object, scene_bounds
+from hapticdb.store.attributes import scene_bounds
+from hapticdb.store.base import Object
 from hapticdb.units import UNITS, length_text, metres_of
 
 Floats = NDArray[np.float64]

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterable
+from html import escape
 
 from hapticdb.errors import UsageError
 
@@ -32,6 +33,13 @@ def place_text(place: Iterable[float], step: float) -> str:
     digits = min(max(math.ceil(-math.log10(step)), 0), 12) if step > 0.0 else 6
     numbers = (f"{round(x, digits) + 0.0:.{digits}f}" for x in place)
     return f"({', '.join(x.rstrip('0').rstrip('.') if '.' in x else x for x in numbers)})"
+
+
+def notebook_html(result: object, rows: Iterable[Iterable[object]]) -> str:
+    """HTML of a result for notebooks: its line, and rows of a table; their texts are escaped."""
+    cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
+    table = "".join(f"<tr>{row}</tr>" for row in cells)
+    return f"<b>{escape(repr(result))}</b><table>{table}</table>"
 
 
 def readable_unit(length: float) -> tuple[float, str]:

@@ -62,6 +62,7 @@ def test_each_call_says_what_is_new_since_the_last(path: Path) -> None:
             (1, 2, "overlapping", "changed"), (2, 3, "touching", "same"), (3, 4, "apart", "gone"),
         }  # fmt: skip
         assert found.measured == 1
+        assert found._repr_html_().count("<tr>") == 2  # what is gone is not shown
         assert [(one.a, one.b) for one in found.of()] == [(1, 2)]
         assert (3, 4) not in {(one.a, one.b) for one in find_clashes(env).pairs}
         env.remove(1)

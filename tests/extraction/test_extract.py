@@ -159,6 +159,7 @@ def test_a_way_round_a_corner_is_planned_and_proved(tmp_path: Path) -> None:
     assert is_out(found, url)
     assert len(found.way.poses) > 2
     assert [one.object.name for one in found.blockers] == ["channel"]
+    assert f"<td>channel</td><td>stops {found.pulls} pulls</td>" in found._repr_html_()
     assert found.blockers[0].pulls == found.pulls  # none leads out straight
 
 

@@ -1,7 +1,6 @@
 """Results of batches: an entry for each pose, in the order in which the poses were given."""
 
 from collections.abc import Mapping
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.query.law import ForceLaw
 from hapticdb.store.base import Object
+from hapticdb.units import notebook_html
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -75,12 +75,12 @@ class TouchBatch:
             "torque, N m": np.linalg.norm(self.torques, axis=1),
             "depth, m": self.deepest,
         }
-        rows = "".join(
-            f"<tr><td>{name}</td><td>{values.max():.4g}</td><td>at pose {values.argmax()}</td></tr>"
+        rows = (
+            (name, f"{values.max():.4g}", f"at pose {values.argmax()}")
             for name, values in measures.items()
             if len(values)
         )
-        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
+        return notebook_html(self, rows)
 
     @property
     def offsets(self) -> Ints:

@@ -7,13 +7,17 @@ from functools import cached_property
 from typing import Literal, NamedTuple
 
 from hapticdb.store.pairs import KIND, KINDS, KeptPairs, Kind, PairRow, Status
-from hapticdb.units import length_text
+from hapticdb.units import length_text, notebook_html
 
 Shown = Literal[Status, "accepted", "not looked at"]
 GRAVITY: tuple[Kind, ...] = ("overlapping", "inside", "not known", "touching", "apart")
 """Kinds that are told, the gravest first."""
 ASKED: tuple[Kind, ...] = ("overlapping",)
 """Kinds that are looked for unless others are asked for."""
+
+
+MOST_SHOWN = 20
+"""Pairs that a notebook shows; more are counted. Larger: a longer table."""
 
 
 class Clash(NamedTuple):
@@ -109,6 +113,13 @@ class Clashes:
     def __repr__(self) -> str:
         found = ", ".join(f"{n} {kind}" for kind, n in self.counts().items() if n)
         return f"Clashes({found or 'no pairs'}, {self.elapsed:.2f} s)"
+
+    def _repr_html_(self) -> str:
+        """The gravest pairs, for notebooks."""
+        shown = [one for one in self.pairs if one.is_open]
+        rows = [(one.a_name, one.b_name, one.kind, one.length_text()) for one in shown[:MOST_SHOWN]]
+        more = len(shown) - len(rows)
+        return notebook_html(self, rows + [(f"and {more:,} more", "", "", "")] * (more > 0))
 
     @cached_property
     def pairs(self) -> tuple[Clash, ...]:

@@ -11,7 +11,8 @@ from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.grid import corners_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.store.base import Object, scene_bounds
+from hapticdb.store.attributes import scene_bounds
+from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.way import Way
 

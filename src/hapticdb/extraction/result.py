@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
 from hapticdb.sweeps.result import Swept
+from hapticdb.units import notebook_html
 
 Floats = NDArray[np.float64]
 
@@ -128,6 +129,13 @@ class Extraction:
         way = "no way found" if self.way is None else f"{self.way.verdict}, by a {self.way.how}"
         names = ", ".join(part.name for part in self.parts[:3])
         return f"Extraction({names}: {way}, pulls tried: {self.pulls}, {self.seconds:.2f} s)"
+
+    def _repr_html_(self) -> str:
+        """What refutes the way, and what stops straight pulls, for notebooks."""
+        met = () if self.way is None else self.way.in_way
+        rows = [*((obj.name, "in the way") for obj in met)]
+        rows += [(one.object.name, f"stops {one.pulls} pulls") for one in self.blockers]
+        return notebook_html(self, rows)
 
     @property
     def verdict(self) -> WayOutVerdict:

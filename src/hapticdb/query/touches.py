@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from html import escape
 from typing import NamedTuple
 
 import numpy as np
@@ -10,6 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.store.base import Object
+from hapticdb.units import notebook_html
 
 PairsOf = Callable[[ForceLaw, NDArray[np.int64]], NDArray[np.int64]]
 """Every (point, object id) pair (P, 2) of some points (C,) of a frame that a law has felt."""
@@ -106,10 +106,7 @@ class Touch:
 
     def _repr_html_(self) -> str:
         """Force, torque and what is touched, for notebooks."""
-        rows = "".join(
-            f"<tr><td>{one.id}</td><td>{escape(one.name)}</td></tr>" for one in self.objects
-        )
-        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
+        return notebook_html(self, ((one.id, one.name) for one in self.objects))
 
     def __repr__(self) -> str:
         x, y, z = self.force

@@ -36,7 +36,7 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.server.access import Role
 from hapticdb.server.limits import TokenBucket
 from hapticdb.server.served import Served
-from hapticdb.store.base import scene_bounds
+from hapticdb.store.attributes import scene_bounds
 
 LOG = logging.getLogger("hapticdb.server")
 FAILED = "this environment cannot be felt by contact proxies now: its operator finds why in the log"

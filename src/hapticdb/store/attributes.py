@@ -1,4 +1,4 @@
-"""What attributes of objects say: the words ``attribute=value``, and which axis points up."""
+"""What objects say: the words ``attribute=value``; a scene's box, and which axis points up."""
 
 import json
 import math
@@ -8,12 +8,19 @@ from fnmatch import translate
 from typing import cast
 
 import numpy as np
+from numpy.typing import NDArray
 
 from hapticdb.store.base import Object
 
 AXES = ("x", "y", "z")
 MOST_TOLD = 5
 """Most values or names of attributes that an error lists. Larger: longer lines."""
+
+
+def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
+    """Lower and upper corner (2, 3) of all objects, metres, world frame; None without any."""
+    boxes = np.array([obj.bounds for obj in objects])
+    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]) if len(boxes) else None
 
 
 def up_axis(objects: Iterable[Object]) -> int:

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.store.pairs import KeepsPairs
-from hapticdb.units import length_text
+from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
 Table = Literal["voxel", "brick", "band"]
@@ -186,16 +186,17 @@ class Object:
         size = length_text(float(np.ptp(self.bounds, axis=0).max()))
         return f"Object({self.id} {self.name!r}, {size} long, {self.voxels:,} voxels)"
 
+    def _repr_html_(self) -> str:
+        """Box, file and unit, for notebooks."""
+        low, high = (place_text(corner, 1e-4) for corner in self.bounds.tolist())
+        unit = self.attributes.get("unit", "not known")
+        rows = ("box, m", f"{low} to {high}"), ("file", self.link or "none"), ("its unit", unit)
+        return notebook_html(self, rows)
+
     @property
     def has_distances(self) -> bool:
         """Whether distances to its surface are stored beside its voxels."""
         return self.distances_crc is not None
-
-
-def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
-    """Lower and upper corner (2, 3) of all objects, metres, world frame; None without any."""
-    boxes = np.array([obj.bounds for obj in objects])
-    return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]) if len(boxes) else None
 
 
 @dataclass(frozen=True)

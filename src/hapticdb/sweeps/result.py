@@ -1,7 +1,6 @@
 """Results of a sweep, decided on surfaces: metres and fractions of the path."""
 
 from dataclasses import dataclass
-from html import escape
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -10,7 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.proportions import Proportions
 from hapticdb.store.base import Object
 from hapticdb.sweeps.way import Way
-from hapticdb.units import length_text
+from hapticdb.units import length_text, notebook_html
 
 Floats = NDArray[np.float64]
 
@@ -131,11 +130,8 @@ class Swept:
 
     def _repr_html_(self) -> str:
         """Table of what is hit, for notebooks."""
-        rows = "".join(
-            f"<tr><td>{escape(one.object.name)}</td><td>at {one.fraction:.2%} of the path</td></tr>"
-            for one in self.hits
-        )
-        return f"<b>{escape(repr(self))}</b><table>{rows}</table>"
+        rows = ((one.object.name, f"at {one.fraction:.2%} of the path") for one in self.hits)
+        return notebook_html(self, rows)
 
     @property
     def verdict(self) -> Verdict:

@@ -222,7 +222,7 @@ def _meetings(
     import hapticdb
     from hapticdb.clashes.moving import find_meetings, hinge
     from hapticdb.poses import read_poses
-    from hapticdb.store.base import scene_bounds
+    from hapticdb.store.attributes import scene_bounds
 
     if (poses is None) == (turn is None) or turn not in {None, *AXES}:
         raise UsageError("give either --poses CSV, or --turn x, y or z")

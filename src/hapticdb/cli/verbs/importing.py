@@ -197,7 +197,7 @@ class _Held(NamedTuple):
     def by(cls, url: str) -> "_Held":
         from contextlib import closing
 
-        from hapticdb.store.base import scene_bounds
+        from hapticdb.store.attributes import scene_bounds
         from hapticdb.store.connect import open_store
 
         with closing(open_store(url, read_only=True)) as store:

@@ -99,7 +99,7 @@ def info(
 def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]:
     """What `info` tells of an environment, as JSON and in words."""
     from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
-    from hapticdb.store.base import scene_bounds
+    from hapticdb.store.attributes import scene_bounds
     from hapticdb.store.engines import MayLag
 
     objects, grid, size = store.objects(), store.grid, store.size()

@@ -8,7 +8,9 @@ from pathlib import Path
 import pytest
 
 from children import PATIENCE, child, until
+from hapticdb.hosting.preparing import progress_text
 from hapticdb.kernels._cache import IN_WORKER, LENT
+from hapticdb.kernels.compiling import Compiled
 from hapticdb.resident.table import is_alive
 from page_person import PagePerson
 from serving import browser_at
@@ -20,6 +22,14 @@ if os.environ.get("{IN_WORKER}"):
     time.sleep({PATIENCE})
 """
 """A `sitecustomize` that keeps processes from compiling anything."""
+
+
+def test_the_time_left_is_as_expected_or_told_to_be_longer() -> None:
+    """However long no kernel is ready."""
+    start = "compiling what the hand needs, once: "
+    assert progress_text(Compiled(3, 32), 24.4) == f"{start}3 of 32, about 24 s left"
+    assert progress_text(Compiled(31, 32), -18.0) == f"{start}31 of 32, longer than expected"
+    assert progress_text(Compiled(32, 32), 9.0) == f"{start}32 of 32"
 
 
 @pytest.mark.long

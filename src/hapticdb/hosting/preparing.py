@@ -22,10 +22,11 @@ NICE = 10
 class Preparation:
     """Compiles the kernels of some purposes, once, when somebody first waits for them.
 
-    tell : called in the event loop with words on the progress, if anything has to be compiled.
+    tell : called in the event loop with words on the progress, if anything has to be compiled, and
+    with whether more is compiled than when it was called last; else only the time left is another.
     """
 
-    def __init__(self, purposes: tuple[str, ...], tell: Callable[[str], object]) -> None:
+    def __init__(self, purposes: tuple[str, ...], tell: Callable[[str, bool], object]) -> None:
         self._purposes, self._tell = purposes, tell
         self._running = asyncio.Lock()
         self._is_done = False
@@ -45,24 +46,32 @@ class Preparation:
         names = missing(entries_for(*self._purposes))
         if not names:
             return
-        over = time.monotonic() + seconds_of(names)
+        over, now = time.monotonic() + seconds_of(names), Compiled(0, len(names))
+        told, said = -1, ""
         with Process("hapticdb.hosting.preparing:work", self._purposes, ()) as process:
             while not self._is_ending.is_set():
+                text = progress_text(now, over - time.monotonic())
+                if text != said:
+                    loop.call_soon_threadsafe(self._tell, text, now.done != told)
+                    told, said = now.done, text
                 message = process.receive(LOOKED_EVERY)
-                if message is not None:
-                    if message.word == "done":
-                        return
-                    now: Compiled = message.content
-                    left = f", about {max(over - time.monotonic(), 3.0):.0f} s left"
-                    text = f"compiling what the hand needs, once: {now.done} of {now.total}"
-                    text += left if now.done < now.total else ""
-                    loop.call_soon_threadsafe(self._tell, text)
-                elif process.wait(0.0):
+                if message is None and process.wait(0.0):
                     raise HapticDBError("the process that compiles kernels ended too early")
+                if message is not None and message.word == "done":
+                    return
+                now = message.content if message is not None else now
 
     def close(self) -> None:
         """End the compiling, if it runs."""
         self._is_ending.set()
+
+
+def progress_text(now: Compiled, left: float) -> str:
+    """Words on how far the compiling is; left : seconds still expected; may be negative."""
+    text = f"compiling what the hand needs, once: {now.done} of {now.total}"
+    if now.done == now.total:
+        return text
+    return f"{text}, about {left:.0f} s left" if left >= 1.0 else f"{text}, longer than expected"
 
 
 def work(purposes: tuple[str, ...], sender: MessageSender) -> None:

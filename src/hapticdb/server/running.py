@@ -97,8 +97,9 @@ async def run(
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
 
-        def tell(text: str) -> None:
-            note(text)
+        def tell(text: str, is_news: bool) -> None:  # noqa: FBT001 - as `Preparation` calls it
+            if is_news:
+                note(text)
             keeper.tell("preparing", text)
 
         purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))

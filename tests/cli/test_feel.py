@@ -14,7 +14,16 @@ import pytest
 
 import hapticdb
 from children import PATIENCE, child, descendants, named, until
-from command_line import Run, command, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import (  # noqa: F401 - fixtures
+    Run,
+    command,
+    made,
+    on_terminal,
+    refused,
+    run,
+    scene,
+    succeeded,
+)
 from hapticdb.cli.values import size_bytes
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
@@ -108,6 +117,16 @@ def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
     out = succeeded(run(*wish, "--no-baseline"))
     assert out.splitlines()[0].split() == ["session"]
     assert re.search(r"^ *empty loop +not measured", out, re.MULTILINE)
+
+
+@pytest.mark.usefixtures("scene")
+def test_a_terminal_sees_what_is_waited_for_and_how_long_it_took() -> None:
+    wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.6)
+    shown = on_terminal(*wish)
+    for doing in ("loading", "sampling the tool", "measuring an empty loop", "feeling; Ctrl-C"):
+        assert doing in shown
+    assert re.search(r"^ *took +[\d.]+ s in all\r?$", shown, re.MULTILINE)
+    assert "measuring" not in on_terminal(*wish, "--no-baseline")
 
 
 @pytest.mark.usefixtures("scene")

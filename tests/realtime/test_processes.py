@@ -97,7 +97,7 @@ def test_it_ends_when_told_and_by_force_when_it_does_not_hear(
     monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     monkeypatch.setattr(module, "END_PATIENCE", 0.5)
-    for word in ("wait", "hang"):
+    for word in ("wait", "measure", "hang"):
         process = Process(WORKERS, (word, None), [])
         assert process.receive(LONG) is not None
         monkeypatch.setattr(module, "END_PATIENCE", 0.5 if word == "hang" else LONG)

@@ -6,6 +6,8 @@ import time
 from pathlib import Path
 
 from hapticdb.errors import DatabaseError
+from hapticdb.query.law import SMOOTH
+from hapticdb.realtime.loop import empty_loop
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
 
@@ -31,6 +33,9 @@ def work(request: tuple[str, object], sender: MessageSender) -> None:
             time.sleep(1000)
         finally:
             sender.send("tidied")
+    elif word == "measure":
+        sender.send("measuring")
+        empty_loop(SMOOTH, 1000.0, 3600.0)
     elif word == "end of file":
         raise EOFError("of something else")
     elif word == "hang":

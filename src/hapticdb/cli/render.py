@@ -187,8 +187,8 @@ def import_bar() -> "Iterator[ImportCallback | None]":
 def bar(doing: str, noun: str, *, of: int = 1) -> "Iterator[Callable[[float, int], None] | None]":
     """Show a bar with counts, in multiples `of` so many, and the time left.
 
-    Yields a callback of the library, `store.base.Progress`; None where standard error is no
-    terminal.
+    Yields a callback of the library, `store.base.Progress`, whose total is 0 where that is not
+    known; None where standard error is no terminal.
     """
     if not sys.stderr.isatty():
         yield None
@@ -209,13 +209,13 @@ def bar(doing: str, noun: str, *, of: int = 1) -> "Iterator[Callable[[float, int
         task = shown.add_task(doing, total=None, count="")
 
         def advance(done: float, total: int) -> None:
-            is_last = done == total
+            is_last, end = 0 < total == done, f"/{total // of:,}" if total else ""
             shown.update(
                 task,
                 description="finishing" if is_last else doing,
-                total=None if is_last else total,
+                total=None if is_last else total or None,
                 completed=done,
-                count=f"{int(done // of):,}/{total // of:,} {noun}",
+                count=f"{int(done // of):,}{end} {noun}",
             )
 
         yield advance

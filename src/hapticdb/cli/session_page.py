@@ -28,15 +28,14 @@ def show(
     shell: "PointShell",
     recording: str | None,
     path_speed: float | None,
-    *,
-    json: bool,
+    took: float | None,
 ) -> None:
     """Print how the loop kept its time, beside the empty loop, and what happened in it.
 
     recording : file that the session was recorded to; path_speed : speed assumed for a path without
-    times, m/s.
+    times, m/s; took : seconds of all of it, None: print JSON instead.
     """
-    if json:
+    if took is None:
         more = {"path_speed": path_speed, "shell": shell_record(shell)}
         render.say_json(report.figures() | more)
         return
@@ -55,6 +54,7 @@ def show(
         facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
     if recording is not None:
         facts.append(("recorded", _recording_text(report, recording)))
+    facts.append(("took", f"{took:.1f} s in all"))
     render.facts([*facts, *sorted(report.conditions.items())])
 
 

@@ -30,11 +30,11 @@ def shell_of(
 
     inset : how far its points are drawn inward, metres; a saved shell stays as it was saved.
     """
-    from hapticdb.pointshell.shell import PointShell
-
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
     with render.bar("sampling the tool", "points"):
+        from hapticdb.pointshell.shell import PointShell
+
         shell = PointShell.from_file(
             tool, points, spacing=spacing, unit=unit, seed=seed or 0, inset=inset
         )

@@ -7,6 +7,7 @@ kernel is compiled and no garbage is collected.
 import contextlib
 import math
 import signal
+import threading
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
@@ -267,10 +268,18 @@ class Loop:
 
 
 def empty_loop(law: ForceLaw, rate: float, seconds: float) -> LoopFigures:
-    """Run a loop that does nothing at that rate, to measure the machine's lateness."""
+    """Run a loop that does nothing at that rate, to measure the machine's lateness.
+
+    It ends at once if the process that started this one ends, or closes its channel.
+    """
     stations = Stations(law)
     stations.rows["source"], stations.rows["is_running"] = NOBODY, True
-    return LoopFigures.of_seat(stations.seats[0], stations.run(rate, seconds))
+    # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
+    watch = threading.Thread(target=lambda: parent_is_gone(seconds) and stations.stop())
+    watch.start()
+    took = stations.run(rate, seconds)
+    watch.join()
+    return LoopFigures.of_seat(stations.seats[0], took)
 
 
 def n_compiled() -> int:

@@ -225,9 +225,9 @@ def _request() -> object:
         ) from error
 
 
-def parent_is_gone() -> bool:
+def parent_is_gone(seconds: float = 0.0) -> bool:
     """Whether the process that started this one has ended, or has closed its channel.
 
-    Processes that were forked from it may still hold the channel open.
+    It waits so long for that. Processes that were forked from it may still hold the channel open.
     """
-    return bool(_ends.poll(0))
+    return bool(_ends.poll(1000.0 * seconds))

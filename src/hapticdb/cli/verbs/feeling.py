@@ -2,6 +2,8 @@
 
 import signal
 from collections.abc import Sequence
+from contextlib import ExitStack
+from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
 import typer
@@ -41,6 +43,8 @@ if TYPE_CHECKING:
 LOOK_EVERY = 0.25
 """Seconds between two looks at the session: how late is told that its recording has ended, or that
 the tool lies in an object."""
+
+MEASURING = "measuring an empty loop, then starting"
 
 # -- options of this verb alone -------------------------------------------------------------------
 
@@ -196,7 +200,9 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
-    drive = _begin_loop(law, processor, budget_points, frames_on)
+    began = perf_counter()
+    with render.bar("loading", ""):
+        drive = _begin_loop(law, processor, budget_points, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
@@ -205,16 +211,20 @@ def feel(
     compile_for(tool, "feel", drive)
     felt, inset = _looked_at(url, where, exclude, law or "smooth")
     shell = _shell(tool, tool_unit, points, seed, device, 0.0 if conservative else inset)
-    with _cells(url, budget_bytes(budget), felt, law) as cells:
-        session = hapticdb.Session(
-            cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
-            coupling=coupling, budget_points=budget_points, frames_on=frames_on,
-            processor=processor, record=record, append_recording=append, replace_recording=replace,
-            record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
-        )  # fmt: skip
-        with session, ended_by_signals(session.ask_to_end) as signals:
-            report = _waited_for(session, tool, stiffness)
-        session_page.show(report, cells, shell, record, speed, json=json)
+    with ExitStack() as held:
+        with render.bar("starting" if no_baseline else MEASURING, ""):
+            cells = held.enter_context(_cells(url, budget_bytes(budget), felt, law))
+            session = held.enter_context(hapticdb.Session(
+                cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
+                coupling=coupling, budget_points=budget_points, frames_on=frames_on,
+                processor=processor, record=record, append_recording=append,
+                replace_recording=replace, record_limit_bytes=limit_bytes,
+                has_baseline=not no_baseline,
+            ))  # fmt: skip
+        with ended_by_signals(session.ask_to_end) as signals:
+            report = _waited_for(session, tool, stiffness, seconds)
+        took = None if json else perf_counter() - began
+        session_page.show(report, cells, shell, record, speed, took)
     _exit_after(signals, report)
 
 
@@ -290,14 +300,19 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
         raise typer.Exit(1)
 
 
-def _waited_for(session: "Session", tool: str, stiffness: float | None) -> "Report":
+def _waited_for(
+    session: "Session", tool: str, stiffness: float | None, seconds: float | None
+) -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
     lowered = getattr(session.coupling, "lowered", None)
     if stiffness is not None and lowered is not None:
         render.note(lowered)
     fitting.tell(session.proportions, tool, "--scale")
     report, notes = None, session_page.Notes()
-    while report is None:
-        report = session.wait(LOOK_EVERY)
-        notes.look(session)
+    with render.bar("feeling; Ctrl-C ends it", "s") as progress:
+        while report is None:
+            report = session.wait(LOOK_EVERY)
+            notes.look(session)
+            if progress is not None:
+                progress(session.n_frames / session.timing.rate, round(seconds or 0.0))
     return report

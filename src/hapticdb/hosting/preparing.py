@@ -22,12 +22,17 @@ NICE = 10
 class Preparation:
     """Compiles the kernels of some purposes, once, when somebody first waits for them.
 
-    tell : called in the event loop with words on the progress, if anything has to be compiled, and
-    with whether more is compiled than when it was called last; else only the time left is another.
+    note, tell : called in the event loop with words on the progress, if anything has to be
+    compiled: `note` when more is compiled, `tell` also when only the time left is another.
     """
 
-    def __init__(self, purposes: tuple[str, ...], tell: Callable[[str, bool], object]) -> None:
-        self._purposes, self._tell = purposes, tell
+    def __init__(
+        self,
+        purposes: tuple[str, ...],
+        note: Callable[[str], object],
+        tell: Callable[[str], object],
+    ) -> None:
+        self._purposes, self._note, self._tell = purposes, note, tell
         self._running = asyncio.Lock()
         self._is_done = False
         self._is_ending = threading.Event()
@@ -52,7 +57,9 @@ class Preparation:
             while not self._is_ending.is_set():
                 text = progress_text(now, over - time.monotonic())
                 if text != said:
-                    loop.call_soon_threadsafe(self._tell, text, now.done != told)
+                    loop.call_soon_threadsafe(self._tell, text)
+                    if now.done != told:
+                        loop.call_soon_threadsafe(self._note, text)
                     told, said = now.done, text
                 message = process.receive(LOOKED_EVERY)
                 if message is None and process.wait(0.0):

@@ -97,13 +97,8 @@ async def run(
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
 
-        def tell(text: str, is_news: bool) -> None:  # noqa: FBT001 - as `Preparation` calls it
-            if is_news:
-                note(text)
-            keeper.tell("preparing", text)
-
         purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))
-        preparation = Preparation(purposes, tell)
+        preparation = Preparation(purposes, note, lambda text: keeper.tell("preparing", text))
         served = Served(
             serving.urls, serving.tools, access, serving.limits, Figures(), host, preparation
         )

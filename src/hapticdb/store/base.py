@@ -187,10 +187,9 @@ class Object:
         return f"Object({self.id} {self.name!r}, {size} long, {self.voxels:,} voxels)"
 
     def _repr_html_(self) -> str:
-        """Box, file and unit, for notebooks."""
+        """Box and file, for notebooks."""
         low, high = (place_text(corner, 1e-4) for corner in self.bounds.tolist())
-        unit = self.attributes.get("unit", "not known")
-        rows = ("box, m", f"{low} to {high}"), ("file", self.link or "none"), ("its unit", unit)
+        rows = ("box, m", f"{low} to {high}"), ("file", self.link or "none")
         return notebook_html(self, rows)
 
     @property

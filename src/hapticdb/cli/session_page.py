@@ -2,6 +2,7 @@
 
 from collections.abc import Sequence
 from contextlib import suppress
+from time import perf_counter
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
@@ -28,14 +29,14 @@ def show(
     shell: "PointShell",
     recording: str | None,
     path_speed: float | None,
-    took: float | None,
+    began: float | None,
 ) -> None:
     """Print how the loop kept its time, beside the empty loop, and what happened in it.
 
     recording : file that the session was recorded to; path_speed : speed assumed for a path without
-    times, m/s; took : seconds of all of it, None: print JSON instead.
+    times, m/s; began : as of `perf_counter`, None: print JSON instead.
     """
-    if took is None:
+    if began is None:
         more = {"path_speed": path_speed, "shell": shell_record(shell)}
         render.say_json(report.figures() | more)
         return
@@ -54,7 +55,7 @@ def show(
         facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
     if recording is not None:
         facts.append(("recorded", _recording_text(report, recording)))
-    facts.append(("took", f"{took:.1f} s in all"))
+    facts.append(("took", f"{perf_counter() - began:.1f} s in all"))
     render.facts([*facts, *sorted(report.conditions.items())])
 
 

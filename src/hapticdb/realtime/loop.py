@@ -274,8 +274,13 @@ def empty_loop(law: ForceLaw, rate: float, seconds: float) -> LoopFigures:
     """
     stations = Stations(law)
     stations.rows["source"], stations.rows["is_running"] = NOBODY, True
+
     # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
-    watch = threading.Thread(target=lambda: parent_is_gone(seconds) and stations.stop())
+    def end() -> None:
+        if parent_is_gone(seconds):
+            stations.stop()
+
+    watch = threading.Thread(target=end)
     watch.start()
     took = stations.run(rate, seconds)
     watch.join()

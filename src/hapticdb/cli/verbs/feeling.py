@@ -1,8 +1,9 @@
 """The verb feel."""
 
 import signal
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from functools import partial
 from time import perf_counter
 from typing import TYPE_CHECKING, Annotated
 
@@ -37,14 +38,11 @@ from hapticdb.realtime.fork_server import prepare
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.report import Report
-    from hapticdb.realtime.resident_cells import ResidentCells
     from hapticdb.realtime.session import Session
 
 LOOK_EVERY = 0.25
 """Seconds between two looks at the session: how late is told that its recording has ended, or that
 the tool lies in an object."""
-
-MEASURING = "measuring an empty loop, then starting"
 
 # -- options of this verb alone -------------------------------------------------------------------
 
@@ -201,8 +199,7 @@ def feel(
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
-    with render.bar("loading", ""):
-        drive = _begin_loop(law, processor, budget_points, frames_on)
+    drive = _begin_loop(law, processor, budget_points, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
@@ -211,21 +208,34 @@ def feel(
     compile_for(tool, "feel", drive)
     felt, inset = _looked_at(url, where, exclude, law or "smooth")
     shell = _shell(tool, tool_unit, points, seed, device, 0.0 if conservative else inset)
-    with ExitStack() as held:
-        with render.bar("starting" if no_baseline else MEASURING, ""):
-            cells = held.enter_context(_cells(url, budget_bytes(budget), felt, law))
-            session = held.enter_context(hapticdb.Session(
-                cells, shell, hand, rate=rate, seconds=seconds, handle=handle, law=chosen,
-                coupling=coupling, budget_points=budget_points, frames_on=frames_on,
-                processor=processor, record=record, append_recording=append,
-                replace_recording=replace, record_limit_bytes=limit_bytes,
-                has_baseline=not no_baseline,
-            ))  # fmt: skip
+    begin = partial(
+        hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
+        law=chosen, coupling=coupling, budget_points=budget_points, frames_on=frames_on,
+        processor=processor, record=record, append_recording=append, replace_recording=replace,
+        record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
+    )  # fmt: skip
+    with _begun(begin, url, budget_bytes(budget), felt, law) as session:
         with ended_by_signals(session.ask_to_end) as signals:
             report = _waited_for(session, tool, stiffness, seconds)
-        took = None if json else perf_counter() - began
-        session_page.show(report, cells, shell, record, speed, took)
+        session_page.show(report, session.cells, shell, record, speed, None if json else began)
     _exit_after(signals, report)
+
+
+@contextmanager
+def _begun(
+    begin: "partial[Session]", url: str, budget_bytes: int, felt: Felt, law: LawName | None
+) -> "Iterator[Session]":
+    """Begin a session; its resident cells have distances where the law reads them."""
+    is_measured = begin.keywords["has_baseline"]
+    doing = "measuring an empty loop, then starting" if is_measured else "starting"
+    with ExitStack() as held:
+        with render.bar(doing, ""):
+            cells = held.enter_context(hapticdb.ResidentCells(
+                url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude,
+                distances=None if law is None else law == "smooth",
+            ))  # fmt: skip
+            session = held.enter_context(begin(cells))
+        yield session
 
 
 def _shell(
@@ -263,8 +273,9 @@ def _begin_loop(
     drive = "direct" if law == "plane" else "coupling"
     prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
 
-    from hapticdb.pointshell.shell import checked_budget
-    from hapticdb.realtime.timing import Timing
+    with render.bar("loading", ""):
+        from hapticdb.pointshell.shell import checked_budget
+        from hapticdb.realtime.timing import Timing
 
     checked_budget(budget_points)
     Timing(processor=processor)
@@ -279,14 +290,6 @@ def _looked_at(
 
     with hapticdb.open(url, read_only=True) as env:
         return felt_objects(env, where, exclude), inset_of(env.grid.voxel_size, law)
-
-
-def _cells(url: str, budget_bytes: int, felt: Felt, law: LawName | None) -> "ResidentCells":
-    """Resident cells for a session; they have distances where the law reads them."""
-    distances = None if law is None else law == "smooth"
-    return hapticdb.ResidentCells(
-        url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude, distances=distances
-    )
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:

@@ -16,6 +16,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
     connection.guard(server)
     slider = server.gui.add_slider("slider", 0.0, 1.0, 0.1, 0.5)
     said = server.gui.add_markdown("nothing yet")
+    server.gui.add_tab_group()
     clock = server.scene.add_label("/clock", "0")
     gizmo = server.scene.add_transform_controls("/gizmo")
 

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 from playwright.sync_api import ConsoleMessage, Page
 
-from chromium import chromium
+from chromium import chromium, until
 from hapticdb.server.access import Role
 from hapticdb.server.served import Serving
 from serving import TOKENS, Running, running, urls
@@ -20,14 +20,26 @@ INJECTED = """() => {
     return window.injected ?? null;
 }"""
 """Adds a script to the page, as a part's name with markup would."""
-WATCHING = """setInterval(() => {
-    for (const button of document.querySelectorAll("button")) {
-        if (button.textContent !== "Save Canvas") continue;
-        window.laid_out = true;
-        window.shown ||= button.checkVisibility({visibilityProperty: true});
+WORDS = ["Save Canvas", "Drop a panel here", "Inactive"]
+"""Words of viser's own, each in an element of its own."""
+WATCHING = (
+    f"const WORDS = {WORDS}"
+    """
+window.own = {}
+window.cover = () => getComputedStyle(document.body, "::after").content
+setInterval(() => {
+    if (!document.body) return
+    window.was_covered ||= cover().includes("Connecting ...")
+    for (const one of document.querySelectorAll("span, p, div")) {
+        if (one.children.length || !WORDS.includes(one.textContent)) continue
+        const is_seen = one.checkVisibility({visibilityProperty: true}) && cover() === "none"
+        own[one.textContent] = own[one.textContent] || is_seen
     }
-}, 5)"""
-"""Notes whether viser's own settings are part of the page, and whether a person sees them."""
+}, 5)
+"""
+)
+"""Notes which of viser's own words were part of the page, and whether a person saw them; `cover`
+is what the page shows over everything."""
 LONG = 30_000.0
 """Longest wait for the page, milliseconds."""
 
@@ -62,13 +74,25 @@ def test_the_view_opens_by_its_link_and_works_under_the_policy(server: Running, 
     box.focus()
     page.keyboard.press("ArrowRight")
     page.get_by_text("slider 0.6").wait_for(timeout=LONG)
-    assert page.evaluate("[window.laid_out, window.shown]") == [True, False]
+    until(lambda: len(page.evaluate("own")) == len(WORDS), "viser's own words are there", page)
+    assert page.evaluate("own") == dict.fromkeys(WORDS, False)
+    assert page.evaluate("cover()") == "none"
     cookies = page.context.cookies()
     assert [(c["httpOnly"], c["sameSite"]) for c in cookies] == [(True, "Strict")]
     assert complaints == []
     assert token not in page.url
     assert page.evaluate(INJECTED) is None
     assert complaints != []
+
+
+def test_without_a_connection_the_page_says_that_it_connects(environment: Path, page: Page) -> None:
+    page.add_init_script(WATCHING)
+    with running(Serving(urls(environment), tokens=TOKENS, page="viser_page:work")) as server:
+        page.goto(f"{server.address}?token={next(iter(TOKENS))}", timeout=LONG)
+        page.get_by_text(" is a ").wait_for(timeout=LONG)
+        until(lambda: page.evaluate("cover()") == "none", "the page is seen", page)
+        assert page.evaluate("was_covered")
+    until(lambda: "Connecting ..." in page.evaluate("cover()"), "its end is told", page)
 
 
 def test_a_person_signs_in_by_the_form(server: Running, page: Page) -> None:

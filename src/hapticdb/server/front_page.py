@@ -40,10 +40,15 @@ HIDING = (
     ".mantine-ActionIcon-root:has(.tabler-icon-adjustments,.tabler-icon-share)"
     "{display:none!important}"
     ".mantine-Stack-root:has(>.mantine-TextInput-root input[value*='://'])"
-    "{visibility:hidden!important}</style>"
+    "{visibility:hidden!important}"
+    "[data-dock-area]>*>.mantine-Text-root:only-child{visibility:hidden}"
+    "body:has(#root:empty,.tabler-icon-player-pause,.mantine-Loader-root[style*=absolute])::after{"
+    "content:'Connecting ...';position:fixed;inset:0;z-index:9999;display:grid;"
+    "place-items:center;background:#fafbfc;font:16px system-ui,sans-serif}</style>"
 )
-"""Hides viser's note about drawing in software, and its settings, which begin with the server's
-address, with their buttons. They stay laid out, because viser measures them."""
+"""Hides viser's note about drawing in software, its words in an empty tab, and its settings, which
+begin with the server's address, with their buttons. They stay laid out, because viser measures
+them. Covers everything while viser's panel bears its sign for no connection."""
 
 
 class ClientPage(NamedTuple):

@@ -95,7 +95,7 @@ def field(page: Page, label: str) -> Locator:
 
 def hand_fields(page: Page) -> list[Locator]:
     """Three fields of the hand's place, in its opened folder."""
-    return page.locator("xpath=//*[text()='Place, m']/following::input[position()<=3]").all()
+    return [field(page, f"{axis}, m") for axis in "xyz"]
 
 
 def hand_on(page: Page) -> Floats:
@@ -128,10 +128,13 @@ class Eye:
         self._middle = (canvas["x"] + canvas["width"] / 2, canvas["y"] + canvas["height"] / 2)
         self._length = 0.5 * canvas["height"] / np.tan(FIELD_OF_VIEW / 2)
 
+    def pixels_a_metre(self, place: Floats) -> float:
+        """Pixels of a metre across the view at a place (3,), metres."""
+        return float(self._length / ((place - self._place) @ self._ahead))
+
     def pixel(self, place: Floats) -> tuple[float, float]:
         """Pixel of a place (3,), metres."""
-        way = place - self._place
-        share = self._length / (way @ self._ahead)
+        way, share = place - self._place, self.pixels_a_metre(place)
         return (
             float(self._middle[0] + share * (way @ self._right)),
             float(self._middle[1] - share * (way @ self._over)),

@@ -105,6 +105,25 @@ def scene(tmp_path: Path) -> Path:
     return two_parts(folder)
 
 
+def test_survey_coordinates_of_the_hand_are_read_and_typed_whole(tmp_path: Path) -> None:
+    low = np.array([515369.25, 4918340.10, 102.0])
+    box = trimesh.creation.box(bounds=[low, low + 40.0])
+    box.export(tmp_path / "box.obj", digits=2)
+    with hapticdb.create(tmp_path / "scene.db", hapticdb.Grid(1.0, tuple(low - 5.0), 6)) as env:
+        assert env.add(tmp_path / "box.obj", unit="m").status == "imported"
+    with page_of(tmp_path / "scene.db") as (_, person, browser):
+        x, y, z = (person.widgets[person.find(f"{axis}, m")] for axis in "xyz")
+        assert [field["value"] for field in (x, y, z)] == np.round(browser.hand[:3], 3).tolist()
+        assert {field["precision"] for field in (x, y, z)} == {3}
+        assert browser.drawing.words.text == "drag the ball"
+        assert browser.drawing.words.visible
+        before = browser.hand
+        person.put(person.find("y, m"), 4918340.75)
+        until(lambda: (person.look(0.05), browser.hand[1] == 4918340.75)[1])
+        assert np.array_equal(np.delete(browser.hand, 1), np.delete(before, 1))
+        assert not browser.drawing.words.visible
+
+
 def choose(browser: TabbedBrowser, name: str) -> int:
     """Choose the part of a file, as by a click; its id."""
     (found,) = (obj for obj in browser.site.objects.values() if obj.link.endswith(f"/{name}"))

@@ -152,7 +152,7 @@ def pull_hand(page: Page, eye: Eye, aim: Aim, to: Floats) -> None:
             left = float((to - here) @ axis)
             if abs(left) < NEAR * aim.radius:
                 break
-            arrow = axis * (GRABBED * HAND_GIZMO * aim.facts.diagonal)
+            arrow = axis * (GRABBED * HAND_GIZMO / eye.pixels_a_metre(here))
             drag(page, eye, here + arrow, left * axis)
             until(lambda: not np.array_equal(hand_on(page), here), "the hand moves", page)  # noqa: B023 - called now
     assert np.abs(hand_on(page) - to).max() < 2.0 * NEAR * aim.radius

@@ -1,5 +1,7 @@
 """Tools of the page: built-in probes, shells in any frame, and where they start."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
@@ -7,6 +9,8 @@ from hapticdb import PointShell
 from hapticdb.errors import UsageError
 from hapticdb.kernels.field.law import ONSET
 from hapticdb.page import colours, tools
+from hapticdb.page.scene.surroundings import set_first_view
+from hapticdb.page.site import SceneFacts
 from hapticdb.store.base import Object
 
 VOXEL = 0.002
@@ -71,6 +75,24 @@ def test_tools_start_free_and_apart(up: int) -> None:
     places = np.array([pose[:3, 3] for pose in poses])
     gaps = np.linalg.norm(places[:, None] - places[None], axis=-1) + 9.0 * np.eye(5)
     assert gaps.min() > 2.0 * radius
+
+
+@pytest.mark.parametrize("radius", [1e-4, 0.1, 1.0, 100.0])
+def test_the_first_view_shows_scene_and_tool_however_large_it_is(radius: float) -> None:
+    bounds = np.array([[-1.0, -0.5, -0.2], [1.0, 0.5, 0.4]])
+    facts = SceneFacts(bounds, np.eye(3)[2], np.eye(3)[1], VOXEL, is_smooth=True)
+    server = SimpleNamespace(initial_camera=SimpleNamespace())
+    set_first_view(server, bounds, 2, facts.reach(radius))  # type: ignore[arg-type]
+    camera = server.initial_camera
+    way = np.array(camera.look_at) - camera.position
+    start = facts.start(radius, 0)[:3, 3]
+    assert start[2] > bounds[1, 2] + max(radius, 3 * VOXEL)
+    for middle, size in ((bounds.mean(axis=0), facts.diagonal / 2), (start, radius)):
+        seen = middle - camera.position
+        away = np.linalg.norm(seen)
+        angle = np.arccos(seen @ way / away / np.linalg.norm(way)) + np.arcsin(size / away)
+        assert angle <= camera.fov / 2 + 1e-6
+        assert camera.near < away - size < away + size < camera.far
 
 
 def test_contacts_have_the_colour_of_the_nearest_touched_object() -> None:

@@ -17,7 +17,7 @@ from hapticdb.page.connection import Visitor
 from hapticdb.page.drawing import HandDrawing, add_tool, put_at
 from hapticdb.page.scene.browser import BrowserScene
 from hapticdb.page.site import Site
-from hapticdb.page.tools import HeldTool, start_pose
+from hapticdb.page.tools import HeldTool
 from hapticdb.page.wording import plain_name
 from hapticdb.poses import pose_of_row, row_of_pose
 from hapticdb.realtime.coupling import Coupling
@@ -41,6 +41,9 @@ LEAST_SEEN = 1e-4
 sent while a hand rests, and slow motions become steps."""
 PLUMB_EVERY = 0.1
 """Seconds from one line to what lies below the hand to the next. Larger: it follows more slowly."""
+LEAST_SHOWN = 0.01
+"""Least radius of what fills the view, as a share of the scene's diagonal. Smaller: more of it is
+seen, nearer than the eye can see."""
 HISTORY = 300
 """Samples of the plot, ten seconds of them. Larger: a longer time is seen, and more is sent."""
 
@@ -146,7 +149,6 @@ class Browser:
 
         def act(event: Event) -> None:
             self.move_hand(checks.row_of(event.target.position, event.target.wxyz))
-            self.has_moved = True
             if event.phase == "end":
                 self.hand_moved()
 
@@ -155,8 +157,9 @@ class Browser:
     # -- the session -------------------------------------------------------------------------
 
     def move_hand(self, pose: Floats) -> None:
-        """Put the hand at a pose (7,), metres."""
-        self.hand = pose
+        """Put the hand at a pose (7,), metres, for the person."""
+        self.hand, self.has_moved = pose, True
+        self.drawing.words.visible = False
         session = self.session
         if session is not None and not session.is_over:
             session.move(pose)
@@ -172,11 +175,11 @@ class Browser:
             self.hand_moved()
 
     def put_back(self) -> None:
-        """Put the part in hand back to its place; the first tool takes its place in the hand."""
+        """Put the part in hand back to its place, if there is one; take the first tool instead."""
         taken, self.taken = self.taken, None
         if taken is not None:
             self.scene.show((taken,))
-        self.take_in_hand(self.site.tools[0])
+            self.take_in_hand(self.site.tools[0])
 
     @property
     def unfelt(self) -> list[int]:
@@ -310,9 +313,7 @@ class Browser:
             session.set_coupling(Coupling(stiffness=self.stiffness))
 
     def _start(self) -> Floats:
-        facts = self.site.facts
-        pose = start_pose(facts.bounds, facts.up, facts.toward, self.tool.radius, self.number)
-        return row_of_pose(pose)
+        return row_of_pose(self.site.facts.start(self.tool.radius, self.number))
 
     def _share(self) -> None:
         """Show the tool to everyone, with the person's name to everyone else."""

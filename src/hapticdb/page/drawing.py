@@ -28,9 +28,8 @@ ARROW_BEGINS = 1e-3
 LEAST_DRAWN = 2e-4
 """Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap.
 Larger: less is sent while a hand rests."""
-HAND_GIZMO = 0.14
-"""Size of the hand's gizmo, as a share of the scene's diagonal. Larger: easier to grab, and more
-is behind it."""
+HAND_GIZMO = 110.0
+"""Size of the hand's gizmo in every view, pixels. Larger: easier to grab, and more is behind it."""
 PLUMB: colours.Colour = (70, 80, 95)
 """Colour of the line from the hand to what lies below it."""
 CONTACT_SHARE = 0.004
@@ -92,9 +91,10 @@ class HandDrawing:
         self._marked = np.empty((0, 3))
         scene = client.scene
         self.gizmo: TransformControlsHandle = scene.add_transform_controls(
-            "/hand", scale=HAND_GIZMO * diagonal, line_width=3.0, disable_sliders=True, opacity=0.9,
-            depth_test=False, visible=False,
+            "/hand", scale=HAND_GIZMO, fixed=True, line_width=3.0, disable_sliders=True,
+            opacity=0.9, depth_test=False, visible=False, translation_limits=((-1e9, 1e9),) * 3,
         )  # fmt: skip
+        self.words = scene.add_label("/hand/words", "", anchor="top-right")  # until it moves
         shaft, head = 0.0035 * diagonal, 0.010 * diagonal
         nothing = np.zeros((1, 2, 3))
         self._force = scene.add_arrows(
@@ -128,6 +128,7 @@ class HandDrawing:
         if self._ghost is not None:
             self._ghost.remove()
         self.gizmo.visible = True
+        self.words.text = f"drag the {tool.name}"
         put_at(self.gizmo, pose)
         self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
 
@@ -138,11 +139,9 @@ class HandDrawing:
             return
         self._seen = seen
         with self._client.atomic():
-            longest = LONGEST_ARROW * self._diagonal
-            place = tool[:3]
-            self._arrow(self._force, place, wrench[:3] * (longest / self.cap))
-            lever = 0.03 * self._diagonal
-            self._arrow(self._torque, place, wrench[3:] * (longest / (self.cap * lever)))
+            place, lever = tool[:3], 0.03 * self._diagonal
+            self.point(self._force, place, wrench[:3])
+            self.point(self._torque, place, wrench[3:] / lever)
             apart = float(np.linalg.norm(hand[:3] - place))
             self._tether.visible = apart > 0.002 * self._diagonal
             if self._tether.visible:

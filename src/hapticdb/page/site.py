@@ -18,6 +18,7 @@ from hapticdb.page import tools
 from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
 from hapticdb.page.editing import Edits
+from hapticdb.page.scene.surroundings import set_first_view
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
 
@@ -75,6 +76,16 @@ class SceneFacts:
         """Diagonal of the box, metres."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
 
+    def start(self, radius: float, number: int) -> Floats:
+        """Pose of `tools.start_pose`, free in coarse voxels, too."""
+        radius = max(radius, tools.LEAST_VOXELS * self.voxel_size)
+        return tools.start_pose(self.bounds, self.up, self.toward, radius, number)
+
+    def reach(self, radius: float) -> float:
+        """Distance from the box's middle within which the first tool starts, metres."""
+        away = self.start(radius, 0)[:3, 3] - self.bounds.mean(axis=0)
+        return float(np.linalg.norm(away)) + radius
+
 
 @dataclass(eq=False)
 class Site:
@@ -107,6 +118,7 @@ class Site:
             *tools.from_files(request.tools, facts.voxel_size, smooth=facts.is_smooth),
             *tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth),
         ]
+        set_first_view(self.server, facts.bounds, self.view.up, facts.reach(self.tools[0].radius))
         self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)
         self.view.on_edit = self._learn
 

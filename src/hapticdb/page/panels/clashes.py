@@ -10,7 +10,7 @@ from hapticdb.clashes.run import CONTACT, WITHIN, find_clashes
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import Browser
+from hapticdb.page.browser import LEAST_SHOWN, Browser
 from hapticdb.page.drawing import add_marks
 from hapticdb.page.panels.working import Progress, Work
 from hapticdb.page.widgets import put
@@ -28,9 +28,6 @@ MOST_LISTED = 500
 """Lines of the list; the filters find the others. Larger: a browser opens it more slowly."""
 LONGEST_TEXT = 200
 """Letters of a reason, and of words that are looked for."""
-LEAST_SHOWN = 0.01
-"""Least radius of what is shown of a pair, as a share of the scene's. Smaller: more of it is seen,
-nearer than the eye can see."""
 
 
 class ClashPanel:

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.page import checks, colours
-from hapticdb.page.browser import Browser
+from hapticdb.page.browser import LEAST_SHOWN, Browser
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import (
     MOST_SAID,
@@ -60,17 +60,19 @@ class TouchPanel:
 
     def _add_controls(self, gui: "GuiApi") -> None:
         browser = self._browser
-        names = [tool.name for tool in browser.site.tools]
-        self._tool = gui.add_dropdown("Tool", names, initial_value=browser.tool.name)
+        self._names = [tool.name for tool in browser.site.tools]
+        self._tool = gui.add_dropdown("Tool", self._names, initial_value=browser.tool.name)
         self._tool.on_update(browser.guarded("toucher", self._choose_tool))
         home = gui.add_button("Back to the start", color="gray")
         home.on_click(browser.guarded("toucher", self._go_home))
+        see = gui.add_button_group("See", ("Tool", "All"))
+        see.on_click(browser.guarded("toucher", self._look))
         with gui.add_folder("Where the hand is", expand_by_default=False):
-            step = round(browser.site.facts.diagonal / 500, 4)
-            self._place = gui.add_vector3(
-                "Place, m", tuple(np.round(browser.hand[:3], 4)), step=step
-            )
-            self._place.on_update(browser.guarded("toucher", self._type_place))
+            step = float(10.0 ** np.floor(np.log10(browser.site.facts.diagonal / 200)))
+            self._place = [gui.add_number(f"{axis}, m", 0.0, step=step) for axis in "xyz"]
+            for field in self._place:  # a field for each: of three in a row seven digits are cut
+                field.precision = max(2 - round(np.log10(step)), 2)
+                field.on_update(browser.guarded("toucher", self._type_place))
         with gui.add_folder("How it feels", expand_by_default=False):
             stiffness = gui.add_slider(
                 "Stiffness, N/m", SOFTEST, STIFFEST, 10.0, browser.stiffness,
@@ -89,27 +91,33 @@ class TouchPanel:
 
     def _choose_tool(self, event: "GuiEvent[Any]") -> None:
         browser = self._browser
-        if event.client is None:  # set by the page
+        is_held = event.target.value == PART and not self._is_of_the_list
+        if event.client is None or is_held:  # set by the page, or as it is
             return
-        names = [tool.name for tool in browser.site.tools]
-        if event.target.value == PART and not self._is_of_the_list:
-            return
-        name = checks.choice_of(event.target.value, names, "a tool")
-        if browser.taken is not None:
-            browser.put_back()
-        browser.take_in_hand(browser.site.tools[names.index(name)], browser.hand)
+        name = checks.choice_of(event.target.value, self._names, "a tool")
+        browser.put_back()
+        browser.take_in_hand(browser.site.tools[self._names.index(name)], browser.hand)
 
     def _go_home(self, _: object) -> None:
         browser = self._browser
-        if browser.taken is not None:
-            browser.put_back()
+        browser.put_back()
         browser.take_in_hand(browser.tool)
+
+    def _look(self, event: "GuiEvent[Any]") -> None:
+        browser, facts = self._browser, self._browser.site.facts
+        middle, radius = facts.bounds.mean(axis=0), 0.5 * facts.diagonal
+        if checks.choice_of(event.target.value, ("Tool", "All"), "what to see") == "Tool":
+            middle = browser.hand[:3]
+            radius = max(2.0 * browser.tool.radius, LEAST_SHOWN * facts.diagonal)
+        browser.scene.fly_to(middle, radius)
 
     def _type_place(self, event: "GuiEvent[Any]") -> None:
         if event.client is None:  # set by the page
             return
         browser = self._browser
-        position = checks.numbers_of(event.target.value, 3, checks.FARTHEST, "a place")
+        position, far = browser.hand[:3].copy(), checks.FARTHEST
+        typed = checks.number_of(event.target.value, -far, far, "a place")
+        position[self._place.index(event.target)] = typed
         browser.move_hand(checks.row_of(position, browser.hand[3:]))
         browser.drawing.gizmo.position = position
 
@@ -136,16 +144,15 @@ class TouchPanel:
         if not hasattr(self, "_tool"):
             return
         browser = self._browser
-        names = [tool.name for tool in browser.site.tools]
-        options = names if self._is_of_the_list else [*names, PART]
+        options = self._names if self._is_of_the_list else [*self._names, PART]
         self._tool.options = options
         put(self._tool, browser.tool.name if self._is_of_the_list else PART)
 
     def show_hand(self) -> None:
         """Show where the hand is."""
         if hasattr(self, "_place"):
-            x, y, z = (round(float(value), 4) for value in self._browser.hand[:3])
-            put(self._place, (x, y, z))
+            for field, value in zip(self._place, self._browser.hand[:3].tolist(), strict=True):
+                put(field, round(value, field.precision))
 
     def show_wait(self, text: str) -> None:
         """Show what the session waits for, instead of a force."""

@@ -43,10 +43,10 @@ class View(NamedTuple):
     look_at: NDArray[np.float64]
 
 
-def framing(box: NDArray[np.float64], up: int) -> View:
-    """A view from which all of a box (2, 3) is seen."""
+def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
+    """A view from which all of a box (2, 3) is seen, and what is within `reach` of its middle."""
     center = box.mean(axis=0)
-    radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
+    radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, reach, 1e-9)
     way = np.zeros(3)
     way[[(up + 1) % 3, (up + 2) % 3, up]] = TOWARDS
     way /= np.linalg.norm(way)
@@ -55,7 +55,7 @@ def framing(box: NDArray[np.float64], up: int) -> View:
 
 def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
     """Light, background, ground and first view for objects in a box (2, 3), metres."""
-    scene, radius = server.scene, max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
+    scene = server.scene
     scene.set_up_direction(tuple(np.eye(3)[up]))
     scene.configure_default_lights(enabled=True, cast_shadow=False)
     scene.add_light_ambient("/light", intensity=AMBIENT)
@@ -64,8 +64,13 @@ def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -
     shades = (1 - steps) * np.array(ABOVE) + steps * np.array(BELOW)
     scene.set_background_image(np.tile(shades.astype(np.uint8), (1, 8, 1)), format="png")
     _set_ground(scene, box, up)
-    view = framing(box, up)
-    camera = server.initial_camera
+    set_first_view(server, box, up, 0.0)
+
+
+def set_first_view(server: "ViserServer", box: NDArray[np.float64], up: int, reach: float) -> None:
+    """Let browsers begin with the view of `framing`."""
+    view, camera = framing(box, up, reach), server.initial_camera
+    radius = float(np.linalg.norm(view.position - view.look_at)) * np.sin(FIELD_OF_VIEW / 2)
     camera.fov = FIELD_OF_VIEW
     camera.near, camera.far = radius / 200, radius * 100
     camera.up = tuple(np.eye(3)[up])

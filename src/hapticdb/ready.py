@@ -14,8 +14,8 @@ from hapticdb.kernels.compiling import (
     missing,
 )
 
-SECONDS = {"period.loop.run": 25.0, "period.direct.run_directly": 12.0}
-"""Seconds that the longest kernels compile, of one processor; the others take `SHORT` each."""
+SECONDS = {"period.loop.move_by_coupling": 7.0}
+"""Seconds that the longest kernel compiles, of one processor; the others take `SHORT` each."""
 SHORT = 1.2
 
 
@@ -23,6 +23,11 @@ def seconds_of(names: Collection[str]) -> float:
     """Seconds that entries take to compile on this machine's processors, roughly."""
     each = [SECONDS.get(name, SHORT) for name in names]
     return max(sum(each) / min(os.cpu_count() or 1, len(each)), *each)
+
+
+def session_purposes(*, is_smooth: bool, is_recorded: bool) -> list[str]:
+    """Purposes of a session under the smooth or the plane law."""
+    return ["feel", *(["coupling"] + ["recording"] * is_recorded if is_smooth else ["direct"])]
 
 
 _READY: set[str] = set()

@@ -129,7 +129,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("", "sample s --frames 20"),
     ("import", "import a.db s/car.glb --bits 7"),
     ("shell,touch by distance", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
-    ("feel,coupling", FEEL),
+    ("feel,coupling,recording", FEEL),
     ("frames by distance", "replay a.hdbrec a.db"),
     ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
     ("extract", "extract a.db 12 --motions 0 --out 100"),

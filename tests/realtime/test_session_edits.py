@@ -48,7 +48,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
     """Others write just before its kernel begins, and again as soon as it has ended."""
     grid, seats, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
     with CellTable.create(8 << 20, distances=is_smooth) as table, table.reading() as row:
-        periods = Stations(SMOOTH if is_smooth else PLANE, seats, rings)
+        periods = Stations(SMOOTH if is_smooth else PLANE, seats, rings, is_recorded=True)
         cells = table.cells if is_smooth else table.cells.without_distances()
         station = Station(
             periods.rows, cells, row, table.desk.sessions[row, ...], grid, held_tool(sphere, 0.01)

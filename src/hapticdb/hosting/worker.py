@@ -26,8 +26,8 @@ from hapticdb.realtime.timing import undisturbed
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 
-ENTRIES = ("period.loop.run",)
-"""Kernels that a worker calls; the loop's has all others that a frame needs within it."""
+ENTRIES = tuple(f"period.loop.{name}" for name in ("run", "move_by_coupling", "feel@distances"))
+"""Kernels that a worker calls, and those that they call."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""
 LEAVE_PATIENCE = 5.0
@@ -71,7 +71,7 @@ class Worker:
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         self._board = board = request.board
-        self._stations = Stations(SMOOTH, board.seats, board.rings)
+        self._stations = Stations(SMOOTH, board.seats, board.rings, is_recorded=True)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------

@@ -21,7 +21,7 @@ from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
-from hapticdb.kernels._linking import EntryCompiler, compile_once, note_nothing
+from hapticdb.kernels._linking import EntryCompiler, ask_once, compile_once, note_nothing
 
 INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -53,10 +53,12 @@ _ENTRY_OPTIONS: dict[str, Any] = {
 }  # fmt: skip
 """Options of entries. `_nrt` is numba's counting of references to arrays."""
 _LEAF_OPTIONS: dict[str, Any] = _ENTRY_OPTIONS | {"_nrt": False}
+_BY_ADDRESS: dict[str, Any] = {"_nrt": False, "no_cpython_wrapper": True}
 if IN_WORKER in os.environ:
     _ENTRY_OPTIONS |= {"pipeline_class": EntryCompiler}
     _LEAF_OPTIONS |= {"no_cpython_wrapper": True}
     compile_once()
+    ask_once()
     note_nothing()
 
 
@@ -90,7 +92,8 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - likewise
         """Store the machine code, unless it is for types from outside this package."""
         given, _ = normalize_signature(sig)
-        classes = [getattr(kind, "instance_class", None) for kind in given]
+        kinds = [getattr(kind, "dtype", kind) for kind in given]  # a pointer's, too
+        classes = [getattr(kind, "instance_class", None) for kind in kinds]
         if all(c is None or c.__module__.startswith("hapticdb.") for c in classes):
             super().save_overload(sig, data)
 
@@ -98,19 +101,21 @@ class _Cache(FunctionCache):  # type: ignore[misc]
 def entry(
     *signature: Any,  # noqa: ANN401
     also: Mapping[Any, Any] = MappingProxyType({}),
+    by_address: bool = False,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
     """Compile a kernel that Python calls with arguments of those types, when it is first called.
 
     `also` declares the signature for the distance law: some types exchanged. The kernel is
     cached on disk and runs without the interpreter lock. A call with other types is correct, but
-    slow the first time, because the kernel is compiled for them then.
+    slow the first time, because the kernel is compiled for them then. by_address: only kernels call
+    it (`hand.calling`), and it makes no arrays.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
         before = config.CACHE_DIR
         config.CACHE_DIR = CACHE_FOLDER
         try:
-            compiled = numba.njit(**_ENTRY_OPTIONS)(function)
+            compiled = numba.njit(**_ENTRY_OPTIONS | (_BY_ADDRESS if by_address else {}))(function)
             if not config.DISABLE_JIT:
                 compiled._cache = _Cache(function)  # noqa: SLF001 - as cache=True sets numba's own
         finally:

@@ -7,16 +7,20 @@ time is numba's own, before LLVM begins; what it notes there for nobody is left 
 """
 
 from contextlib import nullcontext
+from functools import cache
 from inspect import iscode
 from typing import Any
 
 from numba.core import event, transforms
+from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import Compiler
 from numba.core.compiler_machinery import PassManager, _pass_registry
+from numba.core.cpu import CPUContext
 from numba.core.postproc import PostProcessor, VariableLifetime
 from numba.core.typed_passes import NopythonRewrites
 from numba.core.types.functions import BaseFunction
+from numba.core.typing import Context
 from numba.core.untyped_passes import InlineClosureLikes
 
 
@@ -92,6 +96,14 @@ def compile_once() -> None:
         return known[asked]
 
     BaseFunction.get_call_type = get_call_type  # type: ignore[method-assign]
+
+
+def ask_once() -> None:
+    """Let numba load its registries once, and not for each function, and ask for a size once."""
+    for kind in CPUContext, Context:
+        kind.load_additional_registries = cache(kind.load_additional_registries)
+    for size in "get_abi_sizeof", "get_abi_alignment":
+        setattr(BaseContext, size, cache(getattr(BaseContext, size)))
 
 
 def note_nothing() -> None:

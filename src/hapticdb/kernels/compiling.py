@@ -1,10 +1,11 @@
 """Compile entries before their first call, side by side in several processes.
 
 numba compiles one function at a time in a process, with any number of threads. Each process
-compiles whole modules of entries, because two processes that wrote the index of one entry would
-lose each other's work. The machine code goes into the cache on disk; the process that asked, and
-every later process, loads it from there. A mark file beside the code says that an entry is
-compiled for this copy of the package, so that numba need not be loaded to find out.
+compiles whole entries, because two processes that wrote the index of one entry would lose each
+other's work, and mostly whole modules, which share leaves. The machine code goes into the cache on
+disk; the process that asked, and every later process, loads it from there. A mark file beside the
+code says that an entry is compiled for this copy of the package, so that numba need not be loaded
+to find out.
 """
 
 import contextlib
@@ -28,7 +29,7 @@ from typing import NamedTuple
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 LONGEST = (
-    *("period.loop", "period.direct", "proxy.linearize", "surfaces.distances"),
+    *("period.loop", "proxy.linearize", "surfaces.distances"),
     *("surfaces.voxelize", "resident.nearest", "resident.first_hits", "resident.budget"),
     *("query.refining", "query.contact"),
 )
@@ -52,13 +53,16 @@ def _names() -> tuple[str, ...]:
 NAMES = _names()
 """Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`)."""
 TOGETHER = {
-    "resident.budget": "period.direct",
-    "proxy.linearize": "period.loop",
+    "resident.budget": "period.loop.feel",
+    "proxy.linearize": "period.loop.move_by_coupling",
+    "period.loop.move_directly": "period.loop.run",
     "triangles.sweeping": "triangles.nearest",
     "triangles.parting": "surfaces.nearest",
 }
-"""Modules that are compiled after another module, if it is compiled, too, in the same process: they
-share its leaves."""
+"""Modules, or entries of `APART`, that are compiled after others, if these are compiled, too, in
+the same process: they share leaves."""
+APART = "period.loop"
+"""A module whose entries are jobs of their own: the first session waits for them."""
 LONGEST_S = 600.0
 """Seconds without a compiled job after which all processes are ended. What they have not compiled
 is compiled where it is first called."""
@@ -90,6 +94,8 @@ _RESIDENT = (
     *_COST,
 )
 _FRAMES = "resident.budget.feel_kernel"
+_COUPLING = ("period.loop.run", "period.loop.move_by_coupling")
+_FELT = "period.loop.feel@distances"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "points": ("curves.encode_kernel",),
@@ -116,9 +122,10 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "statement": (_LOCATE, "query.refining.wrench_of_addresses"),
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "hand.handle.*", "motion.*", "rigid.*"),
-    "coupling": ("period.loop.*",),
-    "direct": ("period.direct.*",),
-    "host": (*_RESIDENT, "period.loop.*"),
+    "coupling": _COUPLING,
+    "recording": (_FELT,),
+    "direct": ("period.loop.run", "period.loop.move_directly", "period.loop.feel"),
+    "host": (*_RESIDENT, *_COUPLING, _FELT),
     "frames": (*_RESIDENT, _FRAMES, "rigid.poses_of"),
     "frames by distance": (*_RESIDENT, _FRAMES + "@distances", "rigid.poses_of"),
     "clashes": ("surfaces.sides.*", "surfaces.nearest.*", "triangles.*", "curves.encode_kernel"),
@@ -134,7 +141,7 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "query.contact.*",
         "query.refining.*",
     ),
-    "proxies": (*_RESIDENT, "period.loop.*", "proxy.linearize.*"),
+    "proxies": (*_RESIDENT, *_COUPLING, "proxy.linearize.*"),
     "proxy": ("proxy.evaluate.*", "hand.handle.*"),
     "everything": ("*",),
 }
@@ -206,12 +213,18 @@ def load(names: Collection[str]) -> None:
 def jobs_of(names: Collection[str]) -> list[tuple[str, ...]]:
     """Names by job: a module's entries and those of its partner in `TOGETHER` are one job."""
     jobs: dict[str, list[str]] = {}
-    modules = {name.rpartition(".")[0] for name in names}
+    parts = {_part_of(name) for name in names}
     for name in sorted(names, key=NAMES.index):
-        module = name.rpartition(".")[0]
-        partner = TOGETHER.get(module)
-        jobs.setdefault(partner if partner in modules else module, []).append(name)
+        part = _part_of(name)
+        partner = TOGETHER.get(part)
+        jobs.setdefault(partner if partner in parts else part, []).append(name)
     return list(map(tuple, jobs.values()))
+
+
+def _part_of(name: str) -> str:
+    """What is compiled in one process: an entry's module, or the entry alone in `APART`."""
+    module = name.rpartition(".")[0]
+    return name.partition("@")[0] if module == APART else module
 
 
 @contextlib.contextmanager
@@ -255,7 +268,7 @@ def _workers(queue: Sequence[tuple[str, ...]], count: int) -> Iterator[int]:
 
 def serve() -> None:
     """Run a compiling process, whose arguments are the jobs; see `_workers`."""
-    gc.set_threshold(100_000, 50, 100)  # compiling makes many objects and few cycles
+    gc.set_threshold(1_000_000, 50, 100)  # compiling makes many objects and few cycles
     while number := os.read(0, 1):
         for name in sys.argv[1 + number[0]].split():
             _compile_here(name)

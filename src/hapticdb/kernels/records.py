@@ -432,6 +432,9 @@ STATION: Layout = _record(
         ("gap", "<i8"),  # ns, mean time between arrivals
         ("is_let_go", "<i8"),
         ("way", WAY),
+        # what touches: row of `met`, and number of points
+        ("touching", "<i8"),
+        ("n_touching", "<i8"),
         # what periods keep
         ("servo", SERVO),
         ("follower", FOLLOWER),
@@ -458,6 +461,8 @@ PACE: Layout = _record(
         ("begun", "<i8"),  # ns, when it began
         ("dt", "<f8"),  # s since the one before
         ("moment", "<i8", 4),  # scratch of the clock
+        # addresses: of the kernels that move a tool and feel a frame, and of the law's numbers
+        *((name, "<i8") for name in ("mover", "feeler", "law")),
     ]
 )
 """What the loop of periods is told, and what it tells."""

@@ -91,7 +91,10 @@ class Loop:
         self.reader = Reader(request.device)
         self.table, self.board = request.table, request.board
         self.session = self.table.desk.sessions[request.row, ...]
-        self.stations = Stations(request.law, self.board.seats, self.board.rings)
+        self.stations = Stations(
+            request.law, self.board.seats, self.board.rings,
+            is_recorded=bool(self.board.seats["is_recorded"].any()),
+        )  # fmt: skip
         has_distances = isinstance(request.coupling, SettledCoupling)
         cells = self.table.cells if has_distances else self.table.cells.without_distances()
         tool = held_tool(request.shell, request.grid.voxel_size, request.budget_points)

@@ -14,7 +14,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell, checked_budget
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
-from hapticdb.ready import make_ready
+from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, radius_of
 from hapticdb.realtime.handle import Handle, path_of_hand
@@ -205,7 +205,9 @@ class Session(Closes):
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = ["feel", "coupling" if is_smooth(self.law) else "direct"]
+        purposes = session_purposes(
+            is_smooth=is_smooth(self.law), is_recorded=self._recording is not None
+        )
         make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:

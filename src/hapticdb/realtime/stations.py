@@ -7,9 +7,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
+from hapticdb.kernels.hand.calling import address_of_kernel
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import FIELD_ROWS
-from hapticdb.kernels.period import direct, loop
+from hapticdb.kernels.period import loop
 from hapticdb.kernels.period.following import USUAL_GAP_NS
 from hapticdb.kernels.period.memory import PERIOD_ROWS
 from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
@@ -136,17 +137,26 @@ class Stations:
     """Stations of a process, and the call of their periods.
 
     law : that all sessions feel; seats, rings : of the board (`realtime.board.Board`), and for each
-    seat a station; unless given, of one session alone.
+    seat a station; unless given, of one session alone; is_recorded : whether frames may be
+    recorded, for which the smooth law is felt beside its coupling.
     """
 
     def __init__(
-        self, law: ForceLaw, seats: Record | None = None, rings: Frames | None = None
+        self,
+        law: ForceLaw,
+        seats: Record | None = None,
+        rings: Frames | None = None,
+        *,
+        is_recorded: bool = False,
     ) -> None:
         self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
         self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
-        self._run = loop.run if is_smooth(law) else direct.run_directly
-        self._arguments = (self.rows, seats, rings, self.pace, law.for_kernels)
+        mover = loop.move_by_coupling if is_smooth(law) else loop.move_directly
+        self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
+        if is_recorded or not is_smooth(law):
+            self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
+        self._arguments = (self.rows, seats, rings, self.pace)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
 
     def run(self, rate: float, seconds: float = FOREVER) -> float:
@@ -159,14 +169,14 @@ class Stations:
         self.rows["began"] = self.rows["last"] = begun
         pace["period"], pace["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
         pace["due"] = begun + pace["period"]
-        self._run(*self._arguments)
+        loop.run(*self._arguments)
         return 1e-9 * (time.monotonic_ns() - begun)
 
     def step(self, dt: float, begun: int) -> None:
         """Run one period that has begun at a time, ns, `dt` s after the last one."""
         times = self._times
         times[0][()], times[1][()], times[2][()] = begun, begun, dt
-        self._run(*self._arguments)
+        loop.run(*self._arguments)
 
     def stop(self) -> None:
         """End `run` after its period."""

@@ -199,13 +199,13 @@ def feel(
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
-    drive = _begin_loop(law, processor, budget_points, frames_on)
+    kernels = _begin_loop(law, processor, budget_points, frames_on, is_recorded=record is not None)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
-    compile_for(tool, "feel", drive)
+    compile_for(tool, *kernels)
     felt, inset = _looked_at(url, where, exclude, law or "smooth")
     shell = _shell(tool, tool_unit, points, seed, device, 0.0 if conservative else inset)
     begin = partial(
@@ -259,19 +259,26 @@ def _recording_limit(record: str | None, limit: str | None, *, is_continued: boo
 
 
 def _begin_loop(
-    law: LawName | None, processor: int | None, budget_points: int | None, frames_on: FramesOn
-) -> str:
+    law: LawName | None,
+    processor: int | None,
+    budget_points: int | None,
+    frames_on: FramesOn,
+    *,
+    is_recorded: bool,
+) -> list[str]:
     """Have what forks the processes load kernels while the tool is sampled here.
 
-    It also refuses what the loop cannot do. Returns the purpose of the kernels of the law.
+    It also refuses what the loop cannot do. Returns the purposes of the session's kernels.
     """
     if frames_on != "cpu":
         from hapticdb.query.law import as_law
         from hapticdb.realtime.on_gpu import check_frames
 
         check_frames(frames_on, as_law(law), budget_points)
-    drive = "direct" if law == "plane" else "coupling"
-    prepare("hapticdb.realtime.loop:work", ["resident", "feel", drive])
+    from hapticdb.ready import session_purposes
+
+    purposes = session_purposes(is_smooth=law != "plane", is_recorded=is_recorded)
+    prepare("hapticdb.realtime.loop:work", ["resident", *purposes])
 
     with render.bar("loading", ""):
         from hapticdb.pointshell.shell import checked_budget
@@ -279,7 +286,7 @@ def _begin_loop(
 
     checked_budget(budget_points)
     Timing(processor=processor)
-    return drive
+    return purposes
 
 
 def _looked_at(

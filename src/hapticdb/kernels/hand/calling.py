@@ -1,4 +1,4 @@
-"""A call of a function of Python from a kernel, by an address that a record has."""
+"""Calls from a kernel, by an address: of a function of Python, and of another kernel."""
 
 import ctypes
 from typing import Any
@@ -17,13 +17,48 @@ def address_of(function: Any) -> int:  # noqa: ANN401 - a `FUNCTION`
     return int(ctypes.cast(function, ctypes.c_void_p).value or 0)
 
 
+def address_of_kernel(kernel: Any, types_of_arguments: tuple[Any, ...]) -> int:  # noqa: ANN401
+    """Address of the machine code of an entry for arguments of those types."""
+    if config.DISABLE_JIT:
+        _PLAIN[id(kernel)] = kernel
+        return id(kernel)
+    kernel.compile(types_of_arguments)
+    code = kernel.overloads[types_of_arguments]
+    return int(code.library.get_pointer_to_function(code.fndesc.llvm_func_name))
+
+
+_PLAIN: dict[int, Any] = {}
+
 if config.DISABLE_JIT:
 
     def call(address):
         """Call the function at an address."""
         return FUNCTION(int(address))()
 
+    def call_kernel(address, one, two, three):
+        """Call the kernel at an address."""
+        return _PLAIN[int(address)](one, two, three)
+
 else:
+
+    @intrinsic
+    def call_kernel(typing_context, address, one, two, three):  # noqa: ARG001 - numba's signature
+        """Call the kernel at an address, which returns an integer and raises nothing.
+
+        Each argument is a record, which is handed over by its place, or an integer, which may be
+        the address of what the kernel takes a pointer to.
+        """
+
+        def generate(context, builder, signature, arguments):  # noqa: ARG001
+            address, *given = arguments
+            result = cgutils.alloca_once(builder, cgutils.ir.IntType(64))
+            error = cgutils.alloca_once_value(builder, cgutils.get_null_value(cgutils.voidptr_t))
+            handed = result, error, *given  # as numba calls functions
+            kind = cgutils.ir.FunctionType(cgutils.ir.IntType(32), [one.type for one in handed])
+            builder.call(builder.inttoptr(address, kind.as_pointer()), handed)
+            return builder.load(result)
+
+        return types.int64(types.int64, one, two, three), generate
 
     @intrinsic
     def call(typing_context, address):  # noqa: ARG001 - numba's signature

@@ -1,25 +1,31 @@
-"""The loop of sessions: their periods, one call each or period by period, in this one kernel.
+"""The loop of sessions: their periods, one call each or period by period, in one kernel.
 
 A period of a session reads its hand, moves the tool, pushes the hand, tells others of it, and notes
 the frame. The kernel is one call that ends with the loop: of a session, whose device it reads and
 pushes by functions of Python, or of a worker of a host, which has many sessions and no device. It
-allocates nothing, compiles nothing, holds no interpreter lock and asks no database.
+allocates nothing, compiles nothing, holds no interpreter lock and asks no database. What moves a
+tool and what feels a frame are kernels of their own, which it calls by address: they are compiled
+side by side, and the loop once for all laws.
 Another thread makes sessions and withdraws them: it sets `is_running` of a station whose other
 fields are complete, and may free a station two periods after it was withdrawn.
 """
 
 from typing import Any
 
+import numba
 import numpy as np
+from numba import config, types
+from numba.np.numpy_support import as_dtype, from_dtype
 
-from hapticdb.kernels._jit import chosen_by_type, entry, leaf, record_of
+from hapticdb.kernels._jit import INT, chosen_by_type, entry, leaf, record_of
 from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
-from hapticdb.kernels.hand.calling import call
+from hapticdb.kernels.hand.calling import address_of_kernel, call, call_kernel
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.handle import follow_reading
 from hapticdb.kernels.hand.holding import IS_HELD
-from hapticdb.kernels.hand.near_points import FELT_POINTS, Grasp
+from hapticdb.kernels.hand.near_points import Grasp
 from hapticdb.kernels.hand.quasistatic import IS_LOOSE, advance
+from hapticdb.kernels.law import TANGENT_PLANE
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
 from hapticdb.kernels.period.memory import (
@@ -69,34 +75,28 @@ WITHDRAWN_NS = 250_000_000
 then the objects are named, and whoever wants to know has read them."""
 
 
-@leaf
-def _feel(law, station, cells, which, shell, place, memory, met):
-    """Compute the law's frame at the pose, into memory.felt -> points that the budget left out."""
-    counts = station.counts
-    counts[LOOKED_AT] = counts[LEFT_OUT] = 0
-    felt_within(
-        law, cells, which, shell, memory.pose, place, met, memory.missed, budget_of(station),
-        counts, memory.felt,
-    )  # fmt: skip
-    return counts[LEFT_OUT]
+MOVER = from_dtype(STATION), from_dtype(SEAT), from_dtype(PACE)
+PLANE, DISTANCE = types.CPointer(TANGENT_PLANE), types.CPointer(DISTANCE_FIELD)
+"""Types of the arguments of what moves a tool, and of a pointer to a law's numbers."""
 
 
-def _move_by_coupling(law, station, seat, shell, place, dt, memory):
-    """Move the tool by the quasi-static coupling; for a recording, feel the law where it is then.
+@entry(*MOVER, by_address=True)
+def move_by_coupling(station, seat, pace):
+    """Move the tool of a session; for a recording, feel the law where it is then.
 
     `tool.felt` then has the law's frame, which a replay computes again: the coupling itself has
-    contacts of its own stiffness. Returns the row of `met` with the points that touch, and their
-    number.
+    contacts of its own stiffness.
     """
+    shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
     cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
     tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
     _, felt, missed, met, field = memory
     which = begin_frame(cells, station.reader)
     grasp = Grasp(cells, which, shell, place, follower, field, met, missed)
-    advance(grasp, cells.readers[at], spring, servo, dt)
+    advance(grasp, cells.readers[at], spring, servo, pace.dt)
     pose_of_quaternion(*numbers_of(tool), memory.pose)
     if seat.is_recorded and not sent.marks & IS_HELD:
-        left_out = _feel(law, station, cells, which, shell, place, memory, met[FELT])
+        left_out = call_kernel(pace.feeler, station, which, pace.law)
         for n in range(RESULTS):
             tool.felt[n] = felt[n]
         sent.left_out = max(sent.left_out, left_out)
@@ -106,32 +106,63 @@ def _move_by_coupling(law, station, seat, shell, place, dt, memory):
     if station.begun - station.shown_at >= SHOW_EVERY_NS:
         station.shown_at = station.begun
         show_contacts(seat, shell, memory.pose, place, spring, follower, field, met)
-    return list_touching(follower, field, met, sent.hits)
+    station.touching, station.n_touching = list_touching(follower, field, met, sent.hits)
+    return 0
 
 
-def _move_directly(law, station, seat, shell, place, dt, memory):  # noqa: ARG001 - as above
-    """Put the tool at the hand, and send the law's frame there; returns as above."""
-    cells, servo = voxels_of(station), station.servo
+_cells = chosen_by_type(
+    lambda law_type: (
+        (lambda law, station: cells_of(station))  # noqa: ARG005
+        if law_type is DistanceFieldLaw
+        else (lambda law, station: voxels_of(station))  # noqa: ARG005
+    )
+)
+"""Cells of a station, with distances if that type of law reads them."""
+
+
+@entry(from_dtype(STATION), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)
+def feel(station, which, laws):
+    """Compute the law's frame at `station.pose`, into `station.felt` and row FELT of its `met`.
+
+    which: the directory that the frame reads; laws: a pointer to the law. Returns the number of
+    points that the budget left out.
+    """
+    law, memory, counts = laws[0], memory_of(station), station.counts
+    counts[LOOKED_AT] = counts[LEFT_OUT] = 0
+    felt_within(
+        law, _cells(law, station), which, tool_of(station), memory.pose, grid_of(station),
+        memory.met[FELT], memory.missed, budget_of(station), counts, memory.felt,
+    )  # fmt: skip
+    return counts[LEFT_OUT]
+
+
+def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's NamedTuple
+    """Addresses of `feel` for a law and of the law's numbers, and these, to be kept."""
+    if config.DISABLE_JIT:
+        plain = lambda station, which, _: feel(station, which, [numbers])  # noqa: E731
+        return address_of_kernel(plain, ()), 0, plain
+    kind = numba.typeof(numbers)
+    address = address_of_kernel(feel, (from_dtype(STATION), INT, types.CPointer(kind)))
+    layout = np.dtype([(str(n), as_dtype(each)) for n, each in enumerate(kind.types)], align=True)
+    kept = np.array(tuple(numbers), layout)
+    return address, kept.ctypes.data, kept
+
+
+@entry(*MOVER, by_address=True)
+def move_directly(station, seat, pace):  # noqa: ARG001 - as `coupling.move`
+    """Put the tool of a session at the hand, and send the law's frame there."""
+    cells, servo, memory = voxels_of(station), station.servo, memory_of(station)
     sent = servo.sent
     pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
     if is_rigid(memory.pose):
         which = begin_frame(cells, station.reader)
-        sent.left_out = _feel(
-            law, station, cells, which, shell, place, memory, memory.met[FELT_POINTS]
-        )
+        sent.left_out = call_kernel(pace.feeler, station, which, pace.law)
         sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
         end_frame(cells, station.reader)
-    render(spring_of(station), shell.center, servo, memory.felt, dt)
+    render(spring_of(station), tool_of(station).center, servo, memory.felt, pace.dt)
     pose_of_quaternion(*numbers_of(servo.tool), memory.pose)
-    return FELT_POINTS, sent.hits
-
-
-def _motion_of(law_type: type) -> Any:  # noqa: ANN401 - numba's functions are untyped
-    """What moves a tool under that type of law."""
-    return _move_by_coupling if law_type is DistanceFieldLaw else _move_directly
-
-
-_move = chosen_by_type(_motion_of)
+    station.touching, station.n_touching = FELT, sent.hits
+    return 0
 
 
 @leaf
@@ -152,7 +183,7 @@ def _ask_objects(station, seat, session, shell, place, pose, touching, n_touchin
 
 
 @leaf
-def _run_period(law, station, seat, ring, pace):
+def _run_period(station, seat, ring, pace):
     """Run one period of a session, which was due and has begun as `pace` says."""
     servo, begun = station.servo, pace.begun
     lateness = 1e-9 * (begun - pace.due)
@@ -173,7 +204,7 @@ def _run_period(law, station, seat, ring, pace):
             return
         follow_reading(station.handle, reading.pose, reading.velocity, reading.buttons, hand)
     hand.is_stale = begun - heartbeat > station.staleness
-    row, n_touching = _move(law, station, seat, shell, place, pace.dt, memory)
+    call_kernel(pace.mover, station, seat, pace)
     if station.pushes != 0 and call(station.pushes) != 0:
         pace.is_over = 1
     if begun - station.told_at >= TELL_EVERY_NS or sent.unknown > 0 or not station.is_frame:
@@ -187,8 +218,8 @@ def _run_period(law, station, seat, ring, pace):
     if begun - station.looked_at >= ASK_EVERY_NS:
         station.looked_at = begun
         _ask_objects(
-            station, seat, session, shell, place, memory.pose, memory.met[row], n_touching,
-            heartbeat,
+            station, seat, session, shell, place, memory.pose, memory.met[station.touching],
+            station.n_touching, heartbeat,
         )  # fmt: skip
     station.last = begun
     elapsed = 1e-9 * (now_ns(pace.moment) - begun)
@@ -217,14 +248,15 @@ def _count_missed(stations, seats, pace):
     pace.passed += 1 + behind
 
 
-@leaf
-def run_periods(stations, seats, rings, pace_record, law):
+@entry(record_of(STATION, 1), record_of(SEAT, 1), record_of(FRAME, 2), record_of(PACE))
+def run(stations, seats, rings, pace_record):
     """Run one period of all sessions, or periods until `pace.is_over` or `pace.most` deadlines.
 
     stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the board; pace_record ()
-    of PACE; law: of all sessions. The distance law moves tools by the quasi-static coupling, every
-    other law is rendered directly. If the frames of a period take longer than it, the deadlines
-    within that time are missed by all sessions alike.
+    of PACE, which also has what moves all tools: the quasi-static coupling (`move_by_coupling`)
+    under the distance law; under every other law they are rendered directly (`move_directly`). If
+    the frames of a period take longer than it, the deadlines within that time are missed by all
+    sessions alike.
     """
     pace = pace_record[()]
     is_alone = pace.period > 0
@@ -237,7 +269,7 @@ def run_periods(stations, seats, rings, pace_record, law):
                 if is_alone:
                     pace.begun = now_ns(pace.moment)
                     pace.dt = 1e-9 * (pace.begun - station.last)
-                _run_period(law, station, seats[station.seat], rings[station.seat], pace)
+                _run_period(station, seats[station.seat], rings[station.seat], pace)
         if not is_alone:
             return
         _count_missed(stations, seats, pace)
@@ -245,11 +277,3 @@ def run_periods(stations, seats, rings, pace_record, law):
         pace.periods += 1
         if pace.is_over or pace.passed >= pace.most:
             return
-
-
-@entry(
-    record_of(STATION, 1), record_of(SEAT, 1), record_of(FRAME, 2), record_of(PACE), DISTANCE_FIELD
-)
-def run(stations, seats, rings, pace_record, law):
-    """`run_periods` of sessions with a coupling."""
-    run_periods(stations, seats, rings, pace_record, law)

@@ -8,12 +8,13 @@ import ctypes
 from typing import NamedTuple
 
 import numpy as np
-from numba import carray, config, types
+from numba import config, types
 from numba.core import cgutils
 from numba.extending import intrinsic
+from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import leaf, maker
+from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
@@ -44,21 +45,27 @@ if config.DISABLE_JIT:
 else:
 
     @intrinsic
-    def _pointer(typing_context, address):  # noqa: ARG001 - numba's signature
-        """Pointer of an address."""
+    def array_at(typing_context, address, shape, dtype):  # noqa: ARG001 - numba's signature
+        """Array of that shape and type at an address: memory that nobody counts references to."""
+        kind = types.Array(dtype.dtype, len(shape), "C")
 
         def generate(context, builder, signature, arguments):  # noqa: ARG001
-            return builder.inttoptr(arguments[0], cgutils.voidptr_t)
+            made = context.make_array(kind)(context, builder)
+            lengths = cgutils.unpack_tuple(builder, arguments[1])
+            size = context.get_abi_sizeof(context.get_data_type(kind.dtype))
+            strides = [context.get_constant(types.intp, size)]
+            for length in lengths[:0:-1]:
+                strides.insert(0, builder.mul(strides[0], length))
+            populate_array(
+                made, builder.inttoptr(arguments[0], made.data.type), lengths,
+                strides[: len(lengths)], strides[-1], None,
+            )  # fmt: skip
+            return made._getvalue()  # noqa: SLF001
 
-        return types.voidptr(types.int64), generate
-
-    @maker
-    def array_at(address, shape, dtype):
-        """Array of that shape and type at an address."""
-        return carray(_pointer(address), shape, dtype)
+        return kind(types.int64, shape, dtype), generate
 
 
-@maker
+@leaf
 def _cells_with(station, payload, near):
     """Cells of a session with those distances, or None."""
     n_slots, capacity = station.n_slots, station.capacity
@@ -75,13 +82,13 @@ def _cells_with(station, payload, near):
     )
 
 
-@maker
+@leaf
 def voxels_of(station):
     """Cells of a session, without distances."""
     return _cells_with(station, None, None)
 
 
-@maker
+@leaf
 def cells_of(station):
     """Cells of a session, with distances."""
     payload = array_at(station.payload, (station.n_slots, CELL_VALUES), np.uint8)
@@ -89,7 +96,7 @@ def cells_of(station):
     return _cells_with(station, payload, near)
 
 
-@maker
+@leaf
 def tool_of(station):
     """Tool of a session."""
     n_points = station.n_points
@@ -104,7 +111,7 @@ def tool_of(station):
     )
 
 
-@maker
+@leaf
 def budget_of(station):
     """Budget of a session's tool."""
     at = station.budget
@@ -132,7 +139,7 @@ class Memory(NamedTuple):
     field: NDArray[np.float64]
 
 
-@maker
+@leaf
 def memory_of(station):
     """What the parts of a session's period share."""
     n_points = station.n_points

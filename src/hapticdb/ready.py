@@ -14,9 +14,9 @@ from hapticdb.kernels.compiling import (
     missing,
 )
 
-SECONDS = {"period.loop.move_by_coupling": 7.0}
+SECONDS = {"period.loop.move_by_coupling": 6.0}
 """Seconds that the longest kernel compiles, of one processor; the others take `SHORT` each."""
-SHORT = 1.2
+SHORT = 0.7
 
 
 def seconds_of(names: Collection[str]) -> float:

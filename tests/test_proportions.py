@@ -85,7 +85,7 @@ def test_a_tool_in_another_unit_is_named(
     (misfit,) = fit.misfits
     assert (misfit.what, misfit.unit) == ("tool", unit)
     assert misfit.factor == pytest.approx(factor)
-    assert "in mm, not in" in misfit.text
+    assert "millimetres, not" in misfit.text
     assert f"(factor {factor:g})" in misfit.text
 
 
@@ -205,7 +205,7 @@ def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
     args = ("sweep", scene, *TOOL, "--path", "mm.csv")
     code, out, err = run(*args)
     assert (code, out.startswith("clear ")) == (3, True)
-    assert err.endswith("in mm, not in m (factor 1000); give --path-unit mm if so\n")
+    assert err.endswith("millimetres, not metres (factor 1000); give --path-unit mm if so\n")
     assert len(err.splitlines()) == 1
     code, out, _ = run(*args, "--json")
     assert code == 3

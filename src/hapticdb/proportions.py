@@ -17,7 +17,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.store.attributes import scene_bounds
 from hapticdb.store.base import Object
-from hapticdb.units import UNITS, length_text, metres_of
+from hapticdb.units import NAMES, UNITS, length_text, metres_of
 
 Floats = NDArray[np.float64]
 What = Literal["tool", "path", "scene"]
@@ -277,5 +277,5 @@ def _explained(what: What, text: str, outcome: str, other: str, unit: str) -> Mi
     by = 1.0 / factor if factor < 1.0 else factor
     if other == "km":  # no file is in km: a conversion to metres was applied twice
         return Misfit(what, 1.0 / factor, None, f"{text}: {outcome} {by:.4g} times as large")
-    guess = f"{outcome} if its numbers were in {other}, not in {unit} (factor {by:.4g})"
+    guess = f"{outcome} if its numbers were {NAMES[other]}, not {NAMES[unit]} (factor {by:.4g})"
     return Misfit(what, 1.0 / factor, other, f"{text}: {guess}")

@@ -18,6 +18,18 @@ UNITS = {
     "yd": 0.9144,
 }
 """Length of each, metres; `us-ft` is the US survey foot, which point clouds are measured in."""
+NAMES = {
+    "um": "micrometres",
+    "mm": "millimetres",
+    "cm": "centimetres",
+    "m": "metres",
+    "km": "kilometres",
+    "in": "inches",
+    "ft": "feet",
+    "us-ft": "US survey feet",
+    "yd": "yards",
+}
+"""Each unit in words."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
 

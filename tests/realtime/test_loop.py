@@ -52,7 +52,9 @@ def cells(tmp_path_factory: pytest.TempPathFactory) -> Iterator[ResidentCells]:
 @pytest.fixture
 def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatch) -> Iterator[Run]:
     """A function that runs the loop's work in this process and returns its answer and frames."""
-    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
+    monkeypatch.setattr(
+        subject, "parent_is_gone", lambda _=0.0: False
+    )  # standard input may be closed
     with cells.table.reading() as row:
 
         def ran(device: Device, **options: object) -> Ran:

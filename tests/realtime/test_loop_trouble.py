@@ -78,7 +78,9 @@ class Pressing:
 @pytest.fixture(params=["plane", "smooth"])
 def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     """A floor that is felt directly, or through the coupling."""
-    monkeypatch.setattr(subject, "parent_is_gone", lambda: False)  # standard input may be closed
+    monkeypatch.setattr(
+        subject, "parent_is_gone", lambda _=0.0: False
+    )  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
     made = World(has_distances=request.param == "smooth")

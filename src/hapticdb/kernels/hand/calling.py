@@ -43,20 +43,22 @@ else:
 
     @intrinsic
     def call_kernel(typing_context, address, one, two, three):  # noqa: ARG001 - numba's signature
-        """Call the kernel at an address, which returns an integer and raises nothing.
+        """Call the kernel at an address, which returns an integer; what it raises goes on.
 
         Each argument is a record, which is handed over by its place, or an integer, which may be
         the address of what the kernel takes a pointer to.
         """
 
-        def generate(context, builder, signature, arguments):  # noqa: ARG001
-            address, *given = arguments
-            result = cgutils.alloca_once(builder, cgutils.ir.IntType(64))
-            error = cgutils.alloca_once_value(builder, cgutils.get_null_value(cgutils.voidptr_t))
-            handed = result, error, *given  # as numba calls functions
-            kind = cgutils.ir.FunctionType(cgutils.ir.IntType(32), [one.type for one in handed])
-            builder.call(builder.inttoptr(address, kind.as_pointer()), handed)
-            return builder.load(result)
+        def generate(context, builder, signature, arguments):
+            kinds, calls = signature.args[1:], context.call_conv
+            kind = calls.get_function_type(signature.return_type, kinds)
+            kernel = builder.inttoptr(arguments[0], kind.as_pointer())
+            status, result = calls.call_function(
+                builder, kernel, signature.return_type, kinds, arguments[1:]
+            )
+            with cgutils.if_unlikely(builder, status.is_error):  # a user's law may raise
+                calls.return_status_propagate(builder, status)
+            return result
 
         return types.int64(types.int64, one, two, three), generate
 

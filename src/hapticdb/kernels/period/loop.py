@@ -143,13 +143,34 @@ def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's N
         return address_of_kernel(plain, ()), 0, plain
     kind = numba.typeof(numbers)
     address = address_of_kernel(feel, (from_dtype(STATION), INT, types.CPointer(kind)))
-    layout = np.dtype([(str(n), as_dtype(each)) for n, each in enumerate(kind.types)], align=True)
-    kept = np.array(tuple(numbers), layout)
-    return address, kept.ctypes.data, kept
+    kept = np.array(_packed(numbers), _layout_of(kind))
+    return address, kept.ctypes.data, (kept, numbers)
+
+
+def _layout_of(kind: Any) -> Any:  # noqa: ANN401 - of numba
+    """Layout in memory of a value of a law, as kernels read it."""
+    if isinstance(kind, types.BaseTuple):
+        fields = [(str(n), _layout_of(each)) for n, each in enumerate(kind.types)]
+        return np.dtype(fields, align=True)
+    if isinstance(kind, types.Array):  # as `_packed` has it
+        return np.dtype([(str(n), np.int64) for n in range(5 + 2 * kind.ndim)])
+    return as_dtype(kind)
+
+
+def _packed(value: Any) -> Any:  # noqa: ANN401 - likewise
+    """Value of a law for that layout: of an array, size, bytes of an item, address, shape, strides.
+
+    The two numbers before these are numba's references, which nobody counts here.
+    """
+    if isinstance(value, tuple):
+        return tuple(map(_packed, value))
+    if isinstance(value, np.ndarray):
+        return 0, 0, value.size, value.itemsize, value.ctypes.data, *value.shape, *value.strides
+    return value
 
 
 @entry(*MOVER, by_address=True)
-def move_directly(station, seat, pace):  # noqa: ARG001 - as `coupling.move`
+def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
     """Put the tool of a session at the hand, and send the law's frame there."""
     cells, servo, memory = voxels_of(station), station.servo, memory_of(station)
     sent = servo.sent

@@ -5,6 +5,7 @@ import struct
 import zlib
 from dataclasses import asdict
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -219,7 +220,8 @@ def test_no_password_is_written(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
-    "changes", [{"rate": 0.0}, {"rate": float("nan")}, {"coupling": {"k": {1}}}]
+    "changes",
+    [{"rate": 0.0}, {"rate": float("nan")}, {"coupling": {"k": {1}}}, {"law": SimpleNamespace()}],
 )
 def test_a_header_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError):

@@ -18,7 +18,7 @@ import numpy as np
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
-from hapticdb.query.law import ForceLaw, TangentPlane, law_named
+from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane, law_named
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.store.urls import redact
@@ -43,7 +43,8 @@ def _now() -> str:
 class Header:
     """Environment, tool and settings of a recorded session.
 
-    Raises `UsageError` if the rate is no positive number or the parameters cannot be JSON.
+    Raises `UsageError` if the rate is no positive number, the parameters cannot be JSON, or the law
+    is a user's own, which no file can name.
     """
 
     environment: str
@@ -71,6 +72,9 @@ class Header:
         object.__setattr__(self, "budget_points", checked_budget(self.budget_points))
         if not (math.isfinite(self.rate) and self.rate > 0):
             raise UsageError(f"rate {self.rate}: give frames a second, above 0")
+        if not isinstance(self.law, (TangentPlane, DistanceField)):
+            kind = type(self.law).__name__
+            raise UsageError(f"law {kind}: only frames of the laws plane and smooth are recorded")
         try:
             coupling = json.loads(json.dumps(dict(self.coupling), allow_nan=False))
         except (TypeError, ValueError, RecursionError):

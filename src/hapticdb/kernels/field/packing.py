@@ -333,7 +333,7 @@ def unpack(
 ) -> NDArray[np.uint8]:
     """Unpack the wanted rows (R,) of distances, or all: (R, 1000), unset where not wanted.
 
-    data (n,) and ends (R,) as `pack` gives them, or damaged.
+    data (n,) and ends (R,) as `pack` gives them, or damaged, and wanted, are contiguous.
 
     Raises
     ------
@@ -341,12 +341,12 @@ def unpack(
         If the bytes of a wanted row are no packed row, or an end lies outside the data. Not every
         damage is found, since many changed rows are rows, too.
     """
-    packed = np.ascontiguousarray(data, dtype=np.uint8).reshape(-1).view()
-    packed.flags.writeable = False
-    ends = np.ascontiguousarray(ends, dtype=np.int64)
+    if data.flags.writeable:
+        data = data.view()
+        data.flags.writeable = False
     chosen = np.ones(len(ends), dtype=np.bool_) if wanted is None else wanted
     out = np.empty((len(ends), ROW_VALUES), dtype=np.uint8)
-    damaged = unpack_kernel(packed, ends, np.ascontiguousarray(chosen, dtype=np.bool_), out)
+    damaged = unpack_kernel(data, ends, chosen, out)
     if damaged >= 0:
         raise ValueError(f"row {damaged} of {len(ends)} packed rows of distances is damaged")
     return out

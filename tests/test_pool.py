@@ -82,6 +82,15 @@ def test_who_waits_too_long_is_told(pool: Pool) -> None:
         assert len(env.objects()) == 1
 
 
+@pytest.mark.parametrize("timeout", [-1.0, np.nan])
+def test_a_time_to_wait_that_is_none_is_refused(pool: Pool, timeout: float) -> None:
+    with (
+        pytest.raises(hapticdb.errors.UsageError, match="give seconds, 0 or more"),
+        pool.environment(timeout=timeout),
+    ):
+        pass
+
+
 def test_what_was_given_back_is_no_longer_ones_own(pool: Pool, sphere: PointShell) -> None:
     with pool.environment() as env:
         pass

@@ -46,10 +46,8 @@ class Pool(Closes):
     ) -> None:
         if size < 1:
             raise UsageError(f"a pool of size {size}: give 1 or more")
-        if not timeout >= 0:
-            raise UsageError(f"timeout {timeout}: give seconds, 0 or more")
         self._url, self._size = url, size
-        self._is_read_only, self._timeout = read_only, timeout
+        self._is_read_only, self._timeout = read_only, _checked(timeout)
         self._is_closed = False
         self._free: LifoQueue[Environment | None] = LifoQueue()
         """Members that nobody has; None for each that may still be opened."""
@@ -78,7 +76,7 @@ class Pool(Closes):
         no member was given back in that time, `DatabaseError` when the pool is closed, or a new
         member cannot be opened.
         """
-        env = self._taken(self._timeout if timeout is None else timeout)
+        env = self._taken(self._timeout if timeout is None else _checked(timeout))
         is_sound = True
         try:
             yield env
@@ -125,6 +123,13 @@ class Pool(Closes):
 
     def _opened(self) -> Environment:
         return open_environment(self._url, read_only=self._is_read_only)
+
+
+def _checked(timeout: float) -> float:
+    """Seconds to wait; UsageError if they are negative or no number."""
+    if not timeout >= 0:
+        raise UsageError(f"timeout {timeout}: give seconds, 0 or more")
+    return timeout
 
 
 def _close(env: Environment | None) -> None:

@@ -341,5 +341,24 @@ def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
                 until(lambda: answers(env, shell, expected))
 
 
+def test_ctrl_c_does_not_wait_for_a_server_that_stopped_answering(
+    url: str, caplog: pytest.LogCaptureFixture
+) -> None:
+    """psycopg's own handling, which waits for the server, would write to its log."""
+    shell, expected = two_tools(), hits_at(url)
+    with hapticdb.open(url, read_only=True) as env:
+        until(lambda: answers(env, shell, expected))
+        before = signal.signal(signal.SIGINT, signal.default_int_handler)
+        try:
+            with stopped(backend_of(env)):
+                threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
+                with pytest.raises(KeyboardInterrupt):
+                    env.touch(shell, np.eye(4))
+        finally:
+            signal.signal(signal.SIGINT, before)
+        assert not [one for one in caplog.records if one.name.startswith("psycopg")]
+        until(lambda: answers(env, shell, expected))
+
+
 def backend_of(env: Environment) -> int:
     return int(env.store._connection.driver.info.backend_pid)  # type: ignore[attr-defined]

@@ -1,7 +1,7 @@
 """The link to a server: psycopg's connection with our settings, waited for with a limit.
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
-statement. psycopg waits for the answer, in steps of a tenth of a second. So Ctrl-C interrupts the
+statement. psycopg waits for the answer in short steps. So Ctrl-C interrupts the
 wait, and a server that stops answering causes an error instead of a hang, also during statements
 that may take long.
 
@@ -22,7 +22,7 @@ from collections.abc import Generator, Iterator, Sequence
 from typing import Any, NamedTuple, TypeVar, cast
 
 import psycopg
-from psycopg import generators, pq
+from psycopg import generators, pq, waiting
 from psycopg.errors import error_from_result
 
 from hapticdb.errors import StuckError
@@ -56,6 +56,8 @@ CONNECT_SECONDS = 10
 """Seconds that a server may take to accept a connection, unless the URL says otherwise."""
 GRACE_MS = 3000
 """Milliseconds that the network and a busy server may add to the server's own time limit."""
+STEP_S = 0.1
+"""Seconds between two looks at the limit of a wait. A larger value exceeds it by more."""
 SILENCE_S = 5.0
 """Seconds without a byte from a server, after which it is asked whether it answers at all. A larger
 value asks a busy server less often, and notices later that it hangs."""
@@ -269,7 +271,9 @@ class Link:
     def _result(self) -> pq.abc.PGresult:
         """Result of the statement that was sent. Closes the connection when no result comes."""
         try:
-            found: pq.abc.PGresult = self.driver.wait(generators.execute(self._pgconn))[-1]
+            # the driver's own wait would take 10 s to end after Ctrl-C while a server hangs
+            answer = self.until_out_of_patience(generators.execute(self._pgconn))
+            found: pq.abc.PGresult = waiting.wait(answer, self._pgconn.socket, STEP_S)[-1]
             if found.status not in _FINE:
                 raise error_from_result(found, encoding="utf-8")  # noqa: TRY301 - may be a loss, too
         except psycopg.Error as error:
@@ -282,12 +286,12 @@ class Link:
         return found
 
     def until_out_of_patience(
-        self, waiting: Generator[Any, Any, Result]
+        self, answer: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
         """Run psycopg's own waiting for a statement; give up when the server is silent too long."""
         started = heard = time.monotonic()
         try:
-            wanted = next(waiting)
+            wanted = next(answer)
             while True:
                 ready = yield wanted
                 now, most = time.monotonic(), self._patience_ms
@@ -298,7 +302,7 @@ class Link:
                 elif now - heard > SILENCE_S:
                     self._check_answers()
                     heard = time.monotonic()
-                wanted = waiting.send(ready)
+                wanted = answer.send(ready)
         except StopIteration as end:
             return cast("Result", end.value)
 

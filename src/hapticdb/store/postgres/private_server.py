@@ -355,7 +355,10 @@ class PrivateServer:
 
 @cache
 def shared_server(folder: Path) -> PrivateServer:
-    """The server in a folder, one object a process; released when the process ends."""
+    """The server in a folder, released when the process ends.
+
+    Threads that ask at once may each get an object; the server ends with the last of them.
+    """
     server = PrivateServer.at(folder)
     atexit.register(server.release)
     return server

@@ -3,6 +3,7 @@
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from operator import eq
 from typing import NamedTuple
 
 import numpy as np
@@ -134,9 +135,10 @@ def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = Non
     """Compare two environments: their grids, their objects, and every voxel of each object.
 
     Distances to surfaces are compared where both environments have them for an object in the same
-    place. Engines, layouts and curves may differ. Each environment is read at one revision, and
-    voxels in batches, whatever the size of an object. `progress` is called after each object whose
-    voxels were compared. Raises `DatabaseError` when one of them cannot be opened or read.
+    place. Engines, layouts and curves may differ. Each environment is read at one revision. The
+    memory needed is proportional to the largest object. `progress` is called after each object
+    whose voxels were compared, with the number of such objects done, and of all. Raises
+    `DatabaseError` when one of them cannot be opened or read.
     """
     with (
         closing(open_store(a_url, read_only=True)) as a,
@@ -199,15 +201,28 @@ def _distances_apart(a: Store, b: Store, pairs: Sequence[Pair]) -> Iterator[Dist
     both = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
     stores = [(store, QuantileVector.of(store)) for store in (a, b)] if both else []
     for pair in both:
-        packed = []
-        for (store, quantiles), obj in zip(stores, pair, strict=True):
-            bricks = bricks_of_object(store, obj, quantiles, distances=True)
-            assert bricks.distances is not None  # noqa: S101 - read with distances
-            data, ends = bricks.distances.data.tobytes(), bricks.distances.ends.tolist()
-            pieces = zip(bricks.keys.tolist(), [0, *ends[:-1]], ends, strict=True)
-            packed.append({(key, data[start:end]) for key, start, end in pieces})
-        if n_rows := len({key for key, _ in packed[0] ^ packed[1]}):
+        a_bricks, b_bricks = (
+            bricks_of_object(store, obj, quantiles, distances=True)
+            for (store, quantiles), obj in zip(stores, pair, strict=True)
+        )
+        if n_rows := _count_rows_apart(a_bricks, b_bricks):
             yield DistanceDifference(*pair, n_rows)
+
+
+def _count_rows_apart(a: Bricks, b: Bricks) -> int:
+    """How many bricks differ in their packed distances, or are only in one of the two."""
+    both, at_a, at_b = np.intersect1d(a.keys, b.keys, assume_unique=True, return_indices=True)
+    # row by row: a comparison by sets of all rows took a quarter more memory and half more time
+    n_alike = sum(map(eq, _packed_rows(a, at_a), _packed_rows(b, at_b)))
+    return len(a.keys) + len(b.keys) - len(both) - n_alike
+
+
+def _packed_rows(bricks: Bricks, which: NDArray[np.int64]) -> Iterator[bytes]:
+    """Packed distances of the bricks at the given places, in their order."""
+    assert bricks.distances is not None  # noqa: S101 - read with distances
+    data, ends = bricks.distances.data.tobytes(), bricks.distances.ends[which]
+    for start, end in zip(ends - bricks.distances.lengths[which], ends, strict=True):
+        yield data[start:end]
 
 
 def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int, int]:

@@ -77,7 +77,7 @@ def copy_environment(
     curve : curve name or None
         Curve of the target, by the same rule.
     progress : callable or None
-        Called after each object that was written.
+        Called after each object that was written with the number of objects done, and of all.
 
     Raises
     ------

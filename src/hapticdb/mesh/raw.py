@@ -139,7 +139,7 @@ def placed_once(
     pairs = list(named)
     placements = [Placement(name, i, np.eye(4)) for i, (name, _) in enumerate(pairs)]
     unit, metres = unit_in(comments)
-    said = [*notes, *told(metres is not None, "comment names its unit: '{unit}'", unit=unit)]
+    said = [*notes, *([] if metres is None else [f"a comment in it names a unit: '{unit}'"])]
     return Parsed([shape for _, shape in pairs], placements, None, likely_metres=metres, notes=said)
 
 

@@ -21,19 +21,21 @@ _COMMON = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe])+")
 """Common Chinese characters in GB18030: in words of Latin-1 few such pairs of bytes stand alone."""
 
 _UNIT = re.compile(
-    r"\bunits?(?: used in this file)?\s*(?:[=:]|\bin\b|\bare\b)\s*([a-z]+)"
+    r"\bunits?(?: used in this file)?[ \t]*(?:[=:]|\b(?:in|is|are)\b)[ \t]*(?:in[ \t]+)?"
+    r"([a-z]+)(?![\w/^*-])"
     r"|\buses ([a-z]+) as units\b",
     re.IGNORECASE,
 )
-"""As Maya, SketchUp and others name it in a comment; a name such as 'foot unit' is none."""
-_LENGTHS = UNITS | {name.rstrip("s"): UNITS[sign] for sign, name in NAMES.items()}
-_LENGTHS |= {"inch": UNITS["in"], "foot": UNITS["ft"]}
+"""As Maya, SketchUp and others name it in a comment, or in a sentence such as 'the units are in
+metres'; neither a name such as 'foot unit' nor units of areas or speeds such as mm/s."""
+_LENGTHS = UNITS | {"inch": UNITS["in"], "foot": UNITS["ft"]}
+_LENGTHS |= {word: UNITS[sign] for sign, name in NAMES.items() for word in (name, name[:-1])}
 
 
 def unit_in(text: str) -> tuple[str, float | None]:
     """Words of a text that name a unit, and its length, metres; '' and None without."""
     for found in _UNIT.finditer(text):
-        word = (found[1] or found[2]).lower().rstrip("s").replace("meter", "metre")
+        word = (found[1] or found[2]).lower().replace("meter", "metre")
         if word in _LENGTHS:
             return found[0], _LENGTHS[word]
     return "", None

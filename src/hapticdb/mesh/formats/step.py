@@ -14,10 +14,10 @@ from hapticdb.mesh.text import text_of
 from hapticdb.units import UNITS
 
 _POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
-_WORDS = re.compile(r"('[^']*')|/\*.*?(?:\*/|\Z)", re.DOTALL)
+_WORDS = re.compile(r"('(?:[^']++|'')*+')|/\*.*?(?:\*/|\Z)", re.DOTALL)
 """A string, group 1, or a comment, whose letters may stand in the other, too."""
 _LONGEST = 8_000
-"""Characters of strings that are kept: OpenCASCADE refuses a file for a longer word."""
+"""Characters of a string that are kept, with its quotes: OpenCASCADE refuses longer words."""
 _END = "END-ISO-10303-21"
 _NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
@@ -32,20 +32,26 @@ def read(path: Path) -> Parsed:
     The chord error is cascadio's default: 0.01 of the file's unit, or 0.5 rad between neighbouring
     triangles, whichever is coarser on that face.
     """
-    text = _WORDS.sub(_short, text_of(path.read_bytes()))
+    cut: list[int] = []
+
+    def short(found: re.Match[str]) -> str:
+        """String without its end if it is too long; a blank instead of a comment."""
+        word = found[1] or " "
+        if len(word) <= _LONGEST:
+            return word
+        cut.append(len(word))
+        kept = word[1 : _LONGEST - 1].rstrip("'")  # no half of a doubled quote
+        return f"'{kept}'"
+
+    text = _WORDS.sub(short, text_of(path.read_bytes()))
     if "ISO-10303-21" not in text[:1024]:
         raise UnreadableError("it is no STEP file: 'ISO-10303-21' does not stand at its start")
     found = _tessellated(text, path)
     found = _nearer(found, text, path) if _is_coarse(found) else found
     others = len(re.findall(r"\bDOCUMENT_FILE\s*\(", text))
     notes = told(others, "other file{s} {are} named in it, and {are} not read")
+    notes += told(len(cut), f"string{{s}} of more than {_LONGEST:,} characters {{are}} cut")
     return replace(found, notes=[*found.notes, *notes, *([] if _END in text else [_NO_END])])
-
-
-def _short(found: re.Match[str]) -> str:
-    """String without its end if it is too long; a blank instead of a comment."""
-    word = found[1] or " "
-    return word if len(word) <= _LONGEST else f"{word[:_LONGEST]}'"
 
 
 def _tessellated(text: str, path: Path) -> Parsed:

@@ -34,6 +34,8 @@ def missing(which: str, n: int = 1) -> str:
         ("..\\red.mtl", "..\\red.mtl", False),
         ("..%2Fred.mtl", "..%2Fred.mtl", False),
         (f"{'x' * 300}.mtl", f"{'x' * 56}.mtl", False),
+        ("50%25.mtl", "", True),
+        ("gone.mtl\nmtllib gone.mtl", "gone.mtl", False),
     ],
 )
 def test_a_file_of_materials_that_cannot_be_read_is_told(
@@ -42,7 +44,8 @@ def test_a_file_of_materials_that_cannot_be_read_is_told(
     folder = tmp_path / "in"
     folder.mkdir()
     for place in (tmp_path, folder):
-        text(place / "red.mtl", "newmtl red\nKd 1 0 0\n")
+        for name in ("red.mtl", "50%25.mtl"):
+            text(place / name, "newmtl red\nKd 1 0 0\n")
     file = parse_in_process(text(folder / "a.obj", f"mtllib {line}\n{TRIANGLE_OBJ}"))
     assert file.notes == ((missing(which),) if which else ())
     assert area_and_volume(file)[0] == 0.5
@@ -69,6 +72,7 @@ def test_pictures_of_a_gltf_and_a_dae_that_are_not_there_are_told(tmp_path: Path
     library = (
         '<library_images><image id="a"><init_from>file:///no/gone.png</init_from></image>'
         '<image id="b"><init_from><ref>there%20it%20is.png</ref></init_from></image>'
+        '<image id="c"><init_from><hex format="png">89504e47</hex></init_from></image>'
         "</library_images><library_effects><effect><newparam><surface><init_from>a</init_from></surface></newparam>"
         "</effect></library_effects>"
     )

@@ -126,7 +126,8 @@ def beside(folder: Path, name: str) -> Path | None:
 def told_missing(folder: Path, names: Iterable[str], *more: str) -> list[str]:
     """Note of the files of colours and pictures, of `names`, that are not there; and of `more`."""
     plain = (name.removeprefix("file://") for name in names if name[:5] != "data:")
-    missing = [*more, *(name for name in dict.fromkeys(plain) if beside(folder, name) is None)]
+    gone = (name for name in plain if beside(folder, name) is None)
+    missing = list(dict.fromkeys([*more, *gone]))
     which = ", ".join(name[-_LONGEST_NAME:] for name in missing[:_MOST_NAMES])
     words = "file{s} with its colours or pictures {are} not readable beside it: {which}"
     return told(len(missing), words, which=which)

@@ -202,8 +202,8 @@ class _Document:
         hidden = sum((one.text or "").strip() == "0" for one in root.iter("visibility"))
         moved = {(one.get("target") or "").split("/")[0] for one in root.iter("channel")}
         nodes = sum(("node", name) in self._known for name in moved)
-        images = root.iterfind(".//image/init_from")  # with an element 'ref' inside since 1.5
-        pictures = ("".join(one.itertext()).strip() for one in images)
+        images = root.iterfind(".//image/init_from")  # with 'ref' or, as numbers, 'hex' since 1.5
+        pictures = ((one.findtext("ref") or one.text or "").strip() for one in images)
         others = sum(1 for _ in root.iter("visual_scene")) - 1
         notes = [
             *(note for kind, n in strange.items() for note in told(n, _UNREAD, kind=kind)),

@@ -107,7 +107,7 @@ def read(path: Path) -> Parsed:
     palette: dict[str, Colours] = {}
     pictures: list[str] = []
     unread: list[str] = []
-    for name in libraries:
+    for name in dict.fromkeys(libraries):
         content = _content(path.parent, name)
         palette |= _materials(content or "", pictures)
         unread += [name] if content is None else []
@@ -127,7 +127,7 @@ def read(path: Path) -> Parsed:
 def _content(folder: Path, name: str) -> str | None:
     """Text of a file of materials in the OBJ file's own folder; None if it cannot be read."""
     plain = posixpath.normpath(unquote(name).replace("\\", "/"))
-    file = None if "/" in plain else beside(folder, plain)
+    file = None if "/" in plain else beside(folder, name)
     with suppress(OSError):
         return None if file is None else text_of(file.read_bytes()[:MOST_BYTES])
     return None

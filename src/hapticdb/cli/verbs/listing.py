@@ -9,7 +9,7 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import as_named, opened_to_keep
 from hapticdb.cli.options import JsonOption, UrlArgument
-from hapticdb.units import length_text
+from hapticdb.units import length_text, place_text
 
 if TYPE_CHECKING:
     from hapticdb.query.cost_model import CostModel
@@ -126,7 +126,6 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         "standby": None if lag is None else lag._asdict(),
         "statistics": {"source": source, **freshness._asdict()},
     }
-    origin = ", ".join(f"{x:.6g}" for x in grid.origin)
     a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
     distances = f"of {render.counted(n_banded, 'object')}, {render.bytes_text(size.band_bytes)}"
     n_shapes = render.counted(size.surfaces, "shape")
@@ -138,7 +137,7 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         *([] if lag is None else [("standby", _lag_text(lag))]),
         ("voxel size", length_text(grid.voxel_size)),
         ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
-        ("origin", f"({origin}) m"),
+        ("origin", f"{place_text(grid.origin, grid.voxel_size / 100)} m"),
         ("curve", grid.curve),
         ("layout", store.layout),
         ("objects", f"{len(objects):,}"),

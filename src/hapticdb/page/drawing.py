@@ -94,7 +94,11 @@ class HandDrawing:
             "/hand", scale=HAND_GIZMO, fixed=True, line_width=3.0, disable_sliders=True,
             opacity=0.9, depth_test=False, visible=False, translation_limits=((-1e9, 1e9),) * 3,
         )  # fmt: skip
-        self.words = scene.add_label("/hand/words", "", anchor="top-right")  # until it moves
+        # Until the hand moves. A browser places letters in float32, which scatters them far away.
+        step = float(np.spacing(np.abs(middle).max().astype(np.float32)))
+        self.words = scene.add_label(
+            "/hand/words", "", anchor="top-right", visible=step < LEAST_DRAWN * diagonal
+        )
         shaft, head = 0.0035 * diagonal, 0.010 * diagonal
         nothing = np.zeros((1, 2, 3))
         self._force = scene.add_arrows(

@@ -28,6 +28,7 @@ def test_the_time_left_is_as_expected_or_told_to_be_longer() -> None:
     """However long no kernel is ready."""
     start = "compiling what the hand needs, once: "
     assert progress_text(Compiled(3, 32), 24.4) == f"{start}3 of 32, about 24 s left"
+    assert progress_text(Compiled(0, 1), 0.4) == f"{start}0 of 1, about 1 s left"
     assert progress_text(Compiled(31, 32), -18.0) == f"{start}31 of 32, longer than expected"
     assert progress_text(Compiled(32, 32), 9.0) == f"{start}32 of 32"
 

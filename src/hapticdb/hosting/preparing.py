@@ -78,7 +78,8 @@ def progress_text(now: Compiled, left: float) -> str:
     text = f"compiling what the hand needs, once: {now.done} of {now.total}"
     if now.done == now.total:
         return text
-    return f"{text}, about {left:.0f} s left" if left >= 1.0 else f"{text}, longer than expected"
+    when = f"about {max(left, 1.0):.0f} s left" if left > 0.0 else "longer than expected"
+    return f"{text}, {when}"
 
 
 def work(purposes: tuple[str, ...], sender: MessageSender) -> None:

@@ -5,12 +5,16 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from typing import NamedTuple
 
 import numba
 import pytest
+from numba import types
+from numba.core.caching import FunctionCache
 
 from children import finished
 from hapticdb.kernels._cache import LENT, cache_folder
+from hapticdb.kernels._jit import _Cache
 
 
 @pytest.fixture(autouse=True)
@@ -117,3 +121,21 @@ def test_a_kernel_on_disk_is_loaded_without_what_numba_compiles_with() -> None:
     """Else each process would start half a second later."""
     first, second = (finished([sys.executable, "-c", LOADED], check=True) for _ in range(2))
     assert (first.stdout.strip(), second.stdout.strip()) == ("True", "False")
+
+
+class StrangerNumbers(NamedTuple):
+    """Numbers of a user's law; all are of one kind, which makes them another type of numba's."""
+
+    stiffness: float
+
+
+def test_machine_code_for_a_type_from_outside_is_not_kept(monkeypatch: pytest.MonkeyPatch) -> None:
+    """A process that cannot import its module could read nothing of that entry."""
+    kept: list[object] = []
+    monkeypatch.setattr(FunctionCache, "save_overload", lambda _, sig, __: kept.append(sig))
+    cache, law = object.__new__(_Cache), numba.typeof(StrangerNumbers(1.0))
+    cache.save_overload((types.int64, law), None)
+    cache.save_overload((types.int64, types.CPointer(law)), None)
+    assert kept == []
+    cache.save_overload((types.int64, types.CPointer(types.int64)), None)
+    assert len(kept) == 1

@@ -92,7 +92,7 @@ class _Cache(FunctionCache):  # type: ignore[misc]
     def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - likewise
         """Store the machine code, unless it is for types from outside this package."""
         given, _ = normalize_signature(sig)
-        kinds = [getattr(kind, "dtype", kind) for kind in given]  # a pointer's, too
+        kinds = [kind.dtype if isinstance(kind, types.CPointer) else kind for kind in given]
         classes = [getattr(kind, "instance_class", None) for kind in kinds]
         if all(c is None or c.__module__.startswith("hapticdb.") for c in classes):
             super().save_overload(sig, data)

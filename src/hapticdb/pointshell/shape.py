@@ -97,6 +97,8 @@ class CollisionShape:
 
         Normals of its largest flat faces, and principal axes of all normals: a peg's own axis.
         """
+        if self._oriented is None:
+            return np.empty((0, 3))
         normals, areas = self._face_normals, normals_of(self.tree.corners)[1]
         side = np.sign(normals @ ASKEW)
         cells = np.rint(normals * side[:, None] / ALIKE).astype(np.int64) @ CELLS

@@ -7,7 +7,7 @@ poses could say so, since it has no memory of sides.
 """
 
 from collections.abc import Iterator
-from itertools import islice
+from itertools import chain, islice
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.sweeps.gap import Pair
-from hapticdb.sweeps.separation import GROWTH, NOTHING, MovedPair, Separation
+from hapticdb.sweeps.separation import GROWTH, NOTHING, SAME, MovedPair, Separation
 
 Floats = NDArray[np.float64]
 
@@ -27,6 +27,8 @@ STRIDE = 3.0
 """Contact tolerances between two looks whether the surfaces are apart."""
 BLOCK, MOST_BLOCK = 8, 4096
 """Looks whether surfaces are apart that are done together: at first, and at most."""
+SHARES = (0.02, 0.15, 0.3, 0.5, 0.75)
+"""Shares of the reach that are tried for the least motion where surfaces coincide."""
 MOST_TRIED = 8
 """Motions at the start that are followed. More: contacts are followed farther, slower hits."""
 BACKS = (0.2, 1.0, 5.0)
@@ -37,9 +39,9 @@ MOST_CHANGES = 30
 """Changes of motions along the path."""
 ON, FINE_HIT = 2.0, 0.1
 """Reaches beyond a hit at which its depth is measured, and share of it to which it is found."""
-COARSE = 0.5
-"""Contact tolerances to which depths are found. Less: surfaces sunk by nearly the tolerance take
-many times as long."""
+LOOKS = 4000
+"""Distances that are measured for a depth: some hundredths of a second. It is proved from below,
+however few they are."""
 
 
 class Contact:
@@ -80,12 +82,14 @@ class Contact:
         self._motions = found.separating(pose, self.reach, CLEARANCE, gap=gap)
         first = next(self._motions, None)
         if first is not None:
-            return first
+            if gap > SAME + abs(self.error):
+                self.start = 0.0
+            return first if gap > SAME else self._on_nearest_side(first)
         reach, nearly = None, GROWTH * self._contact + CLEARANCE
         if seated:  # mostly that frees: the depth of what is sunk so little takes long to prove
             reach = found.least(pose, self.reach, nearly, CLEARANCE, gap=gap)
         if reach is None:
-            depth = found.depth(pose, self._contact, coarse=COARSE)[0]
+            depth = found.depth(pose, self._contact, most=LOOKS)[0]
             self.start_at_least = max(depth - abs(self.error), 0.0)
         if reach is None and seated:
             least = max(nearly, depth + CLEARANCE)
@@ -95,6 +99,21 @@ class Contact:
         self.reach, self.start = reach, reach - CLEARANCE + abs(self.error)
         self._motions = found.separating(pose, reach, CLEARANCE, gap=gap)
         return next(self._motions)
+
+    def _on_nearest_side(self, first: MovedPair) -> MovedPair:
+        """The first motion on the side that the least one leads to, of surfaces that coincide.
+
+        So a foil that lies on an open sheet is on the side of its face that touches the sheet.
+        """
+        pose, found = self._pair.way.at([0.0])[0], self._separation
+        for share in SHARES:
+            reach = CLEARANCE + share * (self.reach - CLEARANCE)
+            motions = found.separating(pose, reach, CLEARANCE, gap=0.0, thorough=False)
+            if (least := next(motions, None)) is not None:
+                others = chain([first], self._motions)
+                self._motions = (one for one in others if found.joins(least, one, pose))
+                return next(self._motions, least)
+        return first
 
     @property
     def is_sliding(self) -> bool:
@@ -115,7 +134,7 @@ class Contact:
         """Penetration depth beyond the hit, proved from below, and its place (3,), world frame."""
         way = min(self.way + ON * self.reach, self._pair.way.length)
         pose = self._pair.way.at([way])[0]
-        depth, place = self._separation.depth(pose, self._contact, FINE_HIT, COARSE)
+        depth, place = self._separation.depth(pose, self._contact, FINE_HIT, LOOKS)
         return max(depth - abs(self.error), 0.0), place
 
     def _next_apart(self, end: float) -> tuple[float, bool]:

@@ -6,8 +6,8 @@ overlaps by r at most. Change from one motion to another is proved by conservati
 nothing is met on the straight way of all places.
 """
 
-from collections import deque
 from collections.abc import Callable, Iterator
+from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -16,8 +16,8 @@ from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree, refitted
 from hapticdb.kernels.triangles.depth import depth_in
-from hapticdb.kernels.triangles.nearest import nearest
-from hapticdb.pointshell.shape import CollisionShape, tree_of, units
+from hapticdb.kernels.triangles.nearest import any_near, nearest
+from hapticdb.pointshell.shape import CollisionShape, units
 
 Floats = NDArray[np.float64]
 
@@ -32,14 +32,22 @@ MET, MOST_STEPS = 1e-7, 60
 """Metres at which a change of motions meets something, and its greatest number of steps."""
 GROWTH, FINE = 1.4, 0.05
 """Factor from one reach that is tried to the next, and share of it to which the least is found."""
-FINE_DEPTH, COARSE_DEPTH = 0.02, 0.2
+FINE_DEPTH, TOLERANCE = 0.02, 0.2
 """Shares of a penetration depth and of the contact tolerance to which it is found."""
+MOST_LOOKS = 10_000_000
+"""Distances that are measured for a depth at most: a minute."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 
 
 BLOCKING = 16
 """Pairs of triangles that were too near after other motions, which are measured first."""
+
+
+ALL = slice(None)
+Rows = slice | NDArray[np.int64]
+Displacement = Callable[[Rows], Floats]
+"""Displacements (n, 3, 3) of the corners of some triangles of a tree."""
 
 
 class Motion(NamedTuple):
@@ -78,7 +86,7 @@ class Separation:
         self, thing: CollisionShape, tool: CollisionShape, check: Callable[[], None] = lambda: None
     ) -> None:
         self._object, self._tool, self._check = thing, tool, check
-        self._blocking: deque[NDArray[np.int64]] = deque(maxlen=BLOCKING)
+        self._blocking = np.empty((0, 2), dtype=np.int64)
 
     def separating(
         self, pose: Floats, reach: float, clearance: float, *, gap: float,
@@ -127,12 +135,13 @@ class Separation:
         return min(MOST_REACH, MOST_SHARE * min(edges))
 
     def depth(
-        self, pose: Floats, contact: float, fine: float = FINE_DEPTH, coarse: float = COARSE_DEPTH
+        self, pose: Floats, contact: float, fine: float = FINE_DEPTH, most: int = MOST_LOOKS
     ) -> tuple[float, Floats]:
         """Penetration depth, a proved lower bound, and its place (3,), the object's frame, metres.
 
-        The greater one of tool in object and object in tool, to a share `fine` of it or `coarse` of
-        `contact`; 0 where it is `contact` or less, or what is gone into is not closed.
+        The greater one of tool in object and object in tool, to a share `fine` of it or `TOLERANCE`
+        of `contact`, unless `most` distances were measured before; 0 where it is `contact` or less,
+        or what is gone into is not closed.
         """
         deepest = 0.0, np.zeros(3)
         back = np.linalg.inv(pose)
@@ -143,7 +152,7 @@ class Separation:
             there[:3, 3] -= other.interior.origin
             least = max(contact, deepest[0])
             found, place = depth_in(
-                other.interior.solid(), one.tree, there, least, coarse * contact, fine
+                other.interior.solid(), one.tree, there, least, TOLERANCE * contact, fine, most
             )
             if found:
                 place = place + other.interior.origin
@@ -198,24 +207,24 @@ class Separation:
         found = nearest(moved.object, moved.tool, placed[None], np.array([far]), far)
         if found.pairs[0, 0] < 0:
             return True
-        self._blocking.append(found.pairs[0])
+        self._note_blocking(found.pairs)
         return False
 
-    def _is_blocked(self, motion: Motion, pose: Floats, clearance: float) -> bool:
-        """Whether triangles that were too near after the last motions are so after this one."""
-        if not self._blocking:
-            return False
-        first, second = np.array(self._blocking).T
-        theirs, own = (
-            tree_of(tree.corners[some] + (0.0 if by is None else by[some]))
-            for tree, some, by in (
-                (self._object.tree, first, motion.object),
-                (self._tool.tree, second, motion.tool),
-            )
-        )
-        far = clearance + self._tool.radius + motion.growth
-        found = nearest(theirs, own, pose[None], np.array([far]), far)
-        return bool(found.pairs[0, 0] >= 0)
+    def _is_blocked(
+        self, pose: Floats, clearance: float, by: Displacement, *, is_tool: bool
+    ) -> bool:
+        """Whether triangles that were too near after the last motions are so after an offset."""
+        first, second = self._blocking.T
+        theirs, own = self._object.tree.corners[first], self._tool.tree.corners[second]
+        if is_tool:
+            own = own + by(second)
+        else:
+            theirs = theirs + by(first)
+        return bool(any_near(theirs, own, pose[None], clearance + self._tool.radius)[0])
+
+    def _note_blocking(self, pairs: NDArray[np.int64]) -> None:
+        """Note pairs (N, 2) of triangles that were too near."""
+        self._blocking = np.concatenate([pairs[:1], self._blocking])[:BLOCKING]
 
     def shifted(
         self, pose: Floats, shifts: Floats, clearance: float, base: MovedPair
@@ -224,9 +233,14 @@ class Separation:
         poses = np.tile(pose, (len(shifts), 1, 1))
         poses[:, :3, 3] += shifts
         far = clearance + base.radius
+        first, second = self._blocking.T
+        is_open = ~any_near(base.object.corners[first], base.tool.corners[second], poses, far)
+        poses, shifts = poses[is_open], shifts[is_open]
         found = nearest(base.object, base.tool, poses, np.full(len(poses), far), far)
-        for n in np.flatnonzero(found.pairs[:, 0] < 0):
-            yield base._replace(motion=Motion("shift", shifts[n]))
+        is_free = found.pairs[:, 0] < 0
+        self._note_blocking(found.pairs[~is_free])
+        for shift in shifts[is_free]:
+            yield base._replace(motion=Motion("shift", shift))
 
     def shifts(self, pose: Floats) -> Floats:
         """Unit vectors (N, 3) of shifts that may separate, those along normals first."""
@@ -243,46 +257,54 @@ class Separation:
         if self.is_free(still, pose, clearance):
             yield still
         yield from self.shifted(pose, reach * self.shifts(pose), clearance, still)
-        for motion in self._deformations(reach, thorough=thorough):
-            if self._is_blocked(motion, pose, clearance):
+        own = np.concatenate([self._object.axes, self._tool.axes @ pose[:3, :3].T])
+        yield from self.shifted(pose, reach * np.concatenate([own, -own]), clearance, still)
+        for motion in self._grown(reach):
+            if self.is_free(moved := self.moved(motion), pose, clearance):
+                yield moved
+        for is_tool, by in self._offsets(reach, thorough=thorough):
+            if self._is_blocked(pose, clearance, by, is_tool=is_tool):
                 continue
-            moved = self.moved(motion)
+            tool, thing = (by(ALL), None) if is_tool else (None, by(ALL))
+            moved = self.moved(Motion("offset", NOTHING.shift, tool, thing))
             if self.is_free(moved, pose, clearance):
                 yield moved
 
-    def _deformations(self, reach: float, *, thorough: bool) -> Iterator[Motion]:
-        """Offsets of either surface, inward first; thorough : across and along its axes, too."""
-        zero = np.zeros(3)
-        if self._tool.radius:
-            for growth in (-reach, reach):
-                if self._tool.radius + growth > LEAST_BALL * self._tool.radius:
-                    yield Motion("offset", zero, growth=growth)
-        for by in _offsets(self._tool, reach, thorough=False):
-            yield Motion("offset", zero, tool=by)
-        for by in _offsets(self._object, reach, thorough=False):
-            yield Motion("offset", zero, object=by)
-        if thorough:
-            for by in _offsets(self._tool, reach, thorough=True):
-                yield Motion("offset", zero, tool=by)
-            for by in _offsets(self._object, reach, thorough=True):
-                yield Motion("offset", zero, object=by)
+    def _grown(self, reach: float) -> Iterator[Motion]:
+        """Offsets of a ball."""
+        for growth in (-reach, reach):
+            if self._tool.radius and self._tool.radius + growth > LEAST_BALL * self._tool.radius:
+                yield NOTHING._replace(by="offset", growth=growth)
+
+    def _offsets(self, reach: float, *, thorough: bool) -> Iterator[tuple[bool, Displacement]]:
+        """Offsets of the tool, then of the object, along their normals, inward first.
+
+        thorough : then along their components across and along each of their axes, too, so that a
+        peg or a plate gives way by all of the reach at its edges.
+        """
+        both = [one for one in ((True, self._tool), (False, self._object)) if not one[1].radius]
+        for is_tool, shape in both:
+            for sign in (reach, -reach):
+                yield is_tool, partial(_offset, shape, sign, None, None)
+        for is_tool, shape in both if thorough else []:
+            for axis, sign in product(shape.axes, (reach, -reach)):
+                yield is_tool, partial(_offset, shape, sign, axis, None)
+                yield is_tool, partial(_offset, shape, sign, None, axis)
 
 
-def _offsets(shape: CollisionShape, reach: float, *, thorough: bool) -> Iterator[Floats]:
-    """Displacements (T, 3, 3) of a shape's corners along its normals, inward and outward.
+def _offset(
+    shape: CollisionShape, reach: float, across: Floats | None, along: Floats | None, some: Rows
+) -> Floats:
+    """Displacements (n, 3, 3) of some of a shape's corners along their normals.
 
-    thorough : instead, along their components across and along each of its axes, so that a peg or
-    a plate gives way by all of the reach at its edges, too.
+    across, along : an axis (3,), along whose normals' components they are instead.
     """
-    if shape.radius or shape.is_cloud:
-        return
-    fields = [shape.normals]
-    if thorough:
-        along = [(shape.normals @ axis)[:, :, None] * axis for axis in shape.axes]
-        fields = [units(part) for one in along for part in (shape.normals - one, one)]
-    for field in fields:
-        yield reach * field
-        yield -reach * field
+    normals = shape.normals[some]
+    if across is not None:
+        normals = units(normals - (normals @ across)[..., None] * across)
+    if along is not None:
+        normals = units((normals @ along)[..., None] * along)
+    return reach * normals
 
 
 def _moved_tree(shape: CollisionShape, by: Floats | None) -> TriangleTree:

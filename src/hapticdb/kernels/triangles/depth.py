@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INTS, entry, fields_of, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, fields_of, leaf
 from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
 from hapticdb.kernels.surfaces.sides import (
@@ -170,12 +170,16 @@ def _try_middle(solid, lines, waiting, middle, scratch, hint, out):
 
 
 @leaf
-def _search_triangle(solid, lines, tolerance, fine, waiting, middle, scratch, hint, out):
-    """Search the deepest place of triangle 0 of `waiting`; returns a triangle that is near."""
+def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scratch, hint, out):
+    """Search the deepest place of triangle 0 of `waiting`.
+
+    Returns a triangle that is near, and how many distances were measured, about `most` at most.
+    """
     nodes, squares, stack = scratch
-    top = 1
-    while top > 0:
+    top, looks = 1, np.int64(0)
+    while top > 0 and looks < most:
         top -= 1
+        looks += 1
         enough = _enough(out, tolerance, fine)
         if _below_box(solid.box, waiting[top]) <= enough:
             continue
@@ -195,15 +199,16 @@ def _search_triangle(solid, lines, tolerance, fine, waiting, middle, scratch, hi
         if bound > enough and radius > tolerance and top + 2 <= WAITING:
             _halve(waiting, top)
             top += 2
-    return hint
+    return hint, looks
 
 
-@entry(SOLID, TREE, FLOATS2, FLOATS2, FLOAT, FLOAT, FLOATS)
-def depth_kernel(solid, surface, pose, lines, tolerance, fine, out):
+@entry(SOLID, TREE, FLOATS2, FLOATS2, FLOAT, FLOAT, INT, FLOATS)
+def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
     """Find the deepest place of a surface, moved by a pose (4, 4), in a solid.
 
     out (4,) : depth, metres, which begins as the least one that is looked for, and its place. It is
-    within `tolerance`, or a share `fine` of it, of the greatest depth.
+    within `tolerance`, or a share `fine` of it, of the greatest depth, unless `most` distances were
+    measured before.
     """
     nodes, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
     stack, middle = np.empty(STACK, dtype=np.int64), np.empty(3)
@@ -215,9 +220,10 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, out):
         place_corners(surface.corners, n, n + 1, pose, waiting)
         hint = _try_middle(solid, lines, waiting, middle, scratch, hint, out)
     todo[0] = 0
-    first_leaf = surface.boxes.shape[0] // 2
-    while top > 0:
+    first_leaf, looks = surface.boxes.shape[0] // 2, np.int64(0)
+    while top > 0 and looks < most:
         top -= 1
+        looks += 1
         node = todo[top]
         if surface.boxes[node, 0, 0] > surface.boxes[node, 1, 0]:
             continue
@@ -240,18 +246,21 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, out):
         start = (node - first_leaf) * LEAF_SIZE
         for n in range(start, min(start + LEAF_SIZE, count)):
             place_corners(surface.corners, n, n + 1, pose, waiting)
-            hint = _search_triangle(
-                solid, lines, tolerance, fine, waiting, middle, scratch, hint, out
+            hint, more = _search_triangle(
+                solid, lines, tolerance, fine, most - looks, waiting, middle, scratch, hint, out
             )
+            looks += more
 
 
 def depth_in(
-    solid: Solid, surface: TriangleTree, pose: Floats, least: float, tolerance: float, fine: float
-) -> tuple[float, Floats]:
+    solid: Solid, surface: TriangleTree, pose: Floats, least: float, tolerance: float, fine: float,
+    most: int,
+) -> tuple[float, Floats]:  # fmt: skip
     """Depth of a surface in a solid, and its place (3,), the solid's frame, metres.
 
-    pose (4, 4) : of the surface in that frame. A depth of `least` or less is 0.
+    pose (4, 4) : of the surface in that frame; the others as for `depth_kernel`. A depth of `least`
+    or less is 0.
     """
     out = np.array([least, 0.0, 0.0, 0.0])
-    depth_kernel(solid, surface, np.ascontiguousarray(pose), LINES, tolerance, fine, out)
+    depth_kernel(solid, surface, np.ascontiguousarray(pose), LINES, tolerance, fine, most, out)
     return (float(out[0]) if out[0] > least else 0.0), out[1:]

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
 from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import sides_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
@@ -282,6 +282,25 @@ def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
         nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
 
 
+@entry(FLOATS3, FLOATS3, FLOATS3, FLOAT, BOOLS)
+def any_near_kernel(one, other, poses, far, out):
+    """Find whether any pair n of triangles, one and other (N, 3, 3), is within `far` metres.
+
+    out (P,): at each of poses (P, 4, 4), which lead the other ones into the frame of one.
+    """
+    placed, found = np.empty((1, 3, 3)), np.empty(7)
+    for p in range(poses.shape[0]):
+        out[p] = False
+        for n in range(one.shape[0]):
+            place_corners(other, n, n + 1, poses[p], placed)
+            if (
+                triangle_gap(one, n, placed, 0) < far * far
+                and measure_pair(one, n, placed, 0, 0.0, found)[1] <= far
+            ):
+                out[p] = True
+                break
+
+
 class Nearest(NamedTuple):
     """Distances of two surfaces at N poses, metres, in the frame of the first.
 
@@ -311,3 +330,10 @@ def nearest(
         a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out
     )
     return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)
+
+
+def any_near(one: Floats, other: Floats, poses: Floats, far: float) -> NDArray[np.bool_]:
+    """Whether any pair of triangles (N, 3, 3) is within `far` metres at poses (P, 4, 4): (P,)."""
+    out = np.zeros(len(poses), dtype=np.bool_)
+    any_near_kernel(one, other, np.ascontiguousarray(poses), far, out)
+    return out

@@ -43,7 +43,7 @@ def line(*places: tuple[float, float, float]) -> Way:
 
 def touching(found: Object, until: float, **changed: Any) -> TouchedObject:  # noqa: ANN401 - its fields
     """An object that the tool touches without overlap."""
-    one = TouchedObject(found, 0.0, 0.0, 1e-4, until, is_sliding=False, cut=None)
+    one = TouchedObject(found, 5e-5, 0.0, 7e-5, until, "shift", is_sliding=False)
     return one._replace(**changed)
 
 
@@ -57,6 +57,7 @@ def swept(path: Way | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - f
         "touching": (),
         "enclosed": (),
         "contact": 5e-5,
+        "overlap": 0.0,
         "objects": 3,
         "looks": 40,
         "revision": 1,

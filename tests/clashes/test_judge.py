@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from hapticdb.clashes.judge import Judged, judge
-from hapticdb.clashes.shapes import BuiltShape
+from hapticdb.pointshell.shape import CollisionShape
 
 Floats = NDArray[np.float64]
 
@@ -16,13 +16,13 @@ WITHIN, CONTACT = 1.0 * MM, 0.05 * MM
 TURNS = (np.eye(3), Rotation.from_euler("xyz", [0.3, -1.1, 0.7]).as_matrix())
 
 
-def solid(mesh: trimesh.Trimesh) -> BuiltShape:
-    return BuiltShape(MM * np.asarray(mesh.triangles, dtype=np.float64), is_cloud=False)
+def solid(mesh: trimesh.Trimesh) -> CollisionShape:
+    return CollisionShape(MM * np.asarray(mesh.triangles, dtype=np.float64))
 
 
 def block(
     size: tuple[float, float, float], at: tuple[float, float, float] = (0, 0, 0)
-) -> BuiltShape:
+) -> CollisionShape:
     mesh = trimesh.creation.box(size)
     mesh.apply_translation(at)
     return solid(mesh)
@@ -32,12 +32,14 @@ def rod(radius: float, length: float, sections: int = 48) -> trimesh.Trimesh:
     return trimesh.creation.cylinder(radius, length, sections=sections)
 
 
-def plate(bore: float, sections: int) -> BuiltShape:
+def plate(bore: float, sections: int) -> CollisionShape:
     """A ring of 4 mm, its bore along z."""
     return solid(trimesh.creation.annulus(bore, 10.0, 4.0, sections=sections))
 
 
-def judged(a: BuiltShape, b: BuiltShape, at: tuple[float, float, float] = (0, 0, 0)) -> Judged:
+def judged(
+    a: CollisionShape, b: CollisionShape, at: tuple[float, float, float] = (0, 0, 0)
+) -> Judged:
     """Judge a pair both ways round, and turned: its kind does not depend on it."""
     found = []
     for turn in TURNS:
@@ -47,7 +49,7 @@ def judged(a: BuiltShape, b: BuiltShape, at: tuple[float, float, float] = (0, 0,
         if turn is TURNS[0]:
             found += [judge(a, b, pose, WITHIN, CONTACT), judge(b, a, back, WITHIN, CONTACT)]
         else:  # both turned by the same
-            turned = [BuiltShape(shape.tree.corners @ turn.T, is_cloud=False) for shape in (a, b)]
+            turned = [CollisionShape(shape.tree.corners @ turn.T) for shape in (a, b)]
             shift = np.eye(4)
             shift[:3, 3] = turn @ (MM * np.array(at))
             found.append(judge(turned[0], turned[1], shift, WITHIN, CONTACT))

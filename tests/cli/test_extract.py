@@ -40,7 +40,7 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     assert set(found["way"]) == {"how", "poses", "length", "gap", "proof"}
     assert (found["verdict"], found["way"]["how"]) == ("comes out", "pull")
     (touched,) = found["way"]["proof"]["touching"]
-    assert (touched["name"], touched["cut"]) == ("pot", None)
+    assert (touched["name"], touched["start"]) == ("pot", 5e-5)
     assert [obj["name"] for obj in found["near"]] == ["pot"]
 
 

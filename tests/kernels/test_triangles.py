@@ -10,7 +10,6 @@ from scipy.spatial.transform import Rotation
 
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
 from hapticdb.kernels.triangles.nearest import nearest, own_gap, own_slack
-from hapticdb.kernels.triangles.piercing import piercing
 
 Floats = NDArray[np.float64]
 
@@ -144,22 +143,3 @@ def test_boxes_are_not_told_farther_apart_along_the_axes_of_the_turned_one() -> 
     assert n_apart > 100
     assert own_slack(np.eye(4), 5.0) == np.inf  # not turned
     assert own_slack(pose @ np.diag([2.0, 1.0, 1.0, 1.0]), 5.0) == np.inf  # stretched
-
-
-def test_an_edge_goes_through_faces_and_their_common_edges() -> None:
-    box = np.asarray(trimesh.creation.box((2.0, 2.0, 2.0)).triangles)
-    tree = triangle_tree(box, np.zeros(len(box), dtype=np.int64))
-    edges = np.array(
-        [
-            [[0.3, 0.1, 0.0], [0.3, 0.1, 3.0]],
-            [[-3.0, 0.2, 0.1], [3.0, 0.2, 0.1]],
-            [[0.0, 0.0, 0.0], [0.0, 0.0, 4.0]],  # through the diagonal of a face
-            [[2.0, 2.0, 2.0], [3.0, 2.0, 2.0]],
-            [[-0.5, 0.3, 1.0], [0.5, 0.3, 1.0]],  # in a face's plane
-        ]
-    )
-    which, _, shares = piercing(edges, tree, np.eye(4))
-    assert np.unique(which).tolist() == [0, 1, 2]
-    assert np.allclose(np.unique(shares[which == 0]), 1 / 3)
-    assert np.allclose(np.unique(np.round(shares[which == 1], 12)), [1 / 3, 2 / 3])
-    assert np.allclose(shares[which == 2], 0.25)

@@ -146,7 +146,7 @@ def test_a_part_slides_along_what_it_stands_on(env: Environment) -> None:
     found = sweep(env, TOOL, path)
     assert found.verdict == "slides"
     assert found.comes_out
-    assert found.touching[0].until == pytest.approx(0.05 / 0.13, abs=1e-3)
+    assert found.touching[0].until == pytest.approx(0.05 / 0.13, abs=2e-3)
     still = sweep(env, TOOL, path[:2])
     assert still.verdict == "slides"
     assert still.is_free
@@ -157,12 +157,12 @@ def test_a_part_slides_along_what_it_stands_on(env: Environment) -> None:
 def test_a_part_may_not_be_pushed_into_what_it_stands_on(env: Environment, deep: float) -> None:
     found = sweep(env, TOOL, line(SEATED, (0.0, 0.0, 0.5 * CUBE - deep * CUBE)))
     assert names(found) == ["plate"]
-    cut = found.touching[0].cut
-    assert cut is not None
-    assert cut.pose[2, 3] == pytest.approx(0.5 * CUBE - 2.0 * CONTACT, abs=2.0 * CONTACT)
+    (hit,) = found.hits
+    assert hit.pose[2, 3] == pytest.approx(0.5 * CUBE - CONTACT, abs=0.5 * CONTACT)
+    assert hit.at_least > CONTACT
 
 
-def test_no_cut_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> None:
+def test_nothing_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> None:
     for deep in (0.5, 0.9, 2.1, 3.0):
         found = sweep(env, TOOL, line(SEATED, (0.01, 0.0, 0.5 * CUBE - deep * CONTACT)))
         assert (found.verdict == "hits") == (deep > 2.0), deep
@@ -176,7 +176,7 @@ def test_what_was_left_may_not_be_touched_again(env: Environment) -> None:
     assert found.touching[0].until < 0.1
 
 
-@pytest.mark.parametrize("more", [0.0, 0.01, 0.05])
+@pytest.mark.parametrize("more", [0.0, 0.01, 0.045])
 def test_a_peg_leaves_its_hole_though_it_is_too_thick(tmp_path: Path, more: float) -> None:
     """In mm: 8 wide, of equal size to its hole, or pressed into it."""
     ring = trimesh.creation.annulus(4e-3, 12e-3, 10e-3, sections=32)
@@ -185,7 +185,7 @@ def test_a_peg_leaves_its_hole_though_it_is_too_thick(tmp_path: Path, more: floa
         out = sweep(env, peg, line((0.0, 0.0, 8e-3), (0.0, 0.0, 30e-3)))
         aside = sweep(env, peg, line((0.0, 0.0, 8e-3), (2e-3, 0.0, 8e-3)))
     assert out.comes_out
-    assert out.touching[0].start == pytest.approx(1e-3 * more, abs=1e-5)
+    assert out.touching[0].start == CONTACT
     assert names(aside) == ["ring"]
 
 
@@ -196,9 +196,9 @@ def test_a_block_slides_in_a_slot_that_it_fills(tmp_path: Path) -> None:
         along = sweep(env, TOOL, line((0.0, -0.1, 0.0), (0.0, 0.1, 0.0)))
         aside = sweep(env, TOOL, line((0.0, -0.1, 0.0), (3.0 * CONTACT, 0.1, 0.0)))
     assert along.verdict == "slides"
-    assert along.touching[0].deepest <= CONTACT
-    (cut,) = aside.hits
-    assert cut.pose[0, 3] == pytest.approx(2.0 * CONTACT, abs=CONTACT)
+    assert along.touching[0].start <= CONTACT
+    (hit,) = aside.hits
+    assert hit.pose[0, 3] == pytest.approx(CONTACT, abs=0.5 * CONTACT)
 
 
 def test_a_tolerance_tells_what_touches(env: Environment) -> None:

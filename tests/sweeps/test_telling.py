@@ -16,7 +16,8 @@ BENT = line((0.0, 0.0, 0.0), (0.5, 0.0, 0.0), (0.5, 0.5, 0.0))
 TOOL = PointShell(CORNERS, CORNERS / np.linalg.norm(CORNERS, axis=1)[:, None], np.zeros(3))
 BOLT, SEAT, LID = thing("bolt", 1), thing("seat", 2), thing("lid", 3)
 GAP = Gap(4e-4, 4.01e-4, place_at(BOLT, 0.312, PATH, 4e-4))
-CUT = place_at(SEAT, 0.25, PATH)
+HIT = place_at(SEAT, 0.25, PATH)
+DEEP = HIT._replace(at_least=2e-3)
 
 
 @pytest.mark.parametrize(
@@ -36,8 +37,18 @@ CUT = place_at(SEAT, 0.25, PATH)
          "31.2 % of the path; touches lid to the end of the path")),
         (swept(hits=tuple(place_at(one, 0.312, PATH) for one in (BOLT, SEAT, LID))), "hits",
          "hits bolt at 31.2 % of the path; then seat, lid"),
-        (swept(hits=(CUT,), touching=(touching(SEAT, 0.6, deepest=2e-3, allowed=1e-4, cut=CUT),)),
-         "hits", "cuts into seat at 25 % of the path: 2 mm deep, 0 µm at the start"),
+        (swept(hits=(DEEP,), touching=(touching(SEAT, 0.25),)), "hits",
+         "goes into seat at 25 % of the path: at least 2 mm"),
+        (swept(hits=(HIT,), touching=(touching(SEAT, 0.25),)), "hits",
+         "goes into seat at 25 % of the path by more than the tolerance"),
+        (swept(hits=(DEEP,), touching=(touching(SEAT, 0.0, by="", start=np.inf),)), "hits",
+         "starts inside seat: at least 2 mm"),
+        (swept(gap=GAP, touching=(touching(SEAT, 0.1, start=5e-4), touching(LID, 0.0))), "overlaps",
+         ("clear by 0.4 mm: nearest bolt at 31.2 % of the path, but for overlaps at the start: "
+          "seat 0.5 mm; touches seat, lid until 10 % of the path")),
+        (swept(gap=GAP, touching=(touching(SEAT, 0.1, start=5e-4),), overlap=1e-3), "clear",
+         ("clear by 0.4 mm: nearest bolt at 31.2 % of the path; "
+          "touches seat until 10 % of the path")),
         (swept(hits=(place_at(SEAT, 0.8, PATH),), touching=(touching(SEAT, 0.1),)), "hits",
          "leaves seat and hits it again at 80 % of the path"),
         (swept(enclosed=(thing("tank", 4, 1.0), thing("pea", 5, 1e-3))), "hits",
@@ -56,7 +67,10 @@ def test_what_time_has_ended_is_not_decided_unless_something_is_hit() -> None:
     assert stopped.verdict == "not decided"
     assert verdict_line(stopped, TOOL).startswith("not decided: the time was over")
     hits = (place_at(BOLT, 0.5, PATH),)
-    assert verdict_line(swept(is_stopped=True, hits=hits), TOOL).startswith("hits bolt")
+    late = verdict_line(swept(is_stopped=True, hits=hits), TOOL)
+    assert late == (
+        "hits bolt at 50 % of the path; the time was over: what is hit before may be missing"
+    )
 
 
 def test_a_gap_without_a_place_is_a_bound() -> None:
@@ -66,21 +80,21 @@ def test_a_gap_without_a_place_is_a_bound() -> None:
 
 
 def test_json_has_the_documented_keys_and_no_infinity() -> None:
-    both = touching(SEAT, 0.6, cut=CUT)
-    found = swept(gap=GAP, hits=(CUT,), touching=(both,), enclosed=(LID,))
+    both = touching(SEAT, 0.6), touching(BOLT, 0.0, by="", start=np.inf)
+    found = swept(gap=GAP, hits=(HIT,), touching=both, enclosed=(LID,))
     record = json.loads(json.dumps(sweep_record(found, TOOL, [7], [7, 8]), allow_nan=False))
     assert set(record) == {
         "verdict", "gap", "gap_at_most", "nearest", "line", "comes_out", "hits", "touching",
-        "enclosed", "contact", "objects", "looks", "revision", "elapsed", "is_stopped", "poses",
-        "profile", "tool", "proportions",
+        "enclosed", "contact", "overlap", "objects", "looks", "revision", "elapsed", "is_stopped",
+        "poses", "profile", "tool", "proportions",
     }  # fmt: skip
     assert set(record["hits"][0]) == {
-        "id", "name", "fraction", "segment", "pose", "on_tool", "on_object",
+        "id", "name", "fraction", "segment", "pose", "on_tool", "on_object", "at_least",
     }  # fmt: skip
     assert set(record["touching"][0]) == {
-        "id", "name", "start", "deepest", "allowed", "until", "is_sliding", "cut",
+        "id", "name", "start", "start_at_least", "reach", "until", "by", "is_sliding",
     }  # fmt: skip
-    assert record["touching"][0]["cut"] == record["hits"][0]
+    assert [one["start"] for one in record["touching"]] == [5e-5, None]
     assert (record["verdict"], record["gap"], record["nearest"]["name"]) == ("hits", 4e-4, "bolt")
     assert record["tool"] == {"parts": [7], "excluded": [7, 8]}
     assert record["profile"]["gaps"][-1] is None
@@ -90,18 +104,16 @@ def test_json_has_the_documented_keys_and_no_infinity() -> None:
 
 def test_csv_has_a_row_for_each_object_that_is_met() -> None:
     hit = place_at(BOLT, 0.5, PATH)
-    found = swept(hits=(hit, CUT), touching=(touching(SEAT, 0.6, cut=CUT),), enclosed=(LID,))
+    found = swept(hits=(hit, DEEP), touching=(touching(SEAT, 0.6),), enclosed=(LID,))
     rows = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(found)]
     told = [(row["object_name"], row["what"], row["fraction"]) for row in rows]
     assert told == [
         ("bolt", "hit", 0.5), ("seat", "hit", 0.25), ("lid", "enclosed", ""),
-        ("seat", "touched", 0.25),
+        ("seat", "touched", ""),
     ]  # fmt: skip
     assert [rows[0][f"object_{axis}_m"] for axis in "xyz"] == hit.on_object.tolist()
-    assert (rows[3]["until_fraction"], rows[3]["allowed_m"], rows[0]["allowed_m"]) == (
-        0.6,
-        1e-4,
-        "",
-    )
+    assert [row["reach_m"] for row in rows] == ["", "", "", 7e-5]
+    assert [row["depth_at_least_m"] for row in rows] == [0.0, 2e-3, "", ""]
+    assert (rows[3]["until_fraction"], rows[3]["start_m"], rows[3]["by"]) == (0.6, 5e-5, "shift")
     (nearest,) = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(swept(gap=GAP))]
     assert (nearest["what"], nearest["gap_m"], nearest["verdict"]) == ("nearest", 4e-4, "clear")

@@ -7,7 +7,8 @@ from numpy.typing import NDArray
 
 from hapticdb.batches.result import ClearanceBatch
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.pointshell.moving import MovingSurface, tree_of
+from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.pointshell.shape import tree_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, Store
 

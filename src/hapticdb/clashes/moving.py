@@ -13,12 +13,12 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.clashes.judge import judge
 from hapticdb.clashes.result import GRAVITY
 from hapticdb.clashes.run import CONTACT
-from hapticdb.clashes.shapes import BuiltShape
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.poses import rotation_of
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Progress
@@ -95,12 +95,12 @@ def find_meetings(
         objects = env.felt(against, of)
         gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
-        moved, found = BuiltShape(tool.tree.corners, is_cloud=False), []
+        found: list[Meeting] = []
         for n, (obj, part) in enumerate(parts_of(env.store, near)):
-            still = BuiltShape(part.surface(), is_cloud=part.is_cloud)
+            still = CollisionShape(part.surface(), is_cloud=part.is_cloud)
             for ways in _intervals(Pair(still.tree, tool, way), contact):
                 kind, depth, place = _gravest(
-                    still, moved, way.at(np.linspace(*ways, POSES)), contact
+                    still, tool, way.at(np.linspace(*ways, POSES)), contact
                 )
                 found.append(Meeting(obj.id, obj.name, *_numbers(way, ways), kind, depth, place))
             if progress is not None:
@@ -163,7 +163,7 @@ def _gaps(pair: Pair, ways: Floats, contact: float) -> Floats:
 
 
 def _gravest(
-    still: BuiltShape, moved: BuiltShape, poses: Floats, contact: float
+    still: CollisionShape, moved: CollisionShape, poses: Floats, contact: float
 ) -> tuple[Kind, float, tuple[float, ...]]:
     """The gravest of what a pair is at poses, how deep it is there, and where."""
     judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]

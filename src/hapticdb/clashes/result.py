@@ -57,6 +57,9 @@ class Clash(NamedTuple):
         at_least = length_text(self.at_least)
         if self.kind != "overlapping":
             return at_least
+        if not self.at_least:
+            at_most = "" if self.at_most is None else f"up to {length_text(self.at_most)} "
+            return f"{at_most}(how deep at least is not known)"
         if self.at_most is None:
             return f"{at_least} or more"
         return f"{at_least} to {length_text(self.at_most)}"

@@ -1,20 +1,13 @@
 """Shapes of objects, each built once for all objects that place it, as long as memory lasts."""
 
 from collections import OrderedDict
-from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import no_surface, unpacked_part
-from hapticdb.kernels.triangles.parting import components
-from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.moving import tree_of
-from hapticdb.pointshell.orientation import orient
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import Object, Store
-from hapticdb.sweeps.cut import Mesh
-from hapticdb.sweeps.easing import stretches
 
 Floats = NDArray[np.float64]
 
@@ -25,63 +18,17 @@ BYTES_OF_CORNERS = 6
 """Bytes of a shape for each byte of its corners, with all that is built from them."""
 
 
-class BuiltShape:
-    """A surface in a frame that rigid transforms place.
-
-    tree : its triangles; a cloud's points are ones without area.
-    """
-
-    def __init__(self, triangles: Floats, *, is_cloud: bool) -> None:
-        self.tree, self.is_cloud = tree_of(triangles), is_cloud
-        self._stretches: dict[float, Floats] = {}
-        self.box = self.tree.corners.min(axis=(0, 1)), self.tree.corners.max(axis=(0, 1))
-
-    @cached_property
-    def mesh(self) -> Mesh:
-        """The surface with its corners joined."""
-        return Mesh(self.tree)
-
-    @cached_property
-    def interior(self) -> Interior | None:
-        """Its inside; None where it has no closed body."""
-        try:
-            inside = Interior(orient(self.tree.corners))
-        except UsageError:  # no area
-            return None
-        return inside or None
-
-    @cached_property
-    def bodies(self) -> Floats:
-        """A corner (B, 3) of each piece that is connected."""
-        pieces = components(self.mesh.edges, len(self.mesh.points))
-        return self.mesh.points[np.unique(pieces)]
-
-    def stretches(self, contact: float) -> Floats:
-        """Maps (N, 4, 4) that move no place of it by more than `contact`, built once for each."""
-        if contact not in self._stretches:
-            self._stretches[contact] = stretches(*self.box, contact)
-        return self._stretches[contact]
-
-    def holds(self, places: Floats) -> NDArray[np.bool_]:
-        """Whether each of places (Q, 3), its frame, is in a closed body of it."""
-        low, high = self.box
-        held = np.asarray(((places >= low) & (places <= high)).all(axis=1))
-        if held.any():
-            held[held] = self.interior is not None and self.interior.holds(places[held])
-        return held
-
-
 class Shapes:
     """The shapes of an environment's objects, those used last kept within `budget` bytes."""
 
     def __init__(self, store: Store, budget: int) -> None:
         self._store, self._budget = store, budget
-        self._kept: OrderedDict[tuple[str, bytes], BuiltShape] = OrderedDict()
+        self._kept: OrderedDict[tuple[str, bytes], CollisionShape] = OrderedDict()
         self._bytes = 0
         self._placements: dict[int, tuple[tuple[str, bytes], Floats]] = {}
 
-    def shape(self, obj: Object) -> BuiltShape | None:
-        """Shape of an object; None if it was written meanwhile.
+    def shape(self, obj: Object) -> CollisionShape | None:
+        """CollisionShape of an object; None if it was written meanwhile.
 
         Raises `NoSurfaceError` if the object's surface is not in the database.
         """
@@ -105,7 +52,7 @@ class Shapes:
             self._placements[obj.id] = (obj.digest, linear.tobytes()), pose
         return self._placements[obj.id]
 
-    def _read(self, obj: Object, linear: Floats) -> BuiltShape | None:
+    def _read(self, obj: Object, linear: Floats) -> CollisionShape | None:
         packed = self._store.surfaces([obj.digest]).get(obj.digest)
         if packed is None:
             if all(now.digest != obj.digest for now in self._store.objects([obj.id])):
@@ -114,11 +61,11 @@ class Shapes:
         part = unpacked_part(self._store.url, obj, packed)
         corners = part.vertices @ linear.T
         if part.faces is None:
-            return BuiltShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
-        return BuiltShape(corners[part.faces], is_cloud=False)
+            return CollisionShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
+        return CollisionShape(corners[part.faces])
 
 
-def _bytes_of(shape: BuiltShape) -> int:
+def _bytes_of(shape: CollisionShape) -> int:
     return BYTES_OF_CORNERS * int(shape.tree.corners.nbytes)
 
 

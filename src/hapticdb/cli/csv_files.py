@@ -5,6 +5,7 @@ a formula gets an apostrophe in front, which is how spreadsheets themselves mark
 """
 
 import csv
+import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
@@ -38,8 +39,8 @@ CONTACTS = ("pose", "point", "x_m", "y_m", "z_m", "depth_m", "object_id", "objec
 """Columns of `touch --contacts-csv`: a row for each contact with each object that it touches."""
 SWEPT = (
     "object_id", "object_name", "what", "fraction", "segment", "tool_x_m", "tool_y_m", "tool_z_m",
-    "object_x_m", "object_y_m", "object_z_m", "until_fraction", "start_depth_m", "deepest_m",
-    "allowed_m", "gap_m", "verdict",
+    "object_x_m", "object_y_m", "object_z_m", "until_fraction", "start_m", "start_at_least_m",
+    "reach_m", "by", "depth_at_least_m", "gap_m", "verdict",
 )  # fmt: skip
 """Columns of `sweep --csv`: a row for each object that is hit, enclosed or touched at the start,
 and one for the nearest object; `what` says which. A cell that does not belong to it is empty."""
@@ -163,22 +164,24 @@ def rows_of_sweep(found: "Swept") -> Iterator[list[object]]:
         what: str,
         obj: "Object",
         place: "PathPlace | None" = None,
-        depths: Sequence[float | str] = ("",) * 4,
+        contact: Sequence[float | str] = ("",) * 5,
         gap: float | str = "",
     ) -> list[object]:
         where: list[object] = [""] * 8
         if place is not None:
             on_both = [*place.on_tool.tolist(), *place.on_object.tolist()]
             where = [place.fraction, place.segment, *on_both]
-        return [obj.id, text_cell(obj.name), what, *where, *depths, gap, found.verdict]
+        depth = place.at_least if what == "hit" and place is not None else ""
+        return [obj.id, text_cell(obj.name), what, *where, *contact, depth, gap, found.verdict]
 
     for place in found.hits:
         yield row("hit", place.object, place)
     for obj in found.enclosed:
         yield row("enclosed", obj)
     for one in found.touching:
-        depths = one.until, one.start, one.deepest, one.allowed
-        yield row("touched", one.object, one.cut, depths)
+        start = one.start if math.isfinite(one.start) else ""
+        contact = one.until, start, one.start_at_least, one.reach, one.by
+        yield row("touched", one.object, contact=contact)
     if found.gap.place is not None and found.is_free:
         yield row("nearest", found.gap.place.object, found.gap.place, gap=found.gap.at_least)
 

@@ -33,7 +33,7 @@ LEAST = 0.1
 """Seconds of a search for which no time is left: it tries one pull."""
 SHARE = 0.25
 """Greatest share of the whole time for one search. Larger: fewer searches, each more thorough."""
-DisassemblyVerdict = Literal["comes out", "no order found"]
+DisassemblyVerdict = Literal["comes out", "overlaps", "no order found"]
 
 
 class Removal(NamedTuple):
@@ -103,8 +103,14 @@ class Disassembly:
 
     @property
     def verdict(self) -> DisassemblyVerdict:
-        """Each step is proved on its whole path; "no order found" proves nothing."""
-        return "comes out" if self.is_found else "no order found"
+        """Each step is proved on its whole path, or but for overlaps where its parts stand.
+
+        "no order found" proves nothing.
+        """
+        if not self.is_found:
+            return "no order found"
+        overlaps = any(step.found.verdict == "overlaps" for step in self.steps)
+        return "overlaps" if overlaps else "comes out"
 
     @property
     def blockers(self) -> tuple[Blocker, ...]:
@@ -123,6 +129,7 @@ def disassemble(
     out: float | None = None,
     screw: float | None = None,
     contact: float = CONTACT,
+    overlap: float = 0.0,
     seconds: float = DEFAULT_ORDER_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
@@ -140,8 +147,7 @@ def disassemble(
 
     Parameters
     ----------
-    env, words, where, exclude, out, screw, contact, seed, budget_bytes, progress
-        As for `extract`.
+    env, words, where, exclude, out, screw, contact, overlap, seed, budget_bytes, progress
     seconds : float
         Time of all searches together; one search has a quarter of it at most.
     motions : int
@@ -169,7 +175,7 @@ def disassemble(
     stays = {*ids_of(parts), *ids_of(env.felt(where, exclude))}
     left_out = tuple(obj.id for obj in env.objects() if obj.id not in stays)
     kept = frozenset(ids_of(env.find(*keep)) if keep else ())
-    options = {"out": out, "screw": screw, "contact": contact, "seed": seed,
+    options = {"out": out, "screw": screw, "contact": contact, "overlap": overlap, "seed": seed,
                "budget_bytes": budget_bytes, "progress": progress}  # fmt: skip
     asked = _Asked(parts, left_out, kept, seconds, motions, options)
     with connected(on) as workers:
@@ -413,7 +419,7 @@ class _OrderSearch:
             left = max(self._until - time.monotonic(), LEAST)
             again = sweep(
                 self._env, found.shell, way.poses, exclude=excluded, contact=way.swept.contact,
-                seconds=left,
+                overlap=way.swept.overlap, seated=True, seconds=left,
             )  # fmt: skip
             if not again.is_free:
                 return None

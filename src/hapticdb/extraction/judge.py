@@ -25,7 +25,7 @@ def judge(problem: Problem, poses: Floats, how: How, until: float = math.inf) ->
     left = max(min(problem.until, until) - time.monotonic(), LEAST)
     found = sweep(
         problem.env, problem.shell, poses, where=problem.where, exclude=problem.exclude,
-        contact=problem.contact, seconds=left, until_hit=True,
+        contact=problem.contact, overlap=problem.overlap, seated=True, seconds=left, until_hit=True,
     )  # fmt: skip
     return WayOut(poses, how, found)
 

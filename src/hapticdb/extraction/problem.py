@@ -32,11 +32,11 @@ class Problem(NamedTuple):
     """Parts that are to come out as one rigid body, and the objects that stand.
 
     parts : the objects that move, at their places; where, exclude : words of what is felt,
-    `exclude` with the parts' ids; contact : of the sweeps that prove paths; standing : the objects
-    that are felt; box (2, 3) : corners of their bounding box, metres; shell : points of the parts'
-    surface, world frame, so that its poses are displacements; corners (8, 3), center (3,) : of the
-    surface's bounding box; radius : greatest distance of the surface from there, metres; until :
-    time of `time.monotonic` at which the search ends, with its sweeps.
+    `exclude` with the parts' ids; contact, overlap : of the sweeps that prove paths; standing : the
+    objects that are felt; box (2, 3) : corners of their bounding box, metres; shell : points of the
+    parts' surface, world frame, so that its poses are displacements; corners (8, 3), center (3,) :
+    of the surface's bounding box; radius : greatest distance of the surface from there, metres;
+    until : time of `time.monotonic` at which the search ends, with its sweeps.
     """
 
     env: Environment
@@ -44,6 +44,7 @@ class Problem(NamedTuple):
     where: tuple[int | str, ...]
     exclude: tuple[int | str, ...]
     contact: float
+    overlap: float
     standing: tuple[Object, ...]
     box: Floats
     shell: PointShell
@@ -70,8 +71,9 @@ class Problem(NamedTuple):
 
 
 def problem_of(
-    env: Environment, words: Words, where: Words, exclude: Words, *, seed: int, contact: float
-) -> Problem:
+    env: Environment, words: Words, where: Words, exclude: Words, *, seed: int, contact: float,
+    overlap: float,
+) -> Problem:  # fmt: skip
     """Read the parts that words choose, and look up what stands.
 
     Raises `ObjectNotFoundError` if a word chooses nothing. Raises `UsageError` if no word is given,
@@ -91,7 +93,7 @@ def problem_of(
     center = box.mean(axis=0)
     radius = float(np.linalg.norm(outline - center, axis=1).max())
     return Problem(
-        env, tuple(parts), tuple(where), left_out, contact, tuple(standing),
+        env, tuple(parts), tuple(where), left_out, contact, overlap, tuple(standing),
         _box_of(standing), shell, corners_of(box), center, radius,
     )  # fmt: skip
 

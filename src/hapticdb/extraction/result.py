@@ -14,7 +14,7 @@ from hapticdb.units import notebook_html
 
 Floats = NDArray[np.float64]
 
-WayOutVerdict = Literal["comes out", "slides", "not decided", "no way found"]
+WayOutVerdict = Literal["comes out", "slides", "overlaps", "not decided", "no way found"]
 How = Literal["pull", "screw", "plan"]
 
 
@@ -53,9 +53,12 @@ class WayOut:
         """What is proved.
 
         "comes out": nothing is hit on the whole path, and nothing is touched at its end. "slides":
-        nothing is hit, but the parts still touch what they touch at their start. "not decided": the
-        time ended the sweep, or it refutes the path.
+        nothing is hit, but the parts still touch what they touch at their start. "overlaps": as
+        either, but for overlaps at the start. "not decided": the time ended the sweep, or it
+        refutes the path.
         """
+        if self.swept.verdict == "overlaps":
+            return "overlaps"
         if self.swept.comes_out:
             return "comes out"
         return "slides" if self.swept.is_free else "not decided"

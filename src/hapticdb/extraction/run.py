@@ -59,6 +59,7 @@ def extract(
     out: float | None = None,
     screw: float | None = None,
     contact: float = CONTACT,
+    overlap: float = 0.0,
     seconds: float = DEFAULT_SECONDS,
     seed: int = 0,
     motions: int = DEFAULT_MOTIONS,
@@ -69,11 +70,10 @@ def extract(
 
     Parameters
     ----------
-    env : Environment
-        An environment whose order is not lexicographic.
+    env : Environment, whose order is not lexicographic
     words : int or str
         Parts that move together, as for `Environment.find`.
-    where, exclude, contact
+    where, exclude, contact, overlap
         As for `hapticdb.sweep`; the parts themselves are not felt.
     to : (4, 4) array or None
         Displacement that the parts are to reach, rigid, metres; out unless given.
@@ -106,7 +106,7 @@ def extract(
     asked = _Asked(None, seconds, seed, motions, out, screw, budget_bytes)
     asked.check()
     began = time.monotonic()
-    problem = problem_of(env, words, where, exclude, seed=seed, contact=contact)
+    problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, overlap=overlap)
     goal = None if to is None else _checked_goal(problem, to, asked)
     found = _searched(problem, asked._replace(to=goal), progress)
     return replace(found, seconds=time.monotonic() - began)

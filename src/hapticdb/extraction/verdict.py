@@ -10,6 +10,7 @@ from hapticdb.sweeps.verdict import (
     MOST_NAMED,
     gap_text,
     names_of,
+    overlaps_text,
     plain,
     sweep_record,
     until_text,
@@ -28,8 +29,9 @@ def extraction_line(found: Extraction) -> str:
     path = f"{how}, {length_text(way.length)}"
     if not found.is_free:
         return f"not decided: a path {path} long: {verdict_line(way.swept, found.shell)}"
-    does = "slides" if way.verdict == "slides" else "comes out"
-    return f"{does if found.to is None else 'reaches the pose'} {path}{_proved(way)}"
+    does = "comes out" if way.swept.comes_out else "slides"
+    does = does if found.to is None else "reaches the pose"
+    return f"{does} {path}{overlaps_text(way.swept)}{_proved(way)}"
 
 
 def _proved(way: WayOut) -> str:

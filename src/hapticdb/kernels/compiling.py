@@ -57,7 +57,7 @@ TOGETHER = {
     "proxy.linearize": "period.loop.move_by_coupling",
     "period.loop.move_directly": "period.loop.run",
     "triangles.sweeping": "triangles.nearest",
-    "triangles.parting": "surfaces.nearest",
+    "triangles.depth": "surfaces.nearest",
 }
 """Modules, or entries of `APART`, that are compiled after others, if these are compiled, too, in
 the same process: they share leaves."""

@@ -5,12 +5,14 @@ a point within r. It bounds the size of a detail that may pass between the point
 """
 
 import contextlib
+from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces import sides
+from hapticdb.kernels.triangles.depth import Solid
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
@@ -100,28 +102,48 @@ class Ball(NamedTuple):
 class Interior:
     """The inside of the closed bodies of a result of `orient`, or of a ball.
 
-    Open bodies enclose nothing, and a void is outside.
+    Open bodies enclose nothing, and a void is outside. tree : of all triangles, about `origin`
+    (3,); boxes : of the closed bodies, likewise.
     """
 
     def __init__(self, surface: "Surface | Ball") -> None:
         self._ball = surface if isinstance(surface, Ball) else None
         self._bodies: list[tuple[int, int]] = []
-        self._boxes: dict[int, tuple[Floats, Floats]] = {}
+        self.boxes: dict[int, tuple[Floats, Floats]] = {}
         if isinstance(surface, Ball):
             return
-        self._origin = surface.center
+        self.origin = surface.center
         local = surface.triangles - surface.center
         closed = np.unique(surface.bodies[surface.bodies > 0])
-        self._tree = sides.triangle_tree(local, surface.bodies)
+        self.tree = sides.triangle_tree(local, surface.bodies)
         volumes = -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas
         for body in closed.tolist():
             own = surface.bodies == body
             corners = local[own].reshape(-1, 3)
             self._bodies.append((body, 1 if volumes[own].sum() > 0.0 else -1))
-            self._boxes[body] = corners.min(axis=0), corners.max(axis=0)
+            self.boxes[body] = corners.min(axis=0), corners.max(axis=0)
 
     def __bool__(self) -> bool:
         return self._ball is not None or bool(self._bodies)
+
+    def moved(self, by: Floats) -> "Interior":
+        """The inside after the corners of the surface's triangles have moved by (F, 3, 3) metres.
+
+        A ball's has none; the bodies stay closed, whatever moves.
+        """
+        found, reach = copy(self), float(np.abs(by).max(initial=0.0))
+        found.tree = sides.refitted(self.tree, self.tree.corners + by[self.tree.faces])
+        found.boxes = {k: (low - reach, high + reach) for k, (low, high) in self.boxes.items()}
+        return found
+
+    def solid(self) -> Solid:
+        """The closed bodies for `kernels.triangles.depth`, about `origin`."""
+        numbers = np.array(self._bodies, dtype=np.int64).reshape(-1, 2)
+        low, high = (
+            np.array([box[n] for box in self.boxes.values()]).reshape(-1, 3) for n in (0, 1)
+        )
+        box = np.stack([low.min(axis=0), high.max(axis=0)])
+        return Solid(self.tree, numbers[:, 0].copy(), numbers[:, 1].copy(), box)
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
         """Whether each of the positions (Q, 3), metres, surface's frame, is inside: (Q,).
@@ -137,10 +159,10 @@ class Interior:
 
     def _holds_in(self, body: int, positions: Floats) -> NDArray[np.bool_]:
         """Whether a closed body encloses each of the positions (Q, 3): (Q,)."""
-        local = np.ascontiguousarray(positions - self._origin)
-        low, high = self._boxes[body]
+        local = np.ascontiguousarray(positions - self.origin)
+        low, high = self.boxes[body]
         held = np.asarray(((local >= low) & (local <= high)).all(axis=1))
         which = np.flatnonzero(held)
         if len(which):
-            held[which] = sides.encloses(self._tree, body, local[which])
+            held[which] = sides.encloses(self.tree, body, local[which])
         return held

@@ -4,11 +4,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
+from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.motion import PathMotion
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
 from hapticdb.kernels.triangles.sweeping import Search
 from hapticdb.pointshell.coverage import Ball
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
 
 Floats = NDArray[np.float64]
@@ -17,11 +18,10 @@ AT_ONCE = 32
 """Boxes that are compared together. Larger: more memory."""
 
 
-class MovingSurface:
+class MovingSurface(CollisionShape):
     """A shell's surface, tool frame: triangles, or a ball about the origin.
 
-    tree : its triangles, or the ball's middle as one without area; corners (V, 3) : whose box holds
-    it; radius : of the ball, 0 of a surface; metres.
+    corners (V, 3) : whose box holds it, metres.
 
     Raises `UsageError` if the shell has no surface.
     """
@@ -29,14 +29,12 @@ class MovingSurface:
     def __init__(self, shell: PointShell) -> None:
         if shell.surface is None:
             raise UsageError("the tool has points but no surface: give its mesh, not a saved shell")
-        self.surface = shell.surface
-        if isinstance(self.surface, Ball):
-            self.radius, triangles = self.surface.radius, np.zeros((1, 3, 3))
-            self.corners = self.radius * np.array([[-1.0, -1.0, -1.0], [1.0, 1.0, 1.0]])
+        if isinstance(shell.surface, Ball):
+            super().__init__(np.zeros((1, 3, 3)), radius=shell.surface.radius)
+            self.corners = self.box
         else:
-            self.radius, triangles = 0.0, self.surface.triangles
-            self.corners = np.unique(triangles.reshape(-1, 3), axis=0)
-        self.tree = tree_of(triangles)
+            super().__init__(shell.surface.triangles, shell.surface)
+            self.corners = np.unique(shell.surface.triangles.reshape(-1, 3), axis=0)
 
     def nearest(
         self, other: TriangleTree, poses: Floats, farthest: Floats, enough: float = 0.0
@@ -79,8 +77,3 @@ class MovingSurface:
             np.maximum(apart, 0.0, out=apart)
             np.sqrt(np.einsum("onk,onk->on", apart, apart), out=out[some])
         return out
-
-
-def tree_of(triangles: Floats) -> TriangleTree:
-    """Tree over triangles (F, 3, 3) of one surface."""
-    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))

@@ -31,6 +31,7 @@ class Surface(NamedTuple):
     center: Floats  # (3,)
     is_closed: bool
     bodies: Ints  # (F,) 0 for all open ones, then the closed ones
+    faces: Ints  # (F,) number of each among the given triangles
 
 
 class _Edges(NamedTuple):
@@ -69,7 +70,7 @@ def orient(triangles: Floats) -> Surface:
     corners = triangles.reshape(-1, 3)
     origin = corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0
     local = triangles - origin
-    faces = _join_corners(local)
+    faces = join_corners(local)
     kept, walls = _drop_repeated(faces)
     sides, is_even = _sides_of(faces[kept], local[kept])
     outer = walls[~_are_within(sides, faces[kept], faces[walls], local[walls])]
@@ -85,7 +86,7 @@ def orient(triangles: Floats) -> Surface:
     sampled = areas > 0.0
     return Surface(
         triangles[kept][sampled], areas[sampled], inward[sampled], center + origin, is_closed,
-        sides.body[sampled],
+        sides.body[sampled], kept[sampled],
     )  # fmt: skip
 
 
@@ -125,7 +126,7 @@ def _edges_of(faces: Ints) -> _Edges:
     return _Edges(number.astype(np.int64), tail < head, uses.astype(np.int64))
 
 
-def _join_corners(triangles: Floats) -> Ints:
+def join_corners(triangles: Floats) -> Ints:
     """Number the corners (F, 3) so that corners that coincide have one number.
 
     Corners with equal bits are one. If edges stay open, their corners are also joined within
@@ -150,10 +151,10 @@ def _join_corners(triangles: Floats) -> Ints:
     distinct = corners[order[is_new]]
     tolerance = JOIN * float(np.linalg.norm(np.ptp(distinct, axis=0)))
     pairs = loose[cKDTree(distinct[loose]).query_pairs(tolerance, output_type="ndarray")]
-    return _components(pairs, len(distinct))[faces]
+    return components(pairs, len(distinct))[faces]
 
 
-def _components(pairs: Ints, n: int) -> Ints:
+def components(pairs: Ints, n: int) -> Ints:
     """Component (n,) of each node of a graph, numbered by lowest node. pairs (E, 2) are its edges.
 
     In each round every root with a lower neighbour becomes a child of the lowest one, which leaves
@@ -197,7 +198,7 @@ def _drop_repeated(faces: Ints) -> tuple[Ints, Ints]:
     edges = _edges_of(faces[kept])
     sides = np.flatnonzero(np.repeat(is_even, 3))
     pairs = _neighbours(edges.number, sides)
-    patch = _components(pairs // 3, len(kept))
+    patch = components(pairs // 3, len(kept))
     within = np.bincount(edges.number[sides], minlength=len(edges.uses))
     is_border = (within == 1) & (edges.uses > 1)
     border = sides[is_border[edges.number[sides]]]
@@ -223,7 +224,7 @@ def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
             np.stack((f + n, np.where(agrees, g + n, g)), axis=1),
         )
     )
-    sheet = _components(links, 2 * n)
+    sheet = components(links, 2 * n)
     is_one_sided = sheet[:n] == sheet[n:]
     patch = np.minimum(sheet[:n], sheet[n:])
     is_flipped = (sheet[:n] > sheet[n:]) & ~is_one_sided
@@ -234,7 +235,7 @@ def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
 def _bodies(n_faces: int, edges: _Edges) -> Ints:
     """Body (F,) of each face: 1, 2, ... for closed bodies of faces that share edges, 0 for open."""
     pairs = _neighbours(edges.number, np.arange(3 * n_faces))
-    body = _components(pairs // 3, n_faces)
+    body = components(pairs // 3, n_faces)
     is_open = np.zeros(n_faces, dtype=bool)
     is_open[body[np.flatnonzero((edges.uses % 2 == 1)[edges.number]) // 3]] = True
     body += 1

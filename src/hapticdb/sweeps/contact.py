@@ -1,174 +1,157 @@
-"""Objects that the tool touches where its path starts: followed until they are apart.
+"""Contacts: objects that the tool touches where its path starts, followed until they are apart.
 
-Where a small motion of the tool frees it, tool and object overlap by no more than that motion
-(`easing`). So the tool that is moved aside is swept on: until it meets the object, the contact is
-no deeper. Where no such motion is found, how deep they overlap is measured, look by look (`cut`).
+The path is free of a touched object if the tool, moved aside or deformed once by a small motion
+(`separation`), follows it and meets nothing: then no place of the tool gets to another side of
+anything, however thin. A change to another motion on the way is proved, too. No depth at single
+poses could say so, since it has no memory of sides.
 """
 
-from typing import NamedTuple
+from collections.abc import Iterator
+from itertools import islice
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.sweeps.cut import NONE, Cut, Mesh, cut
-from hapticdb.sweeps.easing import Easing
+from hapticdb.kernels.triangles.sweeping import MEETING
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.sweeps.gap import Pair
+from hapticdb.sweeps.separation import NOTHING, MovedPair, Separation
 
 Floats = NDArray[np.float64]
 
+CLEARANCE = 2.0 * MEETING
+"""Metres that a small motion keeps the surfaces apart where it begins."""
 SLIDE = 4.0
 """Contact tolerances that the tool moves on while it touches, from which it slides."""
 STRIDE = 3.0
-"""Contact tolerances between two looks whether the surfaces are apart, where they are eased."""
-STEP, STEP_OF_GROWTH = 1.5, 0.75
-"""Way between two looks at a cut: contact tolerances, or a share of what a cut may grow by if that
-is more. Larger: fewer looks, and less is allowed at each."""
-KEPT = 0.53
-"""Share of that way by which a cut must stay below what is allowed, since it is deeper by half of
-the way at most between two looks."""
-SHIFT = 0.05
-"""Contact tolerances by which surfaces are shifted, to measure how deep they overlap."""
-DEEP = 0.06
-"""Share of the start's cut by which it may grow, if that is more than the tolerance: measurements
-differ by half as much where places and corners are few. Larger: more of it is allowed."""
-FLOOR = 0.9
-"""Share of the last cut below which the next one is not measured. Less: slower looks, and longer
-ways between them where a cut gets less."""
-BLOCK = 64
-"""Looks whether surfaces are apart that are done together."""
-REACH = 0.9
-"""Share of the way up to the next look on which a cut would stay as deep. Larger: fewer looks, more
-of which are done again, nearer."""
-PATIENCE = 16
-"""Shortest ways between looks until motions that ease a cut are tried again."""
+"""Contact tolerances between two looks whether the surfaces are apart."""
+BLOCK, MOST_BLOCK = 64, 4096
+"""Looks whether surfaces are apart that are done together: at first, and at most."""
+MOST_TRIED = 8
+"""Motions at the start that are followed. More: contacts are followed farther, slower hits."""
+BACKS = (0.2, 1.0, 5.0)
+"""Reaches before a meeting at which another motion takes over."""
+BEYOND = 0.25
+"""Reaches beyond a meeting that another motion has to get."""
+MOST_CHANGES = 30
+"""Changes of motions along the path."""
+ON = 2.0
+"""Reaches beyond a hit at which its depth is measured."""
 
 
-class FollowedContact(NamedTuple):
-    """How a contact goes on: as `result.TouchedObject`, with ways in metres.
+class Contact:
+    """A contact from the start of the path, where the surfaces are within `contact` metres.
 
-    until : way at which they are apart, or where it ends; is_apart : whether they are apart there;
-    refused : way and cut where they overlap by more than is allowed, or None.
+    start : overlap at the start that a motion frees, at most, metres, infinite where none does;
+    start_at_least : proved penetration depth there; reach : of the motions; by : the kind of the
+    last one, empty where none frees; way : followed so far, metres; is_over, is_apart, is_hit :
+    whether it has ended, by surfaces that are apart, or that meet.
     """
 
-    start: float
-    deepest: float
-    allowed: float
-    until: float
-    is_apart: bool = False
-    refused: tuple[float, Cut] | None = None
-
-    def is_sliding(self, contact: float) -> bool:
-        """Whether the tool moves on while it touches."""
-        return self.until > SLIDE * contact
-
-
-def follow(pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> FollowedContact:
-    """Follow a contact from the start of the path, where the surfaces are within `contact` metres.
-
-    A cut may grow to the greater one of the start's and `contact`, and by `contact` more, or by
-    `DEEP` of the start's if that is more.
-    """
-    return _Following(pair, contact, object_mesh, tool_mesh).followed()
-
-
-class _Following:
-    """State of a contact that is followed."""
-
-    def __init__(self, pair: Pair, contact: float, object_mesh: Mesh, tool_mesh: Mesh) -> None:
+    def __init__(
+        self, pair: Pair, shape: CollisionShape, contact: float, gap: float, *, seated: bool
+    ) -> None:
+        """Begin; gap : of the surfaces, from below; seated : whether the tool may overlap more."""
         self._pair, self._contact = pair, contact
-        self._object, self._tool = object_mesh, tool_mesh
-        self._depth = contact
-        self._start = self._cut(pair.way.at([0.0])[0], np.inf, contact).depth
-        growth = max(contact, DEEP * self._start)
-        self._step = max(STEP * contact, STEP_OF_GROWTH * growth)
-        self._allowed = max(self._start, contact) + growth
-        deep = self._start > contact
-        self._easing = Easing(pair, self._start + 0.5 * growth if deep else contact)
-        self._deepest = self._depth = self._start
+        self._separation = Separation(shape, pair.tool, pair.check_time)
+        self._still = self._separation.moved(NOTHING)
+        self.start, self.start_at_least, self.reach, self.by = contact, 0.0, contact + CLEARANCE, ""
+        self.way, self.is_over, self.is_apart, self.is_hit = 0.0, False, False, False
+        self._since, self._block, self._changes = 0.0, BLOCK, 0
+        self._moved = self._begun(gap, seated=seated)
+        if self._moved is None:
+            self.start, self.is_over, self.is_hit = np.inf, True, True
+        else:
+            self.by = self._moved.motion.by
 
-    def followed(self) -> FollowedContact:
-        """Follow it to its end."""
-        way, length = 0.0, self._pair.length
-        while way < length:
-            eased = self._easing.until(way)
-            if eased > way + self._step or eased >= length:
-                self._deepest = max(self._deepest, self._easing.reach)
-                apart = self._first_apart(way, eased)
-                if apart is not None:
-                    return self._told(apart, is_apart=True)
-                way = eased
-                self._depth = self._easing.reach
-                continue
-            told = self._looked(way, min(way + PATIENCE * self._step, length))
-            if told is not None:
-                return told
-            way = min(way + PATIENCE * self._step, length)
-        return self._told(length)
+    def _begun(self, gap: float, *, seated: bool) -> MovedPair | None:
+        """The first motion that frees the surfaces at the start; None if there is none."""
+        pose, found = self._pair.way.at([0.0])[0], self._separation
+        self._motions: Iterator[MovedPair] = iter(())
+        self._motions = found.separating(pose, self.reach, CLEARANCE, gap=gap)
+        first = next(self._motions, None)
+        if first is not None:
+            return first
+        self.start_at_least = found.depth(pose, self._contact)[0]
+        if not seated:
+            return None
+        least = max(self._contact, self.start_at_least) + CLEARANCE
+        reach = found.least(pose, least, found.most_reach, CLEARANCE, gap=gap)
+        if reach is None:
+            return None
+        self.reach, self.start = reach, reach - CLEARANCE
+        self._motions = found.separating(pose, reach, CLEARANCE, gap=gap)
+        return next(self._motions)
 
-    def _told(
-        self, until: float, refused: tuple[float, Cut] | None = None, *, is_apart: bool = False
-    ) -> FollowedContact:
-        return FollowedContact(self._start, self._deepest, self._allowed, until, is_apart, refused)
+    @property
+    def is_sliding(self) -> bool:
+        """Whether the tool moves on while it touches."""
+        return self.way > SLIDE * self._contact
 
-    def _first_apart(self, begin: float, end: float) -> float | None:
-        """The first look between two ways at which the surfaces are apart."""
+    def advance(self, end: float) -> None:
+        """Follow the contact to a way, or to where it ends."""
+        while self.way < end and not self.is_over:
+            stop, is_apart = self._next_apart(end)
+            while self.way < stop and not self.is_over:
+                self._pair.check_time()
+                self._go_on(stop)
+            if is_apart and not self.is_over and self._is_left(stop):
+                self.is_over = self.is_apart = True
+
+    def depth(self) -> tuple[float, Floats]:
+        """Penetration depth beyond the hit, proved from below, and its place (3,), world frame."""
+        way = min(self.way + ON * self.reach, self._pair.way.length)
+        return self._separation.depth(self._pair.way.at([way])[0], self._contact)
+
+    def _next_apart(self, end: float) -> tuple[float, bool]:
+        """The next look at which the surfaces are apart, or the last one of a block."""
         stride = STRIDE * self._contact
-        for first in np.arange(begin, end, BLOCK * stride).tolist():
-            ways = np.minimum(first + stride * np.arange(1, BLOCK + 1), end)
-            ways = ways[: int(np.searchsorted(ways, end)) + 1]
-            far = np.flatnonzero(self._gaps(ways, self._contact) > self._contact)
-            if len(far):
-                return float(ways[far[0]])
-        return None
-
-    def _gaps(self, ways: Floats, enough: float = 0.0) -> Floats:
+        ways = np.minimum(self.way + stride * np.arange(1, self._block + 1), end)
+        ways = ways[: int(np.searchsorted(ways, end)) + 1]
+        self._block = min(2 * self._block, MOST_BLOCK)
         far = np.full(len(ways), 2.0 * self._contact)
-        return self._pair.measure(ways, far, enough).at_least
+        gaps = self._pair.measure(ways, far, self._contact).at_least
+        apart = np.flatnonzero(gaps > self._contact)
+        return (float(ways[apart[0]]), True) if len(apart) else (float(ways[-1]), False)
 
-    def _looked(self, begin: float, end: float) -> FollowedContact | None:
-        """Look at the cut between two ways; how it ends if it does.
+    def _is_left(self, way: float) -> bool:
+        """Whether the tool itself gets from where its motion has moved it to where it is."""
+        assert self._moved is not None  # noqa: S101 - it is followed
+        return self._separation.joins(self._moved, self._still, self._pair.way.at([way])[0])
 
-        On a way of some length a cut gets deeper by as much at most. So between two looks it is no
-        deeper than half of both cuts and the way. Where that is too much, a nearer look follows.
-        """
-        way, length = begin, 0.0
-        while way < end:
-            if not length:
-                length = max(REACH * 2.0 * (self._allowed - self._depth), self._step)
-            there = min(way + length, end)
-            enough = min(2.0 * self._allowed - self._depth - (there - way), self._allowed)
-            is_nearest = length <= self._step
-            if is_nearest:
-                enough = self._allowed - KEPT * self._step
-            found, is_apart = self._look(there, enough, is_nearest=is_nearest)
-            if is_apart:
-                return self._told(there, is_apart=True)
-            if found.depth <= enough:
-                self._depth, way, length = found.depth, there, 0.0
-                self._deepest = max(self._deepest, found.depth)
-            elif is_nearest:
-                self._deepest = max(self._deepest, found.depth)
-                return self._told(there, (there, found))
-            else:
-                length = max(0.5 * length, self._step)
-        return None
+    def _go_on(self, stop: float) -> None:
+        """Follow the motion to a way, change it where it meets the object, or note a hit."""
+        assert self._moved is not None  # noqa: S101 - as above
+        met = self._pair.first_met(self._moved, self.way, stop)
+        self.way = max(self.way, met)
+        if met >= stop:
+            return
+        for moved in islice(self._motions, MOST_TRIED):
+            reached = self._pair.first_met(moved, 0.0, stop)
+            if reached > self.way:
+                self._change(moved, 0.0, reached)
+                return
+        self._motions = iter(())
+        if self._changes == MOST_CHANGES or not self._hand_over(met):
+            self.is_over = self.is_hit = True
 
-    def _look(self, way: float, enough: float, *, is_nearest: bool) -> tuple[Cut, bool]:
-        """The cut at a way, and whether the surfaces are apart there.
+    def _hand_over(self, met: float) -> bool:
+        """Change to a shift that gets beyond a meeting, a little before it."""
+        assert self._moved is not None  # noqa: S101 - as above
+        beyond = min(met + BEYOND * self.reach, self._pair.way.length)
+        for back in BACKS:
+            way = max(met - back * self.reach, self._since)
+            pose = self._pair.way.at([way])[0]
+            shifts = self.reach * self._separation.shifts(pose)
+            for moved in self._separation.shifted(pose, shifts, CLEARANCE, self._still):
+                if (
+                    self._separation.joins(self._moved, moved, pose)
+                    and self._pair.first_met(moved, way, beyond) >= beyond
+                ):
+                    self._change(moved, way, beyond)
+                    self._changes += 1
+                    return True
+        return False
 
-        Unless it is the nearest look, a greater cut is not looked at closely.
-        """
-        gap = self._gaps(np.array([way]))[0]
-        if gap > 0.0:
-            return NONE, gap > self._contact
-        self._pair.check_time()
-        most = self._allowed + self._contact
-        pose = self._pair.way.at([way])[0]
-        return self._cut(pose, most, enough if is_nearest else np.inf), False
-
-    def _cut(self, pose: Floats, most: float, enough: float) -> Cut:
-        """Cut at a pose, up to `most` metres; `enough` ends its search."""
-        known = min(max(self._depth, self._contact), enough)
-        floor = FLOOR * known if known > self._contact else 0.0
-        shift = SHIFT * self._contact
-        return cut(self._object, self._tool, pose, most, shift, enough, known, floor)
+    def _change(self, moved: MovedPair, since: float, way: float) -> None:
+        self._moved, self._since, self.way, self.by = moved, since, way, moved.motion.by

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree
-from hapticdb.kernels.triangles.nearest import Nearest, nearest
+from hapticdb.kernels.triangles.nearest import Nearest
 from hapticdb.kernels.triangles.sweeping import MEETING, Search
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.store.base import Object
+from hapticdb.sweeps.separation import MovedPair
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -66,33 +67,15 @@ class Pair:
         """Measure at one pose (4, 4) of the tool, however far."""
         return self.tool.nearest(self.tree, pose[None], np.array([np.inf]))
 
-    def are_apart(
-        self, poses: Floats, far: float, stretch: Floats, *, is_object: bool
-    ) -> NDArray[np.bool_]:
-        """Whether the surfaces keep `far` metres apart at poses (n, 4, 4), one of them stretched.
-
-        stretch (4, 4) : affine, in the frame of its surface: the object's, or the tool's.
-        """
-        self.check_time()
-        self.looks += len(poses)
-        least = far + self.tool.radius
-        one, other, moved = self.tree, self.tool.tree, poses @ stretch
-        if is_object:
-            one, other, moved = other, one, np.linalg.inv(poses) @ stretch
-        found = nearest(one, other, moved, np.full(len(poses), least), least)
-        return np.asarray(found.pairs[:, 0] < 0)
-
-    def first_met(
-        self, begin: float, shift: Floats, theirs: TriangleTree, own: TriangleTree
-    ) -> float:
-        """Way of the first meeting of surfaces that are eased, from a way on; or the end."""
+    def first_met(self, moved: MovedPair, begin: float, end: float) -> float:
+        """Way of the first meeting of surfaces after a small motion, from a way on; or the end."""
         motion = self.way.motion
         search = Search(
-            theirs, own, motion._replace(centers=motion.centers + shift),
-            radius=self.tool.radius, begin=begin, best=2.0 * MEETING, fine=COARSE,
+            moved.object, moved.tool, motion._replace(centers=motion.centers + moved.motion.shift),
+            radius=moved.radius, begin=begin, best=2.0 * MEETING, fine=COARSE,
         )  # fmt: skip
-        self._finish(search)
-        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else self.length
+        self._finish(search, end)
+        return float(search.found.way[0]) if search.found.way[0] >= 0.0 else end
 
     def least(self, begin: float, best: float) -> tuple[Least | None, float]:
         """Least distance from a way on, if it is less than `best`; else None.
@@ -112,7 +95,7 @@ class Pair:
     def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
         """The same to `fine` metres, and how many looks it took."""
         search = self.tool.search(self.tree, self.way.motion, begin=begin, best=best, fine=fine)
-        self._finish(search)
+        self._finish(search, self.length)
         (at_most, closed), (way,), (on_object, on_tool) = search.found
         if way < 0.0:
             return None, float(closed), search.looks
@@ -122,16 +105,16 @@ class Pair:
         found = Least(float(at_most), float(way), on_object, on_tool)
         return found, float(closed), search.looks
 
-    def _finish(self, search: Search) -> None:
-        """Search to the end; on a part of the path, as if they met at its end."""
-        if self.length < self.way.length:
-            search.found.distance[0], search.found.way[0] = MEETING, self.length
+    def _finish(self, search: Search, end: float) -> None:
+        """Search to an end; on a part of the path, as if they met there."""
+        if end < self.way.length:
+            search.found.distance[0], search.found.way[0] = MEETING, end
         is_over = False
         while not is_over:
             self.check_time()
             is_over = search.go_on(STEPS)
         self.looks += search.looks
-        if self.length < self.way.length and search.found.way[0] >= self.length:
+        if end < self.way.length and search.found.way[0] >= end:
             search.found.way[0] = -1.0
 
     def check_time(self) -> None:

@@ -13,7 +13,7 @@ from hapticdb.units import length_text, notebook_html
 
 Floats = NDArray[np.float64]
 
-Verdict = Literal["clear", "slides", "hits", "not decided"]
+Verdict = Literal["clear", "slides", "overlaps", "hits", "not decided"]
 
 
 class PathPlace(NamedTuple):
@@ -22,7 +22,8 @@ class PathPlace(NamedTuple):
     fraction : share of the path's motion before it, 0 .. 1; segment : index of the given pose where
     its segment starts, 0 .. M - 2; pose (4, 4) : `world_from_tool`; on_tool, on_object (3,) : the
     nearest places of the two surfaces, world frame; where the surfaces meet, both are near the
-    meeting place.
+    meeting place, or the deepest; at_least : proved penetration depth shortly after it, metres, of
+    what is touched from the start; 0 if none is proved.
     """
 
     object: Object
@@ -31,6 +32,7 @@ class PathPlace(NamedTuple):
     pose: Floats
     on_tool: Floats
     on_object: Floats
+    at_least: float = 0.0
 
 
 class Gap(NamedTuple):
@@ -48,20 +50,21 @@ class Gap(NamedTuple):
 class TouchedObject(NamedTuple):
     """An object within the contact tolerance of the tool where the path starts.
 
-    start : how deep the surfaces overlap at the start; deepest : no deeper than this on the path
-    while they touch: the deepest cut, or the motion that frees them if that is more; allowed : how
-    deep they may; until : fraction of the path up to which they touch, 1 if
-    they still do at its end; is_sliding : whether the tool moves on by more than the tolerance
-    while they touch; cut : where they overlap by more than is allowed, or None.
+    start : overlap at the start, at most, metres: the least motion that frees it there, or the
+    contact tolerance if that frees it; infinite where none does; start_at_least : penetration depth
+    there, proved, 0 if none is; reach : by which no place of the tool or object is moved, so that
+    the path is free; by : the kind of that motion; until : fraction of the path up to which they
+    touch, or are followed, 1 if they still touch at its end; is_sliding : whether the tool moves on
+    by more than the tolerance while they touch.
     """
 
     object: Object
     start: float
-    deepest: float
-    allowed: float
+    start_at_least: float
+    reach: float
     until: float
+    by: str
     is_sliding: bool
-    cut: PathPlace | None
 
 
 class Profile(NamedTuple):
@@ -84,14 +87,14 @@ class Swept:
         Of all objects that are not touched where the path starts; 0 if anything is hit.
     hits : tuple of PathPlace
         First place on the path where each object is hit, in that order: its surface is met (within
-        0.01 mm), or, touched from the start, it is cut deeper than is allowed or met again.
+        0.01 mm), or, touched from the start, no small motion frees it any more, or it is met again.
     touching : tuple of TouchedObject
         Objects that the tool touches where the path starts.
     enclosed : tuple of Object
         Objects inside a closed body of the tool, or around the tool: they count as hit, since
         nothing leaves a closed body. Where the path starts.
-    contact : float
-        The contact tolerance, metres.
+    contact, overlap : float
+        The contact tolerance, and the overlap that is allowed at the start; metres.
     objects : int
         Number of objects near the path, whose surfaces were looked at.
     looks : int
@@ -114,6 +117,7 @@ class Swept:
     touching: tuple[TouchedObject, ...]
     enclosed: tuple[Object, ...]
     contact: float
+    overlap: float
     objects: int
     looks: int
     revision: int
@@ -135,7 +139,7 @@ class Swept:
 
     @property
     def verdict(self) -> Verdict:
-        """What is proved: something is hit; the time was over; the tool slides; it is clear.
+        """What is proved: a hit, the time over, an overlap at the start, sliding, or clear.
 
         It slides if it moves on in contact with what it touches at the start, and hits nothing.
         """
@@ -143,12 +147,21 @@ class Swept:
             return "hits"
         if self.is_stopped:
             return "not decided"
+        if self.overlapping:
+            return "overlaps"
         return "slides" if any(one.is_sliding for one in self.touching) else "clear"
 
     @property
+    def overlapping(self) -> tuple[TouchedObject, ...]:
+        """Objects that the tool overlaps at the start by more than is allowed, the most first."""
+        allowed = max(self.contact, self.overlap)
+        found = [one for one in self.touching if one.start > allowed]
+        return tuple(sorted(found, key=lambda one: -one.start))
+
+    @property
     def is_free(self) -> bool:
-        """Whether nothing is hit on the whole path: it is clear, or slides."""
-        return self.verdict in {"clear", "slides"}
+        """Whether nothing is hit on the whole path: clear, slides, or but for what it overlaps."""
+        return self.verdict in {"clear", "slides", "overlaps"}
 
     @property
     def comes_out(self) -> bool:

@@ -5,7 +5,6 @@ The objects' boxes say which of them may be near the path, never too few. Their 
 
 import time
 from contextlib import suppress
-from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
@@ -16,22 +15,23 @@ from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.mesh import Part
-from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.moving import MovingSurface, tree_of
-from hapticdb.pointshell.orientation import orient
+from hapticdb.pointshell.moving import MovingSurface
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.contact import FollowedContact, follow
-from hapticdb.sweeps.cut import Mesh
+from hapticdb.sweeps.contact import Contact
 from hapticdb.sweeps.gap import OverTimeError, Pair, box_gaps, error_of
 from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
+from hapticdb.sweeps.separation import SAME, Separation
 from hapticdb.sweeps.way import Way
 
 CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
+FIRST_SHARE, LATER = 1 / 64, 4.0
+"""Share of the path on which contacts are followed first, and the factor of each later share."""
 WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
 
@@ -45,15 +45,13 @@ def sweep(
     *,
     where: Words = (),
     exclude: Words = (),
-    contact: float = CONTACT,
+    contact: float = CONTACT, overlap: float = 0.0, seated: bool = False,
     about: ArrayLike | None = None,
-    limit: float | None = None,
-    seconds: float | None = None,
-    profile: bool = False,
-    until_hit: bool = False,
+    limit: float | None = None, seconds: float | None = None,
+    profile: bool = False, until_hit: bool = False,
     proportions: Proportions | None = None,
     progress: Progress | None = None,
-) -> Swept:
+) -> Swept:  # fmt: skip
     """Move a tool along a path; say what it hits and where, or how near it comes.
 
     Parameters
@@ -68,19 +66,21 @@ def sweep(
         What can be met: the objects that `where` chooses, all if it is empty, without those of
         `exclude`. A part that is taken out must not hit itself. Words as for `Environment.find`.
     contact : float
-        Metres. Objects so near at the first pose may touch, and overlap by so much more than
-        there; once they are so far apart, they may not touch again.
+        Metres. Objects so near at the first pose may touch, as `Contact` says, until they are
+        farther apart.
+    overlap : float
+        Metres by which a seated tool may overlap at the first pose, if that is more than `contact`.
+    seated : bool
+        Whether the tool is a part at its place: what it overlaps there by more is no hit.
     about : (3,) array or None
         The tool's point that moves straight and that turns are about, tool frame, metres; the
         middle of the tool's box unless given.
     limit, seconds : float or None
         Greatest distance that is told, metres; time after which the sweep ends undecided.
-    profile : bool
-        Compute the distance along the path, too.
-    until_hit : bool
-        End at the first hit: what is met later is not told.
+    profile, until_hit : bool
+        Compute the distance along the path, too; end at the first hit.
     proportions : Proportions or None
-        Of the same tool, path and scene, with their units; compared here in metres unless given.
+        Of the same tool, path and scene; compared here in metres unless given.
     progress : callable or None
         Called with the number of objects decided, and of all near the path.
 
@@ -91,7 +91,7 @@ def sweep(
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _Asked(contact, profile, until_hit, progress).begun(limit, seconds)
+    asked = _Asked(contact, overlap, seated, profile, until_hit, progress).begun(limit, seconds)
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, center_of(tool, about))
@@ -104,6 +104,8 @@ class _Asked(NamedTuple):
     """What is asked, as for `sweep`; until : time of `time.monotonic`."""
 
     contact: float
+    overlap: float
+    seated: bool
     profile: bool
     until_hit: bool
     progress: Progress | None
@@ -115,6 +117,8 @@ class _Asked(NamedTuple):
         most = np.inf if limit is None else limit
         if not (0.0 < self.contact < np.inf and most > 0.0):
             raise UsageError(f"contact {self.contact} m, limit {limit} m: give lengths above 0")
+        if not 0.0 <= self.overlap < np.inf:
+            raise UsageError(f"overlap {self.overlap} m: give 0 or a length above 0")
         if seconds is not None and not seconds > 0.0:
             raise UsageError(f"a sweep of {seconds} seconds: give more than 0")
         until = np.inf if seconds is None else time.monotonic() + seconds
@@ -144,7 +148,7 @@ class _Sweep:
         self._closed = asked.limit  # proved where nothing nearer was looked for
         self._nearest: PathPlace | None = None
         self._hits: list[PathPlace] = []
-        self._touching: list[TouchedObject] = []
+        self._contacts: list[tuple[Object, Pair, Contact]] = []
         self._enclosed: list[Object] = []
         self._fractions = np.linspace(0.0, 1.0, WINDOWS)
         self._gaps = np.full(WINDOWS, asked.limit)
@@ -161,6 +165,7 @@ class _Sweep:
                 )
             try:
                 near = self._decide(objects)
+                self._follow()
             except OverTimeError:
                 near, is_stopped = len(objects), True
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
@@ -171,9 +176,11 @@ class _Sweep:
         elif is_stopped:
             gap = gap._replace(at_least=0.0)
         return Swept(
-            path=self._way, gap=gap, hits=hits, touching=tuple(self._touching),
-            enclosed=tuple(self._enclosed), contact=self._asked.contact, objects=near,
-            looks=self._looks, revision=revision, elapsed=time.monotonic() - began,
+            path=self._way, gap=gap, hits=hits, touching=tuple(map(self._touched, self._contacts)),
+            enclosed=tuple(self._enclosed), contact=self._asked.contact,
+            overlap=self._asked.overlap, objects=near,
+            looks=self._looks + sum(pair.looks for _, pair, _ in self._contacts),
+            revision=revision, elapsed=time.monotonic() - began,
             proportions=proportions, is_stopped=is_stopped,
             profile=Profile(self._fractions, self._gaps) if self._asked.profile else None,
         )  # fmt: skip
@@ -211,42 +218,69 @@ class _Sweep:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
 
-    @cached_property
-    def _mesh(self) -> Mesh:
-        """The tool's surface with its corners joined."""
-        return Mesh(self._tool.tree)
-
     def _is_profiled(self, least: float) -> bool:
         return self._asked.profile and least < float(self._gaps.max())
 
     def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
-        """Decide about one object; is_inside : whether its box meets the tool's at the start."""
-        triangles = part.surface()
-        pair = Pair(tree_of(triangles), self._tool, self._way, self._asked.until, self._end)
-        try:
-            start = pair.measure(np.zeros(1), np.array([2.0 * self._asked.contact])).at_most[0]
-            if start <= self._asked.contact and not part.is_cloud:
-                begin = self._follow(obj, pair)
-                if begin < pair.length:
-                    self._measure(obj, pair, begin)
-            else:
-                if is_inside and self._holds(triangles, obj):
-                    self._enclosed.append(obj)
-                self._measure(obj, pair, 0.0)
-        finally:
-            self._looks += pair.looks
+        """Decide about one object; is_inside : whether its box meets the tool's at the start.
 
-    def _follow(self, obj: Object, pair: Pair) -> float:
-        """Follow a contact; returns the way from which on the object counts as any other."""
-        contact = self._asked.contact
-        found = follow(pair, contact, Mesh(pair.tree), self._mesh)
-        refused = None
-        if found.refused is not None:
-            way, cut = found.refused
-            refused = self._place(obj, way, cut.place, cut.place)
-            self._hits.append(refused)
-        self._touching.append(_told(obj, found, self._way, contact, refused))
-        return found.until if found.is_apart else pair.length
+        One that is touched is only followed a little: most of those that are hit, are hit there.
+        """
+        shape = CollisionShape(part.surface(), is_cloud=part.is_cloud)
+        pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end)
+        contact, pose = self._asked.contact, self._way.at([0.0])[0]
+        gap = pair.measure(np.zeros(1), np.array([2.0 * contact]))
+        apart = float(gap.at_least[0])
+        is_touched = gap.at_most[0] <= contact
+        is_nested = (
+            (is_inside or is_touched)
+            and apart > SAME
+            and Separation(shape, self._tool).is_nested(pose)
+        )
+        if is_nested:
+            self._enclosed.append(obj)
+        elif is_touched and not part.is_cloud:
+            found = Contact(pair, shape, contact, apart, seated=self._asked.seated)
+            self._contacts.append((obj, pair, found))
+            if found.is_hit:
+                self._note_hit(obj, pair, found)
+            self._advance(obj, pair, found, FIRST_SHARE * self._way.length)
+            return
+        self._measure(obj, pair, 0.0)
+        self._looks += pair.looks
+
+    def _follow(self) -> None:
+        """Follow all contacts in the order of the path, then what is left again from there on."""
+        share = FIRST_SHARE
+        while share < 1.0:
+            share = min(LATER * share, 1.0)
+            for obj, pair, found in self._contacts:
+                self._advance(obj, pair, found, share * self._way.length)
+        for obj, pair, found in self._contacts:
+            if found.is_apart and found.way < self._end:
+                self._measure(obj, pair, found.way)
+
+    def _advance(self, obj: Object, pair: Pair, found: Contact, end: float) -> None:
+        """Follow a contact to a way, and note a hit."""
+        if not found.is_over:
+            found.advance(min(end, self._end))
+            if found.is_hit:
+                self._note_hit(obj, pair, found)
+
+    def _note_hit(self, obj: Object, pair: Pair, found: Contact) -> None:
+        depth, place = found.depth()
+        if not depth:
+            place = pair.nearest_at(self._way.at([found.way])[0]).on_a[0]
+        self._hits.append(self._place(obj, found.way, place, place, depth))
+
+    def _touched(self, one: tuple[Object, Pair, Contact]) -> TouchedObject:
+        obj, _, found = one
+        is_open = not found.is_over and found.way >= self._way.length
+        until = 1.0 if is_open else self._way.fraction(found.way)
+        return TouchedObject(
+            obj, found.start, found.start_at_least, found.reach, until, found.by,
+            found.is_sliding,
+        )  # fmt: skip
 
     def _measure(self, obj: Object, pair: Pair, begin: float) -> None:
         """Find where an object is met first from a way on, or how near it comes.
@@ -275,40 +309,9 @@ class _Sweep:
         near = pair.measure(ways[at], self._gaps[at])
         self._gaps[at] = np.minimum(self._gaps[at], near.at_most)
 
-    def _place(self, obj: Object, way: float, on_tool: Floats, on_object: Floats) -> PathPlace:
+    def _place(
+        self, obj: Object, way: float, on_tool: Floats, on_object: Floats, depth: float = 0.0
+    ) -> PathPlace:
         ways = np.array([way])
-        segment = int(self._way.segments(ways)[0])
-        return PathPlace(
-            obj, self._way.fraction(way), segment, self._way.at(ways)[0], on_tool, on_object
-        )
-
-    def _holds(self, triangles: Floats, obj: Object) -> bool:
-        """Whether the object is in a closed body of the tool, or around it, at the start.
-
-        Both are apart there, so a triangle is inside if one of its corners is.
-        """
-        pose = self._way.at([0.0])[0]
-        low, high = self._tool.corners.min(axis=0), self._tool.corners.max(axis=0)
-        corners = (triangles[:, 0] - pose[:3, 3]) @ pose[:3, :3]
-        corners = corners[((corners >= low) & (corners <= high)).all(axis=1)]
-        if len(corners) and self._interior and self._interior.holds(corners).any():
-            return True
-        tool = self._tool.corners @ pose[:3, :3].T + pose[:3, 3]
-        if not ((tool >= obj.bounds[0]) & (tool <= obj.bounds[1])).all():
-            return False
-        around = Interior(orient(triangles))
-        return bool(around and around.holds(tool).any())
-
-    @cached_property
-    def _interior(self) -> Interior:
-        """Insides of the tool's closed bodies."""
-        return Interior(self._tool.surface)
-
-
-def _told(
-    obj: Object, found: FollowedContact, way: Way, contact: float, refused: PathPlace | None
-) -> TouchedObject:
-    until = way.fraction(found.until) if found.is_apart or refused is not None else 1.0
-    return TouchedObject(
-        obj, found.start, found.deepest, found.allowed, until, found.is_sliding(contact), refused
-    )
+        segment, pose = int(self._way.segments(ways)[0]), self._way.at(ways)[0]
+        return PathPlace(obj, self._way.fraction(way), segment, pose, on_tool, on_object, depth)

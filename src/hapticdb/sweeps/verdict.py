@@ -14,8 +14,8 @@ from hapticdb.units import length_text
 MOST_NAMED = 3
 """Greatest number of objects that a line names; the others are only counted."""
 FOUND = (
-    "comes_out", "hits", "touching", "enclosed", "contact", "objects", "looks", "revision",
-    "elapsed", "is_stopped",
+    "comes_out", "hits", "touching", "enclosed", "contact", "overlap", "objects", "looks",
+    "revision", "elapsed", "is_stopped",
 )  # fmt: skip
 """What is told of a `Swept` as it is."""
 
@@ -38,13 +38,23 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
     shell : the tool; its size tells whether it lies inside an object, or the object inside it.
     """
     if found.verdict == "hits":
-        return "; ".join([*_enclosed_clauses(found, shell), *_hit_clauses(found)])
+        late = "the time was over: what is hit before may be missing" if found.is_stopped else ""
+        clauses = [*_enclosed_clauses(found, shell), *_hit_clauses(found), late]
+        return "; ".join(filter(None, clauses))
     if found.verdict == "not decided":
         return (
             "not decided: the time was over before the surfaces of all objects near the path were "
             "measured; give more --seconds"
         )
-    return "; ".join([_free_clause(found), *_touching_clauses(found)])
+    return "; ".join([_free_clause(found) + overlaps_text(found), *_touching_clauses(found)])
+
+
+def overlaps_text(found: Swept) -> str:
+    """Say what the part overlaps where it stands, the most first."""
+    overlaps = [f"{one.object.name} {length_text(one.start)}" for one in found.overlapping]
+    more = len(overlaps) - MOST_NAMED
+    said = ", ".join(overlaps[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
+    return f", but for overlaps at the start: {said}" if said else ""
 
 
 def gap_text(found: Swept) -> str:
@@ -68,15 +78,17 @@ def until_text(fraction: float) -> str:
 
 def hit_text(found: Swept, place: PathPlace) -> str:
     """Say how and where an object is hit."""
-    where = f"at {where_text(found, place)}"
+    where, name = f"at {where_text(found, place)}", place.object.name
+    depth = f": at least {length_text(place.at_least)}" if place.at_least else ""
     for one in found.touching:
         if one.object.id != place.object.id:
             continue
-        if one.cut is None or one.cut.fraction != place.fraction:
-            return f"leaves {place.object.name} and hits it again {where}"
-        depth, start = length_text(one.deepest), length_text(one.start)
-        return f"cuts into {place.object.name} {where}: {depth} deep, {start} at the start"
-    return f"hits {place.object.name} {where}"
+        if not one.by:
+            return f"starts inside {name}{depth}"
+        if one.until != place.fraction:
+            return f"leaves {name} and hits it again {where}"
+        return f"goes into {name} {where}{depth or ' by more than the tolerance'}"
+    return f"hits {name} {where}"
 
 
 def is_around(obj: Object, found: Swept, shell: PointShell) -> bool:

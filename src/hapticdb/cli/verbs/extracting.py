@@ -21,6 +21,7 @@ from hapticdb.cli.values import budget_bytes, numbers_of
 from hapticdb.cli.verbs.sweeping import (
     MM,
     ContactOption,
+    OverlapOption,
     PictureOption,
     UpName,
     UpOption,
@@ -37,7 +38,8 @@ if TYPE_CHECKING:
     from hapticdb.extraction.result import Extraction
 
 EXIT_CODES = {
-    "comes out": 0, "slides": 0, "not decided": 3, "no way found": 1, "no order found": 1,
+    "comes out": 0, "slides": 0, "overlaps": 4, "not decided": 3, "no way found": 1,
+    "no order found": 1,
 }  # fmt: skip
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way, and of the table of searches that failed."""
@@ -111,9 +113,11 @@ The path is written by --path as displacements from the present place, as
 --seconds end the search.
 
 Comes out: nothing is hit on the whole path, and nothing is touched at its end.
-Slides: nothing is hit, but the part still touches something at the end. Not
-decided: the time was over before the sweep of a path was. No way found: what
-blocks most of the straight pulls is named; this is no proof that there is none.
+Slides: nothing is hit, but the part still touches something at the end. Overlaps:
+it comes out or slides, but overlaps others by more than --contact and --overlap
+where it stands. Not decided: the time was over before the sweep of a path was. No
+way found: what blocks most of the straight pulls is named; this is no proof that
+there is none.
 
 With --disassemble, what blocks the parts is taken off first, each object alone
 and on a path that is proved; --keep names what stays. Each step has a file of its
@@ -123,8 +127,8 @@ necessary.
 --animation writes a page for any browser, with all that it needs in one file (pip
 install viser).
 
-The exit code is 0 when it comes out or slides, 3 when it is not decided, 1 when no
-path is found.
+The exit code is 0 when it comes out or slides, 4 when it overlaps, 3 when it is
+not decided, 1 when no path is found.
 
 Example: hapticdb extract car.db body/hood --path out.csv --picture out.png
 """
@@ -145,16 +149,16 @@ def extract(
     to: ToOption = None,
     screw: ScrewOption = None,
     contact: ContactOption = 0.05,
+    overlap: OverlapOption = 0.0,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
     budget: BudgetOption = 256.0,
     on: ClusterOption = None,
     path: WayOption = None,
-    picture: PictureOption = None,
-    animation: AnimationOption = None,
+    picture: PictureOption = None, animation: AnimationOption = None,
     up: UpOption = None,
     json: JsonOption = False,
-) -> None:
+) -> None:  # fmt: skip
     """Search a path on which parts come out; the help text is `HELP`."""
     import hapticdb
     from hapticdb.extraction import disassembly as orders
@@ -170,7 +174,7 @@ def extract(
     asked = _Outputs(path, picture, animation, up, json)
     options: dict[str, Any] = {
         "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
-        "contact": MM * contact, "budget_bytes": budget_bytes(budget),
+        "contact": MM * contact, "overlap": MM * overlap, "budget_bytes": budget_bytes(budget),
         **({} if seconds is None else {"seconds": seconds}),
     }  # fmt: skip
     with hapticdb.open(url, read_only=True) as env:
@@ -181,7 +185,7 @@ def extract(
         with render.bar("pulling", "searches" if on else "pulls") as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:
-                options |= {} if depth is None else {"depth": depth}
+                options |= {"depth": depth} if depth is not None else {}
                 options |= {"exclude": exclude or (), "keep": kept, "on": on}
                 order = orders.disassemble(env, *ids, **options)
             else:
@@ -297,7 +301,7 @@ def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
 
             swept = sweep(
                 env, found.shell, found.way.poses, exclude=excluded, profile=True,
-                contact=found.way.swept.contact,
+                contact=found.way.swept.contact, overlap=found.way.swept.overlap, seated=True,
             )  # fmt: skip
             figure = compose_sweep(
                 env, found.shell, swept, exclude=excluded, verdict=extraction_line(found),

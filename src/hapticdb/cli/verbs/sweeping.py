@@ -1,5 +1,6 @@
 """The verb sweep."""
 
+import math
 from collections.abc import Sequence
 from pathlib import Path
 from time import perf_counter
@@ -35,10 +36,10 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.sweeps.result import Swept
 
-EXIT_CODES = {"clear": 0, "slides": 0, "hits": 1, "not decided": 3}
+EXIT_CODES = {"clear": 0, "slides": 0, "hits": 1, "not decided": 3, "overlaps": 4}
 DOUBTFUL = 3
 """Exit code where nothing is hit, too, but tool, path and scene do not fit."""
-WORST = (1, 3, 0)
+WORST = (1, 3, 4, 0)
 """Exit codes, the worst first: the code of a batch is the first that a sweep of it has."""
 MM = 1e-3
 """Metres of a millimetre: all lengths among the options are in millimetres."""
@@ -63,9 +64,18 @@ ContactOption = Annotated[
     float,
     typer.Option(
         metavar="MM",
-        help="Millimetres: what is so near where the path starts may be touched; the tool may go "
-        "so much deeper into it.",
+        help="Millimetres: what is so near where the path starts may be touched; a motion by so "
+        "much has to free the tool from it all along.",
     ),
+]
+OverlapOption = Annotated[
+    float,
+    typer.Option(
+        metavar="MM", help="Millimetres by which a part may overlap others where it stands."
+    ),
+]
+UntilHitOption = Annotated[
+    bool, typer.Option("--until-hit", help="End at the first hit on the path: faster.")
 ]
 AboutOption = Annotated[
     str | None,
@@ -100,9 +110,11 @@ UpOption = Annotated[
 HELP = """Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
 Clear by a gap: no surface meets the tool's. Slides: it moves along what it
-touches where the path starts, and hits nothing. Hits: a surface is met, or what
-is touched is cut; or one lies inside the other. Not decided: --seconds were over.
-The triangles decide, between the poses, too; the gap is right to 0.01 mm or 1 %.
+touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
+the part overlaps others by more than --contact and --overlap where it stands.
+Hits: a surface is met, what is touched is gone into, or one lies inside the
+other. Not decided: --seconds were over. The triangles decide, between the poses,
+too; the gap is right to 0.01 mm or 1 %.
 
 Between two poses the centre moves straight while the tool turns about it.
 Segment 0 leads from pose 0 to pose 1.
@@ -111,15 +123,18 @@ With --part, objects of the environment are the tool, one rigid body; the poses
 are displacements from their place: x,y,z 0 and qw 1 leaves them there. 'hapticdb
 objects --help' says how names choose objects.
 
-What is touched at the start may not get deeper than there, or than --contact,
-by more than --contact; once it is farther than that, to meet it again is a hit.
+The path is free of what is touched at the start if the tool, moved aside or
+deformed once by --contact, follows it and meets nothing; once they are farther
+apart than that, to meet it again is a hit. A foreign tool has no seat: if that
+does not free it at the first pose, it starts inside.
 
 --batch reads a CSV file with the columns part or tool, and path; and if wanted
 where, exclude and contact (mm). Several words in a cell stand with ; between.
 
-The exit code is 0 when it is clear or slides, 1 when it hits, 3 when it is not
-decided or, without --as-given, when the sizes or places of tool, path and scene do
-not fit together; a line then says so. A batch has the worst: 1 before 3 before 0.
+The exit code is 0 when it is clear or slides, 4 when it overlaps, 1 when it hits,
+3 when it is not decided or, without --as-given, when the sizes or places of tool,
+path and scene do not fit together; a line then says so. A batch has the worst: 1
+before 3 before 4 before 0.
 
 Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
 """
@@ -127,12 +142,14 @@ Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
 
 
 class _Options(NamedTuple):
-    """Options that all sweeps of a command share; about : metres."""
+    """Options that all sweeps of a command share; about, overlap : metres."""
 
     tool_unit: str | None
     path_unit: str | None
     about: "list[float] | None"
+    overlap: float
     seconds: float | None
+    until_hit: bool
     is_drawn: bool
     as_given: bool
 
@@ -165,11 +182,13 @@ def sweep(
     where: WhereOption = None,
     exclude: ExcludeOption = None,
     contact: ContactOption = 0.05,
+    overlap: OverlapOption = 0.0,
     about: AboutOption = None,
     tool_unit: ToolUnitOption = None,
     path_unit: PathUnitOption = None,
     batch: BatchOption = None,
     seconds: SweepSecondsOption = None,
+    until_hit: UntilHitOption = False,
     as_given: AsGivenOption = False,
     csv: CsvOption = None,
     picture: PictureOption = None,
@@ -185,8 +204,8 @@ def sweep(
         raise UsageError("--csv - and --json: only one may be standard output")
     center = None if about is None else numbers_of(about, 3, "--about", "X,Y,Z in millimetres")
     options = _Options(
-        tool_unit, path_unit, center and [MM * x for x in center], seconds, picture is not None,
-        as_given,
+        tool_unit, path_unit, center and [MM * x for x in center], MM * overlap, seconds,
+        until_hit, picture is not None, as_given,
     )  # fmt: skip
     asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
@@ -272,8 +291,9 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude, proportions=fit,
-                contact=MM * asked.contact, about=options.about, seconds=options.seconds,
-                profile=options.is_drawn, progress=progress,
+                contact=MM * asked.contact, overlap=options.overlap, seated=asked.tool is None,
+                about=options.about, seconds=options.seconds, profile=options.is_drawn,
+                until_hit=options.until_hit, progress=progress,
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
@@ -340,13 +360,13 @@ def _show(told: _Told) -> None:
             one.object.name,
             "touched",
             until_text(one.until).removesuffix(" of the path"),
-            length_text(one.start),
-            length_text(one.deepest),
+            length_text(one.start_at_least) if one.start_at_least else "",
+            length_text(one.start) if math.isfinite(one.start) else "",
         )
         for one in found.touching
     ]
     if rows:
-        columns = ("id>", "object", "is", "where", "deep at start>", "deep at most>")
+        columns = ("id>", "object", "is", "where", "overlap at start at least>", "at most>")
         render.table(columns, rows[:MOST_OBJECTS])
         if len(rows) > MOST_OBJECTS:
             render.say(f"{len(rows)} rows, {MOST_OBJECTS} of them shown")

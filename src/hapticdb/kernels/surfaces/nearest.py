@@ -59,7 +59,7 @@ def shares_of(sides, x, y, z):
 
 
 @leaf
-def _square_to_triangle(corners, n, x, y, z):
+def square_to_triangle(corners, n, x, y, z):
     """Squared distance from (x, y, z) to triangle n: to an edge, or to the plane above it."""
     sides = sides_of(corners, n)
     ax, ay, az, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
@@ -88,7 +88,7 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
     n_triangles = tree.corners.shape[0]
     best, found = farthest * farthest, np.int64(-1)
     if hint >= 0:
-        square = _square_to_triangle(tree.corners, hint, x, y, z)
+        square = square_to_triangle(tree.corners, hint, x, y, z)
         if square < best:
             best, found = square, hint
     waiting[0], squares[0] = 0, _square_to_box(boxes, np.int64(0), x, y, z)
@@ -110,7 +110,7 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
             continue
         start = (node - first_leaf) * LEAF_SIZE
         for n in range(start, min(start + LEAF_SIZE, n_triangles)):
-            square = _square_to_triangle(tree.corners, n, x, y, z)
+            square = square_to_triangle(tree.corners, n, x, y, z)
             if square < best:
                 best, found = square, np.int64(n)
     return np.sqrt(best), found

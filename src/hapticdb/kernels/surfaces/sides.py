@@ -71,29 +71,49 @@ def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
     cells = ((centroids - least) * ((2**21 - 1) / extent)).astype(np.int64)
     order = np.lexsort((encode(cells, 21, Z_ORDER), bodies))
     corners = np.ascontiguousarray(triangles[order])
+    boxes, slack = _boxes_of(corners)
+    n_leaves = (len(boxes) + 1) // 2
+    first, last = np.full((2, n_leaves * LEAF_SIZE), np.iinfo(np.int64).max)
+    last[:] = -1
+    first[: len(corners)] = last[: len(corners)] = bodies[order]
+    spans = np.empty((len(boxes), 2), dtype=np.int64)
+    while len(first) > 1:
+        first, last = np.minimum(first[::2], first[1::2]), np.maximum(last[::2], last[1::2])
+        if len(first) <= n_leaves:
+            nodes = slice(len(first) - 1, 2 * len(first) - 1)
+            spans[nodes, 0], spans[nodes, 1] = first, last
+    return TriangleTree(corners, order.astype(np.int64), bodies[order], boxes, spans, slack)
+
+
+def refitted(tree: TriangleTree, corners: Floats) -> TriangleTree:
+    """Tree over the same triangles with other corners (T, 3, 3), in the tree's order.
+
+    Its boxes are as tight as those of a new tree, but the order is that of the old corners.
+    """
+    boxes, slack = _boxes_of(corners)
+    return tree._replace(corners=corners, boxes=boxes, slack=slack)
+
+
+def _boxes_of(corners: Floats) -> tuple[Floats, float]:
+    """Boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), and the tree's slack."""
     n_leaves = 1
-    while n_leaves * LEAF_SIZE < len(triangles):
+    while n_leaves * LEAF_SIZE < len(corners):
         n_leaves *= 2
     # A rounding error could make a line in the plane of a flat box miss it, so boxes are larger.
-    slack = 1e-11 * float(np.abs(triangles).max())
+    slack = 1e-11 * float(np.abs(corners).max())
     boxes = np.empty((2 * n_leaves - 1, 2, 3))
-    spans = np.empty((2 * n_leaves - 1, 2), dtype=np.int64)
     low, high = np.full((2, n_leaves * LEAF_SIZE, 3), np.inf)
-    first, last = np.full((2, n_leaves * LEAF_SIZE), np.iinfo(np.int64).max)
-    high[:], last[:] = -np.inf, -1
+    high[:] = -np.inf
     np.minimum(np.minimum(corners[:, 0], corners[:, 1]), corners[:, 2], out=low[: len(corners)])
     np.maximum(np.maximum(corners[:, 0], corners[:, 1]), corners[:, 2], out=high[: len(corners)])
     low -= slack
     high += slack
-    first[: len(corners)] = last[: len(corners)] = bodies[order]
     while len(low) > 1:  # ufuncs of two arrays: many times as fast as reductions of short axes
         low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
-        first, last = np.minimum(first[::2], first[1::2]), np.maximum(last[::2], last[1::2])
         if len(low) <= n_leaves:
             nodes = slice(len(low) - 1, 2 * len(low) - 1)
             boxes[nodes, 0], boxes[nodes, 1] = low, high
-            spans[nodes, 0], spans[nodes, 1] = first, last
-    return TriangleTree(corners, order.astype(np.int64), bodies[order], boxes, spans, slack)
+    return boxes, slack
 
 
 @leaf
@@ -280,7 +300,7 @@ def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
     return np.where(is_own, picks, -1).astype(np.int64)
 
 
-def _directions(n: int) -> Floats:
+def directions_of(n: int) -> Floats:
     """Return `n` fixed directions, spread over the sphere, none along an axis."""
     directions = np.random.default_rng(2015).normal(size=(n, 3))
     directions[np.abs(directions) < 1e-3] = 1e-3
@@ -302,7 +322,7 @@ def side_votes(
     """
     picks = _pick_faces(patch, areas, int(patch.max()) + 1)
     votes = np.zeros(len(picks), dtype=np.int64)
-    side_votes_kernel(tree, picks, _directions(PATIENCE), centroids, normals, body, votes)
+    side_votes_kernel(tree, picks, directions_of(PATIENCE), centroids, normals, body, votes)
     return votes
 
 
@@ -316,7 +336,7 @@ def enclosures(
     """For each pair (inner, outer) of bodies, whether the outer body encloses the inner body."""
     picks = _pick_faces(body, areas, int(body.max()) + 1)
     out = np.zeros(len(pairs), dtype=np.uint8)
-    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), centroids, out)
+    nesting_kernel(tree, pairs, picks, directions_of(PATIENCE), centroids, out)
     return out.astype(np.bool_)
 
 
@@ -326,5 +346,5 @@ def encloses(tree: TriangleTree, body: int, positions: Floats) -> NDArray[np.boo
     pairs = np.stack([numbers, np.full(len(positions), body)], axis=1)
     picks = np.repeat(numbers[:, None], PATIENCE, axis=1)
     out = np.zeros(len(positions), dtype=np.uint8)
-    nesting_kernel(tree, pairs, picks, _directions(PATIENCE), positions, out)
+    nesting_kernel(tree, pairs, picks, directions_of(PATIENCE), positions, out)
     return out.astype(np.bool_)

@@ -26,7 +26,7 @@ Floats = NDArray[np.float64]
 
 MOST_NAMED = 8
 """Objects that the answer names, with where each is hit."""
-VERDICTS = {"hits": "#c62838", "not decided": "#a8730f"}
+VERDICTS = {"hits": "#c62838", "not decided": "#a8730f", "overlaps": "#a8730f"}
 FREE = "#1f8a4c"
 """Colours of verdicts; FREE: of all others."""
 WAYS = {
@@ -160,7 +160,10 @@ class _SweepJob:
         with open_environment(self._site.url, read_only=True) as env:
             shell = self._tool.shell if self._part is None else env.shell(self._part, inset=0.0)
             present = [i for i in self._exclude if i in self._site.objects]
-            swept = sweep(env, shell, self._path(shell), exclude=present, progress=progress)
+            swept = sweep(
+                env, shell, self._path(shell), exclude=present, seated=self._part is not None,
+                progress=progress,
+            )  # fmt: skip
         return _SweepAnswer(shell, swept)
 
     def _path(self, shell: PointShell) -> Floats:

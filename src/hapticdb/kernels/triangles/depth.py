@@ -1,0 +1,174 @@
+"""Depth of one surface in the closed bodies of another: branch and bound over its triangles.
+
+A place inside a closed body, at distance d from all of the other surface, stays inside after every
+motion that moves it by less than d. So whatever separates the two moves some place by the greatest
+such distance at least: the depth bounds the penetration from below, for any deformation.
+
+Distances change by no more than a place moves. So a triangle of radius R about its middle, which is
+at distance d, is nowhere deeper than d + R if the middle is inside, and than R - d if it is
+outside. Distance to one triangle is convex: no place is farther from the triangle next to the
+middle than a corner is, which ends flush faces at once.
+"""
+
+import math
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, entry, fields_of, leaf
+from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
+from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree, crossings, directions_of
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+WAITING = 256
+"""Pieces of triangles that wait: more than the halvings from 1 km to 1 um."""
+LINES = directions_of(5)
+"""Directions of the lines that decide whether a place is inside."""
+MAJORITY = 2
+"""Lines that agree."""
+FINE = 0.02
+"""Share of the depth to which it is found. Larger: faster."""
+
+
+class Solid(NamedTuple):
+    """Surface with closed bodies.
+
+    tree : all of the surface; bodies (B,) : numbers of the closed ones; signs (B,) : 1, or -1 of
+    the wall of a void; box (2, 3) : corners.
+    """
+
+    tree: TriangleTree
+    bodies: Ints
+    signs: Ints
+    box: Floats
+
+
+SOLID = fields_of(Solid, TREE, INTS, INTS, FLOATS2)
+
+
+@leaf
+def _is_inside(solid, place, lines, stack):
+    """Whether a place (3,) off the surface is inside, by the parity of crossings."""
+    count = 0
+    for k in range(solid.bodies.shape[0]):
+        inside = outside = 0
+        for n in range(lines.shape[0]):
+            ahead, behind, _ = crossings(
+                place, lines[n], solid.bodies[k], np.int64(-1), solid.tree, stack
+            )
+            if ahead < 0 or ahead % 2 != behind % 2:
+                continue
+            if ahead % 2 == 1:
+                inside += 1
+            else:
+                outside += 1
+            if max(inside, outside) == MAJORITY:
+                break
+        if inside > outside:
+            count += solid.signs[k]
+    return count > 0
+
+
+@leaf
+def _below_box(box, triangle):
+    """Greatest depth of a triangle (3, 3) below the faces of a box; negative if it is outside."""
+    found = math.inf
+    for axis in range(3):
+        a, b, c = triangle[0, axis], triangle[1, axis], triangle[2, axis]
+        found = min(found, max(a, b, c) - box[0, axis], box[1, axis] - min(a, b, c))
+    return found
+
+
+@leaf
+def _middle_of(triangle, middle):
+    """Write the middle (3,) of a triangle (3, 3); returns its radius about the middle."""
+    for axis in range(3):
+        middle[axis] = (triangle[0, axis] + triangle[1, axis] + triangle[2, axis]) / 3.0
+    square = 0.0
+    for i in range(3):
+        x, y, z = triangle[i, 0] - middle[0], triangle[i, 1] - middle[1], triangle[i, 2] - middle[2]
+        square = max(square, x * x + y * y + z * z)
+    return math.sqrt(square)
+
+
+@leaf
+def _farthest(tree, near, triangle):
+    """Greatest distance of the corners of a triangle (3, 3) from triangle `near` of a tree."""
+    square = 0.0
+    for i in range(3):
+        x, y, z = triangle[i, 0], triangle[i, 1], triangle[i, 2]
+        square = max(square, square_to_triangle(tree.corners, near, x, y, z))
+    return math.sqrt(square)
+
+
+@leaf
+def _halve(waiting, n):
+    """Replace triangle n of some (.., 3, 3) by its halves n and n + 1, across its longest side."""
+    first, longest = 0, -1.0
+    for i in range(3):
+        square = 0.0
+        for axis in range(3):
+            square += (waiting[n, i, axis] - waiting[n, (i + 1) % 3, axis]) ** 2
+        if square > longest:
+            first, longest = i, square
+    second, third = (first + 1) % 3, (first + 2) % 3
+    for axis in range(3):
+        a, b, c = waiting[n, first, axis], waiting[n, second, axis], waiting[n, third, axis]
+        middle = 0.5 * (a + b)
+        waiting[n, 0, axis], waiting[n, 1, axis], waiting[n, 2, axis] = a, middle, c
+        waiting[n + 1, 0, axis], waiting[n + 1, 1, axis], waiting[n + 1, 2, axis] = middle, b, c
+
+
+@entry(SOLID, FLOATS3, FLOATS2, FLOAT, FLOATS)
+def depth_kernel(solid, triangles, lines, tolerance, out):
+    """Find the deepest place of triangles (T, 3, 3), frame of the solid's tree.
+
+    out (4,) : depth, metres, which begins as the least one that is looked for, and its place. It is
+    within `tolerance` or `FINE` of the greatest depth.
+    """
+    nodes, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
+    stack, middle = np.empty(STACK, dtype=np.int64), np.empty(3)
+    waiting, hint = np.empty((WAITING, 3, 3)), np.int64(-1)
+    for t in range(triangles.shape[0]):
+        for i in range(3):
+            for axis in range(3):
+                waiting[0, i, axis] = triangles[t, i, axis]
+        top = 1
+        while top > 0:
+            top -= 1
+            enough = out[0] + max(tolerance, FINE * out[0])
+            if _below_box(solid.box, waiting[top]) <= enough:
+                continue
+            radius = _middle_of(waiting[top], middle)
+            x, y, z = middle[0], middle[1], middle[2]
+            far, near = distance_at(solid.tree, x, y, z, 0.0, math.inf, hint, nodes, squares)
+            hint = near
+            if min(far + radius, _farthest(solid.tree, near, waiting[top])) <= enough:
+                continue
+            bound = radius - far
+            if _is_inside(solid, middle, lines, stack):
+                bound = far + radius
+                if far > out[0]:
+                    out[0], out[1], out[2], out[3] = far, x, y, z
+                    enough = far + max(tolerance, FINE * far)
+            if bound > enough and radius > tolerance and top + 2 <= WAITING:
+                _halve(waiting, top)
+                top += 2
+
+
+def depth_in(
+    solid: Solid, triangles: Floats, least: float, tolerance: float
+) -> tuple[float, Floats]:
+    """Depth of triangles (T, 3, 3) in a solid, and its place (3,), the solid's frame, metres.
+
+    A depth of `least` or less is 0.
+    """
+    edges = triangles[:, 1:] - triangles[:, :1]
+    sizes = (np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(axis=1)
+    out = np.array([least, 0.0, 0.0, 0.0])
+    largest_first = np.ascontiguousarray(triangles[np.argsort(-sizes, kind="stable")])
+    depth_kernel(solid, largest_first, LINES, tolerance, out)
+    return (float(out[0]) if out[0] > least else 0.0), out[1:]

@@ -1,0 +1,136 @@
+"""A surface for exact queries: its BVH, and on demand its inside, connected pieces and normals."""
+
+from functools import cached_property
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.surfaces.sides import TriangleTree, normals_of, triangle_tree
+from hapticdb.pointshell.coverage import Interior
+from hapticdb.pointshell.orientation import components, join_corners, orient
+
+if TYPE_CHECKING:
+    from hapticdb.pointshell.orientation import Surface
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+FLATS, PARALLEL = 3, 0.999
+"""Flat faces whose normals are axes, and the cosine from which two of them are parallel."""
+ALIKE, CELLS = 1e-3, np.array([1, 1 << 12, 1 << 24])
+"""Length of cells of normals that are those of one face, and the steps of their numbers."""
+ASKEW = np.array([0.62, 0.54, 0.57])
+"""Vector in no likely plane: it chooses one of two opposite normals."""
+FLAT = 1e-6
+"""Length of a sum of unit vectors below which it has no direction."""
+
+
+class CollisionShape:
+    """Triangles (T, 3, 3) of one surface, or of a ball: its centre, without area.
+
+    tree : BVH, whose order all arrays below have; box (2, 3) : corners; radius : of the ball, 0 of
+    a surface, metres; is_cloud : whether the triangles are points, which enclose nothing.
+    """
+
+    def __init__(
+        self, triangles: Floats, surface: "Surface | None" = None, *, radius: float = 0.0,
+        is_cloud: bool = False,
+    ) -> None:  # fmt: skip
+        """Build the tree; surface : the same triangles, if `orient` has seen them."""
+        self.tree = tree_of(triangles)
+        low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
+        self.box = np.stack([low - radius, high + radius])
+        self.radius, self.is_cloud = radius, is_cloud
+        self._given = surface
+
+    @cached_property
+    def _oriented(self) -> "tuple[Surface, Ints] | None":
+        """Surface with its inner side, and the tree's number of each of its triangles (F,)."""
+        if self._given is not None:
+            return self._given, np.argsort(self.tree.faces)
+        if self.is_cloud or self.radius:
+            return None
+        try:
+            surface = orient(self.tree.corners)
+        except UsageError:  # no area
+            return None
+        return surface, surface.faces
+
+    @cached_property
+    def interior(self) -> Interior | None:
+        """Its inside; None where it has no closed body."""
+        return (Interior(self._oriented[0]) or None) if self._oriented else None
+
+    def moved_interior(self, by: Floats | None) -> Interior | None:
+        """The inside after the tree's corners have moved by (T, 3, 3) metres, if they have."""
+        if by is None or self.interior is None or self._oriented is None:
+            return self.interior
+        return self.interior.moved(by[self._oriented[1]])
+
+    @cached_property
+    def _corners(self) -> Ints:
+        """Number (T, 3) of each corner; corners that coincide have the same."""
+        return join_corners(self.tree.corners - self.box[0])
+
+    @cached_property
+    def pieces(self) -> Ints:
+        """Connected piece (3 T,) of each corner, 0, 1, ..."""
+        faces = self._corners
+        links = np.concatenate([faces[:, :2], faces[:, 1:]])
+        return components(links, int(faces.max()) + 1)[faces.reshape(-1)]
+
+    @cached_property
+    def _face_normals(self) -> Floats:
+        """Inward unit normals (T, 3); zeros without area."""
+        found = np.zeros_like(self.tree.corners[:, 0])
+        if self._oriented is not None:
+            surface, numbers = self._oriented
+            found[numbers] = surface.normals
+        return found
+
+    @cached_property
+    def axes(self) -> Floats:
+        """Unit vectors (N, 3) across which or along which it is alike: `FLATS` + 3 at most.
+
+        Normals of its largest flat faces, and principal axes of all normals: a peg's own axis.
+        """
+        normals, areas = self._face_normals, normals_of(self.tree.corners)[1]
+        side = np.sign(normals @ ASKEW)
+        cells = np.rint(normals * side[:, None] / ALIKE).astype(np.int64) @ CELLS
+        _, first, face = np.unique(cells, return_index=True, return_inverse=True)
+        largest = np.argsort(-np.bincount(face.reshape(-1), areas), kind="stable")[:FLATS]
+        principal = np.linalg.eigh((normals.T * areas) @ normals)[1].T
+        found = np.zeros((0, 3))
+        for axis in np.concatenate([normals[first[largest]], principal]):
+            if axis.any() and not (np.abs(found @ axis) > PARALLEL).any():
+                found = np.concatenate([found, axis[None]])
+        return found
+
+    @cached_property
+    def normals(self) -> Floats:
+        """Inward unit normals (T, 3, 3) at the corners, weighted by angle; zeros where none is."""
+        found = self._face_normals[:, None] * _angles(self.tree.corners)[:, :, None]
+        corners = self._corners.reshape(-1)
+        sums = [np.bincount(corners, found[..., k].reshape(-1)) for k in range(3)]
+        return units(np.array(sums, dtype=np.float64).T)[corners].reshape(-1, 3, 3)
+
+
+def units(vectors: Floats) -> Floats:
+    """Unit vectors (.., 3) along others; zero for those shorter than `FLAT`."""
+    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+    return np.asarray(vectors / np.where(lengths > FLAT, lengths, np.inf), dtype=np.float64)
+
+
+def _angles(triangles: Floats) -> Floats:
+    """Angles (T, 3), radians, at the corners of triangles (T, 3, 3); 0 or pi without area."""
+    ahead = np.roll(triangles, -1, axis=1) - triangles
+    back = np.roll(triangles, 1, axis=1) - triangles
+    across = np.linalg.norm(np.cross(ahead, back), axis=2)
+    return np.asarray(np.arctan2(across, (ahead * back).sum(axis=2)))
+
+
+def tree_of(triangles: Floats) -> TriangleTree:
+    """BVH over triangles (T, 3, 3) of one surface."""
+    return triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))

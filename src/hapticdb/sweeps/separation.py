@@ -1,0 +1,311 @@
+"""Separating motions: small motions of a tool or an object after which their surfaces are apart.
+
+A motion moves no place by more than its reach: a shift, or an offset of one surface along its
+normals, which frees a peg from its hole. A pair that a motion of reach r separates
+overlaps by r at most. Change from one motion to another is proved by conservative advancement:
+nothing is met on the straight way of all places.
+"""
+
+from collections.abc import Callable, Iterator
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels.surfaces.sides import TriangleTree, refitted
+from hapticdb.kernels.triangles.depth import depth_in
+from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.pointshell.shape import CollisionShape, units
+
+Floats = NDArray[np.float64]
+
+DIRECTIONS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
+DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
+"""Unit vectors (26, 3) of shifts, beside the normals of the nearest triangles."""
+LEAST_BALL = 0.01
+"""Least factor to which a ball shrinks."""
+SAME = 1e-6
+"""Metres: surfaces that are nearer coincide, and their sides are told by their insides alone."""
+MET, MOST_STEPS = 1e-7, 60
+"""Metres at which a change of motions meets something, and its greatest number of steps."""
+GROWTH, FINE = 1.4, 0.05
+"""Factor from one reach that is tried to the next, and share of it to which the least is found."""
+MOST_REACH, MOST_SHARE = 20e-3, 0.75
+"""Greatest reach: metres, and share of the second edge of the lesser box."""
+TOLERANCE = 0.2
+"""Contact tolerances to which a depth is found."""
+
+
+class Motion(NamedTuple):
+    """Small motion of the tool, or of the object.
+
+    by : its kind; shift (3,) : of the tool, world frame; tool, object (T, 3, 3) or None :
+    displacements of the corners of their trees, own frames; growth : of a ball's radius. Metres.
+    """
+
+    by: str
+    shift: Floats
+    tool: Floats | None = None
+    object: Floats | None = None
+    growth: float = 0.0
+
+
+NOTHING = Motion("nothing", np.zeros(3))
+
+
+class MovedPair(NamedTuple):
+    """Both surfaces after a motion: trees, own frames, the tool's shift, and a ball's radius."""
+
+    motion: Motion
+    object: TriangleTree
+    tool: TriangleTree
+    radius: float
+
+
+class Separation:
+    """Motions that separate a tool from an object, its pose in the object's frame.
+
+    check : called before each measurement; it may end the search by an exception.
+    """
+
+    def __init__(
+        self, thing: CollisionShape, tool: CollisionShape, check: Callable[[], None] = lambda: None
+    ) -> None:
+        self._object, self._tool, self._check = thing, tool, check
+
+    def separating(
+        self, pose: Floats, reach: float, clearance: float, *, gap: float,
+        thorough: bool = True, nested: bool = False,
+    ) -> Iterator[MovedPair]:  # fmt: skip
+        """Motions of a reach that keep the surfaces a clearance apart at a pose, and on its side.
+
+        gap : of the surfaces at the pose. Where they are apart, the motion itself must meet
+        nothing; where they coincide, it must leave no piece in a closed body, or one if `nested`.
+        """
+        still = self.moved(NOTHING)
+        for moved in self._candidates(pose, reach, clearance, still, thorough=thorough):
+            if gap > SAME:
+                if self.joins(still, moved, pose):
+                    yield moved
+            elif self.is_nested(pose, moved.motion) == nested:
+                yield moved
+
+    def least(
+        self, pose: Floats, least: float, most: float, clearance: float, *, gap: float
+    ) -> float | None:
+        """Least reach, to `FINE`, of a motion that separates, as above; None if there is none."""
+
+        def is_free(reach: float, *, thorough: bool) -> bool:
+            found = self.separating(pose, reach, clearance, gap=gap, thorough=thorough)
+            return next(found, None) is not None
+
+        low, high = least, least
+        while True:
+            high = min(GROWTH * high, most)
+            if high > low and is_free(high, thorough=False):
+                break
+            if high >= most:
+                return None
+        while high - low > FINE * high:  # the thorough ones are slow: only here
+            middle = 0.5 * (low + high)
+            low, high = (low, middle) if is_free(middle, thorough=True) else (middle, high)
+        return high
+
+    @property
+    def most_reach(self) -> float:
+        """Greatest reach that is tried, metres."""
+        edges = [float(np.sort(np.ptp(one.box, axis=0))[1]) for one in (self._object, self._tool)]
+        return min(MOST_REACH, MOST_SHARE * min(edges))
+
+    def depth(self, pose: Floats, contact: float) -> tuple[float, Floats]:
+        """Penetration depth, a proved lower bound, and its place (3,), the object's frame, metres.
+
+        The greater one of tool in object and object in tool; 0 where it is `contact` or less, or
+        what is gone into is not closed.
+        """
+        deepest = 0.0, np.zeros(3)
+        back = np.linalg.inv(pose)
+        for one, other, to in ((self._tool, self._object, pose), (self._object, self._tool, back)):
+            if one.radius or one.is_cloud or other.interior is None:
+                continue
+            triangles = one.tree.corners @ to[:3, :3].T + (to[:3, 3] - other.interior.origin)
+            found, place = depth_in(other.interior.solid(), triangles, contact, TOLERANCE * contact)
+            if found > deepest[0]:
+                place = place + other.interior.origin
+                place = place if other is self._object else pose[:3, :3] @ place + pose[:3, 3]
+                deepest = found, place
+        return deepest
+
+    def is_nested(self, pose: Floats, motion: Motion = NOTHING) -> bool:
+        """Whether a piece of one surface is in a closed body of the other; they are apart."""
+        placed = pose.copy()
+        placed[:3, 3] += motion.shift
+        back = np.asarray(np.linalg.inv(placed), dtype=np.float64)
+        return _holds_piece(
+            self._object, motion.object, self._tool, motion.tool, placed
+        ) or _holds_piece(self._tool, motion.tool, self._object, motion.object, back, motion.growth)
+
+    def moved(self, motion: Motion, base: Motion = NOTHING, share: float = 1.0) -> MovedPair:
+        """Both surfaces on the way from one motion to another."""
+        here = _between(base, motion, share)
+        radius = self._tool.radius + here.growth
+        return MovedPair(
+            here, _moved_tree(self._object, here.object), _moved_tree(self._tool, here.tool), radius
+        )
+
+    def gap(self, moved: MovedPair, pose: Floats, farthest: float) -> float:
+        """Distance of the surfaces after a motion, from below, up to `farthest` metres."""
+        self._check()
+        placed = pose.copy()
+        placed[:3, 3] += moved.motion.shift
+        far = np.array([farthest + moved.radius])
+        found = nearest(moved.object, moved.tool, placed[None], far)
+        return float(found.at_least[0]) - moved.radius
+
+    def joins(self, before: MovedPair, after: MovedPair, pose: Floats) -> bool:
+        """Whether the straight change from one motion to another meets nothing at a pose."""
+        travel = _travel(before.motion, after.motion)
+        share = 0.0
+        for _ in range(MOST_STEPS if travel else 0):
+            here = self.moved(after.motion, before.motion, share)
+            gap = self.gap(here, pose, 2.0 * travel)
+            if gap < MET or share >= 1.0:
+                return gap >= MET
+            share = min(1.0, share + 0.999 * gap / travel)
+        return not travel
+
+    def shifted(
+        self, pose: Floats, shifts: Floats, clearance: float, base: MovedPair
+    ) -> Iterator[MovedPair]:
+        """Of shifts (N, 3) of the tool, those that keep the surfaces a clearance apart."""
+        poses = np.tile(pose, (len(shifts), 1, 1))
+        poses[:, :3, 3] += shifts
+        far = clearance + base.radius
+        found = nearest(base.object, base.tool, poses, np.full(len(poses), far), far)
+        for n in np.flatnonzero(found.pairs[:, 0] < 0):
+            yield base._replace(motion=Motion("shift", shifts[n]))
+
+    def shifts(self, pose: Floats) -> Floats:
+        """Unit vectors (N, 3) of shifts that may separate, those along normals first."""
+        near = nearest(self._object.tree, self._tool.tree, pose[None], np.array([np.inf]))
+        first, second = near.pairs[0]
+        theirs = self._tool.tree.corners[second] @ pose[:3, :3].T
+        normals = np.array([_normal(self._object.tree.corners[first]), _normal(theirs)])
+        return np.concatenate([normals, -normals, DIRECTIONS])
+
+    def _candidates(
+        self, pose: Floats, reach: float, clearance: float, still: MovedPair, *, thorough: bool
+    ) -> Iterator[MovedPair]:
+        """Motions of a reach that keep the surfaces a clearance apart: none, shifts, others."""
+        if self.gap(still, pose, clearance) >= clearance:
+            yield still
+        yield from self.shifted(pose, reach * self.shifts(pose), clearance, still)
+        for motion in self._deformations(reach, thorough=thorough):
+            moved = self.moved(motion)
+            if self.gap(moved, pose, clearance) >= clearance:
+                yield moved
+
+    def _deformations(self, reach: float, *, thorough: bool) -> Iterator[Motion]:
+        """Offsets of either surface, inward first; thorough : across and along its axes, too."""
+        zero = np.zeros(3)
+        if self._tool.radius:
+            for growth in (-reach, reach):
+                if self._tool.radius + growth > LEAST_BALL * self._tool.radius:
+                    yield Motion("offset", zero, growth=growth)
+        for by in _offsets(self._tool, reach, thorough=False):
+            yield Motion("offset", zero, tool=by)
+        for by in _offsets(self._object, reach, thorough=False):
+            yield Motion("offset", zero, object=by)
+        if thorough:
+            for by in _offsets(self._tool, reach, thorough=True):
+                yield Motion("offset", zero, tool=by)
+            for by in _offsets(self._object, reach, thorough=True):
+                yield Motion("offset", zero, object=by)
+
+
+def _offsets(shape: CollisionShape, reach: float, *, thorough: bool) -> Iterator[Floats]:
+    """Displacements (T, 3, 3) of a shape's corners along its normals, inward and outward.
+
+    thorough : instead, along their components across and along each of its axes, so that a peg or
+    a plate gives way by all of the reach at its edges, too.
+    """
+    if shape.radius or shape.is_cloud:
+        return
+    fields = [shape.normals]
+    if thorough:
+        along = [(shape.normals @ axis)[:, :, None] * axis for axis in shape.axes]
+        fields = [units(part) for one in along for part in (shape.normals - one, one)]
+    for field in fields:
+        yield reach * field
+        yield -reach * field
+
+
+def _moved_tree(shape: CollisionShape, by: Floats | None) -> TriangleTree:
+    return shape.tree if by is None else refitted(shape.tree, shape.tree.corners + by)
+
+
+def _between(first: Motion, second: Motion, share: float) -> Motion:
+    """Motion with a share of the second and the rest of the first."""
+    if share >= 1.0:
+        return second
+    rest = 1.0 - share
+    return Motion(
+        second.by, rest * first.shift + share * second.shift,
+        _sum_of(first.tool, rest, second.tool, share),
+        _sum_of(first.object, rest, second.object, share),
+        rest * first.growth + share * second.growth,
+    )  # fmt: skip
+
+
+def _sum_of(a: Floats | None, weight: float, b: Floats | None, other: float) -> Floats | None:
+    """Sum of weighted displacements; None stands for none."""
+    if a is None or b is None:
+        found, weight = (a, weight) if b is None else (b, other)
+        return None if found is None else weight * found
+    return weight * a + other * b
+
+
+def _travel(first: Motion, second: Motion) -> float:
+    """Metres by which the change between two motions moves surfaces together at most."""
+    found = float(np.linalg.norm(second.shift - first.shift)) + abs(second.growth - first.growth)
+    for a, b in ((first.tool, second.tool), (first.object, second.object)):
+        change = _sum_of(a, -1.0, b, 1.0)
+        if change is not None:
+            found += float(np.linalg.norm(change, axis=2).max())
+    return found
+
+
+def _holds_piece(
+    outer: CollisionShape, outer_by: Floats | None, inner: CollisionShape, inner_by: Floats | None,
+    outer_from_inner: Floats, growth: float = 0.0,
+) -> bool:  # fmt: skip
+    """Whether a closed body holds a piece of a surface that is apart from it.
+
+    A piece with a corner outside the body's box is not in it.
+    """
+    corners = inner.tree.corners if inner_by is None else inner.tree.corners + inner_by
+    corners = corners.reshape(-1, 3) @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
+    if outer.radius:
+        return bool((np.linalg.norm(corners, axis=1) < outer.radius + growth).any())
+    reach = 0.0 if outer_by is None else float(np.abs(outer_by).max())
+    low, high = outer.box[0] - reach, outer.box[1] + reach
+    is_out = ((corners < low) | (corners > high)).any(axis=1)
+    if is_out.all():
+        return False
+    if inner.is_cloud:
+        first = np.flatnonzero(~is_out)
+    else:
+        pieces, first = np.unique(inner.pieces, return_index=True)
+        first = first[np.bincount(inner.pieces, is_out, len(pieces)) == 0.0]
+    if not len(first):
+        return False
+    interior = outer.moved_interior(outer_by)
+    return interior is not None and bool(interior.holds(corners[first]).any())
+
+
+def _normal(triangle: Floats) -> Floats:
+    """Unit normal (3,) of a triangle (3, 3); zero where it has no area."""
+    found = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
+    length = float(np.linalg.norm(found))
+    return found / length if length > 0.0 else np.zeros(3)

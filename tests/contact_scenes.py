@@ -16,7 +16,7 @@ import hapticdb
 from assemblies import write_obj
 from hapticdb import Environment, PointShell
 from hapticdb.clashes.judge import Judged, judge
-from hapticdb.clashes.shapes import BuiltShape
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import sweep
 
@@ -196,7 +196,7 @@ def swept(
 
 def judged(a: Floats, b: Floats, contact: float = CONTACT, within: float = 1.0) -> Judged:
     """Judge two surfaces; lengths of the result in millimetres."""
-    shapes = [BuiltShape(MM * triangles, is_cloud=False) for triangles in (a, b)]
+    shapes = [CollisionShape(MM * triangles) for triangles in (a, b)]
     found = judge(shapes[0], shapes[1], np.eye(4), MM * within, MM * contact)
     return found._replace(at_least=found.at_least / MM, at_most=found.at_most / MM)
 

@@ -112,11 +112,11 @@ class Surface:
 
     @cached_property
     def _sides(self) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Corners (3 F, 2) of the sides of triangles, the lesser first, and their triangles."""
+        """Corners (S, 2) of the sides of triangles, each once, and their triangles (S,)."""
         _, number = np.unique(self.triangles.reshape(-1, 3), axis=0, return_inverse=True)
-        faces = number.reshape(-1, 3)
+        faces, once = np.unique(np.sort(number.reshape(-1, 3), axis=1), axis=0, return_index=True)
         pairs = np.concatenate([faces[:, [i, (i + 1) % 3]] for i in range(3)])
-        return np.sort(pairs, axis=1), np.tile(np.arange(len(faces)), 3)
+        return np.sort(pairs, axis=1), np.tile(once, 3)
 
 
 def crossed(

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.sweeps.gap import Pair
-from hapticdb.sweeps.separation import NOTHING, MovedPair, Separation
+from hapticdb.sweeps.separation import GROWTH, NOTHING, MovedPair, Separation
 
 Floats = NDArray[np.float64]
 
@@ -25,7 +25,7 @@ SLIDE = 4.0
 """Contact tolerances that the tool moves on while it touches, from which it slides."""
 STRIDE = 3.0
 """Contact tolerances between two looks whether the surfaces are apart."""
-BLOCK, MOST_BLOCK = 64, 4096
+BLOCK, MOST_BLOCK = 8, 4096
 """Looks whether surfaces are apart that are done together: at first, and at most."""
 MOST_TRIED = 8
 """Motions at the start that are followed. More: contacts are followed farther, slower hits."""
@@ -35,8 +35,11 @@ BEYOND = 0.25
 """Reaches beyond a meeting that another motion has to get."""
 MOST_CHANGES = 30
 """Changes of motions along the path."""
-ON = 2.0
-"""Reaches beyond a hit at which its depth is measured."""
+ON, FINE_HIT = 2.0, 0.1
+"""Reaches beyond a hit at which its depth is measured, and share of it to which it is found."""
+COARSE = 0.5
+"""Contact tolerances to which depths are found. Less: surfaces sunk by nearly the tolerance take
+many times as long."""
 
 
 class Contact:
@@ -72,11 +75,14 @@ class Contact:
         first = next(self._motions, None)
         if first is not None:
             return first
-        self.start_at_least = found.depth(pose, self._contact)[0]
-        if not seated:
-            return None
-        least = max(self._contact, self.start_at_least) + CLEARANCE
-        reach = found.least(pose, least, found.most_reach, CLEARANCE, gap=gap)
+        reach, nearly = None, GROWTH * self._contact + CLEARANCE
+        if seated:  # mostly that frees: the depth of what is sunk so little takes long to prove
+            reach = found.least(pose, self.reach, nearly, CLEARANCE, gap=gap)
+        if reach is None:
+            self.start_at_least = found.depth(pose, self._contact, coarse=COARSE)[0]
+        if reach is None and seated:
+            least = max(nearly, self.start_at_least + CLEARANCE)
+            reach = found.least(pose, least, found.most_reach, CLEARANCE, gap=gap)
         if reach is None:
             return None
         self.reach, self.start = reach, reach - CLEARANCE
@@ -101,7 +107,7 @@ class Contact:
     def depth(self) -> tuple[float, Floats]:
         """Penetration depth beyond the hit, proved from below, and its place (3,), world frame."""
         way = min(self.way + ON * self.reach, self._pair.way.length)
-        return self._separation.depth(self._pair.way.at([way])[0], self._contact)
+        return self._separation.depth(self._pair.way.at([way])[0], self._contact, FINE_HIT, COARSE)
 
     def _next_apart(self, end: float) -> tuple[float, bool]:
         """The next look at which the surfaces are apart, or the last one of a block."""
@@ -126,7 +132,10 @@ class Contact:
         self.way = max(self.way, met)
         if met >= stop:
             return
+        pose = self._pair.way.at([self.way])[0]
         for moved in islice(self._motions, MOST_TRIED):
+            if not self._separation.is_free(moved, pose, MEETING):
+                continue
             reached = self._pair.first_met(moved, 0.0, stop)
             if reached > self.way:
                 self._change(moved, 0.0, reached)
@@ -139,13 +148,15 @@ class Contact:
         """Change to a shift that gets beyond a meeting, a little before it."""
         assert self._moved is not None  # noqa: S101 - as above
         beyond = min(met + BEYOND * self.reach, self._pair.way.length)
+        there = self._pair.way.at([beyond])[0]
         for back in BACKS:
             way = max(met - back * self.reach, self._since)
             pose = self._pair.way.at([way])[0]
             shifts = self.reach * self._separation.shifts(pose)
             for moved in self._separation.shifted(pose, shifts, CLEARANCE, self._still):
                 if (
-                    self._separation.joins(self._moved, moved, pose)
+                    self._separation.is_free(moved, there, MEETING)
+                    and self._separation.joins(self._moved, moved, pose)
                     and self._pair.first_met(moved, way, beyond) >= beyond
                 ):
                     self._change(moved, way, beyond)

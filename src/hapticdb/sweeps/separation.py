@@ -6,6 +6,7 @@ overlaps by r at most. Change from one motion to another is proved by conservati
 nothing is met on the straight way of all places.
 """
 
+from collections import deque
 from collections.abc import Callable, Iterator
 from itertools import product
 from typing import NamedTuple
@@ -16,7 +17,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels.surfaces.sides import TriangleTree, refitted
 from hapticdb.kernels.triangles.depth import depth_in
 from hapticdb.kernels.triangles.nearest import nearest
-from hapticdb.pointshell.shape import CollisionShape, units
+from hapticdb.pointshell.shape import CollisionShape, tree_of, units
 
 Floats = NDArray[np.float64]
 
@@ -31,10 +32,14 @@ MET, MOST_STEPS = 1e-7, 60
 """Metres at which a change of motions meets something, and its greatest number of steps."""
 GROWTH, FINE = 1.4, 0.05
 """Factor from one reach that is tried to the next, and share of it to which the least is found."""
+FINE_DEPTH, COARSE_DEPTH = 0.02, 0.2
+"""Shares of a penetration depth and of the contact tolerance to which it is found."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
-TOLERANCE = 0.2
-"""Contact tolerances to which a depth is found."""
+
+
+BLOCKING = 16
+"""Pairs of triangles that were too near after other motions, which are measured first."""
 
 
 class Motion(NamedTuple):
@@ -73,6 +78,7 @@ class Separation:
         self, thing: CollisionShape, tool: CollisionShape, check: Callable[[], None] = lambda: None
     ) -> None:
         self._object, self._tool, self._check = thing, tool, check
+        self._blocking: deque[NDArray[np.int64]] = deque(maxlen=BLOCKING)
 
     def separating(
         self, pose: Floats, reach: float, clearance: float, *, gap: float,
@@ -102,14 +108,16 @@ class Separation:
 
         low, high = least, least
         while True:
-            high = min(GROWTH * high, most)
+            low, high = high, min(GROWTH * high, most)
             if high > low and is_free(high, thorough=False):
                 break
             if high >= most:
                 return None
-        while high - low > FINE * high:  # the thorough ones are slow: only here
+        if high > (nearly := (1.0 + FINE) * least) and is_free(nearly, thorough=True):
+            return nearly  # the thorough ones are slow: only once
+        while high - low > FINE * high:
             middle = 0.5 * (low + high)
-            low, high = (low, middle) if is_free(middle, thorough=True) else (middle, high)
+            low, high = (low, middle) if is_free(middle, thorough=False) else (middle, high)
         return high
 
     @property
@@ -118,20 +126,26 @@ class Separation:
         edges = [float(np.sort(np.ptp(one.box, axis=0))[1]) for one in (self._object, self._tool)]
         return min(MOST_REACH, MOST_SHARE * min(edges))
 
-    def depth(self, pose: Floats, contact: float) -> tuple[float, Floats]:
+    def depth(
+        self, pose: Floats, contact: float, fine: float = FINE_DEPTH, coarse: float = COARSE_DEPTH
+    ) -> tuple[float, Floats]:
         """Penetration depth, a proved lower bound, and its place (3,), the object's frame, metres.
 
-        The greater one of tool in object and object in tool; 0 where it is `contact` or less, or
-        what is gone into is not closed.
+        The greater one of tool in object and object in tool, to a share `fine` of it or `coarse` of
+        `contact`; 0 where it is `contact` or less, or what is gone into is not closed.
         """
         deepest = 0.0, np.zeros(3)
         back = np.linalg.inv(pose)
         for one, other, to in ((self._tool, self._object, pose), (self._object, self._tool, back)):
             if one.radius or one.is_cloud or other.interior is None:
                 continue
-            triangles = one.tree.corners @ to[:3, :3].T + (to[:3, 3] - other.interior.origin)
-            found, place = depth_in(other.interior.solid(), triangles, contact, TOLERANCE * contact)
-            if found > deepest[0]:
+            there = np.array(to, dtype=np.float64)
+            there[:3, 3] -= other.interior.origin
+            least = max(contact, deepest[0])
+            found, place = depth_in(
+                other.interior.solid(), one.tree, there, least, coarse * contact, fine
+            )
+            if found:
                 place = place + other.interior.origin
                 place = place if other is self._object else pose[:3, :3] @ place + pose[:3, 3]
                 deepest = found, place
@@ -175,6 +189,34 @@ class Separation:
             share = min(1.0, share + 0.999 * gap / travel)
         return not travel
 
+    def is_free(self, moved: MovedPair, pose: Floats, clearance: float) -> bool:
+        """Whether the surfaces keep a clearance after a motion."""
+        self._check()
+        placed = pose.copy()
+        placed[:3, 3] += moved.motion.shift
+        far = clearance + moved.radius
+        found = nearest(moved.object, moved.tool, placed[None], np.array([far]), far)
+        if found.pairs[0, 0] < 0:
+            return True
+        self._blocking.append(found.pairs[0])
+        return False
+
+    def _is_blocked(self, motion: Motion, pose: Floats, clearance: float) -> bool:
+        """Whether triangles that were too near after the last motions are so after this one."""
+        if not self._blocking:
+            return False
+        first, second = np.array(self._blocking).T
+        theirs, own = (
+            tree_of(tree.corners[some] + (0.0 if by is None else by[some]))
+            for tree, some, by in (
+                (self._object.tree, first, motion.object),
+                (self._tool.tree, second, motion.tool),
+            )
+        )
+        far = clearance + self._tool.radius + motion.growth
+        found = nearest(theirs, own, pose[None], np.array([far]), far)
+        return bool(found.pairs[0, 0] >= 0)
+
     def shifted(
         self, pose: Floats, shifts: Floats, clearance: float, base: MovedPair
     ) -> Iterator[MovedPair]:
@@ -198,12 +240,14 @@ class Separation:
         self, pose: Floats, reach: float, clearance: float, still: MovedPair, *, thorough: bool
     ) -> Iterator[MovedPair]:
         """Motions of a reach that keep the surfaces a clearance apart: none, shifts, others."""
-        if self.gap(still, pose, clearance) >= clearance:
+        if self.is_free(still, pose, clearance):
             yield still
         yield from self.shifted(pose, reach * self.shifts(pose), clearance, still)
         for motion in self._deformations(reach, thorough=thorough):
+            if self._is_blocked(motion, pose, clearance):
+                continue
             moved = self.moved(motion)
-            if self.gap(moved, pose, clearance) >= clearance:
+            if self.is_free(moved, pose, clearance):
                 yield moved
 
     def _deformations(self, reach: float, *, thorough: bool) -> Iterator[Motion]:

@@ -6,8 +6,8 @@ such distance at least: the depth bounds the penetration from below, for any def
 
 Distances change by no more than a place moves. So a triangle of radius R about its middle, which is
 at distance d, is nowhere deeper than d + R if the middle is inside, and than R - d if it is
-outside. Distance to one triangle is convex: no place is farther from the triangle next to the
-middle than a corner is, which ends flush faces at once.
+outside. Boxes of triangles are searched likewise. Distance to one triangle is convex: no place is
+farther from the triangle next to the middle than a corner is, which ends flush faces at once.
 """
 
 import math
@@ -16,9 +16,18 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, entry, fields_of, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INTS, entry, fields_of, leaf
+from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
-from hapticdb.kernels.surfaces.sides import STACK, TREE, TriangleTree, crossings, directions_of
+from hapticdb.kernels.surfaces.sides import (
+    LEAF_SIZE,
+    STACK,
+    TREE,
+    TriangleTree,
+    crossings,
+    directions_of,
+)
+from hapticdb.kernels.triangles.nearest import middle_of, place_corners
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -27,10 +36,10 @@ WAITING = 256
 """Pieces of triangles that wait: more than the halvings from 1 km to 1 um."""
 LINES = directions_of(5)
 """Directions of the lines that decide whether a place is inside."""
-MAJORITY = 2
-"""Lines that agree."""
-FINE = 0.02
-"""Share of the depth to which it is found. Larger: faster."""
+LIKELY, CERTAIN = 1, 2
+"""Lines that agree where a place is only passed over, and where it is the deepest."""
+SAMPLES = 256
+"""Triangles whose middles are tried first: a depth soon found spares the search of others."""
 
 
 class Solid(NamedTuple):
@@ -50,7 +59,7 @@ SOLID = fields_of(Solid, TREE, INTS, INTS, FLOATS2)
 
 
 @leaf
-def _is_inside(solid, place, lines, stack):
+def _is_inside(solid, place, lines, majority, stack):
     """Whether a place (3,) off the surface is inside, by the parity of crossings."""
     count = 0
     for k in range(solid.bodies.shape[0]):
@@ -65,7 +74,7 @@ def _is_inside(solid, place, lines, stack):
                 inside += 1
             else:
                 outside += 1
-            if max(inside, outside) == MAJORITY:
+            if max(inside, outside) == majority:
                 break
         if inside > outside:
             count += solid.signs[k]
@@ -122,53 +131,127 @@ def _halve(waiting, n):
         waiting[n + 1, 0, axis], waiting[n + 1, 1, axis], waiting[n + 1, 2, axis] = middle, b, c
 
 
-@entry(SOLID, FLOATS3, FLOATS2, FLOAT, FLOATS)
-def depth_kernel(solid, triangles, lines, tolerance, out):
-    """Find the deepest place of triangles (T, 3, 3), frame of the solid's tree.
+@leaf
+def _below_ball(box, middle, radius):
+    """Greatest depth of a ball below the faces of a box; negative if it is outside."""
+    found = math.inf
+    for axis in range(3):
+        beside = min(middle[axis] - box[0, axis], box[1, axis] - middle[axis])
+        found = min(found, beside + radius)
+    return found
+
+
+@leaf
+def _ball_of(boxes, node, pose, middle):
+    """Write the middle (3,) of a node's box, moved by a pose (4, 4); returns its radius."""
+    x, y, z, hx, hy, hz = middle_of(boxes, node)
+    middle[0], middle[1], middle[2] = moved(transform_of(pose), x, y, z)
+    return math.sqrt(hx * hx + hy * hy + hz * hz)
+
+
+@leaf
+def _enough(out, tolerance, fine):
+    """Depth from which on a place is wanted."""
+    return out[0] + max(tolerance, fine * out[0])
+
+
+@leaf
+def _try_middle(solid, lines, waiting, middle, scratch, hint, out):
+    """Note the middle of triangle 0 of `waiting` if it is deepest; returns a triangle near it."""
+    nodes, squares, stack = scratch
+    _middle_of(waiting[0], middle)
+    if _below_ball(solid.box, middle, 0.0) <= out[0]:
+        return hint
+    x, y, z = middle[0], middle[1], middle[2]
+    far, near = distance_at(solid.tree, x, y, z, out[0], math.inf, hint, nodes, squares)
+    if far > out[0] and _is_inside(solid, middle, lines, CERTAIN, stack):
+        out[0], out[1], out[2], out[3] = far, x, y, z
+    return near
+
+
+@leaf
+def _search_triangle(solid, lines, tolerance, fine, waiting, middle, scratch, hint, out):
+    """Search the deepest place of triangle 0 of `waiting`; returns a triangle that is near."""
+    nodes, squares, stack = scratch
+    top = 1
+    while top > 0:
+        top -= 1
+        enough = _enough(out, tolerance, fine)
+        if _below_box(solid.box, waiting[top]) <= enough:
+            continue
+        radius = _middle_of(waiting[top], middle)
+        x, y, z = middle[0], middle[1], middle[2]
+        wanted = max(enough - radius, 0.0)
+        far, near = distance_at(solid.tree, x, y, z, wanted, math.inf, hint, nodes, squares)
+        hint = near
+        if min(far + radius, _farthest(solid.tree, near, waiting[top])) <= enough:
+            continue
+        bound = radius - far
+        if _is_inside(solid, middle, lines, LIKELY, stack):
+            bound = far + radius
+            if far > out[0] and _is_inside(solid, middle, lines, CERTAIN, stack):
+                out[0], out[1], out[2], out[3] = far, x, y, z
+                enough = _enough(out, tolerance, fine)
+        if bound > enough and radius > tolerance and top + 2 <= WAITING:
+            _halve(waiting, top)
+            top += 2
+    return hint
+
+
+@entry(SOLID, TREE, FLOATS2, FLOATS2, FLOAT, FLOAT, FLOATS)
+def depth_kernel(solid, surface, pose, lines, tolerance, fine, out):
+    """Find the deepest place of a surface, moved by a pose (4, 4), in a solid.
 
     out (4,) : depth, metres, which begins as the least one that is looked for, and its place. It is
-    within `tolerance` or `FINE` of the greatest depth.
+    within `tolerance`, or a share `fine` of it, of the greatest depth.
     """
     nodes, squares = np.empty(STACK, dtype=np.int64), np.empty(STACK)
     stack, middle = np.empty(STACK, dtype=np.int64), np.empty(3)
     waiting, hint = np.empty((WAITING, 3, 3)), np.int64(-1)
-    for t in range(triangles.shape[0]):
-        for i in range(3):
-            for axis in range(3):
-                waiting[0, i, axis] = triangles[t, i, axis]
-        top = 1
-        while top > 0:
-            top -= 1
-            enough = out[0] + max(tolerance, FINE * out[0])
-            if _below_box(solid.box, waiting[top]) <= enough:
-                continue
-            radius = _middle_of(waiting[top], middle)
-            x, y, z = middle[0], middle[1], middle[2]
-            far, near = distance_at(solid.tree, x, y, z, 0.0, math.inf, hint, nodes, squares)
-            hint = near
-            if min(far + radius, _farthest(solid.tree, near, waiting[top])) <= enough:
-                continue
-            bound = radius - far
-            if _is_inside(solid, middle, lines, stack):
-                bound = far + radius
-                if far > out[0]:
-                    out[0], out[1], out[2], out[3] = far, x, y, z
-                    enough = far + max(tolerance, FINE * far)
-            if bound > enough and radius > tolerance and top + 2 <= WAITING:
-                _halve(waiting, top)
-                top += 2
+    todo, top = np.empty(STACK, dtype=np.int64), 1
+    scratch = nodes, squares, stack
+    count = surface.corners.shape[0]
+    for n in range(0, count, max(count // SAMPLES, 1)):
+        place_corners(surface.corners, n, n + 1, pose, waiting)
+        hint = _try_middle(solid, lines, waiting, middle, scratch, hint, out)
+    todo[0] = 0
+    first_leaf = surface.boxes.shape[0] // 2
+    while top > 0:
+        top -= 1
+        node = todo[top]
+        if surface.boxes[node, 0, 0] > surface.boxes[node, 1, 0]:
+            continue
+        enough = _enough(out, tolerance, fine)
+        radius = _ball_of(surface.boxes, node, pose, middle)
+        if _below_ball(solid.box, middle, radius) <= enough:
+            continue
+        wanted = max(enough - radius, 0.0)
+        far, hint = distance_at(
+            solid.tree, middle[0], middle[1], middle[2], wanted, math.inf, hint, nodes, squares
+        )
+        if far + radius <= enough:
+            continue
+        if radius - far <= enough and not _is_inside(solid, middle, lines, LIKELY, stack):
+            continue
+        if node < first_leaf:
+            todo[top], todo[top + 1] = 2 * node + 2, 2 * node + 1
+            top += 2
+            continue
+        start = (node - first_leaf) * LEAF_SIZE
+        for n in range(start, min(start + LEAF_SIZE, count)):
+            place_corners(surface.corners, n, n + 1, pose, waiting)
+            hint = _search_triangle(
+                solid, lines, tolerance, fine, waiting, middle, scratch, hint, out
+            )
 
 
 def depth_in(
-    solid: Solid, triangles: Floats, least: float, tolerance: float
+    solid: Solid, surface: TriangleTree, pose: Floats, least: float, tolerance: float, fine: float
 ) -> tuple[float, Floats]:
-    """Depth of triangles (T, 3, 3) in a solid, and its place (3,), the solid's frame, metres.
+    """Depth of a surface in a solid, and its place (3,), the solid's frame, metres.
 
-    A depth of `least` or less is 0.
+    pose (4, 4) : of the surface in that frame. A depth of `least` or less is 0.
     """
-    edges = triangles[:, 1:] - triangles[:, :1]
-    sizes = (np.cross(edges[:, 0], edges[:, 1]) ** 2).sum(axis=1)
     out = np.array([least, 0.0, 0.0, 0.0])
-    largest_first = np.ascontiguousarray(triangles[np.argsort(-sizes, kind="stable")])
-    depth_kernel(solid, largest_first, LINES, tolerance, out)
+    depth_kernel(solid, surface, np.ascontiguousarray(pose), LINES, tolerance, fine, out)
     return (float(out[0]) if out[0] > least else 0.0), out[1:]

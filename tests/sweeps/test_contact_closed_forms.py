@@ -14,6 +14,7 @@ from contact_scenes import (
     MM,
     PULLS,
     REACH,
+    SMALL,
     SUNK,
     TIN,
     Pull,
@@ -181,6 +182,15 @@ def test_what_is_left_may_not_be_entered_again(env: Environment) -> None:
     assert 14.9 <= first_hit(found) <= 15.1
     found = swept(env, LABEL, pulls((0, 0, 5), (5, 0, 5), (5, 0, 0.1)), tin)
     assert outcome(found) == "free"
+
+
+def test_a_sheet_is_not_passed_whatever_the_length_of_the_path(env: Environment) -> None:
+    """Looks at shares of the path may find it apart on the other side, by less than the reach."""
+    sheet = [named(SCENES["sheet through sheet"], 0)]
+    for length in np.geomspace(0.1, 40.0, 60):
+        found = swept(env, SMALL, pulls((0, 0, -length)), sheet)
+        assert found.verdict == "hits", length
+        assert first_hit(found) <= 0.1
 
 
 def test_a_ball_is_freed_as_surfaces_are(env: Environment) -> None:

@@ -5,7 +5,7 @@ The truth of a pull comes from how it is made (`random_pulls`), from winding num
 """
 
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 import pytest
@@ -62,9 +62,8 @@ class Case(NamedTuple):
 
     def reach(self, name: str) -> float:
         """Millimetres that the motion that frees an object moves at most, as it is told."""
-        touching: tuple[Any, ...] = self.found.touching
-        starts = [one.start / MM for one in touching if one.object.name == name]
-        return float(max([REACH, *starts])) + SLACK
+        told = [one.reach / MM for one in self.found.touching if one.object.name == name]
+        return max([REACH, *told]) + SLACK
 
 
 def swept_case(env: Environment, seed: int) -> Case:

@@ -56,6 +56,7 @@ def swept(path: Way | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - f
         "hits": (),
         "touching": (),
         "enclosed": (),
+        "undecided": (),
         "contact": 5e-5,
         "overlap": 0.0,
         "objects": 3,

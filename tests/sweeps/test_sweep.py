@@ -279,7 +279,7 @@ def test_the_profile_tells_the_distance_along_the_path(env: Environment) -> None
 
 def test_a_limit_ends_what_is_told(env: Environment) -> None:
     found = sweep(env, TOOL, line((0.0, 0.0, 0.05)), limit=0.01)
-    assert found.gap == (0.01, 0.01, None)
+    assert found.gap[:3] == (0.01, 0.01, None)
     assert found.verdict == "clear"
 
 
@@ -292,17 +292,16 @@ def test_time_that_is_over_leaves_it_undecided(env: Environment) -> None:
 def test_time_ends_a_contact_that_is_followed(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """The tool is stuck through a plate and slides in it: each look takes a second of the clock."""
+    """The tool slides by many tolerances: each look at the clock takes a second of it."""
     seconds = count()
     clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
     monkeypatch.setattr("hapticdb.sweeps.gap.time", clock)
     monkeypatch.setattr("hapticdb.sweeps.run.time", clock)
-    path = line((0.0, 0.0, 0.0), (0.05, 0.0, 0.0))
-    with imported(tmp_path, {"plate": box_at((0.3, 0.3, 0.02), (0.0, 0.0, 0.0))}) as env:
+    path = line(SEATED, (0.05, 0.0, 0.5 * CUBE))
+    with imported(tmp_path, {"plate": box_at((0.3, 0.3, 0.02), (0.0, 0.0, -0.01))}) as env:
         found = sweep(env, TOOL, path, contact=1e-6, seconds=20.0)
     assert found.verdict == "not decided"
     assert next(seconds) <= 25
-    assert found.looks <= 100
 
 
 def test_progress_counts_objects(env: Environment) -> None:

@@ -84,9 +84,9 @@ def test_json_has_the_documented_keys_and_no_infinity() -> None:
     found = swept(gap=GAP, hits=(HIT,), touching=both, enclosed=(LID,))
     record = json.loads(json.dumps(sweep_record(found, TOOL, [7], [7, 8]), allow_nan=False))
     assert set(record) == {
-        "verdict", "gap", "gap_at_most", "nearest", "line", "comes_out", "hits", "touching",
-        "enclosed", "contact", "overlap", "objects", "looks", "revision", "elapsed", "is_stopped",
-        "poses", "profile", "tool", "proportions",
+        "verdict", "gap", "gap_at_most", "chord_error", "nearest", "line", "comes_out", "hits",
+        "touching", "undecided", "enclosed", "contact", "overlap", "objects", "looks", "revision",
+        "elapsed", "is_stopped", "poses", "profile", "tool", "proportions",
     }  # fmt: skip
     assert set(record["hits"][0]) == {
         "id", "name", "fraction", "segment", "pose", "on_tool", "on_object", "at_least",

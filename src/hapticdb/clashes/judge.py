@@ -56,25 +56,42 @@ def judge(
     a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
 ) -> Judged:
     """Judge two surfaces, the second one at a rigid pose (4, 4) in the frame of the first."""
-    near = _nearest(a, b, pose, within)
+    error = a.chord + b.chord
+    near = _nearest(a, b, pose, within + error)
     if a.is_cloud or b.is_cloud:
         return _told("not known" if near.pairs[0, 0] >= 0 else "far", near)
     gap, separation = float(near.at_least[0]), Separation(a, b)
     if gap > 0.0:
         if separation.is_nested(pose):
-            return _told("inside", near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose))
+            near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
+            return _told("inside" if gap > error or not error else "not known", near, error)
         if near.pairs[0, 0] < 0:
-            return _told("far", near)
-        return _told("apart" if gap > contact else "touching", near)
-    if next(separation.separating(pose, contact, TINY, gap=0.0), None) is not None:
-        return _told("touching", near)
-    if next(separation.separating(pose, contact, TINY, gap=0.0, nested=True), None) is not None:
+            return _told("far", near, error)
+        if gap - error > contact:
+            return _told("apart", near, error)
+        if gap + error <= contact or not error:
+            return _told("touching", near, error)
+        return _told("not known", near, error)
+    if _is_freed(separation, pose, contact - error):
+        return _told("touching", near, error)
+    if not error and _is_freed(separation, pose, contact, nested=True):
         return _told("inside", near)
-    return _overlap(separation, pose, contact, near)
+    if error and _is_freed(separation, pose, contact + error):
+        return _told("not known", near, error)
+    return _overlap(separation, pose, contact, near, error)
 
 
-def _told(kind: Kind, near: Nearest) -> Judged:
-    at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
+def _is_freed(separation: Separation, pose: Floats, reach: float, *, nested: bool = False) -> bool:
+    """Whether a motion of a reach frees surfaces that meet, or only into a closed body."""
+    if reach <= 0.0:
+        return False
+    found = separation.separating(pose, reach, TINY, gap=0.0, nested=nested)
+    return next(found, None) is not None
+
+
+def _told(kind: Kind, near: Nearest, error: float = 0.0) -> Judged:
+    at_least = max(float(near.at_least[0]) - error, 0.0)
+    at_most = float(near.at_most[0]) + error
     return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])
 
 
@@ -84,9 +101,13 @@ def _nearest(
     return nearest(a.tree, b.tree, pose[None], np.array([farthest]))
 
 
-def _overlap(separation: Separation, pose: Floats, contact: float, near: Nearest) -> Judged:
+def _overlap(
+    separation: Separation, pose: Floats, contact: float, near: Nearest, error: float
+) -> Judged:
     """Bounds of how deep surfaces overlap that no motion of the tolerance frees."""
     depth, place = separation.depth(pose, contact)
-    at_most = separation.least(pose, max(contact, depth), separation.most_reach, TINY, gap=0.0)
+    least = max(contact + error, depth)
+    at_most = separation.least(pose, least, separation.most_reach, TINY, gap=0.0)
     place = place if depth else near.on_a[0]
-    return Judged("overlapping", depth, np.inf if at_most is None else at_most, place, place)
+    at_most = np.inf if at_most is None else at_most + error
+    return Judged("overlapping", max(depth - error, 0.0), at_most, place, place)

@@ -147,7 +147,7 @@ class _Asked(NamedTuple):
     @property
     def setting(self) -> str:
         """What a row depends on beside its objects."""
-        return f"within {self.within!r} contact {self.contact!r}"
+        return f"within {self.within!r} contact {self.contact!r} by motions"
 
 
 class _Search:

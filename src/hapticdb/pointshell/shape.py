@@ -31,18 +31,19 @@ class CollisionShape:
     """Triangles (T, 3, 3) of one surface, or of a ball: its centre, without area.
 
     tree : BVH, whose order all arrays below have; box (2, 3) : corners; radius : of the ball, 0 of
-    a surface, metres; is_cloud : whether the triangles are points, which enclose nothing.
+    a surface, metres; is_cloud : whether the triangles are points, which enclose nothing; chord :
+    chord error, metres: no place of the true surface is farther from the triangles.
     """
 
     def __init__(
         self, triangles: Floats, surface: "Surface | None" = None, *, radius: float = 0.0,
-        is_cloud: bool = False,
+        is_cloud: bool = False, chord: float = 0.0,
     ) -> None:  # fmt: skip
         """Build the tree; surface : the same triangles, if `orient` has seen them."""
         self.tree = tree_of(triangles)
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self.box = np.stack([low - radius, high + radius])
-        self.radius, self.is_cloud = radius, is_cloud
+        self.radius, self.is_cloud, self.chord = radius, is_cloud, chord
         self._given = surface
 
     @cached_property

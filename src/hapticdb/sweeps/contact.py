@@ -47,18 +47,24 @@ class Contact:
 
     start : overlap at the start that a motion frees, at most, metres, infinite where none does;
     start_at_least : proved penetration depth there; reach : of the motions; by : the kind of the
-    last one, empty where none frees; way : followed so far, metres; is_over, is_apart, is_hit :
-    whether it has ended, by surfaces that are apart, or that meet.
+    last one, empty where none frees; error : as given; way : followed so far, metres; is_over,
+    is_apart, is_hit : whether it has ended, by surfaces that are apart, or that meet.
     """
 
     def __init__(
-        self, pair: Pair, shape: CollisionShape, contact: float, gap: float, *, seated: bool
-    ) -> None:
-        """Begin; gap : of the surfaces, from below; seated : whether the tool may overlap more."""
-        self._pair, self._contact = pair, contact
+        self, pair: Pair, shape: CollisionShape, contact: float, gap: float, *, seated: bool,
+        error: float = 0.0,
+    ) -> None:  # fmt: skip
+        """Begin; gap : of the surfaces, from below; seated : whether the tool may overlap more.
+
+        error : chord errors of both surfaces: motions have so much less reach, so that the true
+        surfaces are free, too. A negative one: where these hit, the true surfaces do.
+        """
+        self._pair, self._contact, self.error = pair, contact, error
         self._separation = Separation(shape, pair.tool, pair.check_time)
         self._still = self._separation.moved(NOTHING)
-        self.start, self.start_at_least, self.reach, self.by = contact, 0.0, contact + CLEARANCE, ""
+        self.start, self.start_at_least, self.by = contact, 0.0, ""
+        self.reach = contact - error + CLEARANCE
         self.way, self.is_over, self.is_apart, self.is_hit = 0.0, False, False, False
         self._since, self._block, self._changes = 0.0, BLOCK, 0
         self._moved = self._begun(gap, seated=seated)
@@ -79,13 +85,14 @@ class Contact:
         if seated:  # mostly that frees: the depth of what is sunk so little takes long to prove
             reach = found.least(pose, self.reach, nearly, CLEARANCE, gap=gap)
         if reach is None:
-            self.start_at_least = found.depth(pose, self._contact, coarse=COARSE)[0]
+            depth = found.depth(pose, self._contact, coarse=COARSE)[0]
+            self.start_at_least = max(depth - abs(self.error), 0.0)
         if reach is None and seated:
-            least = max(nearly, self.start_at_least + CLEARANCE)
+            least = max(nearly, depth + CLEARANCE)
             reach = found.least(pose, least, found.most_reach, CLEARANCE, gap=gap)
         if reach is None:
             return None
-        self.reach, self.start = reach, reach - CLEARANCE
+        self.reach, self.start = reach, reach - CLEARANCE + abs(self.error)
         self._motions = found.separating(pose, reach, CLEARANCE, gap=gap)
         return next(self._motions)
 
@@ -107,7 +114,9 @@ class Contact:
     def depth(self) -> tuple[float, Floats]:
         """Penetration depth beyond the hit, proved from below, and its place (3,), world frame."""
         way = min(self.way + ON * self.reach, self._pair.way.length)
-        return self._separation.depth(self._pair.way.at([way])[0], self._contact, FINE_HIT, COARSE)
+        pose = self._pair.way.at([way])[0]
+        depth, place = self._separation.depth(pose, self._contact, FINE_HIT, COARSE)
+        return max(depth - abs(self.error), 0.0), place
 
     def _next_apart(self, end: float) -> tuple[float, bool]:
         """The next look at which the surfaces are apart, or the last one of a block."""
@@ -115,9 +124,9 @@ class Contact:
         ways = np.minimum(self.way + stride * np.arange(1, self._block + 1), end)
         ways = ways[: int(np.searchsorted(ways, end)) + 1]
         self._block = min(2 * self._block, MOST_BLOCK)
-        far = np.full(len(ways), 2.0 * self._contact)
-        gaps = self._pair.measure(ways, far, self._contact).at_least
-        apart = np.flatnonzero(gaps > self._contact)
+        enough = self._contact + abs(self.error)
+        gaps = self._pair.measure(ways, np.full(len(ways), 2.0 * enough), enough).at_least
+        apart = np.flatnonzero(gaps > enough)
         return (float(ways[apart[0]]), True) if len(apart) else (float(ways[-1]), False)
 
     def _is_left(self, way: float) -> bool:

@@ -46,13 +46,15 @@ class Pair:
     """The tool and one object along a path.
 
     tree : triangles of the object, world frame; until : time of `time.monotonic` at which it ends
-    by OverTimeError; end : way up to which they are looked at, the whole path unless given.
+    by OverTimeError; end : way up to which they are looked at, the whole path unless given; error :
+    chord errors of both, metres.
     """
 
     def __init__(
         self, tree: TriangleTree, tool: MovingSurface, way: Way, until: float = np.inf,
-        end: float | None = None,
+        end: float | None = None, error: float = 0.0,
     ) -> None:  # fmt: skip
+        self.error = error
         self.tree, self.tool, self.way, self.until = tree, tool, way, until
         self.length = way.length if end is None else end
         self.looks = 0

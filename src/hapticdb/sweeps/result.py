@@ -39,12 +39,14 @@ class Gap(NamedTuple):
     """Least distance of the tool's surface from any other on the whole path.
 
     at_least : proved; at_most : the distance at `place`, never farther above `at_least` than
-    0.01 mm or 1 %; place : None if nothing is nearer than the limit, which both numbers are then.
+    0.01 mm or 1 %, but for chord errors; place : None if nothing is nearer than the limit, which
+    both numbers are then; error : chord errors of both surfaces there, which `at_least` is less.
     """
 
     at_least: float
     at_most: float
     place: PathPlace | None
+    error: float = 0.0
 
 
 class TouchedObject(NamedTuple):
@@ -93,6 +95,8 @@ class Swept:
     enclosed : tuple of Object
         Objects inside a closed body of the tool, or around the tool: they count as hit, since
         nothing leaves a closed body. Where the path starts.
+    undecided : tuple of Object
+        Objects that are met or touched by no more than the chord error of their surfaces.
     contact, overlap : float
         The contact tolerance, and the overlap that is allowed at the start; metres.
     objects : int
@@ -116,6 +120,7 @@ class Swept:
     hits: tuple[PathPlace, ...]
     touching: tuple[TouchedObject, ...]
     enclosed: tuple[Object, ...]
+    undecided: tuple[Object, ...]
     contact: float
     overlap: float
     objects: int
@@ -145,7 +150,7 @@ class Swept:
         """
         if self.hits or self.enclosed:
             return "hits"
-        if self.is_stopped:
+        if self.is_stopped or self.undecided:
             return "not decided"
         if self.overlapping:
             return "overlaps"

@@ -23,7 +23,7 @@ from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import Contact
-from hapticdb.sweeps.gap import OverTimeError, Pair, box_gaps, error_of
+from hapticdb.sweeps.gap import Least, OverTimeError, Pair, box_gaps, error_of
 from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
 from hapticdb.sweeps.separation import SAME, Separation
 from hapticdb.sweeps.way import Way
@@ -32,6 +32,8 @@ CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
 FIRST_SHARE, LATER = 1 / 64, 4.0
 """Share of the path on which contacts are followed first, and the factor of each later share."""
+BEYOND = 4.0
+"""Chord errors beyond a meeting at which it is looked whether the true surfaces overlap."""
 WINDOWS = 256
 """Places of a path's profile. Larger: a finer profile, more time."""
 
@@ -135,6 +137,16 @@ def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
     return center
 
 
+class _Touched(NamedTuple):
+    """A contact from the start; gap : of the surfaces there, from below, metres."""
+
+    object: Object
+    pair: Pair
+    shape: CollisionShape
+    gap: float
+    found: Contact
+
+
 class _Sweep:
     """State of one sweep."""
 
@@ -148,8 +160,10 @@ class _Sweep:
         self._closed = asked.limit  # proved where nothing nearer was looked for
         self._nearest: PathPlace | None = None
         self._hits: list[PathPlace] = []
-        self._contacts: list[tuple[Object, Pair, Contact]] = []
+        self._contacts: list[_Touched] = []
         self._enclosed: list[Object] = []
+        self._undecided: list[Object] = []
+        self._error = 0.0  # chord errors where the gap was measured
         self._fractions = np.linspace(0.0, 1.0, WINDOWS)
         self._gaps = np.full(WINDOWS, asked.limit)
 
@@ -170,16 +184,17 @@ class _Sweep:
                 near, is_stopped = len(objects), True
         hits = tuple(sorted(self._hits, key=lambda place: place.fraction))
         hits = hits[:1] if self._asked.until_hit else hits
-        gap = Gap(max(min(self._closed, self._best), 0.0), self._best, self._nearest)
+        at_least = max(min(self._closed, self._best - self._error), 0.0)
+        gap = Gap(at_least, self._best, self._nearest, self._error)
         if hits or self._enclosed:
             gap = Gap(0.0, 0.0, hits[0] if hits else None)
         elif is_stopped:
             gap = gap._replace(at_least=0.0)
         return Swept(
-            path=self._way, gap=gap, hits=hits, touching=tuple(map(self._touched, self._contacts)),
-            enclosed=tuple(self._enclosed), contact=self._asked.contact,
-            overlap=self._asked.overlap, objects=near,
-            looks=self._looks + sum(pair.looks for _, pair, _ in self._contacts),
+            path=self._way, gap=gap, hits=hits, touching=tuple(map(self._told, self._contacts)),
+            enclosed=tuple(self._enclosed), undecided=tuple(self._undecided),
+            contact=self._asked.contact, overlap=self._asked.overlap, objects=near,
+            looks=self._looks + sum(one.pair.looks for one in self._contacts),
             revision=revision, elapsed=time.monotonic() - began,
             proportions=proportions, is_stopped=is_stopped,
             profile=Profile(self._fractions, self._gaps) if self._asked.profile else None,
@@ -227,7 +242,8 @@ class _Sweep:
         One that is touched is only followed a little: most of those that are hit, are hit there.
         """
         shape = CollisionShape(part.surface(), is_cloud=part.is_cloud)
-        pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end)
+        error = shape.chord + self._tool.chord
+        pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end, error)
         contact, pose = self._asked.contact, self._way.at([0.0])[0]
         gap = pair.measure(np.zeros(1), np.array([2.0 * contact]))
         apart = float(gap.at_least[0])
@@ -238,51 +254,72 @@ class _Sweep:
             and Separation(shape, self._tool).is_nested(pose)
         )
         if is_nested:
-            self._enclosed.append(obj)
+            (self._enclosed if apart > error else self._undecided).append(obj)
         elif is_touched and not part.is_cloud:
-            found = Contact(pair, shape, contact, apart, seated=self._asked.seated)
-            self._contacts.append((obj, pair, found))
-            if found.is_hit:
-                self._note_hit(obj, pair, found)
-            self._advance(obj, pair, found, FIRST_SHARE * self._way.length)
+            self._touch(obj, pair, shape, apart)
             return
-        self._measure(obj, pair, 0.0)
+        self._measure(obj, pair, shape, 0.0)
         self._looks += pair.looks
+
+    def _touch(self, obj: Object, pair: Pair, shape: CollisionShape, gap: float) -> None:
+        """Begin to follow a contact; gap : of the surfaces where the path starts."""
+        is_fine = pair.error < self._asked.contact
+        found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
+        if not is_fine:
+            self._undecided.append(obj)
+        self._contacts.append(_Touched(obj, pair, shape, gap, found))
+        if found.is_hit:
+            self._note_hit(len(self._contacts) - 1)
+        self._advance(len(self._contacts) - 1, FIRST_SHARE * self._way.length)
+
+    def _contact(self, pair: Pair, shape: CollisionShape, gap: float, error: float) -> Contact:
+        asked = self._asked
+        return Contact(pair, shape, asked.contact, gap, seated=asked.seated, error=error)
 
     def _follow(self) -> None:
         """Follow all contacts in the order of the path, then what is left again from there on."""
         share = FIRST_SHARE
         while share < 1.0:
             share = min(LATER * share, 1.0)
-            for obj, pair, found in self._contacts:
-                self._advance(obj, pair, found, share * self._way.length)
-        for obj, pair, found in self._contacts:
+            for n in range(len(self._contacts)):
+                self._advance(n, share * self._way.length)
+        for obj, pair, shape, _, found in self._contacts:
             if found.is_apart and found.way < self._end:
-                self._measure(obj, pair, found.way)
+                self._measure(obj, pair, shape, found.way)
 
-    def _advance(self, obj: Object, pair: Pair, found: Contact, end: float) -> None:
-        """Follow a contact to a way, and note a hit."""
+    def _advance(self, n: int, end: float) -> None:
+        """Follow the n-th contact to a way, and note a hit."""
+        found = self._contacts[n].found
         if not found.is_over:
             found.advance(min(end, self._end))
             if found.is_hit:
-                self._note_hit(obj, pair, found)
+                self._note_hit(n)
 
-    def _note_hit(self, obj: Object, pair: Pair, found: Contact) -> None:
+    def _note_hit(self, n: int) -> None:
+        """Note where the n-th contact ends by a hit, unless it is within the chord error."""
+        obj, pair, shape, gap, found = self._contacts[n]
+        if found.error > 0.0:
+            found = self._contact(pair, shape, gap, -found.error)
+            found.advance(self._end)
+            self._contacts[n] = self._contacts[n]._replace(found=found)
+            if not found.is_hit:
+                self._undecided.append(obj)
+                return
         depth, place = found.depth()
         if not depth:
             place = pair.nearest_at(self._way.at([found.way])[0]).on_a[0]
         self._hits.append(self._place(obj, found.way, place, place, depth))
 
-    def _touched(self, one: tuple[Object, Pair, Contact]) -> TouchedObject:
-        obj, _, found = one
+    def _told(self, one: _Touched) -> TouchedObject:
+        found = one.found
         is_open = not found.is_over and found.way >= self._way.length
         until = 1.0 if is_open else self._way.fraction(found.way)
         return TouchedObject(
-            obj, found.start, found.start_at_least, found.reach, until, found.by,
+            one.object, found.start, found.start_at_least, found.reach, until, found.by,
             found.is_sliding,
         )  # fmt: skip
 
-    def _measure(self, obj: Object, pair: Pair, begin: float) -> None:
+    def _measure(self, obj: Object, pair: Pair, shape: CollisionShape, begin: float) -> None:
         """Find where an object is met first from a way on, or how near it comes.
 
         What was touched begins to be near, so it has no part in the gap: is it met again?
@@ -290,18 +327,25 @@ class _Sweep:
         if self._asked.profile:
             self._note_profile(pair, begin)
         is_counted = not (begin or self._hits or self._enclosed)
-        least, closed = pair.least(begin, self._best if is_counted else 2.0 * MEETING)
+        best = self._best if is_counted else 2.0 * MEETING + pair.error
+        least, closed = pair.least(begin, best)
         if is_counted:
-            self._closed = min(self._closed, closed)
+            self._closed = min(self._closed, closed - pair.error)
         if least is None:
             return
-        if least.at_most <= MEETING:
+        if pair.error and least.at_most <= pair.error and not self._is_met(pair, shape, least):
+            self._undecided.append(obj)
+        elif least.at_most <= MEETING:
             self._hits.append(self._place(obj, least.way, least.on_tool, least.on_object))
-            return
-        if not is_counted:
-            return
-        self._best = least.at_most
-        self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)
+        elif is_counted:
+            self._best, self._error = least.at_most, pair.error
+            self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)
+
+    def _is_met(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
+        """Whether the true surfaces meet: they overlap by more than the chord errors soon after."""
+        way = min(least.way + BEYOND * pair.error, self._way.length)
+        found = Separation(shape, self._tool, pair.check_time)
+        return found.depth(self._way.at([way])[0], pair.error)[0] > 0.0
 
     def _note_profile(self, pair: Pair, begin: float) -> None:
         ways = self._fractions * self._way.length

@@ -14,8 +14,8 @@ from hapticdb.units import length_text
 MOST_NAMED = 3
 """Greatest number of objects that a line names; the others are only counted."""
 FOUND = (
-    "comes_out", "hits", "touching", "enclosed", "contact", "overlap", "objects", "looks",
-    "revision", "elapsed", "is_stopped",
+    "comes_out", "hits", "touching", "enclosed", "undecided", "contact", "overlap", "objects",
+    "looks", "revision", "elapsed", "is_stopped",
 )  # fmt: skip
 """What is told of a `Swept` as it is."""
 
@@ -41,6 +41,11 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
         late = "the time was over: what is hit before may be missing" if found.is_stopped else ""
         clauses = [*_enclosed_clauses(found, shell), *_hit_clauses(found), late]
         return "; ".join(filter(None, clauses))
+    if found.undecided:
+        return (
+            f"not decided: {names_of(found.undecided)} within the chord error of the triangles; "
+            "import the STEP file with a finer --chord, such as 0.001"
+        )
     if found.verdict == "not decided":
         return (
             "not decided: the time was over before the surfaces of all objects near the path were "
@@ -133,10 +138,15 @@ def _clear_clause(found: Swept) -> str:
     gap, place = found.gap, found.gap.place
     if place is not None:
         nearest = f"nearest {place.object.name} at {where_text(found, place)}"
-        return f"clear by {length_text(gap.at_least)}: {nearest}"
+        return f"clear by {length_text(gap.at_least)}: {nearest}{error_text(gap.error)}"
     if np.isfinite(gap.at_least):
         return f"clear: nothing nearer than {length_text(gap.at_least)}"
     return "clear: nothing else is there"
+
+
+def error_text(error: float) -> str:
+    """Say the chord errors that a length carries; empty without any."""
+    return f", ±{length_text(error)} by tessellation" if error else ""
 
 
 def _touching_clauses(found: Swept) -> Iterable[str]:
@@ -162,6 +172,7 @@ def sweep_record(
         "verdict": found.verdict,
         "gap": plain(found.gap.at_least),
         "gap_at_most": plain(found.gap.at_most),
+        "chord_error": found.gap.error,
         "nearest": plain(found.gap.place),
         "line": verdict_line(found, shell),
         **{name: plain(getattr(found, name)) for name in FOUND},

@@ -19,7 +19,7 @@ MOST_BYTES = 20_000
 OTHERS = (".npz", ".csv", ".hdbrec")
 """Suffixes of saved shells, paths and recordings. They are read in the caller's own process."""
 
-_STEP = """ISO-10303-21;
+STEP = """ISO-10303-21;
 HEADER;
 FILE_DESCRIPTION((''),'2;1');
 FILE_NAME('','2020-01-01T00:00:00',(''),(''),'','','');
@@ -119,7 +119,7 @@ def _texts() -> list[tuple[str, bytes]]:
             (".stl", solid + solid.replace(" a\n", " b\n")),
             (".ply", f"{ply}{coloured}4 0 1 2 3\n3 0 1 4\n"),
             (".dae", COLLADA),
-            (".step", _STEP),
+            (".step", STEP),
         )
     ]
 

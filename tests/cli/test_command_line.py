@@ -12,6 +12,7 @@ from pathlib import Path
 import pytest
 
 import hapticdb
+import step_files
 from children import child, finished
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
@@ -25,6 +26,7 @@ from command_line import (  # noqa: F401 - fixtures among them
     succeeded,
 )
 from hapticdb import cli
+from hapticdb.cli.values import length_of
 from hapticdb.store import connect
 
 VERBS = [verb.__name__.rstrip("_") for verb in cli.VERBS if verb not in cli.HIDDEN]
@@ -142,12 +144,29 @@ def test_import_json_has_a_line_a_file(run: Run, tmp_path: Path) -> None:
     good, bad = map(json.loads, out.splitlines())
     assert set(good) == {
         "file", "status", "objects", "present", "restored", "kept_removed", "replaced", "dropped",
-        "voxels", "is_unit_assumed", "defects", "notes", "error", "scene",
+        "voxels", "chord_error", "is_unit_assumed", "defects", "notes", "error", "scene",
     }  # fmt: skip
     assert (good["status"], good["objects"], good["error"]) == ("imported", 3, None)
+    assert good["chord_error"] is None
     assert bad["status"] == "failed"
     assert "none.stl" in bad["error"]
     assert "none.stl" in err
+
+
+def test_a_chord_error_is_asked_for_and_told_where_there_is_one(run: Run, tmp_path: Path) -> None:
+    file, small = step_files.cylinder(tmp_path / "a.step", 5, 10), ("--bits", 4)
+    assert "chord error of its triangles: 4." in succeeded(run("import", "a.db", file, *small))
+    code, out, _ = run("import", "b.db", file, *small, "--chord", "0.1", "--json")
+    assert code == 0
+    assert 0.4e-4 < json.loads(out)["chord_error"] < 1e-4
+    assert {length_of(text, "--chord") for text in ("0.1", ".1mm", "100 um", "1e-4m")} == {1e-4}
+    refused(run("import", "a.db", file, "--chord", "0.1"), "--chord", "--replace")
+    for chord in ("0", "-1", "1e-9", "2m", "nan", "", "1 furlong", "1e999"):
+        refused(run("import", "c.db", file, "--chord", chord), "chord")
+    assert not (tmp_path / "c.db").exists()
+    mesh = boxes(tmp_path / "boxes.glb")
+    code, out, err = run("import", "d.db", mesh, *small, "--chord", "1")
+    assert (code, "chord error" in out, "--chord changes nothing" in err) == (0, False, True)
 
 
 def test_defects_are_counted_in_the_summary(run: Run, tmp_path: Path) -> None:

@@ -68,7 +68,7 @@ EXPECTED: dict[str, Reads | str] = {
     "trimesh_cube_and_sphere_same_name.3mf": Reads(2, 5132, (0.0928, 0.04, 0.04)),
     "trimesh_empty.stl": "1 empty",
     "trimesh_empty_nodes.glb": "2 empty",
-    "trimesh_featuretype.STEP": Reads(1, 8326, (0.127, 0.0635, 0.0349)),
+    "trimesh_featuretype.STEP": Reads(1, 9564, (0.127, 0.0635, 0.0349)),
     "trimesh_mirror.ply": Reads(1, 286, (1.118, 1.118, 0.118)),
     "trimesh_mode5.gltf": Reads(54, 2786, (57.15, 64.5358, 76.1178)),
     "trimesh_multibody.stl": Reads(2, 32, (0.636, 1.0884, 0.3399)),

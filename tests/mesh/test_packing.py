@@ -35,10 +35,16 @@ def geometries(draw: st.DrawFn) -> Geometry:
 
 
 @settings(max_examples=200, deadline=None)
-@given(geometries())
-def test_what_is_packed_returns_bit_for_bit(geometry: Geometry) -> None:
+@given(geometries(), st.sampled_from([0.0, 1e-5, 5e-324]))
+def test_what_is_packed_returns_bit_for_bit(geometry: Geometry, chord: float) -> None:
+    """The chord error is last, so that surfaces without one are as before."""
     vertices, faces, colours = geometry
-    found, corners, painted = unpack(pack(vertices, faces, colours))
+    packed = pack(vertices, faces, colours, chord)
+    found, corners, painted, told = unpack(packed)
+    assert told == chord
+    without = pack(vertices, faces, colours)
+    assert packed[: len(without)] == without
+    assert len(packed) - len(without) == (8 if chord else 0)
     assert (painted is None) == (colours is None)
     if painted is not None and colours is not None:
         np.testing.assert_array_equal(painted, colours)
@@ -69,15 +75,18 @@ def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObjec
     vertices, faces = ball(9)
     colours = np.arange(4 * len(faces), dtype=np.uint8).reshape(-1, 4) // 64
     is_mesh = data.draw(st.booleans())
-    whole = bytearray(pack(vertices, *((faces, colours) if is_mesh else (None,))))
+    chord = data.draw(st.sampled_from([0.0, 1e-5]))
+    painted = colours if is_mesh else None
+    whole = bytearray(pack(vertices, faces if is_mesh else None, painted, chord))
     for _ in range(data.draw(st.integers(1, 3))):
         at = data.draw(st.integers(0, len(whole) - 1))
         whole[at] ^= data.draw(st.integers(1, 255))
     damaged = bytes(whole[: data.draw(st.integers(0, len(whole)))])
     try:
-        found, corners, painted = unpack(damaged)
+        found, corners, painted, chord = unpack(damaged)
     except ValueError:
         return
+    assert 0.0 <= chord < np.inf
     assert np.isfinite(found).all()
     assert corners is None or not corners.size or 0 <= corners.min() <= corners.max() < len(found)
     assert painted is None or len(painted) == len(found if corners is None else corners)

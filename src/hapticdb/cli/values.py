@@ -4,12 +4,16 @@ import re
 from math import isfinite
 
 from hapticdb.errors import UsageError
+from hapticdb.units import UNITS
 
 MIB = 1 << 20
 LARGEST_MIB = 1e6
 """Largest size that an option takes, MiB: a typing error beyond it is refused."""
 SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 """A size as an option takes it; a number without a unit is MiB."""
+
+LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?) ?([a-z-]+)?", re.IGNORECASE)
+"""A number and a unit of length; a number without a unit is millimetres."""
 
 
 def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
@@ -21,6 +25,15 @@ def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
     if len(numbers) != count or not all(map(isfinite, numbers)):
         raise UsageError(f"{option} {text[:80]!r}: give {example}")
     return numbers
+
+
+def length_of(text: str, option: str) -> float:
+    """Metres of a length that is given in millimetres, or with its unit, such as ``0.01mm``."""
+    match = LENGTH.fullmatch(text.strip())
+    unit = (match[2] or "mm") if match else ""
+    if match is None or unit not in UNITS:
+        raise UsageError(f"{option} {text[:80]!r}: give millimetres, or a length such as 10um")
+    return float(f"{float(match[1]) * UNITS[unit]:.12g}")  # one number for 0.1mm and 100um
 
 
 def budget_bytes(mib: float) -> int:

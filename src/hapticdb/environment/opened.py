@@ -199,6 +199,7 @@ class Environment(Queries, Closes):
         jobs: int | None = None,
         keep_removed: bool = False,
         replace: bool = False,
+        chord: float | None = None,
         progress: ImportCallback | None = None,
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
@@ -216,6 +217,8 @@ class Environment(Queries, Closes):
         replace : bool
             Replace objects whose parts have changed in the file, and remove objects whose parts it
             no longer has.
+        chord : float or None
+            Greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 unless given.
         progress : callable or None
             Called after each part with a `hapticdb.ingest.files.ImportProgress`.
 
@@ -226,9 +229,10 @@ class Environment(Queries, Closes):
         """
         self._check_writable()
         options = ImportOptions(
-            unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed, replace=replace
-        )
-        mesh_file = read_file(file, unit=unit)
+            unit=unit, jobs=jobs, layout=self.layout, keep_removed=keep_removed, replace=replace,
+            chord=chord,
+        )  # fmt: skip
+        mesh_file = read_file(file, **options.reading)
         with self._store.loading():
             report = ingest_file(self._store, mesh_file, options, progress)
         if report.status == "imported":

@@ -33,6 +33,7 @@ from hapticdb.ingest.planning import (
 )
 from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, read_file
+from hapticdb.mesh.chord import checked_chord
 from hapticdb.query.grouping import covering
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
@@ -78,12 +79,17 @@ class FileReport:
     notes: tuple[str, ...] = ()
     """What the file holds that was not read, or not as it is meant."""
     error: HapticDBError | None = None
+    chord: float = 0.0
+    """Greatest chord error of the file's parts where it places them, metres; 0.0 if it has none."""
     is_unit_assumed: bool = False
     """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
 
     def __repr__(self) -> str:
         what = f"objects added: {len(self.added)}, there before: {self.present}"
         return f"FileReport({self.link}: {self.status}, {self.error or what})"
+
+
+_READING = ("unit", "time_limit", "memory_limit", "chord")
 
 
 @dataclass(frozen=True)
@@ -105,6 +111,9 @@ class ImportOptions:
     time_limit: float | None = None
     memory_limit: int | None = None
     """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
+    chord: float | None = None
+    """Greatest chord error wanted of the tessellations of STEP files, metres; 0.00001 unless given.
+    Chord errors are stored with the surfaces (`hapticdb.mesh.Part.chord`)."""
     replace: bool = False
     """Make the environment agree with the file: replace objects, under their ids, whose parts have
     another geometry, placement or unit now, and remove objects whose parts the file lacks."""
@@ -116,6 +125,7 @@ class ImportOptions:
         for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
             if limit is not None and not 0 < limit < np.inf:
                 raise UsageError(f"a limit of {limit} {name}: give a number above 0")
+        checked_chord(self.chord)
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"{self.jobs} jobs: give 1 or more")
         if self.jobs is not None and self.on is not None:
@@ -124,10 +134,10 @@ class ImportOptions:
             check_curve(self.grid.curve, self.layout)
 
     @property
-    def limits(self) -> dict[str, Any]:
-        """Limits of reading a file that are given, by their names in `read_file`."""
-        named = {"time_limit": self.time_limit, "memory_limit": self.memory_limit}
-        return {name: limit for name, limit in named.items() if limit is not None}
+    def reading(self) -> dict[str, Any]:
+        """Options of `read_file` that are given, by their names there."""
+        named = {name: getattr(self, name) for name in _READING}
+        return {name: value for name, value in named.items() if value is not None}
 
 
 def import_files(
@@ -189,7 +199,7 @@ def _import_file(
 ) -> FileReport:
     """Import one file; if it cannot be used, the report says why."""
     try:
-        mesh_file = read_file(file, unit=options.unit, **options.limits)
+        mesh_file = read_file(file, **options.reading)
         store = target.store_for(mesh_file)
         return ingest_file(store, mesh_file, options, progress, workers)
     except (FileError, MissingExtraError) as error:
@@ -304,6 +314,7 @@ def ingest_file(
         dropped=n_dropped,
         defects=mesh_file.defects,
         notes=mesh_file.notes,
+        chord=max(part.placed_chord for part in mesh_file.parts),
         is_unit_assumed=options.unit is None and not mesh_file.names_unit,
     )
 

@@ -70,13 +70,13 @@ def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Objec
 def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
     """Geometry of an object from its packed surface; DamagedError if it is not that of its digest.
 
-    The digest is a checksum of positions, corners and colours, so nothing else is ever returned.
+    The digest is a checksum of all that the part has, so nothing else is ever returned.
     """
     try:
-        vertices, faces, colours = packing.unpack(surface)
+        vertices, faces, colours, chord = packing.unpack(surface)
     except ValueError as error:
         raise damaged(url, f"object {obj.id}: {error}") from None
-    part = Part(obj.name, vertices, faces, obj.transform, colours=colours)
+    part = Part(obj.name, vertices, faces, obj.transform, colours=colours, chord=chord)
     if part.digest != obj.digest:
         raise damaged(url, f"object {obj.id}: its surface is not the one that was written")
     return part
@@ -84,7 +84,7 @@ def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
 
 def packed_surface(part: Part) -> bytes:
     """Pack the geometry of a part; FileError if it is more than a database holds in a row."""
-    surface = packing.pack(part.vertices, part.faces, part.colours)
+    surface = packing.pack(part.vertices, part.faces, part.colours, part.chord)
     if len(surface) > MOST_BYTES:
         raise FileError(
             f"part {part.name!r}: its surface takes {len(surface) / 1e9:.1f} GB packed, and at "

@@ -180,7 +180,7 @@ def planned(
         if obj.digest != part.digest and not replace:
             raise GeometryChangedError(
                 f"{file.link}: part {part.name!r} has changed since it was imported, or was "
-                "read with another --unit; --replace puts the file's in its place"
+                "read with another --unit or --chord; --replace puts the file's in its place"
             )
     removed = {part.name for part in missing} & removed
     added = [part for part in missing if not (keep_removed and part.name in removed)]

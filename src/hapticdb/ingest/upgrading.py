@@ -8,6 +8,7 @@ import os
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -17,10 +18,14 @@ from hapticdb.ingest.files import ImportCallback, ImportProgress
 from hapticdb.ingest.geometry import found_parts, packed_surface, rows_of_object
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part, read_file
+from hapticdb.mesh.chord import MARGIN
 from hapticdb.query.grouping import covering
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Object, Rows, Store, joined
 from hapticdb.store.connect import open_store
+
+_EARLIER = 1e-5 * MARGIN
+"""Chord error, metres, with which STEP files become the triangles of versions without one."""
 
 
 class LeftOut(NamedTuple):
@@ -217,14 +222,13 @@ def _parts_in_files(
         if len(some) > 1:
             first += f" and {len(some) - 1} of the same file"
         try:
-            found = read_file(link, unit=unit).parts
+            found = read_file(link, unit=unit, chord=_EARLIER).parts
         except HapticDBError as error:
             unread = FileError(f"{first} cannot be upgraded, its file cannot be read: {error}")
             yield tuple(some), unread
             continue
-        parts = {(part.name, part.digest): part for part in found}
-        bare = [part.uncoloured for part in found if part.colours is not None]
-        parts |= {(part.name, part.digest): part for part in bare}
+        all_forms = chain(found, *(part.before for part in found))
+        parts = {(part.name, part.digest): part for part in all_forms}
         for obj in some:
             part = parts.get((obj.name, obj.digest))
             yield (

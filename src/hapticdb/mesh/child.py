@@ -82,7 +82,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
             # The files that it refers to are listed under the limit of this file alone.
             _limit_memory(allowance(path, bytes_beside(path)), None)
-        file = parse(path, request["metres"])
+        file = parse(path, request["metres"], request["chord"])
     except (UnreadableError, MemoryError, ImportError) as error:
         if before is not None:
             resource.setrlimit(_memory_kind(), before)
@@ -96,6 +96,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         "geometries": [
             [None if a is None else (a.shape, a.dtype.str) for a in arrays] for arrays in geometries
         ],
+        "chords": [part.chord for part in first.values()],
         "parts": [
             [part.name, number[id(part.shared)], vars(part.defects) if part.defects else {}]
             for part in file.parts

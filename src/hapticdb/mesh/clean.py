@@ -48,7 +48,8 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
                 defects = replace(defects, degenerate=flattened)
             name = names.unique(_printable(placement.name))
             known = shared[placement.shape]
-            parts.append(Part(name, vertices, faces, worlds[n], defects, known, colours))
+            chord = parsed.shapes[placement.shape].chord * scale
+            parts.append(Part(name, vertices, faces, worlds[n], defects, known, colours, chord))
             if defects:
                 total += defects
         elif n_found:

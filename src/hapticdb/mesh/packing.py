@@ -7,7 +7,8 @@ lzma 0.3 to 0.5 less and ten times as long; the distinct values of each axis, so
 less and twice the code. Unpacking takes a quarter of a second for a million triangles.
 
 Colours follow as a zlib stream of their own, where there are some: a palette, and the number in it
-of each triangle. Without them nothing follows, which is how versions without colours packed.
+of each triangle. The chord error comes last, where there is one. Without them nothing follows, as
+in versions that knew neither.
 """
 
 import struct
@@ -24,6 +25,8 @@ HEADER = struct.Struct("<QQ")
 """Numbers of vertices and of triangles; `CLOUD` instead of triangles for a point cloud."""
 COUNT = struct.Struct("<Q")
 """Number of colours of the palette, before it."""
+CHORD = struct.Struct("<d")
+"""Chord error, metres. A block of colours is longer, so what has this length is one."""
 CLOUD = (1 << 64) - 1
 LEVEL = 6
 """Level of zlib. Larger: hardly smaller, and much slower to pack."""
@@ -31,10 +34,12 @@ MOST_RATIO = 1032
 """Bytes that a byte of zlib's can stand for, at most (https://zlib.net/zlib_tech.html)."""
 
 
-def pack(vertices: Vertices, faces: Faces | None, colours: Colours | None = None) -> bytes:
+def pack(
+    vertices: Vertices, faces: Faces | None, colours: Colours | None = None, chord: float = 0.0
+) -> bytes:
     """Pack vertices (V, 3), and faces (F, 3) with indices 0 .. V - 1, None for a point cloud.
 
-    colours : (F, 4), or (V, 4) of a point cloud.
+    colours : (F, 4), or (V, 4) of a point cloud; chord : chord error, metres, or 0.
     """
     n_faces = CLOUD if faces is None else len(faces)
     planes = [_planes(np.ascontiguousarray(vertices, dtype="<f8").view("<u8"), 8)]
@@ -42,10 +47,10 @@ def pack(vertices: Vertices, faces: Faces | None, colours: Colours | None = None
         planes.append(_planes(_differences(faces), _width(len(vertices))))
     packed = zlib.compress(b"".join(planes), LEVEL)
     painted = b"" if colours is None else _packed_colours(colours)
-    return HEADER.pack(len(vertices), n_faces) + packed + painted
+    return HEADER.pack(len(vertices), n_faces) + packed + painted + _packed_chord(chord)
 
 
-def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None]:
+def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None, float]:
     """What `pack` was given, read-only; ValueError if the bytes cannot be that."""
     if len(data) < HEADER.size:
         raise ValueError("a surface that is cut off")
@@ -55,22 +60,39 @@ def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None]:
     size = split + (0 if n_faces == CLOUD else 3 * width * n_faces)
     if size > MOST_RATIO * len(data):
         raise ValueError("a surface that tells of more than it holds")
-    planes, painted = _inflated(data[HEADER.size :], size)
+    planes, rest = _inflated(data[HEADER.size :], size)
     if len(planes) != size:
         raise ValueError("a surface of another length than it tells")
     n_colours = n_vertices if n_faces == CLOUD else n_faces
-    colours = _unpacked_colours(painted, n_colours) if painted else None
+    colours = None
+    if len(rest) > CHORD.size:
+        colours, rest = _unpacked_colours(rest, n_colours)
+    chord = _unpacked_chord(rest)
     vertices = _numbers(planes[:split], 8).view(np.float64)
     vertices.flags.writeable = False
     if not np.isfinite(vertices).all():
         raise ValueError("a surface with a position that is no number")
     if n_faces == CLOUD:
-        return vertices, None, colours
+        return vertices, None, colours, chord
     faces = _sums(_numbers(planes[split:], width))
     faces.flags.writeable = False
     if faces.size and not (faces.min() >= 0 and faces.max() < n_vertices):
         raise ValueError("a surface with a triangle of a vertex that is not there")
-    return vertices, faces, colours
+    return vertices, faces, colours, chord
+
+
+def _packed_chord(chord: float) -> bytes:
+    return CHORD.pack(chord) if chord else b""
+
+
+def _unpacked_chord(data: bytes) -> float:
+    """Undo `_packed_chord`."""
+    if not data:
+        return 0.0
+    chord = float(CHORD.unpack(data)[0]) if len(data) == CHORD.size else 0.0
+    if not 0.0 < chord < np.inf:
+        raise ValueError("a surface of another length than it tells")
+    return chord
 
 
 def _inflated(data: bytes, most: int) -> tuple[bytes, bytes]:
@@ -97,10 +119,8 @@ def _packed_colours(colours: Colours) -> bytes:
     return COUNT.pack(len(palette)) + zlib.compress(content, LEVEL)
 
 
-def _unpacked_colours(data: bytes, n: int) -> Colours:
-    """Undo `_packed_colours`."""
-    if len(data) < COUNT.size:
-        raise ValueError("a surface that is cut off")
+def _unpacked_colours(data: bytes, n: int) -> tuple[Colours, bytes]:
+    """Undo `_packed_colours` at the start of data; and what follows."""
     (n_palette,) = COUNT.unpack_from(data)
     if n_palette > n:
         raise ValueError("a surface with more colours than triangles")
@@ -109,7 +129,7 @@ def _unpacked_colours(data: bytes, n: int) -> Colours:
     if size > MOST_RATIO * len(data):
         raise ValueError("a surface that tells of more than it holds")
     content, rest = _inflated(data[COUNT.size :], size)
-    if len(content) != size or rest:
+    if len(content) != size:
         raise ValueError("a surface of another length than it tells")
     planes = np.frombuffer(content, np.uint8, 4 * n_palette).reshape(4, n_palette)
     colours = np.ascontiguousarray(planes.T)
@@ -119,7 +139,7 @@ def _unpacked_colours(data: bytes, n: int) -> Colours:
             raise ValueError("a surface with a colour that is not there")
         colours = colours[number]
     colours.flags.writeable = False
-    return colours
+    return colours, rest
 
 
 def _number_type(n_palette: int) -> str:

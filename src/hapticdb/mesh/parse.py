@@ -1,6 +1,8 @@
 """Picks the reader of a format, and turns any reader's failure into one line of plain words."""
 
+import functools
 import importlib
+import os
 import struct
 import zipfile
 import zlib
@@ -9,6 +11,7 @@ from pathlib import Path
 
 import numpy as np
 
+from hapticdb.mesh.chord import DEFAULT
 from hapticdb.mesh.clean import clean
 from hapticdb.mesh.part import MeshFile
 from hapticdb.mesh.raw import Parsed, UnreadableError
@@ -30,19 +33,28 @@ READERS = {
 """Module of the reader, by suffix in lower case."""
 
 
-def reader_of(path: Path) -> Callable[[Path], Parsed]:
-    """Reader of a format. Its import loads only the libraries of this format."""
+def is_tessellated(path: str | os.PathLike[str]) -> bool:
+    """Whether a file's triangles stand for CAD surfaces, by its suffix."""
+    return READERS.get(Path(path).suffix.lower()) == "step"
+
+
+def reader_of(path: Path, chord: float = DEFAULT) -> Callable[[Path], Parsed]:
+    """Reader of a format. Its import loads only the libraries of this format.
+
+    chord : greatest chord error wanted of a tessellation, metres.
+    """
     module = importlib.import_module(f"hapticdb.mesh.formats.{READERS[path.suffix.lower()]}")
-    reader: Callable[[Path], Parsed] = module.read
-    return reader
+    reader: Callable[..., Parsed] = module.read
+    return functools.partial(reader, chord=chord) if is_tessellated(path) else reader
 
 
-def parse(path: Path, metres: float | None) -> MeshFile:
+def parse(path: Path, metres: float | None, chord: float = DEFAULT) -> MeshFile:
     """Sound parts of a file, read in this process; every failure is an `UnreadableError`.
 
-    metres : length of the unit of a file without a unit of its own; None if none was given.
+    metres : length of the unit of a file without a unit of its own; None if none was given; chord :
+    greatest chord error wanted of a tessellation, metres.
     """
-    read = reader_of(path)
+    read = reader_of(path, chord)
     try:
         with np.errstate(over="ignore", invalid="ignore"):  # `clean` counts what is not finite
             return clean(read(path), metres, str(path))

@@ -70,6 +70,15 @@ class Part:
     colours: NDArray[np.uint8] | None = None
     """(F, 4) red, green, blue (sRGB) and opacity of each triangle, or (V, 4) of each point of a
     cloud; None if the file has none."""
+    chord: float = 0.0
+    """Chord error, metres, part frame: greatest distance between the triangles and the CAD surface
+    that they stand for; 0.0 where the triangles are the shape."""
+
+    @property
+    def placed_chord(self) -> float:
+        """Chord error, metres, world frame: `chord` times the placement's greatest stretch."""
+        linear = self.world_from_part[:3, :3]
+        return self.chord * float(np.linalg.norm(linear, 2)) if self.chord else 0.0
 
     @property
     def is_cloud(self) -> bool:
@@ -78,14 +87,19 @@ class Part:
 
     @property
     def digest(self) -> str:
-        """SHA-256 of geometry and colours in the part's frame, 64 hex digits, without placement."""
-        return self._hashed("digest", (self.vertices, self.faces, self.colours))
+        """SHA-256 of geometry, colours and chord error, 64 hex digits, without placement."""
+        chord = np.array([self.chord]) if self.chord else None
+        return self._hashed("digest", (self.vertices, self.faces, self.colours, chord))
 
     @property
-    def uncoloured(self) -> "Part":
-        """The part without colours, as versions that read none had it."""
-        digest = self._hashed("uncoloured", (self.vertices, self.faces))
-        return replace(self, colours=None, shared={"digest": digest})
+    def before(self) -> tuple["Part", "Part"]:
+        """The part without chord error, and without colours, too, as earlier versions had it."""
+        exact = self._hashed("exact", (self.vertices, self.faces, self.colours))
+        bare = self._hashed("bare", (self.vertices, self.faces))
+        return (
+            replace(self, chord=0.0, shared={"digest": exact}),
+            replace(self, chord=0.0, colours=None, shared={"digest": bare}),
+        )
 
     def _hashed(self, key: str, arrays: tuple[NDArray[Any] | None, ...]) -> str:
         if key not in self.shared:

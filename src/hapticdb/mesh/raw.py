@@ -42,13 +42,16 @@ class Shape:
 
     vertices (V, 3), the file's unit, any number type; faces (F, 3) of any integer type, or None for
     a point cloud; defects : what the reader itself dropped; colours : (F, 4) of the triangles or
-    (V, 4) of a cloud's points, as `Part` has them, None if the file has none.
+    (V, 4) of a cloud's points, as `Part` has them, None if the file has none; normals : (V, 3), or
+    None; chord : chord error, the file's unit, 0 where triangles are the shape.
     """
 
     vertices: NDArray[np.generic]
     faces: NDArray[np.generic] | None
     defects: Defects = field(default_factory=Defects)
     colours: NDArray[np.uint8] | None = None
+    normals: NDArray[np.generic] | None = None
+    chord: float = 0.0
 
 
 @dataclass(frozen=True, slots=True)

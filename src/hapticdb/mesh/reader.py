@@ -19,8 +19,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, MissingExtraError, pip_line
+from hapticdb.mesh.chord import DEFAULT, checked_chord
 from hapticdb.mesh.clean import read_only
-from hapticdb.mesh.parse import READERS, parse
+from hapticdb.mesh.parse import READERS, is_tessellated, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
 from hapticdb.mesh.raw import UnreadableError
 from hapticdb.mesh.scratch import scratch_folder
@@ -50,6 +51,7 @@ def read_file(
     unit: str | None = None,
     memory_limit: int | None = None,
     time_limit: float | None = None,
+    chord: float | None = None,
 ) -> MeshFile:
     """All usable parts of a mesh, CAD or point-cloud file, in metres.
 
@@ -69,6 +71,9 @@ def read_file(
         Bytes that parsing may take; by default in proportion to the file, see `child.allowance`.
     time_limit : float, optional
         Seconds that parsing may take; by default in proportion to the file.
+    chord : float, optional
+        Greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 by default. What
+        it is became `Part.chord`. Other files have none.
 
     Raises
     ------
@@ -78,13 +83,15 @@ def read_file(
     MissingExtraError
         If the format needs an extra that is not installed.
     UsageError
-        If the unit is unknown.
+        If the unit is unknown, or the chord error out of range.
     """
+    wanted = checked_chord(chord)
     metres, file = _checked(path, unit)
     seconds = _seconds_for(file) if time_limit is None else time_limit
     request = {
         "path": str(file),
         "metres": metres,
+        "chord": wanted,
         "memory_limit": memory_limit,
         "time_limit": seconds,
         "parent": os.getpid(),
@@ -93,14 +100,19 @@ def read_file(
     try:
         return _ask_child(request, seconds)
     except UnreadableError as error:
-        raise FileError(_one_line(path, error)) from None
+        is_fine = wanted < DEFAULT and is_tessellated(file) and _MORE_TIME in str(error)
+        cause = f"{error}, or a larger --chord" if is_fine else error
+        raise FileError(_one_line(path, cause)) from None
 
 
-def parse_in_process(path: str | os.PathLike[str], *, unit: str | None = None) -> MeshFile:
+def parse_in_process(
+    path: str | os.PathLike[str], *, unit: str | None = None, chord: float | None = None
+) -> MeshFile:
     """`read_file` without a child process and without limits, for files known to be sound."""
+    wanted = checked_chord(chord)
     metres, file = _checked(path, unit)
     try:
-        return parse(file, metres)
+        return parse(file, metres, wanted)
     except UnreadableError as error:
         raise FileError(_one_line(path, error)) from None
 
@@ -230,8 +242,8 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
     parts = []
     for (name, n, found), placed in zip(head["parts"], worlds, strict=True):
         vertices, faces, colours = geometries[n]
-        defects = Defects(**found)
-        parts.append(Part(name, vertices, faces, placed.copy(), defects, shared[n], colours))
+        shape = (vertices, faces, placed.copy(), Defects(**found), shared[n], colours)
+        parts.append(Part(name, *shape, head["chords"][n]))
     said = (head["names_unit"], head["up"], tuple(head["notes"]))
     return MeshFile(link, parts, Defects(**head["defects"]), *said)
 

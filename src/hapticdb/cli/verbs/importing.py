@@ -16,7 +16,7 @@ from hapticdb.cli.options import (
     UrlArgument,
 )
 from hapticdb.cli.root import left_at
-from hapticdb.cli.values import numbers_of
+from hapticdb.cli.values import length_of, numbers_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -88,6 +88,15 @@ DistancesOption = Annotated[
         show_default="yes for bricks",
     ),
 ]
+ChordOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LENGTH",
+        help="Chord error of STEP files: how far triangles may lie from the CAD surfaces; "
+        "millimetres, or such as 10um.",
+        show_default="0.01",
+    ),
+]
 PartitionsOption = Annotated[
     str | None,
     typer.Option(
@@ -116,6 +125,7 @@ def import_(
     memory_limit: MemoryLimitOption = None,
     replace: ReplaceOption = False,
     distances: DistancesOption = None,
+    chord: ChordOption = None,
     partitions: PartitionsOption = None,
     json: JsonOption = False,
 ) -> None:
@@ -147,6 +157,7 @@ def import_(
         unit=unit, grid=grid, layout=layout, jobs=jobs, on=on, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
         replace=replace, distances=distances,
+        chord=None if chord is None else length_of(chord, "--chord"),
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)
     _tell(url, files, reports, elapsed, json=json)
@@ -178,7 +189,12 @@ def _imported(
 ) -> "tuple[list[FileReport], float]":
     """Import files: a report of each, and seconds."""
     from hapticdb.ingest.files import import_files
+    from hapticdb.mesh.parse import is_tessellated
 
+    if options.chord is not None and not any(map(is_tessellated, files)):
+        render.note(
+            "--chord changes nothing: it is for STEP files, and the triangles of others are kept"
+        )
     with left_at("what went in is whole, and the same command goes on from there"):
         render.compile_kernels("import", files=files)
         started = time.perf_counter()
@@ -221,6 +237,7 @@ def _record(report: "FileReport") -> dict[str, object]:
         "replaced": report.replaced,
         "dropped": report.dropped,
         "voxels": sum(obj.voxels for obj in report.added),
+        "chord_error": report.chord or None,
         "is_unit_assumed": report.is_unit_assumed,
         "defects": report.defects.as_dict(),
         "notes": list(report.notes),
@@ -229,6 +246,8 @@ def _record(report: "FileReport") -> dict[str, object]:
 
 
 def _say(file: str, report: "FileReport") -> None:
+    from hapticdb.units import length_text
+
     if report.status == "complete":
         there = render.counted(report.present, "object")
         line = f"{file}: complete already ({there}), nothing to do"
@@ -254,6 +273,8 @@ def _say(file: str, report: "FileReport") -> None:
     render.say(line)
     if report.is_unit_assumed:
         render.say("  its unit is not known: its numbers are taken as metres; --unit gives another")
+    if report.chord:
+        render.say(f"  chord error of its triangles: {length_text(report.chord)}")
     if report.defects:
         render.say(f"  found in the file: {report.defects.describe()}")
     for note in report.notes:

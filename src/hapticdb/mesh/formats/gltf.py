@@ -69,8 +69,11 @@ def read(path: Path) -> Parsed:
     return parsed(path.read_bytes(), path)
 
 
-def parsed(content: bytes, path: Path) -> Parsed:
-    """Parts of a file's content; files that it refers to are beside `path`."""
+def parsed(content: bytes, path: Path, *, normals: bool = False) -> Parsed:
+    """Parts of a file's content; files that it refers to are beside `path`.
+
+    normals : whether shapes come with the normals at their vertices, if all have some.
+    """
     tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
     accessors = Accessors(tree, chunks, path.parent)
@@ -86,7 +89,14 @@ def parsed(content: bytes, path: Path) -> Parsed:
     meshes, materials = objects_of(tree, "meshes"), _base_colours(tree)
     return Parsed(
         shapes=[
-            _shape(meshes[pose.mesh], pose, joints.get(pose.skin), accessors, materials)
+            _shape(
+                meshes[pose.mesh],
+                pose,
+                joints.get(pose.skin),
+                accessors,
+                materials,
+                normals=normals,
+            )
             for pose in poses
         ],
         placements=placements,
@@ -185,9 +195,12 @@ def _shape(
     joints: NDArray[np.float64] | None,
     accessors: Accessors,
     materials: _Materials,
+    *,
+    normals: bool,
 ) -> Shape:
     """One shape from a mesh's pieces; vertices that pieces share are kept once."""
     vertices: dict[object, NDArray[np.generic]] = {}
+    upright: list[NDArray[np.generic]] = []
     offsets: dict[object, int] = {}
     faces: list[NDArray[np.int64]] = []
     points: list[NDArray[np.generic]] = []
@@ -211,6 +224,8 @@ def _shape(
         if position not in offsets:
             offsets[position], vertices[position] = n_vertices, corners
             n_vertices += len(corners)
+            if normals and "NORMAL" in piece["attributes"]:
+                upright.append(accessors.array(piece["attributes"]["NORMAL"]))
         # An index outside its own piece must not reach into the next piece's vertices.
         found = _corners(piece, mode, len(corners), accessors, pose.mesh)
         inside = (found >= 0) & (found < len(corners))
@@ -220,7 +235,9 @@ def _shape(
     if faces:
         lost = Defects(unsupported=len(points))
         whole_faces = _one(faces)
-        return Shape(_one(list(vertices.values())), whole_faces, defects + lost, joined(painted))
+        all_upright = _one(upright) if len(upright) == len(vertices) else None
+        found = _one(list(vertices.values()))
+        return Shape(found, whole_faces, defects + lost, joined(painted), all_upright)
     if points:
         return Shape(_one(points), None, defects, joined(dotted))
     return Shape(np.empty((0, 3)), np.empty((0, 3), dtype=np.int64), defects)

@@ -1,0 +1,158 @@
+"""The chord error that is stored: never less than what samples of the true surfaces show."""
+
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import step_files
+from hapticdb.errors import FileError, UsageError
+from hapticdb.kernels.surfaces.nearest import distances_to
+from hapticdb.kernels.surfaces.sides import triangle_tree
+from hapticdb.mesh import Part, parse_in_process, read_file
+from hapticdb.mesh import reader as reader_module
+from hapticdb.mesh.chord import DEFAULT, chord_error
+from hapticdb.mesh.raw import UnreadableError
+from mesh_files import TRIANGLE, gltf
+
+Floats = NDArray[np.float64]
+TURN = np.linspace(0.0, 2.0 * np.pi, 997)
+SHARE = np.linspace(0.0, 1.0, 101)
+
+
+def distance(part: Part, points: Floats) -> float:
+    """Greatest distance of points (..., 3) from a part's triangles, metres."""
+    triangles = part.triangles()
+    tree = triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
+    return float(distances_to(tree, points.reshape(-1, 3)).max())
+
+
+def revolved(radii: Floats, heights: Floats) -> Floats:
+    """Points of a surface of revolution."""
+    flat = radii[:, None] * np.cos(TURN), radii[:, None] * np.sin(TURN)
+    return np.stack([*flat, np.broadcast_to(heights[:, None], flat[0].shape)], axis=-1)
+
+
+def points_of(kind: str, size: float) -> Floats:
+    """Samples of the true surface, metres, of the solid of that size, metres."""
+    angles = SHARE * 2.0 * np.pi
+    if kind == "sphere":
+        return revolved(size * np.sin(angles / 2), size * np.cos(angles / 2))
+    if kind == "torus":
+        return revolved(size * (3.0 + 0.5 * np.cos(angles)), 0.5 * size * np.sin(angles))
+    if kind == "cylinder":
+        return revolved(np.full(101, size), 2.0 * size * SHARE)
+    if kind == "sheet":
+        return revolved(size * SHARE, np.zeros(101))
+    return revolved(size * SHARE, (0.1 if kind == "flat cone" else 2.0) * size * SHARE)
+
+
+def written(folder: Path, kind: str, size: float, unit: str) -> Path:
+    """A STEP file of that solid, its size in the file's unit."""
+    path = folder / "a.step"
+    if kind == "sphere":
+        return step_files.sphere(path, size, unit)
+    if kind == "torus":
+        return step_files.torus(path, 3.0 * size, 0.5 * size, unit)
+    if kind == "cylinder":
+        return step_files.cylinder(path, size, 2.0 * size, unit)
+    if kind == "sheet":
+        return step_files.sheet(path, size, unit)
+    return step_files.cone(path, size, (0.1 if kind == "flat cone" else 2.0) * size, unit)
+
+
+@pytest.mark.parametrize("kind", ["sphere", "torus", "cylinder", "cone", "flat cone", "sheet"])
+@pytest.mark.parametrize(
+    ("unit", "chord"), [("mm", DEFAULT), ("mm", 1e-4), ("in", 1e-4), ("m", 1e-4)]
+)
+def test_the_chord_error_bounds_the_true_one_and_is_near_it(
+    tmp_path: Path, kind: str, unit: str, chord: float
+) -> None:
+    """In each unit alike: a sphere is tessellated twice as coarse as was asked for."""
+    size = {"mm": 10.0, "in": 0.4, "m": 0.01}[unit]
+    (part,) = parse_in_process(written(tmp_path, kind, size, unit), chord=chord).parts
+    true = distance(part, points_of(kind, size * step_files.UNITS[unit][1]))
+    assert true <= part.chord <= (3.0 if kind == "sheet" else 1.5) * true
+    assert part.chord <= 1.05 * chord or kind == "sphere"
+
+
+@pytest.mark.parametrize(
+    "name", ["dirty/trimesh_featuretype.STEP", "reports/s04_latin1.step", "reports/s13_far_mm.step"]
+)
+def test_no_vertex_of_a_finer_tessellation_is_farther_away(real_files: Path, name: str) -> None:
+    """Not even where OpenCASCADE exceeds its tolerance ten times; then a note says so."""
+    for chord in (DEFAULT, 1e-4):
+        file = parse_in_process(real_files / name, chord=chord)
+        finer = parse_in_process(real_files / name, chord=chord / 7)
+        for part, other in zip(file.parts, finer.parts, strict=True):
+            assert distance(part, other.world_points()) <= part.chord
+        over = max(part.chord for part in file.parts) > 1.05 * chord
+        assert any("chord error" in note for note in file.notes) == over
+
+
+def test_a_flat_shape_has_none_unless_it_ends_somewhere() -> None:
+    """A tetrahedron, each face with vertices of its own, far from the origin; then without one."""
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]) + 7.3
+    vertices = corners[[0, 2, 1, 0, 1, 3, 0, 3, 2, 1, 2, 3]].astype(np.float32)
+    flat = vertices.reshape(4, 3, 3)
+    normals = np.cross(flat[:, 1] - flat[:, 0], flat[:, 2] - flat[:, 0])
+    normals = np.repeat(normals / np.linalg.norm(normals, axis=1)[:, None], 3, axis=0)
+    faces = np.arange(12).reshape(4, 3)
+    assert chord_error(vertices, normals, faces, 1e-5) == 0.0
+    assert chord_error(vertices, normals, faces[:3], 1e-5) == pytest.approx(1e-5, rel=0.1)
+    assert chord_error(vertices, None, faces, 1e-5) == pytest.approx(1e-5, rel=0.1)
+
+
+def test_mesh_files_have_none(tmp_path: Path) -> None:
+    tree = {"nodes": [{"mesh": 0, "scale": [3, 3, 3]}]}
+    (part,) = parse_in_process(gltf(tree, tmp_path / "a.gltf"), chord=1e-3).parts
+    assert part.chord == part.placed_chord == 0.0
+
+
+def test_a_placement_stretches_the_chord_error() -> None:
+    world = np.diag([1.0, -3.0, 2.0, 1.0])
+    corners = TRIANGLE.astype(np.float64)
+    part = Part("a", corners, np.array([[0, 1, 2]]), world, chord=1e-5)
+    assert part.placed_chord == pytest.approx(3e-5)
+
+
+def test_the_digest_is_of_the_chord_error_too() -> None:
+    corners, faces = TRIANGLE.astype(np.float64), np.array([[0, 1, 2]])
+    plain, one, other = (
+        Part("a", corners, faces, np.eye(4), chord=chord) for chord in (0.0, 1e-5, 2e-5)
+    )
+    assert len({plain.digest, one.digest, other.digest}) == 3
+    assert {part.digest for part in one.before} == {plain.digest}
+
+
+def test_the_child_hands_the_chord_error_back(tmp_path: Path) -> None:
+    path = step_files.cylinder(tmp_path / "a.step", 10.0, 20.0)
+    here, there = parse_in_process(path, chord=1e-4), read_file(path, chord=1e-4)
+    assert here.parts[0].chord == there.parts[0].chord > 0.0
+    assert here.parts[0].digest == there.parts[0].digest
+    assert len(here.parts[0].triangles()) < len(read_file(path).parts[0].triangles())
+
+
+@pytest.mark.parametrize("chord", [0.0, -1e-5, float("nan"), float("inf"), 1e-12])
+@pytest.mark.parametrize("read", [read_file, parse_in_process])
+def test_a_chord_error_out_of_range_is_refused(
+    tmp_path: Path, chord: float, read: Callable[..., object]
+) -> None:
+    with pytest.raises(UsageError, match="chord error"):
+        read(step_files.sphere(tmp_path / "a.step", 1.0), chord=chord)
+
+
+def test_what_takes_too_long_says_that_a_larger_chord_is_faster(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def late(*_: object) -> None:
+        raise UnreadableError(f"it took long; {reader_module._MORE_TIME}")
+
+    monkeypatch.setattr(reader_module, "_ask_child", late)
+    path = step_files.sphere(tmp_path / "a.step", 1.0)
+    for chord, is_told in ((1e-6, True), (None, False)):
+        with pytest.raises(FileError) as refused:
+            read_file(path, chord=chord)
+        assert str(refused.value).endswith("larger --chord") == is_told

@@ -167,3 +167,36 @@ def test_times_that_cannot_be_are_told_only_where_times_are_asked_for(
         read_timed_poses(path)
     assert "\n" not in str(caught.value)
     assert np.isfinite(read_poses(path)).all()
+
+
+UPRIGHT, TURNED = (0.0, 0.0, 0.0, 1.0), (0.0, 0.0, 0.6, 0.8)
+"""Quaternions qx, qy, qz, qw: the identity, and a turn about z."""
+
+
+@pytest.mark.parametrize("first", [UPRIGHT, TURNED])
+def test_quaternions_in_another_order_than_their_names_are_told(
+    tmp_path: Path, first: tuple[float, ...]
+) -> None:
+    lines = [",".join(map(str, (0, 0, 0, *q))) for q in (first, TURNED)]
+    path = tmp_path / "path.csv"
+    path.write_text(HEADER + "\n".join(lines))
+    for read in (read_poses, read_timed_poses):
+        with pytest.warns(UserWarning, match=r"path.csv: all qw are 0, .* qx,qy,qz,qw\?"):
+            read(path)
+
+
+@pytest.mark.parametrize(
+    "rows",
+    [
+        [(1, 0, 0, 0), (0, 0, 0, 1)],  # a half turn about z, after no turn
+        [(0, 1, 0, 0), (0, 1, 0, 0)],  # half turns about x, and about y
+        [(0, 0, 1, 0), (0, 0, 0.6, 0.8)],
+    ],
+)
+def test_honest_half_turns_are_not_doubted(
+    tmp_path: Path, rows: list[tuple[float, ...]], recwarn: pytest.WarningsRecorder
+) -> None:
+    path = tmp_path / "path.csv"
+    path.write_text(HEADER + "\n".join(",".join(map(str, (0, 0, 0, *q))) for q in rows))
+    read_poses(path)
+    assert not list(recwarn)

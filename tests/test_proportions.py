@@ -4,7 +4,9 @@
 
 import json
 from collections.abc import Iterable
+from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -151,6 +153,43 @@ def test_a_part_larger_than_what_is_left_is_no_misfit() -> None:
     assert found(car(), hull, path, tool_unit=None).misfits == ()
 
 
+@pytest.mark.parametrize("length", [0.0001, 6.0])
+def test_a_given_unit_of_the_tool_is_believed(length: float) -> None:
+    """A tool smaller than a voxel, and one longer than the scene, which inches would fit."""
+    shell, path = wrench(length), along(*SLIDE)
+    assert [misfit.what for misfit in found(car(), shell, path).misfits] == ["tool"]
+    assert found(car(), replace(shell, has_unit=True), path).misfits == ()
+
+
+def test_a_given_unit_of_the_path_is_believed() -> None:
+    """A long path is no misfit then. One elsewhere is, without another unit."""
+    long, far = along(*SLIDE, (900, 0, 0)), along(*SLIDE, factor=1000.0)
+    for path, misfits in ((long, []), (far, [("path", None)])):
+        (misfit,) = found(car(), wrench(), path).misfits
+        assert misfit.what == "path"
+        fit = found(car(), wrench(), path, is_path_unit_given=True)
+        assert [(one.what, one.unit) for one in fit.misfits] == misfits
+    assert found(car(), wrench(), far).misfits[0].unit == "mm"
+
+
+@pytest.mark.parametrize("known", [{"link": "a.step"}, {"attributes": {"unit": "m"}}])
+def test_a_given_unit_of_the_scene_is_believed(known: dict[str, Any]) -> None:
+    scene = [replace(obj, **known) for obj in car(1000.0)]
+    assert "scene" not in [misfit.what for misfit in found(scene, wrench(), along(*SLIDE)).misfits]
+
+
+def test_shells_of_files_know_whether_their_unit_was_given(tmp_path: Path) -> None:
+    mesh = trimesh.creation.box((6.0, 1.0, 1.0))
+    for suffix in ("stl", "glb"):
+        mesh.export(tmp_path / f"a.{suffix}")
+    made = PointShell.from_file(tmp_path / "a.stl", 60)
+    assert not made.has_unit
+    assert PointShell.from_file(tmp_path / "a.stl", 60, unit="m").has_unit
+    assert PointShell.from_file(tmp_path / "a.glb", 60).has_unit
+    made.save(tmp_path / "a.npz")
+    assert PointShell.from_file(tmp_path / "a.npz").has_unit
+
+
 # -- the gap is a bound ----------------------------------------------------------------------------
 
 
@@ -213,6 +252,20 @@ def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
     assert [(m["what"], m["unit"]) for m in record["misfits"]] == [("path", "mm")]
     assert run(*args, "--as-given")[0] == 0
     succeeded(run(*args, "--path-unit", "mm"))
+
+
+def test_a_given_unit_is_never_overruled(run: Run, scene: Path) -> None:
+    """A clear path is clear where the tool's unit, or the path's, was given."""
+    trimesh.creation.box((6.0, 0.1, 0.1)).export(scene.parent / "beam.stl")
+    poses(scene.parent / "above.csv", (0, 0, 0.3), (0.2, 0, 0.3))
+    args = ("sweep", scene, "--tool", "beam.stl", "--path", "above.csv")
+    code, _, err = run(*args)
+    assert (code, "--tool-unit" in err) == (3, True)
+    succeeded(run(*args, "--tool-unit", "m"))
+    poses(scene.parent / "long.csv", (-60, 0, 0.3), (60, 0, 0.3))
+    args = ("sweep", scene, *TOOL, "--path", "long.csv")
+    assert run(*args)[0] == 3
+    succeeded(run(*args, "--path-unit", "m"))
 
 
 def test_touch_says_that_no_pose_is_near(run: Run, scene: Path) -> None:

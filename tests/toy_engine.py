@@ -32,6 +32,7 @@ from hapticdb.store.base import (
     Keys,
     Layout,
     Object,
+    Replacements,
     Rows,
     Size,
     Store,
@@ -246,22 +247,35 @@ class MemoryStore:
             object_id = record.id if is_free else self._contents.n_ids + 1
             self._contents.n_ids = max(self._contents.n_ids, object_id)
             new = replace(record, id=object_id)
-            self._commit("add", object_id, rows.keys, new, rows, surface)
+            self._commit(self._next(state, "add", object_id, rows.keys, new, rows, surface))
         return object_id
 
     def replace(
         self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
     ) -> None:
         with self._contents.write_lock:
-            known, old = self._known(record.id)
-            check_unwritten(record, known, self.url)
-            touched = np.concatenate([old.keys, rows.keys])
-            self._commit("move", record.id, touched, record, rows, surface)
+            self._commit(self._exchanged(self._newest(), record, rows, surface))
+
+    def replace_all(self, made: Replacements, covering: Covering) -> None:
+        with self._contents.write_lock:
+            state = self._newest()
+            for record, rows in made():
+                state = self._exchanged(state, record, rows)
+            self._commit(state)
+
+    def _exchanged(
+        self, state: State, record: Object, rows: Rows, surface: bytes | None = None
+    ) -> State:
+        known, old = self._known(state, record.id)
+        check_unwritten(record, known, self.url)
+        touched = np.concatenate([old.keys, rows.keys])
+        return self._next(state, "move", record.id, touched, record, rows, surface)
 
     def remove(self, object_id: int, covering: Covering) -> None:
         with self._contents.write_lock:
-            _, old = self._known(object_id)
-            self._commit("remove", object_id, old.keys, None, NO_ROWS)
+            state = self._newest()
+            _, old = self._known(state, object_id)
+            self._commit(self._next(state, "remove", object_id, old.keys, None, NO_ROWS))
 
     def add_surface(self, digest: str, surface: bytes) -> None:
         with self._contents.write_lock:
@@ -290,23 +304,26 @@ class MemoryStore:
         if self.is_read_only:
             raise ReadOnlyError(f"{self.url} was opened to read: open it without read_only")
 
-    def _known(self, object_id: int) -> tuple[Object, Rows]:
-        objects = self._newest().objects
-        if object_id not in objects:
+    def _known(self, state: State, object_id: int) -> tuple[Object, Rows]:
+        if object_id not in state.objects:
             raise no_object(object_id, self.url)
-        return objects[object_id]
+        return state.objects[object_id]
 
-    def _commit(
+    def _commit(self, state: State) -> None:
+        """Replace the newest state. The caller holds the write lock."""
+        self._contents.state = state
+
+    def _next(
         self,
+        state: State,
         action: Literal["add", "move", "remove"],
         object_id: int,
         touched: Keys,
         record: Object | None,
         rows: Rows,
         surface: bytes | None = None,
-    ) -> None:
-        """Replace the newest state by the next one. The caller holds the write lock."""
-        state = self._contents.state
+    ) -> State:
+        """The state after a write of one object."""
         revision = state.revision + 1
         objects, removed = dict(state.objects), set(state.removed)
         surfaces = dict(state.surfaces)
@@ -327,9 +344,7 @@ class MemoryStore:
                 surfaces.setdefault(record.digest, surface)
         ranges = touched_ranges(self.grid, self.layout, touched)
         change = Change(revision, action, object_id, ranges)
-        self._contents.state = State(
-            objects, (*state.changes, change), frozenset(removed), surfaces, state.pairs
-        )
+        return State(objects, (*state.changes, change), frozenset(removed), surfaces, state.pairs)
 
     # -- pairs -------------------------------------------------------------------------------
 

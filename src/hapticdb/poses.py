@@ -2,7 +2,7 @@
 
 The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order. Other columns are ignored, except
 ``t``, seconds, when a caller asks for it. Quaternions are normalised; ``q`` and ``-q`` are the same
-pose.
+pose. A warning says where their columns seem to be in another order than their names.
 """
 
 import codecs
@@ -10,6 +10,7 @@ import csv
 import io
 import math
 import os
+import warnings
 from pathlib import Path
 
 import numpy as np
@@ -23,6 +24,9 @@ COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 FARTHEST = 1e9
 """Largest coordinate of a position, metres. A larger value accepts less likely positions."""
 
+_UPRIGHT = 0.5
+"""Least scalar of a quaternion that is near the identity: turned by 120 degrees at most. A smaller
+value suspects more half turns."""
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
@@ -219,7 +223,14 @@ def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
         raise FileError(f"{path}, line {reader.line_num}: {error}; {_HINT}") from error
     if not rows:
         raise FileError(f"{path} holds no poses after its header; {_HINT}")
-    return np.array(rows)
+    found = np.array(rows)
+    if (np.abs(found[:, 3]) < 1e-9).all() and abs(found[0, 6]) > _UPRIGHT:
+        warnings.warn(
+            f"{path}: all qw are 0, and the first pose is half a turn from the identity: are the "
+            "columns qx,qy,qz,qw?",
+            stacklevel=3,
+        )
+    return found
 
 
 def _columns(fields: list[str], where: str, optional: str | None) -> dict[str, int]:

@@ -2,11 +2,13 @@
 
 A length in a wrong unit gives an answer that looks valid: nothing is hit. Only clear cases are
 reported: a tool larger than the whole scene or smaller than a voxel; a path that stays farther from
-the scene than the scene or the tool is long; a path a hundred times as long as both.
+the scene than the scene or the tool is long; a path a hundred times as long as both. A unit that a
+person or a file gave is believed: then a size is no misfit, and no other unit is suggested.
 """
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -17,7 +19,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.store.attributes import scene_bounds
 from hapticdb.store.base import Object
-from hapticdb.units import NAMES, UNITS, length_text, metres_of
+from hapticdb.units import NAMES, UNITLESS, UNITS, length_text, metres_of
 
 Floats = NDArray[np.float64]
 What = Literal["tool", "path", "scene"]
@@ -87,6 +89,7 @@ def compare_proportions(
     exclude: Iterable[int] = (),
     tool_unit: str | None = "m",
     path_unit: str = "m",
+    is_path_unit_given: bool = False,
     is_moving: bool = True,
     margin: float = 0.0,
 ) -> Proportions:
@@ -104,7 +107,10 @@ def compare_proportions(
         Ids of objects that are left out.
     tool_unit, path_unit : str
         Units in which the numbers of tool and path were read, of `hapticdb.mesh.UNITS`. A
-        `tool_unit` of None skips the check of the tool's size: the tool is a part of the scene.
+        `tool_unit` of None skips the check of the tool's size, as does `shell.has_unit`: the tool
+        is a part of the scene.
+    is_path_unit_given : bool
+        Whether a person gave `path_unit`; else it is assumed.
     is_moving : bool
         Whether the tool moves in straight lines between the poses; else it is only at the poses.
     margin : float
@@ -125,10 +131,11 @@ def compare_proportions(
         empty = Misfit("scene", None, None, "the scene holds nothing that could be hit")
         return Proportions(None, tool.length, path, None, (empty,))
     boxes = np.array([obj.bounds for obj in felt])
-    look = _Look(boxes, scene, voxel_size, tool, centers, is_moving, margin)
+    is_known = all("unit" in obj.attributes or not _is_unitless(obj.link) for obj in felt)
+    look = _Look(boxes, scene, voxel_size, tool, centers, is_moving, margin, is_known)
     gap = None if centers is None else look.gap()
-    misfits = [] if tool_unit is None else _tool_misfits(look, tool_unit)
-    misfits += _path_misfits(look, gap, path_unit)
+    misfits = [] if tool_unit is None or shell.has_unit else _tool_misfits(look, tool_unit)
+    misfits += _path_misfits(look, gap, None if is_path_unit_given else path_unit)
     scenes = [misfit for misfit in misfits if misfit.what == "scene"]
     # a misfit of the scene explains those of tool and path, so it is reported alone
     return Proportions(scene, tool.length, path, gap, tuple(scenes[:1] or misfits))
@@ -151,7 +158,10 @@ class _Tool(NamedTuple):
 
 
 class _Look(NamedTuple):
-    """Boxes to compare, metres; is_moving, margin as for `compare_proportions`."""
+    """Boxes to compare, metres; is_moving, margin as for `compare_proportions`.
+
+    has_unit : whether the unit of every object was given by a person or its file.
+    """
 
     boxes: Floats  # (O, 2, 3) of the objects
     scene: Floats  # (2, 3) of all objects
@@ -160,6 +170,7 @@ class _Look(NamedTuple):
     centers: Floats | None  # (M, 3) places of the tool's middle
     is_moving: bool
     margin: float
+    has_unit: bool
 
     @property
     def extent(self) -> float:
@@ -216,7 +227,7 @@ def _tool_misfits(look: _Look, unit: str) -> list[Misfit]:
         is_off = f"{length / extent:.3g} times as long as the scene, {length_text(extent)}"
     elif length < look.voxel_size:
         is_off = f"smaller than a voxel ({length_text(look.voxel_size)})"
-        if look.centers is not None and 0.0 < look.way < 0.01 * extent:
+        if look.centers is not None and 0.0 < look.way < 0.01 * extent and not look.has_unit:
             return [_scene_misfit(look, is_off)]
     else:
         return []
@@ -238,8 +249,11 @@ def _scene_misfit(look: _Look, is_off: str) -> Misfit:
     return Misfit("scene", None, None, text)
 
 
-def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
-    """Compare the path's place and length with the scene and the tool."""
+def _path_misfits(look: _Look, gap: float | None, unit: str | None) -> list[Misfit]:
+    """Compare the path's place and length with the scene and the tool.
+
+    unit : None where it was given: then only the place may be a misfit.
+    """
     if gap is None:
         return []
     extent, way = look.extent, look.way
@@ -248,21 +262,28 @@ def _path_misfits(look: _Look, gap: float | None, unit: str) -> list[Misfit]:
     is_far = gap > (larger if look.is_moving else 0.25 * extent)
     if is_far:
         text = f"the path never comes within {length_text(gap)} of the scene, {long} long"
-    elif way > LONG_PATH * larger:
+    elif way > LONG_PATH * larger and unit is not None:
         text = f"the path is {way / extent:.3g} times as long as the scene, {long}"
     else:
         return []
-    if is_far and 5.0 * extent < min(look.tool.length, way) and look.tool.length < LARGE_TOOL:
+    is_small = 5.0 * extent < min(look.tool.length, way) and look.tool.length < LARGE_TOOL
+    if is_far and is_small and not look.has_unit:
         # tool and path fit each other, so the scene is the misfit
         for other, factor in _suspects("m"):
             if look.tool.length <= extent * factor and look.gap(1.0, factor) == 0.0:
                 return [_explained("scene", text, "the scene would fit", other, "m")]
+    if unit is None:
+        return [Misfit("path", None, None, text)]
     for other, factor in _suspects(unit):
         # a path shrunk to the origin meets any scene there, so a least length is required
         is_likely = way * factor >= 0.1 * extent or gap > LONG_PATH * larger
         if is_likely and way * factor <= 10.0 * larger and look.gap(factor) == 0.0:
             return [_explained("path", text, "it would meet it", other, unit)]
     return [Misfit("path", None, None, text)]
+
+
+def _is_unitless(link: str) -> bool:
+    return Path(link).suffix.lower() in UNITLESS
 
 
 def _suspects(unit: str) -> list[tuple[str, float]]:

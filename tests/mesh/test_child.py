@@ -99,11 +99,22 @@ def test_a_parser_that_leaves_ends_in_one_line(fake_laspy: Callable[[str], Path]
     assert "out of luck" in line
 
 
-def test_a_parser_that_hangs_is_ended(fake_laspy: Callable[[str], Path]) -> None:
-    path = fake_laspy("time.sleep(600)")
-    line = cause(path, read_file, time_limit=2)
-    assert "longer than 2 s" in line
+def test_a_parser_that_computes_for_ever_is_ended(fake_laspy: Callable[[str], Path]) -> None:
+    line = cause(fake_laspy("exec('while True: pass')"), read_file, time_limit=0.5)
+    assert "longer than 0.5 s of processor time" in line
     assert "--time-limit" in line
+
+
+def test_a_parser_that_waits_for_ever_is_ended(fake_laspy: Callable[[str], Path]) -> None:
+    line = cause(fake_laspy("time.sleep(600)"), read_file, time_limit=0.2)
+    assert "2 s without an end" in line
+    assert "--time-limit" in line
+
+
+def test_time_without_a_processor_does_not_count(fake_laspy: Callable[[str], Path]) -> None:
+    """As on a busy machine: the parser ends after its limit by the clock."""
+    path = fake_laspy("time.sleep(2.5); raise ValueError('read to its end')")
+    assert "read to its end" in cause(path, read_file, time_limit=2)
 
 
 def test_what_a_parser_prints_does_not_mix_with_its_answer(

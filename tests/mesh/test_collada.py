@@ -44,6 +44,39 @@ def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path)
     assert parse_in_process(path).names_unit
 
 
+@pytest.mark.parametrize(
+    ("unit", "metres"),
+    [
+        ('name="millimeter" meter="1.0"', 1.0),
+        ('name="inch" meter="0.01"', 0.01),
+        ('name="Inch"', 1.0),
+    ],
+)
+def test_a_collada_unit_that_contradicts_itself_is_told_and_may_be_given(
+    tmp_path: Path, unit: str, metres: float
+) -> None:
+    path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', unit))
+    file = parse_in_process(path)
+    (note,) = file.notes
+    assert f"given as {metres:g} m, which is taken; another --unit is taken instead" in note
+    assert file.names_unit
+    np.testing.assert_allclose(np.ptp(file.bounds, axis=0).max(), 2.0 * metres)
+    given = parse_in_process(path, unit="mm")
+    np.testing.assert_allclose(np.ptp(given.bounds, axis=0).max(), 0.002)
+
+
+@pytest.mark.parametrize(
+    "unit", ['name="inch" meter="0.0254"', 'name="foot" meter="0.3048006"', 'name="x" meter="0.01"']
+)
+def test_a_collada_unit_that_is_rounded_or_of_its_own_name_is_believed(
+    tmp_path: Path, unit: str
+) -> None:
+    assert (
+        parse_in_process(text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', unit))).notes
+        == ()
+    )
+
+
 def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
     strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
     spline = "<geometry id='s'><spline/></geometry></library_geometries>"

@@ -1,8 +1,10 @@
 """What a file names and does not bring, hides or moves is told, and its geometry is kept."""
 
+import struct
 from pathlib import Path
 from typing import Any
 
+import laspy
 import numpy as np
 import pytest
 
@@ -218,3 +220,56 @@ def test_long_comments_and_names_of_a_step_file_do_no_harm(
         assert [note for note in file.notes if "/" not in note] == told
     (tmp_path / "open.step").write_bytes(content.replace(b"DATA;", b"DATA; /*", 1))
     assert "it seems cut short" in cause(tmp_path / "open.step")
+
+
+# --- integers of a LAS file -----------------------------------------------------------------------
+
+ENDS = np.iinfo(np.int32)
+
+
+def las(path: Path, integers: Any, scale: Any = 0.001) -> Path:  # noqa: ANN401 - what numpy takes
+    """A LAS file whose points have these integers (n, 3)."""
+    made = laspy.create(point_format=0, file_version="1.2")
+    made.X, made.Y, made.Z = np.asarray(integers, dtype=np.int32).T
+    made.write(path)
+    content = bytearray(path.read_bytes())
+    struct.pack_into("<3d", content, 131, *np.broadcast_to(scale, 3))
+    path.write_bytes(content)
+    return path
+
+
+def spread(n: int = 1000) -> np.ndarray[Any, np.dtype[np.int32]]:
+    """Integers (n, 3) far from both ends."""
+    return np.random.default_rng(1).integers(-(10**6), 10**6, (n, 3), dtype=np.int32)
+
+
+@pytest.mark.parametrize("end", [ENDS.min, ENDS.max])
+def test_points_at_the_end_of_their_integers_are_lost(tmp_path: Path, end: int) -> None:
+    """All of them, as where a northing of 5,000 km is written in millimetres; then a few."""
+    integers = spread()
+    integers[:, 1] = end
+    line = cause(las(tmp_path / "a.las", integers))
+    assert "1,000 points are stuck in y at the end of 32-bit integers" in line
+    assert "larger scale" in line
+    integers = spread()
+    integers[:3, 2] = end
+    (note,) = parse_in_process(las(tmp_path / "b.las", integers)).notes
+    assert note == "3 points are stuck in z at the end of 32-bit integers"
+
+
+def test_a_scale_that_is_chosen_by_the_extent_is_no_loss(tmp_path: Path) -> None:
+    """The farthest points then have the greatest integers, whichever integers begin."""
+    for name, low in (("a.las", ENDS.min), ("b.las", 0)):
+        integers = spread()
+        integers[:200, 0], integers[200:400, 0] = low, ENDS.max
+        if low == 0:
+            np.abs(integers, out=integers)
+        assert parse_in_process(las(tmp_path / name, integers, 1e-8)).notes == ()
+
+
+def test_a_scale_of_nothing_or_of_a_metre_is_told(tmp_path: Path) -> None:
+    line = cause(las(tmp_path / "a.las", spread(), (0.001, 0.0, 0.0)))
+    assert "the scale of its y and z is 0" in line
+    (note,) = parse_in_process(las(tmp_path / "b.las", spread(), (0.001, 1.0, 0.001))).notes
+    assert note.startswith("its points lie on a grid of 1 m, if its numbers are metres: ")
+    assert parse_in_process(las(tmp_path / "c.las", spread(), 0.1)).notes == ()

@@ -3,6 +3,7 @@
 import contextlib
 import re
 import threading
+from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
@@ -14,6 +15,8 @@ import hapticdb
 from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE
 from hapticdb import Grid
+from hapticdb.errors import DatabaseError
+from hapticdb.query.grouping import covering
 from hapticdb.query.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.postgres.address import parse
@@ -281,3 +284,45 @@ def test_frames_are_read_from_the_index_alone(
     shown = "\n".join(plan)
     assert "Index Only Scan using voxel_key" in shown
     assert re.findall(r"Heap Fetches: (\d+)", shown) == ["0"]
+
+
+@pytest.mark.parametrize("reset", ["SET search_path TO {other}", "DISCARD ALL"])
+def test_a_write_behind_a_pooler_of_transactions_is_refused(place: Place, reset: str) -> None:
+    """Each transaction there may be on a server connection with another search path, or with none.
+
+    A write from then on would be in another environment, or in the schema public.
+    """
+    stores = [PostgresStore.create(place(), GRID, "brick") for _ in range(2)]
+    for store in stores:
+        write_voxels(store, floor_voxels(GRID), "floor")
+    one, other = stores
+    text = reset.format(other=parse(other.url).environment)
+    one._connection.driver.execute(text)
+    writes: list[Callable[[], object]] = [
+        lambda: write_voxels(one, blob(1, (20, 20, 20)), "blob"),
+        lambda: one.remove(1, covering(one)),
+        lambda: one.save_costs("here", {}),
+    ]
+    for write in writes:
+        with pytest.raises(DatabaseError, match="seems to be behind a pooler in transaction mode"):
+            write()
+    one.close()
+    for store in (other, PostgresStore.open(one.url)):
+        assert [obj.name for obj in store.objects()] == ["floor"]
+        assert (store.revision(), store.costs("here")) == (1, None)
+        write_voxels(store, blob(1, (20, 20, 20)), "blob")
+        store.close()
+
+
+def test_loading_behind_a_pooler_drops_no_index_of_another(
+    place: Place, admin: psycopg.Connection
+) -> None:
+    one, other = (PostgresStore.create(place(), GRID, "brick") for _ in range(2))
+    name = parse(other.url).environment
+    one._connection.driver.execute(f"SET search_path TO {name}")
+    with pytest.raises(DatabaseError, match="pooler in transaction mode"), one.loading():
+        pass
+    found = admin.execute("SELECT to_regclass(%s) IS NOT NULL", (f"{name}.brick_key",))
+    assert found.fetchone() == (True,)
+    one.close()
+    other.close()

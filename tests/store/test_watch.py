@@ -10,6 +10,7 @@ import numpy as np
 import psycopg
 import pytest
 from psycopg import sql
+from psycopg.pq.abc import PGresult
 
 import hapticdb
 from children import PATIENCE
@@ -138,10 +139,10 @@ def test_a_server_that_refuses_to_be_listened_to_is_asked_instead(
 ) -> None:
     command = ServerConnection.command
 
-    def refuse(connection: ServerConnection, text: str) -> None:
+    def refuse(connection: ServerConnection, text: str) -> PGresult:
         if text.startswith("LISTEN"):
             raise psycopg.errors.ReadOnlySqlTransaction("cannot execute LISTEN during recovery")
-        command(connection, text)
+        return command(connection, text)
 
     monkeypatch.setattr(ServerConnection, "command", refuse)
     monkeypatch.setattr(watching, "HEARING_S", 1e9)

@@ -5,7 +5,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.units import length_text
+from hapticdb.units import UNITLESS, length_text
 
 if TYPE_CHECKING:
     import numpy as np
@@ -14,9 +14,6 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Proportions
-
-UNITLESS = {".stl", ".obj", ".ply", ".off"}
-"""Suffixes of tools whose unit --tool-unit says."""
 
 
 def compare(
@@ -46,6 +43,7 @@ def compare(
         exclude=exclude,
         tool_unit=None if tool is None else tool_unit or "m",
         path_unit=path_unit or "m",
+        is_path_unit_given=path_unit is not None,
         is_moving=is_moving,
     )
     tell(found, tool, "--path-unit")

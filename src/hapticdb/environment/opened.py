@@ -317,15 +317,16 @@ class Environment(Queries, Closes):
         return self.object(object_id)
 
     def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift all objects by the same vector, one transaction an object.
+        """Shift all objects by the same vector, in one transaction: all of them, or none.
+
+        Other writers wait meanwhile; readers do not.
 
         Parameters
         ----------
         object_ids : iterable of int
             Ids of the objects; `find` chooses them by name.
         way : (3,) array
-            Metres, world frame. If another user moves an object meanwhile, it is shifted from its
-            new place.
+            Metres, world frame.
 
         Raises
         ------

@@ -1,12 +1,12 @@
 """Moves objects: voxelizes their surfaces at the new place, and replaces their rows."""
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import ConflictError, NoSurfaceError, UsageError
+from hapticdb.errors import NoSurfaceError, UsageError
 from hapticdb.ingest.geometry import parts_of, unpacked_part
 from hapticdb.ingest.planning import bounds_inside
 from hapticdb.ingest.voxelizing import rows_of_part
@@ -14,7 +14,8 @@ from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
 from hapticdb.query.grouping import covering
-from hapticdb.store.base import Covering, Object, Store
+from hapticdb.ready import make_ready
+from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.finding import MOST_IDS
 
 Floats = NDArray[np.float64]
@@ -24,7 +25,8 @@ def move_object(store: Store, old: Object, transform: ArrayLike, revision: int |
     """Move an object; see `Environment.move`."""
     placed = _as_transform(transform)
     ((_, part),) = parts_of(store, [old])
-    _write_moved(store, old, part, placed, revision or 0, covering(store))
+    new, rows = _moved(store, old, part, placed)
+    store.replace(replace(new, revision=revision or 0), rows, covering(store))
 
 
 def restore_object(store: Store, record: Object) -> int:
@@ -55,34 +57,30 @@ def restore_object(store: Store, record: Object) -> int:
 def rewrite_object(store: Store, obj: Object) -> None:
     """Write an object's rows anew from its surface, wherever rows of it may be."""
     ((_, part),) = parts_of(store, [obj])
-    _write_moved(store, obj, part, obj.transform, 0, lambda _: [(0, MOST_IDS - 1)])
+    store.replace(*_moved(store, obj, part, obj.transform), lambda _: [(0, MOST_IDS - 1)])
 
 
 def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Object]:
     """Shift objects by the same vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
-    pairs = list(parts_of(store, [store.object(int(i)) for i in sorted(as_ids(ids))]))
-    for obj, part in pairs:
-        bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
-    for known, part in pairs:
-        obj = known
-        while True:
-            try:
-                placed = shift @ obj.transform
-                _write_moved(store, obj, part, placed, obj.revision, covering(store))
-                break
-            except ConflictError:  # another user has moved it: shift it from its new place
-                obj = store.object(obj.id)
-                if obj.digest != part.digest:
-                    raise
-    return [store.object(obj.id) for obj, _ in pairs]
+    chosen = as_ids(ids).tolist()
+    make_ready("move")  # not inside the transaction, for which other writers wait
+
+    def moved() -> Iterator[tuple[Object, Rows]]:
+        objects = [store.object(i) for i in chosen]
+        for obj, part in parts_of(store, objects):  # all, before the first is voxelized
+            bounds_inside(part, obj.link, store.grid, shift @ obj.transform)
+        for obj, part in parts_of(store, objects):
+            yield _moved(store, obj, part, shift @ obj.transform)
+
+    if chosen:
+        store.replace_all(moved, covering(store))
+    return [store.object(i) for i in chosen]
 
 
-def _write_moved(
-    store: Store, old: Object, part: Part, placed: Floats, revision: int, old_rows: Covering
-) -> None:
-    """Replace an object's rows by those of its part at the placement `placed` (4, 4)."""
+def _moved(store: Store, old: Object, part: Part, placed: Floats) -> tuple[Object, Rows]:
+    """Record and rows of an object whose part is at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
     rows, n_voxels = rows_of_part(
         part, store.grid, store.layout, placed, distances=old.has_distances
@@ -92,11 +90,11 @@ def _write_moved(
         transform=placed,
         voxels=n_voxels,
         bounds=bounds,
-        revision=revision,
+        revision=0,
         rows_crc=None,
         distances_crc=None,
     )
-    store.replace(new, rows, old_rows)
+    return new, rows
 
 
 def _as_way(way: ArrayLike) -> Floats:

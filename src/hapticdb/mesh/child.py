@@ -1,4 +1,4 @@
-"""The process that parses one file, within limits of memory and time, and returns arrays.
+"""The process that parses one file, within limits of memory and processor time, and returns arrays.
 
 The script is run by its path with a request on standard input (see `reader.py`), and answers on
 standard output. A parser that takes too much memory, crashes or hangs ends only this process.
@@ -78,7 +78,8 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         reader_of(path)  # before the limit, so that its libraries do not count as the file's memory
         np.linalg.det(np.eye(3))  # OpenBLAS allocates its buffers now, before the limit
         before = _limit_memory(allowance(path), request["memory_limit"])
-        _limit_time(request["time_limit"])
+        # Counts all threads; its signal ends this process, also if the parent is gone.
+        signal.setitimer(signal.ITIMER_PROF, request["time_limit"])
         if path.suffix.lower() == ".gltf" and request["memory_limit"] is None:
             # The files that it refers to are listed under the limit of this file alone.
             _limit_memory(allowance(path, bytes_beside(path)), None)
@@ -150,14 +151,6 @@ def _limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
     hard = before[1]
     resource.setrlimit(kind, (wanted if hard < 0 else min(wanted, hard), hard))
     return before
-
-
-def _limit_time(seconds: float) -> None:
-    """Limit the processor time, in case the parent is gone and cannot end this process."""
-    _, hard = resource.getrlimit(resource.RLIMIT_CPU)
-    # The limit counts the sum over a parser's threads.
-    wanted = int(seconds * (os.cpu_count() or 1)) + 10
-    resource.setrlimit(resource.RLIMIT_CPU, (wanted if hard < 0 else min(wanted, hard), hard))
 
 
 if __name__ == "__main__":

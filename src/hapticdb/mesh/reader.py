@@ -32,9 +32,12 @@ _CHILD = Path(__file__).with_name("child.py")
 _SECONDS = 20.0
 _SECONDS_PER_MIB = 5.0
 _SECONDS_PER_MIB_OF = {"step": 20.0, "threemf": 10.0}
-"""Time limit of a file, seconds: a base, plus a number for each MiB. It is at least ten times the
-time of sound files. STEP files are tessellated, and 3MF files unpack to a multiple of their size.
-Larger values let a damaged file take longer before it is refused."""
+"""Limit of a file's processor time, seconds: a base, plus a number for each MiB. It is at least ten
+times the time of sound files. STEP files are tessellated, and 3MF files unpack to a multiple of
+their size. Larger values let a damaged file take longer before it is refused."""
+_WAITING = 10.0
+"""Times the limit of processor time after which a parser is ended by the clock: it waits for
+something that does not come. Smaller: a busy machine may refuse a sound file."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
@@ -55,8 +58,8 @@ def read_file(
 ) -> MeshFile:
     """All usable parts of a mesh, CAD or point-cloud file, in metres.
 
-    The file is parsed in a child process of bounded memory and time, so that no file can bring
-    down or hang its reader.
+    The file is parsed in a child process of bounded memory and processor time, so that no file can
+    bring down or hang its reader.
 
     Parameters
     ----------
@@ -70,7 +73,8 @@ def read_file(
     memory_limit : int, optional
         Bytes that parsing may take; by default in proportion to the file, see `child.allowance`.
     time_limit : float, optional
-        Seconds that parsing may take; by default in proportion to the file.
+        Seconds of processor time that parsing may take; by default in proportion to the file. A
+        parser that waits is ended after ten times as long.
     chord : float, optional
         Greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 by default. What
         it is became `Part.chord`. Other files have none.
@@ -189,7 +193,8 @@ def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
             env=os.environ | settings | {"TMPDIR": scratch},
         )
         late = threading.Event()
-        timer = threading.Timer(seconds, _end, (child, late))
+        longest = min(_WAITING * seconds, threading.TIMEOUT_MAX)
+        timer = threading.Timer(longest, _end, (child, late))
         timer.daemon = True
         timer.start()
         try:
@@ -202,8 +207,11 @@ def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
                 if pipe is not None:
                     pipe.close()
         if found is None:
+            took = f"longer than {seconds:.3g} s of processor time"
             if late.is_set():
-                raise UnreadableError(f"reading it took longer than {seconds:.3g} s; {_MORE_TIME}")
+                took = f"{longest:.3g} s without an end, most of them waiting"
+            if late.is_set() or child.returncode == -signal.SIGPROF:
+                raise UnreadableError(f"reading it took {took}; {_MORE_TIME}")
             raise UnreadableError(_why_ended(child.returncode, words, request["path"]))
         return found
 
@@ -258,8 +266,6 @@ def _filled(described: tuple[tuple[int, ...], str], stream: IO[bytes]) -> NDArra
 
 def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
     """Reason why a child ended without an answer."""
-    if returncode == -signal.SIGXCPU:
-        return f"reading it took too long; {_MORE_TIME}"
     if returncode < 0:
         name = signal.Signals(-returncode).name
         reader = READERS[Path(path).suffix.lower()]

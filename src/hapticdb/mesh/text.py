@@ -35,10 +35,15 @@ _LENGTHS |= {word: UNITS[sign] for sign, name in NAMES.items() for word in (name
 def unit_in(text: str) -> tuple[str, float | None]:
     """Words of a text that name a unit, and its length, metres; '' and None without."""
     for found in _UNIT.finditer(text):
-        word = (found[1] or found[2]).lower().replace("meter", "metre")
-        if word in _LENGTHS:
-            return found[0], _LENGTHS[word]
+        length = length_of(found[1] or found[2])
+        if length is not None:
+            return found[0], length
     return "", None
+
+
+def length_of(word: str) -> float | None:
+    """Length of the unit that a word names, metres; None for other words."""
+    return _LENGTHS.get(word.lower().replace("meter", "metre"))
 
 
 def recoded(content: bytes) -> bytes:

@@ -85,6 +85,8 @@ class PointShell:
     """On which the points lie, or from which they were drawn inward; not saved."""
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     """(N,) how far each point was drawn inward from the surface, metres; zeros unless given."""
+    has_unit: bool = field(default=False, repr=False)
+    """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
 
     def __post_init__(self) -> None:
         if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
@@ -183,7 +185,7 @@ class PointShell:
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
         found = "; ".join(filter(None, [file.defects.describe(), *file.notes]))
-        return replace(shell, defects=found)
+        return replace(shell, defects=found, has_unit=unit is not None or file.names_unit)
 
     @classmethod
     def from_mesh(
@@ -307,6 +309,7 @@ class PointShell:
                     int(saved["seed"]),
                     cover=None if np.isnan(cover) else cover,
                     inset=saved["inset"],
+                    has_unit=True,
                 )
         except FileNotFoundError:
             raise FileError(f"{path}: no such file") from None

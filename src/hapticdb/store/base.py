@@ -213,6 +213,8 @@ class Change:
 
 Covering = Callable[[Object], Iterable[tuple[int, int]]]
 """Gives, for an object as it is when a write begins, closed key ranges that hold its rows."""
+Replacements = Callable[[], Iterable[tuple[Object, Rows]]]
+"""Gives objects to be replaced, each once, with their new rows."""
 
 
 class Histogram(NamedTuple):
@@ -332,6 +334,13 @@ class _WritesObjects(Protocol):
 
         A record with a revision above 0 was derived from the object of that revision. Raises
         ConflictError when the object has been written since.
+        """
+
+    def replace_all(self, made: Replacements, covering: Covering) -> None:
+        """As `replace` for several objects, in one transaction: after an error, for none of them.
+
+        `made` is called inside the transaction, and again when a lost connection is replaced. It
+        may read this store. Rows are written as they come. Each object gets its own revision.
         """
 
     def remove(self, object_id: int, covering: Covering) -> None:

@@ -25,6 +25,7 @@ from hapticdb.store.base import (
     Keys,
     Layout,
     Object,
+    Replacements,
     Rows,
     row_shift,
 )
@@ -323,17 +324,41 @@ class Tables(ABC):
         """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
 
         def work() -> None:
-            revision = self._next_revision()
-            known = self.object(record.id)
-            check_unwritten(record, known, self.url)
-            gone = self._take(known, covering, rows.keys)
-            self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
-            self._put(rows, record.id)
-            self._drop_surface(known.digest)
-            self._put_surface(record.digest, surface)
-            self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
+            self._exchange(self._next_revision(), record, rows, covering, surface)
 
         self._commit(work)
+
+    def replace_all(self, made: Replacements, covering: Covering) -> None:
+        """As `replace` for several objects, in one transaction: after an error, for none of them.
+
+        Each object gets its own revision.
+        """
+
+        def work() -> None:
+            revision = self._next_revision()  # locks, so that nobody writes what `made` reads
+            for n, (record, rows) in enumerate(made()):
+                revision = self._next_revision() if n else revision
+                self._exchange(revision, record, rows, covering)
+
+        self._commit(work)
+
+    def _exchange(
+        self,
+        revision: int,
+        record: Object,
+        rows: Rows,
+        covering: Covering,
+        surface: bytes | None = None,
+    ) -> None:
+        """Exchange an object's rows, inside a transaction."""
+        known = self.object(record.id)
+        check_unwritten(record, known, self.url)
+        gone = self._take(known, covering, rows.keys)
+        self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
+        self._put(rows, record.id)
+        self._drop_surface(known.digest)
+        self._put_surface(record.digest, surface)
+        self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""

@@ -1,6 +1,8 @@
 """Tests of writing: objects, their surfaces, kept pairs; each write is one transaction."""
 
 import contextlib
+import itertools
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -131,6 +133,52 @@ class WritingContract(StoreCase):
         np.testing.assert_array_equal(found.keys[found.ids == 1], rows.keys)
         np.testing.assert_array_equal(store.objects()[0].bounds, new.bounds)
         assert store.objects()[0].revision == 3
+
+    def moved(self, store: Store) -> Iterator[tuple[Object, Rows]]:
+        """Both objects at new places, each read when the one before it was written."""
+        for object_id in (1, 2):
+            ijk = blob(7, (44, 30, 10 + object_id))
+            new = voxel_object(store.grid, ijk, "")
+            yield (
+                replace(store.object(object_id), bounds=new.bounds),
+                rows_of_voxels(ijk, *kind(store)),
+            )
+
+    def test_several_objects_are_replaced_in_one_transaction(self, store: Store) -> None:
+        """Each has a revision and a change of its own; nobody sees a part of them."""
+        reader, seen = self.reopen(store), []
+
+        def made() -> Iterator[tuple[Object, Rows]]:
+            for one in self.moved(store):
+                yield one
+                seen.append((reader.revision(), [obj.revision for obj in reader.objects()]))
+
+        store.replace_all(made, covering(store))
+        assert seen == [(2, [1, 2])] * 2
+        assert [obj.revision for obj in reader.objects()] == [3, 4]
+        changes = [(c.revision, c.action, c.id) for c in reader.changes(since=2)]
+        assert changes == [(3, "move", 1), (4, "move", 2)]
+        for record, rows in self.moved(store):
+            np.testing.assert_array_equal(store.object(record.id).bounds, record.bounds)
+            np.testing.assert_array_equal(store.rows_of(record.id, *EVERYWHERE).keys, rows.keys)
+        reader.close()
+
+    @pytest.mark.parametrize("k", [0, 1, 2])
+    def test_a_move_of_several_that_fails_leaves_none_moved(self, store: Store, k: int) -> None:
+        """It fails at the first object, at the second, and when both are written."""
+        before = store.scan(*EVERYWHERE)
+
+        def made() -> Iterator[tuple[Object, Rows]]:
+            yield from itertools.islice(self.moved(store), k)
+            raise KeyboardInterrupt
+
+        with pytest.raises(KeyboardInterrupt):
+            store.replace_all(made, covering(store))
+        store = self.reopen(store)
+        for found, expected in zip(store.scan(*EVERYWHERE), before, strict=True):
+            np.testing.assert_array_equal(found, expected)
+        assert [obj.revision for obj in store.objects()] == [1, 2]
+        assert (store.revision(), len(list(store.changes()))) == (2, 2)
 
     def test_changes_name_the_keys_touched(self, store: Store) -> None:
         """Every voxel key written lies in a range of its change."""

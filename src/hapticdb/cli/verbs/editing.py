@@ -7,6 +7,7 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import chosen
 from hapticdb.cli.options import JsonOption, ObjectsArgument, UrlArgument
+from hapticdb.cli.root import left_at
 from hapticdb.cli.values import numbers_of
 
 
@@ -29,9 +30,9 @@ def move(
 ) -> None:
     """Place objects anew.
 
-    --translate shifts all objects that are chosen, or none of them when one would
-    leave the grid; --matrix places one object. 'hapticdb objects --help' says how
-    names choose objects.
+    --translate shifts all objects that are chosen in one transaction: all or none of
+    them, whatever ends the command; --matrix places one object. 'hapticdb objects
+    --help' says how names choose objects.
 
     Example: hapticdb move car.db 17 --translate 0,0,0.25
 
@@ -54,10 +55,13 @@ def move(
                 f"--matrix places one object, and {len(found)} are chosen: give one, or --translate"
             )
         render.compile_kernels("move")
-        if shift:
-            moved = env.shift([obj.id for obj in found], shift)
-        else:
-            moved = [env.move(found[0].id, np.array(placed).reshape(4, 4))]
+        with left_at(
+            f"all that was chosen has moved, or nothing: see 'hapticdb objects {env.url}'"
+        ):
+            if shift:
+                moved = env.shift([obj.id for obj in found], shift)
+            else:
+                moved = [env.move(found[0].id, np.array(placed).reshape(4, 4))]
     for obj in moved:
         if json:
             render.say_json(record_of(obj))

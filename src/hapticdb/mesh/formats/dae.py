@@ -32,7 +32,7 @@ from hapticdb.mesh.raw import (
     told_missing,
     walk,
 )
-from hapticdb.mesh.text import xml_of
+from hapticdb.mesh.text import length_of, xml_of
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -43,6 +43,8 @@ _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
 _UNREAD = "piece{s} of the kind '{kind}' {are} not read"
+_ROUNDED = 0.01
+"""Share by which a unit's length may differ from that of its name. Larger: fewer are told."""
 _LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, by COLLADA 1.4.1
 _MOST_CONTROLLERS = 4
 """Controllers of controllers that are followed: a skin of a morph is two."""
@@ -82,22 +84,35 @@ def read(path: Path) -> Parsed:
             world = world_from_node if bound is None else bound
             placements.append(Placement(name, shapes[key], world))
     read_shapes, lost = _shapes(geometries)
+    metres, doubts = _metres(root)
     return Parsed(
         read_shapes,
         placements,
-        metres=_metres(root),
+        metres=None if doubts else metres,
+        likely_metres=metres if doubts else None,
         up=_UP_AXES.get((root.findtext("asset/up_axis") or "").strip() or "Y_UP"),
-        notes=[*lost, *document.notes({id(geometry) for geometry, _ in geometries})],
+        notes=[*doubts, *lost, *document.notes({id(geometry) for geometry, _ in geometries})],
     )
 
 
-def _metres(root: ET.Element) -> float | None:
-    """Length of the document's unit, 1 m if it names none; None if what it names is no number."""
+def _metres(root: ET.Element) -> tuple[float | None, list[str]]:
+    """Length of the document's unit, and what is said if its name is that of another.
+
+    1 m if it names none; None if what it names is no number.
+    """
     unit = root.find("asset/unit")
+    if unit is None:
+        return 1.0, []
     try:
-        return 1.0 if unit is None else float(unit.get("meter", "1"))
+        metres = float(unit.get("meter", "1"))
     except ValueError:
-        return None
+        return None, []
+    name = unit.get("name", "")
+    named = length_of(name)
+    if named is None or abs(metres - named) <= _ROUNDED * named:
+        return metres, []
+    lengths = f"{named:.6g} m, and given as {metres:.6g} m, which is taken"
+    return metres, [f"its unit is named '{name}', {lengths}; another --unit is taken instead"]
 
 
 class _Document:

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from hapticdb.mesh.formats.painting import Colours
 from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once, told
+from hapticdb.units import length_text
 
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
 """Numbers of GeoTIFF keys."""
@@ -24,6 +25,12 @@ _NO_LENGTHS = (
     "which are no lengths: project it to a system in metres, for instance with PDAL's "
     "filters.reprojection, or name the unit (--unit) if its system is wrong"
 )
+_ENDS = np.iinfo(np.int32).min, np.iinfo(np.int32).max
+_MOST_STUCK = 0.01
+"""Share of a file's points that may be stuck at an end of the integers on an axis. A larger value
+accepts more lost places."""
+_COARSE = 0.3
+"""Steps between coordinates, metres, from which on they are told: whole metres, and whole feet."""
 _COLOURS = ("red", "green", "blue")
 _BYTE = 255
 _HEADER = 227
@@ -55,12 +62,14 @@ def read(path: Path) -> Parsed:
         _check_chunks(reader.header)
         _check_layers(path, reader.header)
         lengths = _lengths(reader.header)
+        places = _Places(reader.header.scales, lengths.metres)
         least, most = _POINTS_AT_ONCE
         for points in reader.chunk_iterator(min(most, max(least, path.stat().st_size))):
             if not len(points):
                 break
             axes = [np.asarray(axis, dtype=np.float64) for axis in (points.x, points.y, points.z)]
             pieces.append(np.stack(axes, axis=1))
+            places.count(np.stack([points.X, points.Y, points.Z], axis=1))
             n_withheld += int(np.count_nonzero(points.withheld))
             if {*_COLOURS}.issubset(points.point_format.dimension_names):
                 channels = [np.asarray(points[name]) for name in _COLOURS]
@@ -72,7 +81,7 @@ def read(path: Path) -> Parsed:
     words = "point{s} {are} withheld (deleted) in it, and {come} in like any other"
     return replace(
         parsed, likely_metres=lengths.metres, up=lengths.up, not_lengths=lengths.not_lengths,
-        notes=[*lengths.notes, *told(n_withheld, words)],
+        notes=[*lengths.notes, *places.notes(len(whole)), *told(n_withheld, words)],
     )  # fmt: skip
 
 
@@ -93,6 +102,51 @@ def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
     colours = np.full((len(channels), 4), 255, dtype=np.uint8)
     colours[:, :3] = channels if most <= _BYTE else channels // 257
     return colours
+
+
+class _Places:
+    """Integers that stand for the coordinates: where they have lost the points' places.
+
+    scales (3,) : steps of the integers, in the file's unit; metres : of that unit, None if unknown.
+    """
+
+    def __init__(self, scales: NDArray[np.float64], metres: float | None) -> None:
+        self._scales, self._metres = np.abs(scales), metres
+        self._n_stuck = np.zeros((2, 3), dtype=np.int64)  # at each end, on each axis
+        self._low, self._high = np.full(3, _ENDS[1]), np.full(3, _ENDS[0])
+        if flat := [axis for axis, scale in zip("xyz", scales, strict=True) if scale == 0.0]:
+            raise UnreadableError(
+                f"the scale of its {' and '.join(flat)} is 0: the places of its points are lost; "
+                "write it anew from its source, with a scale such as 0.001"
+            )
+
+    def count(self, integers: NDArray[np.int32]) -> None:
+        """Count those (n, 3) that are stuck at an end."""
+        self._n_stuck += [np.count_nonzero(integers == end, axis=0) for end in _ENDS]
+        self._low = np.minimum(self._low, integers.min(axis=0))
+        self._high = np.maximum(self._high, integers.max(axis=0))
+
+    def notes(self, n_points: int) -> list[str]:
+        """Say what was lost; refuse a file that has lost more than `_MOST_STUCK`."""
+        # not with a scale chosen by the extent, whose points begin at one end, or 0, and end at one
+        is_chosen = np.isin(self._high - self._low, (_ENDS[1], _ENDS[1] - _ENDS[0]))
+        stuck = np.where(is_chosen, 0, self._n_stuck.sum(axis=0))
+        found = []
+        for axis, n in zip("xyz", stuck.tolist(), strict=True):
+            found += told(
+                n, "point{s} {are} stuck in {axis} at the end of 32-bit integers", axis=axis
+            )
+        if stuck.max() > _MOST_STUCK * n_points:
+            raise UnreadableError(
+                f"{'; '.join(found)}, so their places are lost; write it anew from its source, "
+                "with a larger scale or an offset near its points"
+            )
+        step = float(self._scales.max()) * (self._metres or 1.0)
+        if step >= _COARSE:
+            guess = "" if self._metres else ", if its numbers are metres"
+            grid = f"its points lie on a grid of {length_text(step)}{guess}"
+            found.append(f"{grid}: what is finer was lost when it was written")
+        return found
 
 
 class _Lengths(NamedTuple):

@@ -32,6 +32,9 @@ CACHE_KIB = 256 * 1024
 pages are read. A smaller cache reads pages again from the operating system."""
 SHARED_BYTES = 32 << 10
 """Bytes of the file -shm, without which no connection reads an environment in WAL mode."""
+MOUNTS = Path("/proc/self/mountinfo")
+NETWORKS = {"nfs", "nfs4", "cifs", "smb3"}
+"""Types of file systems whose machines share no memory, which the index of a log needs."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
@@ -155,6 +158,8 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
     """
     check_free(path)
     check_folder(path)
+    if network := network_of(path):
+        raise ReadOnlyError(f"{_on_network(path, network)}, or in PostgreSQL")
     with unfinished_beside(path) as unfinished:
         made = apsw.Connection(str(unfinished))
         with named_errors(str(path)), contextlib.closing(made) as new:
@@ -245,22 +250,43 @@ def roll_back(connection: apsw.Connection) -> None:
         connection.execute("ROLLBACK")
 
 
-def needs_immutable(path: Path) -> bool:
-    """Whether this file can only be opened as immutable: this user cannot write its folder.
+def network_of(path: Path) -> str | None:
+    """Type of the network file system on which a file or its folder is, None on another."""
+    device = path.resolve().parent.stat().st_dev
+    with contextlib.suppress(OSError):  # not Linux
+        for line in MOUNTS.read_text().splitlines():
+            mount, _, kind = line.partition(" - ")
+            if mount.split()[2] == f"{os.major(device)}:{os.minor(device)}":
+                found = kind.split()[0]
+                return found if found in NETWORKS else None
+    return None
 
-    A database in WAL mode needs its ``-shm`` beside it. Where that cannot be made, SQLite can still
-    read the file alone, if there is no log whose pages would be missed.
+
+def needs_immutable(path: Path) -> bool:
+    """Whether this file can only be opened as immutable.
+
+    A database in WAL mode needs its ``-shm`` beside it. Where this user cannot make that, or on a
+    network file system, SQLite can still read the file alone, if there is no log whose pages would
+    be missed.
     """
-    real = path.resolve()
-    if os.access(real.parent, os.W_OK) or Path(f"{real}-shm").exists():
+    real, network = path.resolve(), network_of(path)
+    if not network and (os.access(real.parent, os.W_OK) or Path(f"{real}-shm").exists()):
         return False
     log = Path(f"{real}-wal")
     if log.exists() and log.stat().st_size:
+        why = f"are on a network file system ({network})" if network else "cannot be written here"
         raise ReadOnlyError(
-            f"{log} holds changes that are not in {path.name} yet, and its folder cannot be "
-            "written: copy both files into one that can"
+            f"{log} holds changes that are not in {path.name} yet, and both {why}: copy both files "
+            "into a folder on a local disk that can be written"
         )
     return True
+
+
+def _on_network(path: Path, network: str) -> str:
+    return (
+        f"{path} is on a network file system ({network}), where SQLite's log is not safe: write to "
+        "an environment on a local disk"
+    )
 
 
 def _connect_to_read(path: Path) -> apsw.Connection:
@@ -279,6 +305,9 @@ def _connect_to_write(path: Path) -> apsw.Connection:
         raise ReadOnlyError(
             f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
         )
+    if network := network_of(path):
+        backup = f"'hapticdb backup {path} COPY' makes one there"
+        raise ReadOnlyError(f"{_on_network(path, network)}: {backup}; it can be read here")
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
     connection = apsw.Connection(str(path), flags=flags)
     _settle(connection)

@@ -185,13 +185,13 @@ class ServerConnection(Link, Closes):
         """Result of `work`, and whether the server confirmed the commit."""
         if self.is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
+        limits = ["statement_timeout", "idle_in_transaction_session_timeout"]
+        if self.is_loading:  # another loader may be making the index
+            limits.append("lock_timeout")
         with failures.named_errors(self.shown), self.unhurried():
-            self.command("BEGIN ISOLATION LEVEL READ COMMITTED")
             self._depth += 1
             try:
-                self.command("SET LOCAL statement_timeout = 0")
-                if self.is_loading:  # another loader may be making the index
-                    self.command("SET LOCAL lock_timeout = 0")
+                self.begin(*(f"{limit} = 0" for limit in limits))
                 result = work()
             except BaseException:
                 self._roll_back()
@@ -207,6 +207,18 @@ class ServerConnection(Link, Closes):
                     raise
                 return result, False
         return result, True
+
+    def begin(self, *settings: str) -> None:
+        """Begin a transaction that writes, with settings of its own, in one round trip.
+
+        Refuses a server connection that is not the one whose search path was set: a pooler in
+        transaction mode gives each transaction another, and it would write to another schema.
+        """
+        local = [f"SET LOCAL {setting}" for setting in settings]
+        asked = "SELECT current_setting('search_path')"
+        found = self.command("; ".join(["BEGIN ISOLATION LEVEL READ COMMITTED", *local, asked]))
+        if found.get_value(0, 0) != self._search_path.encode():
+            raise failures.pooled(self.shown)
 
     def _end_snapshot(self) -> None:
         """End the transaction. A lost connection is no error: the reads are complete."""

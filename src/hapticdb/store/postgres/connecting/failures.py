@@ -199,6 +199,14 @@ def remade(shown: str) -> ConnectionLostError:
     return ConnectionLostError(f"{shown} is another environment than before: open it again")
 
 
+def pooled(shown: str) -> DatabaseError:
+    """Build the error for a transaction on another server connection than the one that was set."""
+    return DatabaseError(
+        f"{shown} seems to be behind a pooler in transaction mode, which may write to another "
+        "schema: connect to the server itself, or use session pooling; nothing was written"
+    )
+
+
 def no_editor(shown: str) -> ReadOnlyError:
     """Build the error for a user who may write to the environment, but not to its objects."""
     return ReadOnlyError(

@@ -133,6 +133,7 @@ class Link:
         self.address = address
         self.shown = address.shown
         self._conninfo = conninfo
+        self._search_path = f"{_quoted(address.environment)}, pg_temp"
         self.is_read_only = read_only
         self._leisure = 0
         self.given_up: SilentServerError | None = None
@@ -177,7 +178,7 @@ class Link:
     def _settle(self) -> None:
         wanted = {
             **SETTINGS,
-            "search_path": f"{_quoted(self.address.environment)}, pg_temp",
+            "search_path": self._search_path,
             "default_transaction_read_only": "on" if self.is_read_only else "off",
         }
         options = self.driver.info.options.lower().replace("-", "_")
@@ -224,10 +225,10 @@ class Link:
 
     # -- statements --------------------------------------------------------------------------
 
-    def command(self, text: str) -> None:
-        """One statement without parameters or rows, through libpq."""
+    def command(self, text: str) -> pq.abc.PGresult:
+        """Result of the last of some statements without parameters, in one round trip."""
         self._pgconn.send_query(text.encode())
-        self._result()
+        return self._result()
 
     def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
         """Result of a statement, which is prepared when it is first run."""

@@ -53,9 +53,8 @@ class _Indexes:
         """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
-            connection.command("BEGIN")
             try:
-                connection.command("SET LOCAL lock_timeout = '50ms'")
+                connection.begin("lock_timeout = '50ms'")
                 keys = ", ".join(f"{table}_key" for table in self._tables)
                 connection.command(f"DROP INDEX IF EXISTS {keys}")
                 connection.command("COMMIT")

@@ -96,7 +96,8 @@ def check(path: Path, expected: Reads | str, read: Callable[..., MeshFile]) -> N
         return
     file = read(path)
     assert (len(file.parts), n_pieces(file)) == (expected.n_parts, expected.n_pieces)
-    np.testing.assert_allclose(file.bounds[1] - file.bounds[0], expected.extents, atol=6e-5)
+    points = np.concatenate([part.world_points() for part in file.parts])
+    np.testing.assert_allclose(np.ptp(points, axis=0), expected.extents, atol=6e-5)
     assert file.defects == expected.defects
     assert {part.is_cloud for part in file.parts} == {expected.is_cloud}
     assert len({part.name for part in file.parts}) == len(file.parts)

@@ -90,14 +90,14 @@ def find_meetings(
         raise UsageError(f"contact {contact} m: give a length above 0")
     make_ready("sweep", "clashes")
     with env.store.snapshot():
-        tool = MovingSurface(env.shell(*of, inset=0.0))
+        tool = MovingSurface(env.shell(*of, points=1, inset=0.0))
         way = Way.of(poses, tool.corners, center_of(tool, about))
         objects = env.felt(against, of)
         gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
         found: list[Meeting] = []
         for n, (obj, part) in enumerate(parts_of(env.store, near)):
-            still = CollisionShape(part.surface(), is_cloud=part.is_cloud)
+            still = CollisionShape(part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord)
             for ways in _intervals(Pair(still.tree, tool, way), contact):
                 kind, depth, place = _gravest(
                     still, tool, way.at(np.linspace(*ways, POSES)), contact

@@ -104,16 +104,18 @@ def shell_of_objects(
     """Make one shell of several objects at their places; see `Environment.shell`."""
     if not objects:
         raise UsageError("a shell of no objects: name at least one")
-    triangles = []
+    triangles, chord = [], 0.0
     for obj, part in parts_of(store, sorted(objects, key=lambda obj: obj.id)):
         if part.is_cloud:
             raise UsageError(
                 f"object {obj.id} ({obj.name}) is a point cloud, which has no surface: leave it out"
             )
         triangles.append(part.triangles(obj.transform))
+        chord = max(chord, part.placed_chord)
     corners = np.concatenate(triangles).reshape(-1, 3)
     faces = np.arange(len(corners)).reshape(-1, 3)
-    return PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed, inset=inset)
+    shell = PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed, inset=inset)
+    return replace(shell, chord=chord)
 
 
 def _placed(shape: Part, obj: Object) -> Part:

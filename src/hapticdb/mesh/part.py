@@ -134,9 +134,9 @@ class Part:
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Least and greatest corner (2, 3) of the placed part, metres, world frame."""
-        points = self.world_points()
-        return np.stack([points.min(axis=0), points.max(axis=0)])
+        """Box (2, 3) of the placed part, with the surface that its triangles stand for, metres."""
+        points, chord = self.world_points(), self.placed_chord
+        return np.stack([points.min(axis=0) - chord, points.max(axis=0) + chord])
 
 
 @dataclass(frozen=True, eq=False)

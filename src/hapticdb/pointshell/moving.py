@@ -33,7 +33,7 @@ class MovingSurface(CollisionShape):
             super().__init__(np.zeros((1, 3, 3)), radius=shell.surface.radius)
             self.corners = self.box
         else:
-            super().__init__(shell.surface.triangles, shell.surface)
+            super().__init__(shell.surface.triangles, shell.surface, chord=shell.chord)
             self.corners = np.unique(shell.surface.triangles.reshape(-1, 3), axis=0)
 
     def nearest(
@@ -67,7 +67,9 @@ class MovingSurface(CollisionShape):
         """
         low, high = self.corners.min(axis=0), self.corners.max(axis=0)
         middles = poses[:, :3, :3] @ (0.5 * (low + high)) + poses[:, :3, 3]
-        reach = np.abs(poses[:, :3, :3]) @ (0.5 * (high - low)) + np.reshape(more, (-1, 1))
+        reach = (
+            np.abs(poses[:, :3, :3]) @ (0.5 * (high - low)) + np.reshape(more, (-1, 1)) + self.chord
+        )
         out = np.empty((len(bounds), len(poses)))
         low, high = middles - reach, middles + reach
         for first in range(0, len(bounds), AT_ONCE):

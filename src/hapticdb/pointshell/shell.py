@@ -85,6 +85,8 @@ class PointShell:
     """On which the points lie, or from which they were drawn inward; not saved."""
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     """(N,) how far each point was drawn inward from the surface, metres; zeros unless given."""
+    chord: float = field(default=0.0, repr=False)
+    """Chord error of the surface, metres: of the tessellations of STEP files; not saved."""
     has_unit: bool = field(default=False, repr=False)
     """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
 
@@ -185,7 +187,9 @@ class PointShell:
         except UsageError as error:
             raise FileError(f"{path}: {error}") from None
         found = "; ".join(filter(None, [file.defects.describe(), *file.notes]))
-        return replace(shell, defects=found, has_unit=unit is not None or file.names_unit)
+        chord = max(part.placed_chord for part in parts)
+        has_unit = unit is not None or file.names_unit
+        return replace(shell, defects=found, has_unit=has_unit, chord=chord)
 
     @classmethod
     def from_mesh(

@@ -241,7 +241,7 @@ class _Sweep:
 
         One that is touched is only followed a little: most of those that are hit, are hit there.
         """
-        shape = CollisionShape(part.surface(), is_cloud=part.is_cloud)
+        shape = CollisionShape(part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord)
         error = shape.chord + self._tool.chord
         pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end, error)
         contact, pose = self._asked.contact, self._way.at([0.0])[0]

@@ -277,13 +277,14 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
 
     asked, felt = job.asked, job.felt
     began = perf_counter()
-    points = DRAWN_POINTS if options.is_drawn else None
+    points = DRAWN_POINTS if options.is_drawn else 1  # only a picture shows them
     with naming(asked.line):
         if asked.tool is None:
             with render.bar("sampling the parts", "points"):
-                shell = env.shell(*job.parts, points=points or 1, inset=0.0)
+                shell = env.shell(*job.parts, points=points, inset=0.0)
         else:
-            shell = shell_of(asked.tool, options.tool_unit, points, None)
+            is_saved = asked.tool.lower().endswith(".npz")
+            shell = shell_of(asked.tool, options.tool_unit, None if is_saved else points, None)
         fit = fitting.compare(
             env, shell, job.poses, exclude=felt.left_out, tool=asked.tool,
             tool_unit=options.tool_unit, path_unit=options.path_unit, is_moving=True,

@@ -4,15 +4,19 @@
 
 import json
 import os
+import re
 import signal
 from pathlib import Path
 
 import matplotlib.image
+import numpy as np
 import pytest
 
 import hapticdb
+from assemblies import write_obj
 from children import finished
 from command_line import Run, command, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from contact_scenes import box, imported, shell_of
 from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping
 
@@ -207,3 +211,66 @@ def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     refused(run("sweep", scene, *path, *TOOL, "--picture", "no/folder.png"), "cannot write")
     refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
     refused(run("sweep", "none.db", *path, *TOOL), "none.db")
+
+
+@pytest.fixture
+def seam(tmp_path: Path) -> Path:
+    """A hood of 100 x 60 x 1 mm that stands 2 mm deep in its seam, and a rail 5 mm below it."""
+    url = tmp_path / "seam.db"
+    surfaces = {
+        "hood": box((100.0, 60.0, 1.0)),
+        "seam": box((20.0, 60.0, 10.0), (58.0, 0.0, -3.0)),
+        "rail": box((20.0, 60.0, 10.0), (0.0, 0.0, -10.5)),
+    }
+    with imported(url, surfaces):
+        poses(tmp_path / "up.csv", (0.0, 0.0, 0.0), (0.0, 0.0, 0.04))
+        poses(tmp_path / "still.csv", (0.0, 0.0, 0.0))
+        poses(tmp_path / "down.csv", (0.0, 0.0, 0.0), (0.0, 0.0, -0.02))
+        return url
+
+
+def test_an_overlap_at_the_start_has_a_code_of_its_own(
+    run: Run, seam: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(seam.parent)
+    words = ("sweep", seam, "--part", "hood", "--path", "up.csv")
+    code, out, _ = run(*words)
+    assert code == 4
+    assert re.search(
+        r"otherwise clear by 5 mm: nearest rail .*, but for overlaps at the start: seam 2", out
+    )
+    found = json.loads(run(*words, "--json")[1])
+    assert found["verdict"] == "overlaps"
+    (touched,) = found["touching"]
+    assert 1.95e-3 <= touched["start_at_least"] <= 2e-3 + 1e-9 <= touched["start"] <= 2.11e-3
+    assert run(*words, "--overlap", 2.5)[0] == 0
+    assert run(*words, "--overlap", 1.0)[0] == 4
+    Path("many.csv").write_text("part,path\nhood,up.csv\nrail,still.csv\n")
+    assert run("sweep", seam, "--batch", "many.csv")[0] == 4
+    Path("many.csv").write_text("part,path\nhood,up.csv\nhood,down.csv\n")
+    assert run("sweep", seam, "--batch", "many.csv")[0] == 1
+    code, out, _ = run("extract", seam, "hood", "--motions", 0, "--out", 40)
+    assert code == 4
+    assert "but for overlaps at the start: seam 2" in out
+    assert run("extract", seam, "hood", "--motions", 0, "--out", 40, "--overlap", 2.5)[0] == 0
+    code, out, _ = run("extract", seam, "hood", "--motions", 0, "--out", 40, "--disassemble")
+    assert code == 4
+
+
+def test_a_foreign_tool_has_no_seat(run: Run, seam: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(seam.parent)
+    corners = shell_of(box((100.0, 60.0, 1.0))).outline
+    write_obj(Path("hood.obj"), {"hood": (corners, np.arange(len(corners)).reshape(-1, 3))})
+    words = ("--path", "up.csv", "--exclude", "hood")
+    code, out, _ = run("sweep", seam, "--tool", "hood.obj", "--tool-unit", "m", *words)
+    assert code == 1
+    assert re.match(r"starts inside seam: at least (1\.9\d*|2) mm", out)
+
+
+@pytest.mark.usefixtures("through")
+def test_a_sweep_may_end_at_the_first_hit(run: Run, scene: Path) -> None:
+    words = ("sweep", scene, *TOOL, "--path", "through.csv", "--json")
+    every, first = (json.loads(run(*words, *more)[1]) for more in ((), ("--until-hit",)))
+    assert len(every["hits"]) == 3
+    assert [one["name"] for one in first["hits"]] == ["box0"]
+    assert first["hits"][0]["fraction"] == pytest.approx(every["hits"][0]["fraction"], abs=1e-4)

@@ -76,11 +76,16 @@ class CollisionShape:
         return join_corners(self.tree.corners - self.box[0])
 
     @cached_property
+    def points(self) -> Ints:
+        """Number (V,) among all corners (3 T,) of one at each place, ascending by `_corners`."""
+        return np.unique(self._corners, return_index=True)[1]
+
+    @cached_property
     def pieces(self) -> Ints:
-        """Connected piece (3 T,) of each corner, 0, 1, ..."""
+        """Connected piece (V,) of each of `points`, 0, 1, ..."""
         faces = self._corners
         links = np.concatenate([faces[:, :2], faces[:, 1:]])
-        return components(links, int(faces.max()) + 1)[faces.reshape(-1)]
+        return components(links, int(faces.max()) + 1)
 
     @cached_property
     def _face_normals(self) -> Floats:

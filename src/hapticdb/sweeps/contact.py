@@ -39,7 +39,7 @@ MOST_CHANGES = 30
 """Changes of motions along the path."""
 ON, FINE_HIT = 2.0, 0.1
 """Reaches beyond a hit at which its depth is measured, and share of it to which it is found."""
-LOOKS = 4000
+LOOKS = 1500
 """Distances that are measured for a depth: some hundredths of a second. It is proved from below,
 however few they are."""
 

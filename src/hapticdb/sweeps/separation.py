@@ -34,8 +34,8 @@ GROWTH, FINE = 1.4, 0.05
 """Factor from one reach that is tried to the next, and share of it to which the least is found."""
 FINE_DEPTH, TOLERANCE = 0.02, 0.2
 """Shares of a penetration depth and of the contact tolerance to which it is found."""
-MOST_LOOKS = 10_000_000
-"""Distances that are measured for a depth at most: a minute."""
+QUICK, MOST_LOOKS = 256, 10_000_000
+"""Distances that are measured for a depth at most: some milliseconds, and a minute."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 
@@ -87,6 +87,7 @@ class Separation:
     ) -> None:
         self._object, self._tool, self._check = thing, tool, check
         self._blocking = np.empty((0, 2), dtype=np.int64)
+        self._at_shifts, self._at_depth = (np.zeros(0), np.zeros(0)), (np.zeros(0), 0.0)
 
     def separating(
         self, pose: Floats, reach: float, clearance: float, *, gap: float,
@@ -98,7 +99,7 @@ class Separation:
         nothing; where they coincide, it must leave no piece in a closed body, or one if `nested`.
         """
         still = self.moved(NOTHING)
-        for moved in self._candidates(pose, reach, clearance, still, thorough=thorough):
+        for moved in self._candidates(pose, reach, clearance, still, gap, thorough=thorough):
             if gap > SAME:
                 if self.joins(still, moved, pose):
                     yield moved
@@ -244,19 +245,34 @@ class Separation:
 
     def shifts(self, pose: Floats) -> Floats:
         """Unit vectors (N, 3) of shifts that may separate, those along normals first."""
+        if np.array_equal(self._at_shifts[0], pose):
+            return self._at_shifts[1]
         near = nearest(self._object.tree, self._tool.tree, pose[None], np.array([np.inf]))
         first, second = near.pairs[0]
         theirs = self._tool.tree.corners[second] @ pose[:3, :3].T
         normals = np.array([_normal(self._object.tree.corners[first]), _normal(theirs)])
-        return np.concatenate([normals, -normals, DIRECTIONS])
+        self._at_shifts = pose, np.concatenate([normals, -normals, DIRECTIONS])
+        return self._at_shifts[1]
+
+    def _known_depth(self, pose: Floats) -> float:
+        """Penetration depth of a quick search, at least, metres."""
+        if not np.array_equal(self._at_depth[0], pose):
+            self._at_depth = pose, self.depth(pose, SAME, most=QUICK)[0]
+        return self._at_depth[1]
 
     def _candidates(
-        self, pose: Floats, reach: float, clearance: float, still: MovedPair, *, thorough: bool
-    ) -> Iterator[MovedPair]:
-        """Motions of a reach that keep the surfaces a clearance apart: none, shifts, others."""
+        self, pose: Floats, reach: float, clearance: float, still: MovedPair, gap: float,
+        *, thorough: bool,
+    ) -> Iterator[MovedPair]:  # fmt: skip
+        """Motions of a reach that keep the surfaces a clearance apart: none, shifts, others.
+
+        What is deeper than the reach is freed by none, so the slower ones are left out.
+        """
         if self.is_free(still, pose, clearance):
             yield still
         yield from self.shifted(pose, reach * self.shifts(pose), clearance, still)
+        if gap <= SAME and self._known_depth(pose) > reach:
+            return
         own = np.concatenate([self._object.axes, self._tool.axes @ pose[:3, :3].T])
         yield from self.shifted(pose, reach * np.concatenate([own, -own]), clearance, still)
         for motion in self._grown(reach):
@@ -350,8 +366,10 @@ def _holds_piece(
 
     A piece with a corner outside the body's box is not in it.
     """
-    corners = inner.tree.corners if inner_by is None else inner.tree.corners + inner_by
-    corners = corners.reshape(-1, 3) @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
+    corners = inner.tree.corners.reshape(-1, 3)[inner.points]
+    if inner_by is not None:
+        corners = corners + inner_by.reshape(-1, 3)[inner.points]
+    corners = corners @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
     if outer.radius:
         return bool((np.linalg.norm(corners, axis=1) < outer.radius + growth).any())
     reach = 0.0 if outer_by is None else float(np.abs(outer_by).max())
@@ -359,11 +377,8 @@ def _holds_piece(
     is_out = ((corners < low) | (corners > high)).any(axis=1)
     if is_out.all():
         return False
-    if inner.is_cloud:
-        first = np.flatnonzero(~is_out)
-    else:
-        pieces, first = np.unique(inner.pieces, return_index=True)
-        first = first[np.bincount(inner.pieces, is_out, len(pieces)) == 0.0]
+    pieces, first = np.unique(inner.pieces, return_index=True)
+    first = first[np.bincount(inner.pieces, is_out, len(pieces)) == 0.0]
     if not len(first):
         return False
     interior = outer.moved_interior(outer_by)

@@ -67,9 +67,9 @@ SAMPLE = (
     Question(("seats/seat_*_left",), AROUND_SEAT),
     Question(("engine/spark_plug",), ("body/hood*",)),
 )
-"""Of the sample car. Bolts hold the wheel; the harness goes through the battery, and the seat's
-triangles cross those of the floor. Without floor, carpet and door the seat goes forward, up, and
-then out by the door. The spark plug, which is added to the car, comes out along its bore."""
+"""Of the sample car. Bolts hold the wheel; the harness lies over the battery, and the seat stands
+on the floor. Without floor, carpet and door the seat goes forward, up, and then out by the door.
+The spark plug, which is added to the car, comes out along its bore."""
 SEAT = (1.15, 0.40, 0.80)
 """Middle of the spark plug's seat in the engine bay, metres."""
 BORE, PLUG, SEAT_RADIUS = 0.024, 0.012, 0.045

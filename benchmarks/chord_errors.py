@@ -14,9 +14,9 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.kernels.surfaces.nearest import distances_to
-from hapticdb.kernels.surfaces.sides import triangle_tree
+from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.mesh import MeshFile, read_file
+from hapticdb.pointshell.shape import tree_of
 
 MILLIMETRES = (0.1, 0.05, 0.02, 0.01, 0.005)
 
@@ -34,9 +34,12 @@ def sampled(file: MeshFile, finer: MeshFile) -> float:
     shares = [0.0]
     for part, other in zip(file.parts, finer.parts, strict=True):
         if part.chord:
-            triangles = part.triangles()
-            tree = triangle_tree(triangles, np.zeros(len(triangles), dtype=np.int64))
-            shares.append(distances_to(tree, other.world_points()).max() / part.chord)
+            points = other.world_points()
+            poses = np.tile(np.eye(4), (len(points), 1, 1))  # of a single point
+            poses[:, :3, 3] = points
+            tree, far = tree_of(part.triangles()), np.full(len(points), np.inf)
+            found = nearest(tree, tree_of(np.zeros((1, 3, 3))), poses, far)
+            shares.append(found.at_most.max() / part.chord)
     return max(shares)
 
 

@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb.clashes.run import CONTACT
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.surfaces.sides import triangle_tree
 from hapticdb.mesh import Defects, parse_in_process
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.orientation import orient
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
+from point_distances import distances_to
 
 Floats = NDArray[np.float64]
 PLANTED = {

@@ -9,13 +9,13 @@ from numpy.typing import NDArray
 
 import step_files
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.surfaces.nearest import distances_to
 from hapticdb.kernels.surfaces.sides import triangle_tree
 from hapticdb.mesh import Part, parse_in_process, read_file
 from hapticdb.mesh import reader as reader_module
 from hapticdb.mesh.chord import DEFAULT, chord_error
 from hapticdb.mesh.raw import UnreadableError
 from mesh_files import TRIANGLE, gltf
+from point_distances import distances_to
 
 Floats = NDArray[np.float64]
 TURN = np.linspace(0.0, 2.0 * np.pi, 997)

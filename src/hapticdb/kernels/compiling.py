@@ -57,7 +57,6 @@ TOGETHER = {
     "proxy.linearize": "period.loop.move_by_coupling",
     "period.loop.move_directly": "period.loop.run",
     "triangles.sweeping": "triangles.nearest",
-    "triangles.depth": "surfaces.nearest",
 }
 """Modules, or entries of `APART`, that are compiled after others, if these are compiled, too, in
 the same process: they share leaves."""
@@ -128,15 +127,14 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "host": (*_RESIDENT, *_COUPLING, _FELT),
     "frames": (*_RESIDENT, _FRAMES, "rigid.poses_of"),
     "frames by distance": (*_RESIDENT, _FRAMES + "@distances", "rigid.poses_of"),
-    "clashes": ("surfaces.sides.*", "surfaces.nearest.*", "triangles.*", "curves.encode_kernel"),
-    "sweep": (*_SHELL, "triangles.*", "surfaces.nearest.*", *_RANGES),
+    "clashes": ("surfaces.sides.*", "triangles.*", "curves.encode_kernel"),
+    "sweep": (*_SHELL, "triangles.*", *_RANGES),
     "extract": (
         *_SHELL,
         *_RESIDENT,
         _FRAMES,
         "resident.first_hits.*",
         "triangles.*",
-        "surfaces.nearest.*",
         *_RANGES,
         "query.contact.*",
         "query.refining.*",

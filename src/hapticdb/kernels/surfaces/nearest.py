@@ -6,13 +6,10 @@ the caller's choice.
 """
 
 import numpy as np
-from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, entry, inlined, leaf
+from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.rigid import gap, moment
-from hapticdb.kernels.surfaces.sides import LEAF_SIZE, STACK, TREE, TriangleTree
-
-Floats = NDArray[np.float64]
+from hapticdb.kernels.surfaces.sides import LEAF_SIZE
 
 
 @leaf
@@ -114,20 +111,3 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
             if square < best:
                 best, found = square, np.int64(n)
     return np.sqrt(best), found
-
-
-@entry(TREE, FLOATS2, FLOAT, FLOATS)
-def distances_kernel(tree, places, farthest, out):
-    """Distance out (Q,) of each of places (Q, 3) to the nearest triangle, up to `farthest`."""
-    waiting = np.empty(STACK, dtype=np.int64)
-    squares = np.empty(STACK)
-    for q in range(places.shape[0]):
-        x, y, z = places[q, 0], places[q, 1], places[q, 2]
-        out[q], _ = distance_at(tree, x, y, z, 0.0, farthest, np.int64(-1), waiting, squares)
-
-
-def distances_to(tree: TriangleTree, places: Floats, farthest: float = np.inf) -> Floats:
-    """Distances (Q,) of places (Q, 3) to a tree's triangles, up to `farthest`."""
-    out = np.empty(len(places))
-    distances_kernel(tree, np.ascontiguousarray(places), float(farthest), out)
-    return out

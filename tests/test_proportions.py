@@ -240,7 +240,7 @@ def test_a_large_tool_is_named_and_not_the_poses(run: Run, scene: Path) -> None:
 
 
 def test_a_path_in_millimetres_is_no_proof(run: Run, scene: Path) -> None:
-    poses(scene.parent / "mm.csv", (0, 0, 55), (200, 0, 300))
+    poses(scene.parent / "mm.csv", (0, 0, 61), (200, 0, 300))
     args = ("sweep", scene, *TOOL, "--path", "mm.csv")
     code, out, err = run(*args)
     assert (code, out.startswith("clear ")) == (3, True)

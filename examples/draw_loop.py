@@ -145,7 +145,7 @@ def part(
     env, ids = stage.env, [obj.id for word in words for obj in stage.env.find(word)]
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[1, :3, 3] = way
-    swept = hapticdb.sweep(env, env.shell(*ids), poses, exclude=[*ids, *exclude])
+    swept = hapticdb.sweep(env, env.shell(*ids), poses, exclude=[*ids, *exclude], seated=True)
     hit = min((place.fraction for place in swept.hits), default=None)
     colour = FREE if hit is None else CAUGHT
     far = 1.0 if hit is None else float(hit)

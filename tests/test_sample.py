@@ -68,6 +68,7 @@ def test_clashes_finds_the_two_planted_overlaps_alone(files: SampleFiles, tmp_pa
     assert deep == PLANTED
 
 
+@pytest.mark.long
 def test_no_place_of_a_part_lies_deep_in_another_but_for_the_planted_overlaps(
     files: SampleFiles,
 ) -> None:

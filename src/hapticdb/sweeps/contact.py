@@ -1,9 +1,9 @@
-"""Contacts: objects that the tool touches where its path starts, followed until they are apart.
+"""Contacts at the start of a path, followed by separating motions until the surfaces are apart.
 
-The path is free of a touched object if the tool, moved aside or deformed once by a small motion
-(`separation`), follows it and meets nothing: then no place of the tool gets to another side of
-anything, however thin. A change to another motion on the way is proved, too. No depth at single
-poses could say so, since it has no memory of sides.
+The path is free of a touched object if one small motion (`separation`) of the tool or the object
+lets the tool follow the path without a collision: then no place of the tool gets to another side of
+anything, however thin. Changes of the motion along the path are proved. The depth at single poses
+is no criterion, since it has no memory of sides.
 """
 
 from collections.abc import Iterator
@@ -20,28 +20,27 @@ from hapticdb.sweeps.separation import GROWTH, NOTHING, SAME, MovedPair, Separat
 Floats = NDArray[np.float64]
 
 CLEARANCE = 2.0 * MEETING
-"""Metres that a small motion keeps the surfaces apart where it begins."""
+"""Gap after a separating motion, metres."""
 SLIDE = 4.0
-"""Contact tolerances that the tool moves on while it touches, from which it slides."""
+"""Length of a sliding contact, contact tolerances, at least."""
 STRIDE = 3.0
-"""Contact tolerances between two looks whether the surfaces are apart."""
+"""Contact tolerances between two proximity queries for the end of a contact."""
 BLOCK, MOST_BLOCK = 8, 4096
-"""Looks whether surfaces are apart that are done together: at first, and at most."""
+"""Proximity queries of a batch: the first one, and the largest."""
 SHARES = (0.02, 0.15, 0.3, 0.5, 0.75)
-"""Shares of the reach that are tried for the least motion where surfaces coincide."""
+"""Shares of the reach for the least motion of coinciding surfaces."""
 MOST_TRIED = 8
-"""Motions at the start that are followed. More: contacts are followed farther, slower hits."""
+"""Motions at the start that are swept. More: fewer false hits, slower hits."""
 BACKS = (0.2, 1.0, 5.0)
-"""Reaches before a meeting at which another motion takes over."""
+"""Reaches before a collision for the change to another motion."""
 BEYOND = 0.25
-"""Reaches beyond a meeting that another motion has to get."""
+"""Reaches beyond a collision for another motion, at least."""
 MOST_CHANGES = 30
 """Changes of motions along the path."""
 ON, FINE_HIT = 2.0, 0.1
-"""Reaches beyond a hit at which its depth is measured, and share of it to which it is found."""
+"""Reaches beyond a hit for the pose of its depth, and the depth's relative tolerance."""
 LOOKS = 1500
-"""Distances that are measured for a depth: some hundredths of a second. It is proved from below,
-however few they are."""
+"""Distance queries for a depth: some hundredths of a second. Any number gives a lower bound."""
 
 
 class Contact:

@@ -1,9 +1,9 @@
-"""Separating motions: small motions of a tool or an object after which their surfaces are apart.
+"""Separating motions of a tool and an object, and their penetration depth.
 
-A motion moves no place by more than its reach: a shift, or an offset of one surface along its
-normals, which frees a peg from its hole. A pair that a motion of reach r separates
-overlaps by r at most. Change from one motion to another is proved by conservative advancement:
-nothing is met on the straight way of all places.
+A motion of reach r displaces every place by r at most: a shift, or an offset of one surface along
+its normals. A motion that separates the surfaces bounds their overlap from above, the penetration
+depth (`kernels.triangles.depth`) from below. Conservative advancement proves the change from one
+motion to another: all places move straight, and the surfaces stay apart.
 """
 
 from collections.abc import Callable, Iterator
@@ -27,23 +27,19 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 LEAST_BALL = 0.01
 """Least factor to which a ball shrinks."""
 SAME = 1e-6
-"""Metres: surfaces that are nearer coincide, and their sides are told by their insides alone."""
+"""Metres: nearer surfaces coincide; closed bodies alone decide on which side they are."""
 MET, MOST_STEPS = 1e-7, 60
-"""Metres at which a change of motions meets something, and its greatest number of steps."""
+"""Gap at which a change of motions ends as a collision, metres; its greatest number of steps."""
 GROWTH, FINE = 1.4, 0.05
-"""Factor from one reach that is tried to the next, and share of it to which the least is found."""
+"""Factor between successive reaches of the search, and relative tolerance of the least one."""
 FINE_DEPTH, TOLERANCE = 0.02, 0.2
-"""Shares of a penetration depth and of the contact tolerance to which it is found."""
+"""Tolerances of a penetration depth: relative, and as a share of the contact tolerance."""
 QUICK, MOST_LOOKS = 256, 10_000_000
-"""Distances that are measured for a depth at most: some milliseconds, and a minute."""
+"""Limits of distance queries for a depth: some milliseconds, and a minute."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
-
-
 BLOCKING = 16
-"""Pairs of triangles that were too near after other motions, which are measured first."""
-
-
+"""Pairs of triangles in collision after earlier motions, tested first."""
 ALL = slice(None)
 Rows = slice | NDArray[np.int64]
 Displacement = Callable[[Rows], Floats]
@@ -51,7 +47,7 @@ Displacement = Callable[[Rows], Floats]
 
 
 class Motion(NamedTuple):
-    """Small motion of the tool, or of the object.
+    """Small motion of the tool or of the object.
 
     by : its kind; shift (3,) : of the tool, world frame; tool, object (T, 3, 3) or None :
     displacements of the corners of their trees, own frames; growth : of a ball's radius. Metres.
@@ -77,9 +73,9 @@ class MovedPair(NamedTuple):
 
 
 class Separation:
-    """Motions that separate a tool from an object, its pose in the object's frame.
+    """Separating motions of a tool and an object; poses of the tool in the object's frame.
 
-    check : called before each measurement; it may end the search by an exception.
+    check : called before each distance query; its exception ends the search.
     """
 
     def __init__(
@@ -93,10 +89,10 @@ class Separation:
         self, pose: Floats, reach: float, clearance: float, *, gap: float,
         thorough: bool = True, nested: bool = False,
     ) -> Iterator[MovedPair]:  # fmt: skip
-        """Motions of a reach that keep the surfaces a clearance apart at a pose, and on its side.
+        """Motions of a reach after which the surfaces have a clearance, without a change of sides.
 
-        gap : of the surfaces at the pose. Where they are apart, the motion itself must meet
-        nothing; where they coincide, it must leave no piece in a closed body, or one if `nested`.
+        gap : of the surfaces at the pose. Surfaces with a gap must stay apart during the motion;
+        coinciding ones must end without a piece in a closed body, or with one if `nested`.
         """
         still = self.moved(NOTHING)
         for moved in self._candidates(pose, reach, clearance, still, gap, thorough=thorough):
@@ -109,7 +105,7 @@ class Separation:
     def least(
         self, pose: Floats, least: float, most: float, clearance: float, *, gap: float
     ) -> float | None:
-        """Least reach, to `FINE`, of a motion that separates, as above; None if there is none."""
+        """Least reach of a separating motion, as above, to `FINE`; None without any."""
 
         def is_free(reach: float, *, thorough: bool) -> bool:
             found = self.separating(pose, reach, clearance, gap=gap, thorough=thorough)
@@ -131,18 +127,17 @@ class Separation:
 
     @property
     def most_reach(self) -> float:
-        """Greatest reach that is tried, metres."""
+        """Greatest reach of the search, metres."""
         edges = [float(np.sort(np.ptp(one.box, axis=0))[1]) for one in (self._object, self._tool)]
         return min(MOST_REACH, MOST_SHARE * min(edges))
 
     def depth(
         self, pose: Floats, contact: float, fine: float = FINE_DEPTH, most: int = MOST_LOOKS
     ) -> tuple[float, Floats]:
-        """Penetration depth, a proved lower bound, and its place (3,), the object's frame, metres.
+        """Proved penetration depth, metres, and its place (3,), the object's frame.
 
-        The greater one of tool in object and object in tool, to a share `fine` of it or `TOLERANCE`
-        of `contact`, unless `most` distances were measured before; 0 where it is `contact` or less,
-        or what is gone into is not closed.
+        The greater one of tool in object and object in tool, with tolerances `fine` and `TOLERANCE`
+        and at most `most` distance queries each; 0 for depths up to `contact` and open surfaces.
         """
         deepest = 0.0, np.zeros(3)
         back = np.linalg.inv(pose)

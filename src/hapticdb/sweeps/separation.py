@@ -34,8 +34,8 @@ GROWTH, FINE = 1.4, 0.05
 """Factor between successive reaches of the search, and relative tolerance of the least one."""
 FINE_DEPTH, TOLERANCE = 0.02, 0.2
 """Tolerances of a penetration depth: relative, and as a share of the contact tolerance."""
-QUICK, MOST_LOOKS = 256, 10_000_000
-"""Limits of distance queries for a depth: some milliseconds, and a minute."""
+QUICK, MOST_LOOKS = 256, 1_000_000
+"""Limits of distance queries for a depth: some milliseconds, and some seconds."""
 MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 BLOCKING = 16
@@ -226,6 +226,7 @@ class Separation:
         self, pose: Floats, shifts: Floats, clearance: float, base: MovedPair
     ) -> Iterator[MovedPair]:
         """Of shifts (N, 3) of the tool, those that keep the surfaces a clearance apart."""
+        self._check()
         poses = np.tile(pose, (len(shifts), 1, 1))
         poses[:, :3, 3] += shifts
         far = clearance + base.radius

@@ -97,7 +97,7 @@ class Contact:
             return None
         self.reach, self.start = reach, reach - CLEARANCE + abs(self.error)
         self._motions = found.separating(pose, reach, CLEARANCE, gap=gap)
-        return next(self._motions)
+        return next(self._motions, None)
 
     def _on_nearest_side(self, first: MovedPair) -> MovedPair:
         """The first motion on the side that the least one leads to, of surfaces that coincide.

@@ -72,21 +72,27 @@ def judge(
         if gap + error <= contact or not error:
             return _told("touching", near, error)
         return _told("not known", near, error)
-    if _is_freed(separation, pose, contact - error):
-        return _told("touching", near, error)
-    if not error and _is_freed(separation, pose, contact, nested=True):
-        return _told("inside", near)
-    if error and _is_freed(separation, pose, contact + error):
+    freed = _freed(separation, pose, contact - error)
+    if freed == "touching" or (freed == "inside" and not error):
+        return _told(freed, near, error)
+    if error and _freed(separation, pose, contact + error) == "touching":
         return _told("not known", near, error)
     return _overlap(separation, pose, contact, near, error)
 
 
-def _is_freed(separation: Separation, pose: Floats, reach: float, *, nested: bool = False) -> bool:
-    """Whether a motion of a reach frees surfaces that meet, or only into a closed body."""
+def _freed(separation: Separation, pose: Floats, reach: float) -> Kind | None:
+    """Kind of surfaces that meet and are freed by a motion of a reach; None without one.
+
+    Inside, if each such motion leaves a piece of one in a closed body of the other.
+    """
+    found: Kind | None = None
     if reach <= 0.0:
-        return False
-    found = separation.separating(pose, reach, TINY, gap=0.0, nested=nested)
-    return next(found, None) is not None
+        return found
+    for moved in separation.separating(pose, reach, TINY, gap=0.0, any_side=True):
+        if not separation.is_nested(pose, moved.motion):
+            return "touching"
+        found = "inside"
+    return found
 
 
 def _told(kind: Kind, near: Nearest, error: float = 0.0) -> Judged:

@@ -28,7 +28,7 @@ class Shapes:
         self._placements: dict[int, tuple[tuple[str, bytes], Floats]] = {}
 
     def shape(self, obj: Object) -> CollisionShape | None:
-        """CollisionShape of an object; None if it was written meanwhile.
+        """Shape of an object; None if it was written meanwhile.
 
         Raises `NoSurfaceError` if the object's surface is not in the database.
         """

@@ -87,19 +87,19 @@ class Separation:
 
     def separating(
         self, pose: Floats, reach: float, clearance: float, *, gap: float,
-        thorough: bool = True, nested: bool = False,
+        thorough: bool = True, any_side: bool = False,
     ) -> Iterator[MovedPair]:  # fmt: skip
         """Motions of a reach after which the surfaces have a clearance, without a change of sides.
 
         gap : of the surfaces at the pose. Surfaces with a gap must stay apart during the motion;
-        coinciding ones must end without a piece in a closed body, or with one if `nested`.
+        coinciding ones must end without a piece in a closed body, unless `any_side`.
         """
         still = self.moved(NOTHING)
         for moved in self._candidates(pose, reach, clearance, still, gap, thorough=thorough):
             if gap > SAME:
                 if self.joins(still, moved, pose):
                     yield moved
-            elif self.is_nested(pose, moved.motion) == nested:
+            elif any_side or not self.is_nested(pose, moved.motion):
                 yield moved
 
     def least(

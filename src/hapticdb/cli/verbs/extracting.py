@@ -185,7 +185,7 @@ def extract(
         with render.bar("pulling", "searches" if on else "pulls") as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:
-                options |= {"depth": depth} if depth is not None else {}
+                options |= {} if depth is None else {"depth": depth}
                 options |= {"exclude": exclude or (), "keep": kept, "on": on}
                 order = orders.disassemble(env, *ids, **options)
             else:

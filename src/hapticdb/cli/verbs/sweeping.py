@@ -113,8 +113,9 @@ Clear by a gap: no surface meets the tool's. Slides: it moves along what it
 touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
 the part overlaps others by more than --contact and --overlap where it stands.
 Hits: a surface is met, what is touched is gone into, or one lies inside the
-other. Not decided: --seconds were over. The triangles decide, between the poses,
-too; the gap is right to 0.01 mm or 1 %.
+other. Not decided: --seconds were over, or the chord error of a STEP file leaves
+it open. The triangles decide, between the poses, too; the gap is right to 0.01 mm
+or 1 %.
 
 Between two poses the centre moves straight while the tool turns about it.
 Segment 0 leads from pose 0 to pose 1.

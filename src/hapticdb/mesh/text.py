@@ -35,13 +35,13 @@ _LENGTHS |= {word: UNITS[sign] for sign, name in NAMES.items() for word in (name
 def unit_in(text: str) -> tuple[str, float | None]:
     """Words of a text that name a unit, and its length, metres; '' and None without."""
     for found in _UNIT.finditer(text):
-        length = length_of(found[1] or found[2])
+        length = unit_length(found[1] or found[2])
         if length is not None:
             return found[0], length
     return "", None
 
 
-def length_of(word: str) -> float | None:
+def unit_length(word: str) -> float | None:
     """Length of the unit that a word names, metres; None for other words."""
     return _LENGTHS.get(word.lower().replace("meter", "metre"))
 

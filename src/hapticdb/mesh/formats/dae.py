@@ -32,7 +32,7 @@ from hapticdb.mesh.raw import (
     told_missing,
     walk,
 )
-from hapticdb.mesh.text import length_of, xml_of
+from hapticdb.mesh.text import unit_length, xml_of
 from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
@@ -108,7 +108,7 @@ def _metres(root: ET.Element) -> tuple[float | None, list[str]]:
     except ValueError:
         return None, []
     name = unit.get("name", "")
-    named = length_of(name)
+    named = unit_length(name)
     if named is None or abs(metres - named) <= _ROUNDED * named:
         return metres, []
     lengths = f"{named:.6g} m, and given as {metres:.6g} m, which is taken"

@@ -11,7 +11,6 @@
     ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
     ├── DeviceError (OSError)                 a haptic device that is not there, or went away
-    ├── ProtocolError (ConnectionError)       a message that is none, or breaks a limit
     ├── ClusterError (ConnectionError)        a scheduler of tasks, or its workers, cannot be used
     └── DatabaseError                         the database cannot do what was asked
         ├── EnvironmentNotFoundError (FileNotFoundError)
@@ -84,10 +83,6 @@ class ObjectNotFoundError(HapticDBError, LookupError):
 
 class DeviceError(HapticDBError, OSError):
     """A haptic device that is not there, does not answer or was unplugged."""
-
-
-class ProtocolError(HapticDBError, ConnectionError):
-    """A message of another machine that cannot be decoded or breaks a limit."""
 
 
 class ClusterError(HapticDBError, ConnectionError):

@@ -30,7 +30,7 @@ FLOORS: list[set[str]] = [
     {"page"},
     {"demo", "pictures"},
     {"pool"},
-    {"client", "hosting"},
+    {"hosting"},
     {"clashes", "extraction", "realtime", "sweeps"},
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
@@ -40,7 +40,7 @@ FLOORS: list[set[str]] = [
     {"store"},
     {"grid", "ready"},
     {"kernels"},
-    {"protocol", "units"},
+    {"units"},
     {"closing", "errors", "interrupting"},
 ]
 LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
@@ -51,7 +51,6 @@ NARROW: dict[str, set[str]] = {
     "errors": set(),
     "interrupting": set(),
     "poses": {"errors", "units"},
-    "protocol": {"errors"},
     "mesh": {"errors", "poses", "units"},
     "devices": {"errors", "kernels", "poses"},
     "sample": {"errors"},

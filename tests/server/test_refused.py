@@ -6,22 +6,14 @@ import logging
 import socket
 from collections.abc import AsyncIterator
 from http.client import HTTPConnection
-from pathlib import Path
-from types import SimpleNamespace
-from typing import Any
-from unittest.mock import AsyncMock
 
 import pytest
 import uvicorn
 from starlette.responses import PlainTextResponse
 from starlette.types import ASGIApp, Receive, Scope, Send
-from starlette.websockets import WebSocket, WebSocketState
+from starlette.websockets import WebSocket
 
 from children import PATIENCE
-from hapticdb.protocol.contacts import ProxyWish, pack_wish
-from hapticdb.protocol.header import CloseCode
-from hapticdb.server.access import Access, Role
-from hapticdb.server.contacts import Contacts
 from hapticdb.server.guards import Guards
 from hapticdb.server.limits import Limits
 from hapticdb.server.transports import limited
@@ -118,29 +110,3 @@ def test_a_refused_websocket_logs_no_error(host: str, caplog: pytest.LogCaptureF
     with caplog.at_level(logging.WARNING):
         asyncio.run(work())
     assert caplog.records == []
-
-
-@pytest.mark.parametrize(
-    ("message", "code"),
-    [
-        (b"malformed", CloseCode.MALFORMED),
-        (b"hd\x02\x80" + bytes(96), CloseCode.VERSION),
-        (pack_wish(ProxyWish("hammer", 1.0, 1.0, 1.0, 1.0)), CloseCode.MALFORMED),
-    ],
-)
-def test_a_wrong_wish_is_refused_before_cells_and_tools_are_made(
-    message: bytes, code: CloseCode, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    def made(_: Contacts) -> None:
-        raise AssertionError
-
-    monkeypatch.setattr(Contacts, "_open", made)
-    access = Access({"a-token-for-toucher": Role.TOUCHER})
-    served: Any = SimpleNamespace(access=access, tools=(str(tmp_path / "plate.stl"),))
-    asking = AsyncMock(
-        application_state=WebSocketState.CONNECTED,
-        headers={"authorization": "Bearer a-token-for-toucher"},
-    )
-    asking.receive.return_value = {"type": "websocket.receive", "bytes": message}
-    asyncio.run(Contacts(served).serve(asking))
-    assert asking.close.await_args.args[0] == code

@@ -5,7 +5,6 @@ import contextlib
 import socket
 import time
 from collections.abc import AsyncIterator, Callable
-from types import SimpleNamespace
 from typing import Any, NoReturn, cast
 from unittest.mock import AsyncMock
 
@@ -16,14 +15,12 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from starlette.websockets import WebSocketState
 
 from children import PATIENCE
-from hapticdb.server import contacts, relay
-from hapticdb.server.access import Access, Role
-from hapticdb.server.contacts import Contacts
+from hapticdb.server import relay
+from hapticdb.server.access import Access
 from hapticdb.server.figures import Figures
 from hapticdb.server.limits import Limits
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
-from hapticdb.server.served import Served
 from hapticdb.server.transports import StrictWebSocket
 from server.test_refused import UPGRADE
 
@@ -107,17 +104,6 @@ def unwilling() -> Any:  # noqa: ANN401 - in place of a WebSocket
     made = AsyncMock(application_state=WebSocketState.CONNECTED, headers=Headers(), close=close)
     made.receive.return_value = {"type": "websocket.receive", "bytes": b"malformed"}
     return made
-
-
-def test_a_remote_hand_that_takes_no_close_frame_keeps_no_place(
-    monkeypatch: pytest.MonkeyPatch,
-) -> None:
-    monkeypatch.setattr(contacts, "CLOSING_WITHIN", 0.01)
-    access = Access({}, open_role=Role.TOUCHER)
-    served = cast("Served", SimpleNamespace(access=access, tools=()))
-    endpoint = Contacts(served)
-    asyncio.run(asyncio.wait_for(endpoint.serve(unwilling()), PATIENCE))
-    assert endpoint.n_clients == 0
 
 
 def test_a_browser_that_takes_no_close_frame_is_let_go(monkeypatch: pytest.MonkeyPatch) -> None:

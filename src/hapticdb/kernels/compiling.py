@@ -29,8 +29,8 @@ from typing import NamedTuple
 from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
 
 LONGEST = (
-    *("period.loop", "proxy.linearize", "surfaces.distances"),
-    *("surfaces.voxelize", "resident.nearest", "resident.first_hits", "resident.budget"),
+    *("period.loop", "surfaces.distances", "surfaces.voxelize"),
+    *("resident.nearest", "resident.first_hits", "resident.budget"),
     *("query.refining", "query.contact"),
 )
 """Modules of entries that take longest to compile, which come first."""
@@ -54,7 +54,6 @@ NAMES = _names()
 """Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`)."""
 TOGETHER = {
     "resident.budget": "period.loop.feel",
-    "proxy.linearize": "period.loop.move_by_coupling",
     "period.loop.move_directly": "period.loop.run",
     "triangles.sweeping": "triangles.nearest",
 }
@@ -139,8 +138,6 @@ PURPOSES: dict[str, tuple[str, ...]] = {
         "query.contact.*",
         "query.refining.*",
     ),
-    "proxies": (*_RESIDENT, *_COUPLING, "proxy.linearize.*"),
-    "proxy": ("proxy.evaluate.*", "hand.handle.*"),
     "everything": ("*",),
 }
 """Entries that each purpose calls; ``*`` is any name (checked by `tests/house/test_warm.py`)."""

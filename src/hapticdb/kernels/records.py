@@ -154,19 +154,6 @@ SERVO: Layout = _record([("tool", TOOL), ("hand", HAND), ("sent", SENT)])
 MOST_TRAIL = 64
 """Places of the hand that the quasi-static coupling remembers for its damping. Larger: the same
 time is remembered at higher loop rates."""
-EQUATIONS: list[tuple[object, ...]] = [
-    ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
-    ("n_near", "<i8"),  # near points at the tool's pose
-    ("n_active", "<i8"),  # points in the contact set of the last step
-    ("n_bends", "<i8"),  # rows of curvature in its equations
-    ("is_bent", "?"),  # the surface is hollow: its curvature is computed
-    ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
-    ("right", "<f8", 6),  # their right-hand side: N, N m
-    ("step", "<f8", 6),  # of the tool's centre: m, rad
-    ("pull", "<f8", 6),  # from tool to hand: m, rad
-    ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
-]
-"""Fields of whoever solves for a step of a tool (`kernels.hand.step`)."""
 FOLLOWER: Layout = _record(
     [
         ("looked_at", "<f8", 7),  # pose of the tool that the near points belong to
@@ -175,7 +162,17 @@ FOLLOWER: Layout = _record(
         ("clearance", "<f8"),  # voxels: no point is nearer to a surface, at the tool's pose
         ("tried_clearance", "<f8"),  # the same at the pose looked at last
         ("least_clearance", "<f8"),  # least of a period
-        *EQUATIONS,
+        # the equations of a step (`kernels.hand.step`)
+        ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
+        ("n_near", "<i8"),  # near points at the tool's pose
+        ("n_active", "<i8"),  # points in the contact set of the last step
+        ("n_bends", "<i8"),  # rows of curvature in its equations
+        ("is_bent", "?"),  # the surface is hollow: its curvature is computed
+        ("matrix", "<f8", (6, 6)),  # of the step's equations: N/m, N, N m
+        ("right", "<f8", 6),  # their right-hand side: N, N m
+        ("step", "<f8", 6),  # of the tool's centre: m, rad
+        ("pull", "<f8", 6),  # from tool to hand: m, rad
+        ("pulls", "<f8", 2),  # stiffnesses along it, lowered at the caps: N/m, N m/rad of the scene
         ("n_tried", "<i8"),  # near points at the pose looked at last, in the other half
         ("n_unknown", "<i8"),  # points in unknown cells there
         ("n_looks", "<i8"),  # poses looked at in this period
@@ -208,43 +205,6 @@ FOLLOWER: Layout = _record(
     ]
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
-
-MOST_PLANES = 16
-"""Most contact planes of a contact proxy. Larger: tools that touch in many places are modelled more
-closely; messages are longer, and a client computes longer."""
-CONTACT_ROWS = 29
-"""Rows with numbers of near points at one pose; `kernels.hand.near_points` names them."""
-CONTACT_MODEL: Layout = _record(
-    [
-        ("hand", "<f8", 7),  # of the model: the tool's centre as the hand holds it, unit quaternion
-        ("tool", "<f8", 7),  # the tool there: its centre, m, and its unit quaternion
-        ("center", "<f8", 3),  # of the tool, in the tool's frame, m
-        ("radius", "<f8"),  # of the point farthest from the centre, m
-        ("trust", "<f8"),  # way of that point beyond which contacts may be missing, m
-        ("wrench", "<f8", 6),  # on the hand there, about the tool's centre in the hand: N, N m
-        ("stiffness", "<f8", (6, 6)),  # K6 = -dW/dx: N/m, N, N m
-        ("spring", "<f8"),  # between hand and tool, N/m
-        ("turn_spring", "<f8"),  # N m/rad
-        ("cap", "<f8"),  # greatest force, N
-        ("turn_cap", "<f8"),  # greatest torque about the centre, N m
-        ("contact", "<f8"),  # stiffness of a contact point, N/m
-        ("onset", "<f8"),  # distance from a surface at which contact begins, m
-        ("n_planes", "<i8"),
-        ("levers", "<f8", (MOST_PLANES, 3)),  # from the tool's centre to the point that touches, m
-        ("normals", "<f8", (MOST_PLANES, 3)),  # unit, away from the surface
-        ("depths", "<f8", MOST_PLANES),  # m; negative: the point is still that far from contact
-        ("weights", "<f8", MOST_PLANES),  # points that the plane stands for
-        ("bends", "<f8", (MOST_PLANES, 2)),  # curvatures along `along` and across it, 1/m
-        ("along", "<f8", (MOST_PLANES, 3)),  # unit, at right angles to the normal
-        # scratch of the client's solver
-        ("position", "<f8", 3),  # of the tool's centre, m
-        ("quaternion", "<f8", 4),
-        *EQUATIONS,
-        ("rows", "<f8", (CONTACT_ROWS, MOST_PLANES)),  # of the planes as near points
-        ("met", "<i8", (2, MOST_PLANES)),
-    ]
-)
-"""A contact proxy: the tool's contacts around one pose of the hand, in the scene's axes."""
 
 FRAME: Layout = np.dtype(
     [

@@ -28,8 +28,8 @@ LARGE_FROM = 4096
 """Points from which the quasi-static coupling tests spheres of runs before their points. The
 results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
-"""Nanoseconds without an answer of the database after which hosted hands and contact proxies take
-all cells for unknown."""
+"""Nanoseconds without an answer of the database after which hosted hands take all cells for
+unknown."""
 FOREVER = 1e9
 """Seconds that mean "no limit": thirty years."""
 

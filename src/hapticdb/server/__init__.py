@@ -1,1 +1,1 @@
-"""What other machines reach: relay, access, endpoints of devices, health."""
+"""What other machines reach: relay, access, health."""

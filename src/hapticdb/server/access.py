@@ -1,8 +1,8 @@
 """Who may do what on the server: roles, the tokens that name them, and browsers' cookies.
 
 A viewer sees, a toucher also feels, an editor also moves objects. A client shows its token once. A
-browser gets a cookie for it; a program sends the token in the header ``Authorization: Bearer`` with
-each connection. Only digests of tokens and cookies are kept.
+browser gets a cookie for it; a program that reads figures sends the token in the header
+``Authorization: Bearer``. Only digests of tokens and cookies are kept.
 """
 
 import hashlib

@@ -8,9 +8,7 @@ from starlette.requests import Request
 from starlette.responses import JSONResponse, PlainTextResponse, Response
 from starlette.routing import BaseRoute, Mount, Route, WebSocketRoute
 from starlette.types import ASGIApp
-from starlette.websockets import WebSocket
 
-from hapticdb.server.contacts import Contacts
 from hapticdb.server.front_page import ClientPage, FrontDoor
 from hapticdb.server.guards import Guards
 from hapticdb.server.health import Doctor
@@ -50,19 +48,12 @@ def application(
         text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
         return Response(text, media_type="text/plain; version=0.0.4")
 
-    contacts = Contacts(served)
-
-    async def device(websocket: WebSocket) -> None:
-        with served.figures.devices.track_inprogress():
-            await contacts.serve(websocket)
-
     routes: list[BaseRoute] = [
         Route("/", door.view, methods=["GET"]),
         Route("/sign-in", door.sign_in, methods=["POST"]),
         Route("/healthz", healthz, methods=["GET"]),
         Route("/metrics", metrics, methods=["GET"]),
         WebSocketRoute("/", relay.browser),
-        WebSocketRoute("/device/contacts", device),
     ]
     # viser's client leaves out the last slash of the page's address
     bare: list[BaseRoute] = [WebSocketRoute(prefix, relay.browser)] if prefix else []

@@ -21,9 +21,6 @@ class Figures:
             ["end"],
             registry=known,
         )
-        self.devices = Gauge(
-            "hapticdb_devices", "Open connections of devices, asking ones too.", registry=known
-        )
         self.messages = Counter(
             "hapticdb_relay_messages", "Messages of browsers passed to the page.", registry=known
         )

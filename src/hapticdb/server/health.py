@@ -15,7 +15,6 @@ from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedFigures
-from hapticdb.server.access import Role
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.served import Served
 from hapticdb.store.connect import open_store
@@ -93,8 +92,7 @@ class Doctor:
         """Ask the database for its revision, in the thread that has it open."""
         try:
             if self._env is None:
-                url = self._served.urls[Role.VIEWER]
-                self._env = Environment(open_store(url, read_only=True))
+                self._env = Environment(open_store(self._served.host.url, read_only=True))
             began = time.perf_counter()
             self._env.store.revision()
         except HapticDBError as error:

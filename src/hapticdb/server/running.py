@@ -47,19 +47,6 @@ class _Server(uvicorn.Server):
         yield
 
 
-class _Config(uvicorn.Config):
-    """uvicorn's configuration, whose TLS sends no session tickets.
-
-    A ticket comes just after the handshake. A client that reads in one thread and writes in another
-    may lose its first request then, because OpenSSL's connections are not made for two threads.
-    """
-
-    def load(self) -> None:
-        super().load()
-        if self.ssl is not None:
-            self.ssl.num_tickets = 0
-
-
 def listening(serving: Serving) -> socket.socket:
     """Bind the server's socket; a UsageError if the address cannot be had."""
     try:
@@ -97,11 +84,10 @@ async def run(
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
 
-        purposes = ("host", "shell", *(("proxies",) if serving.awaits_devices else ()))
-        preparation = Preparation(purposes, note, lambda text: keeper.tell("preparing", text))
-        served = Served(
-            serving.urls, serving.tools, access, serving.limits, Figures(), host, preparation
+        preparation = Preparation(
+            ("host", "shell"), note, lambda text: keeper.tell("preparing", text)
         )
+        served = Served(access, serving.limits, Figures(), host)
         served.figures.add(HostCollector(host))
         keeper = PageKeeper(
             serving.page, partial(_page_request, serving), host.serve, preparation.done
@@ -123,8 +109,6 @@ async def run(
         running = asyncio.create_task(server.serve([sock]))
         ready(port)
         LOG.info("serving", extra={"port": port})
-        if serving.awaits_devices:
-            keeper.prepare()
         await _unless(stop, asyncio.shield(running))
         LOG.info("stopping")
         server.should_exit = True
@@ -161,7 +145,7 @@ async def _cancelled(task: "asyncio.Task[None]") -> None:
 def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
     limits = serving.limits
     http, websocket = limited(limits)
-    return _Config(
+    return uvicorn.Config(
         app,
         http=http,
         ws=websocket,

@@ -13,7 +13,6 @@ from hapticdb.server.limits import Limits
 
 if TYPE_CHECKING:
     from hapticdb.hosting.host import SessionHost
-    from hapticdb.hosting.preparing import Preparation
     from hapticdb.server.figures import Figures
 
 PAGE = "hapticdb.page.process:work"
@@ -29,9 +28,7 @@ class Serving:
     urls : the environment's address for each role; tools : files; tokens : the role that each
     gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
     it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
-    recordings of sessions, None: nobody records; page : function of the page's process;
-    awaits_devices : whether what hands call is compiled from the start, for devices on other
-    machines, and not when somebody first feels something.
+    recordings of sessions, None: nobody records; page : function of the page's process.
     """
 
     urls: Mapping[Role, str]
@@ -48,7 +45,6 @@ class Serving:
     recordings: str | None = None
     limits: Limits = field(default_factory=Limits)
     page: str = PAGE
-    awaits_devices: bool = False
 
     def address(self, port: int, token: str = "") -> str:
         """Address for a browser on this machine."""
@@ -102,12 +98,9 @@ def is_address(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Served:
-    """An environment as one server offers it; `urls` and `tools` as of `Serving`."""
+    """What the parts of a server share."""
 
-    urls: Mapping[Role, str]
-    tools: tuple[str, ...]
     access: Access
     limits: Limits
     figures: "Figures"
     host: "SessionHost"
-    preparation: "Preparation"

@@ -124,7 +124,7 @@ def serve(
     log_json: LogJsonOption = False,
     seconds: SecondsOption = None,
 ) -> None:
-    """Let others see and feel an environment in browsers, and devices on other machines.
+    """Let others see and feel an environment in browsers.
 
     Example: hapticdb serve car.db --tool wrench.stl --token
     """
@@ -135,7 +135,7 @@ def serve(
     serving = replace(
         _serving(url, tool, tokens, role_url, recordings),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
-        certificate=tls_cert, key=tls_key, awaits_devices=True,
+        certificate=tls_cert, key=tls_key,
     )  # fmt: skip
 
     def ready(port: int) -> None:

@@ -7,12 +7,11 @@ the scene is K / S, turning stiffness S K_R, and a torque at the device is the s
 import math
 from typing import NamedTuple
 
-from hapticdb.kernels._jit import FLOAT, fields_of, leaf
+from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.rigid import (
     length_at,
     moment,
     moved,
-    numbers_of,
     product,
     transform_of,
     turn_of,
@@ -50,9 +49,6 @@ class DeviceSpring(NamedTuple):
     fade: float
 
 
-DEVICE_SPRING = fields_of(DeviceSpring, *(FLOAT,) * 9)
-
-
 @leaf
 def contact_stiffness(spring, size):
     """Stiffness of a contact, N/m of the scene."""
@@ -61,43 +57,25 @@ def contact_stiffness(spring, size):
 
 
 @leaf
-def pull_to(pull, hand, lever, at, turned):
-    """Write the stretch, m, and the turn from a tool to a hand into pull (6,).
-
-    hand: position and unit quaternion, seven numbers; lever: from there to the tool's centre in the
-    hand; at, turned: the centre and the unit quaternion of the tool.
-    """
-    for axis in range(3):
-        pull[axis] = hand[axis] + lever[axis] - at[axis]
-    pull[3], pull[4], pull[5] = turn_of(
-        *product(hand[3], hand[4], hand[5], hand[6], turned[0], -turned[1], -turned[2], -turned[3])
-    )
-
-
-@leaf
 def measure_pull(spring, tool, hand, pose, center, follower):
-    """Stretch and turn from tool to hand: see `stretch`.
+    """Stretch, m, and turn from tool to hand into follower.pull (6,), stiffnesses into `pulls`.
 
-    center (3,): the tool's, in the tool's frame.
+    center (3,): the tool's, in the tool's frame. The spring pulls by BEYOND_CAP of its caps at
+    most.
     """
     at = moved(transform_of(pose), center[0], center[1], center[2])
-    pull_to(follower.pull, numbers_of(hand), lever_in_hand(hand, center), at, tool.quaternion)
-    stretch(
-        follower, follower.share * spring.stiffness / spring.scale,
-        follower.share * spring.turn_stiffness * spring.scale, BEYOND_CAP * spring.cap,
-        BEYOND_CAP * spring.turn_cap * spring.scale,
-    )  # fmt: skip
-
-
-@leaf
-def stretch(one, stiffness, turn_stiffness, most, most_turn):
-    """Stiffnesses along one.pull (6,), m and rad in the scene, into one.pulls (2,).
-
-    one: of FOLLOWER or CONTACT_MODEL. The spring pulls by `most` N and `most_turn` N m at most.
-    """
-    way, angle = length_at(one.pull, 0), length_at(one.pull, 3)
-    one.pulls[0] = most / way if stiffness * way > most else stiffness
-    one.pulls[1] = most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
+    pull, at_hand, lever = follower.pull, hand.position, lever_in_hand(hand, center)
+    p, q = tool.quaternion, hand.quaternion
+    for axis in range(3):
+        pull[axis] = at_hand[axis] + lever[axis] - at[axis]
+    turned = product(q[0], q[1], q[2], q[3], p[0], -p[1], -p[2], -p[3])
+    pull[3], pull[4], pull[5] = turn_of(*turned)
+    stiffness = follower.share * spring.stiffness / spring.scale
+    turn_stiffness = follower.share * spring.turn_stiffness * spring.scale
+    most, most_turn = BEYOND_CAP * spring.cap, BEYOND_CAP * spring.turn_cap * spring.scale
+    way, angle = length_at(pull, 0), length_at(pull, 3)
+    follower.pulls[0] = most / way if stiffness * way > most else stiffness
+    follower.pulls[1] = most_turn / angle if turn_stiffness * angle > most_turn else turn_stiffness
 
 
 @leaf
@@ -118,9 +96,9 @@ def at_device(spring, hand, center, fx, fy, fz, tx, ty, tz):
 
 
 @leaf
-def wrench_of(one, cap, turn_cap):
-    """Force and torque against one.pull, about the tool's centre: N and N m, at most the caps."""
-    pull, k, r = one.pull, one.pulls[0], one.pulls[1]
+def wrench_of(follower, cap, turn_cap):
+    """Force and torque against follower.pull, about the tool's centre: N and N m, within caps."""
+    pull, k, r = follower.pull, follower.pulls[0], follower.pulls[1]
     x, y, z = shortened(-k * pull[0], -k * pull[1], -k * pull[2], cap)
     a, b, c = shortened(-r * pull[3], -r * pull[4], -r * pull[5], turn_cap)
     return x, y, z, a, b, c

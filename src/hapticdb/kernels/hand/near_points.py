@@ -53,12 +53,12 @@ in contact, and more computing for each point."""
 NEVER = 1e30
 """A way that no tool travels."""
 
-DUE, LAST_U, LAST_BOUND, ONSETS, RUN_DUE, ACTIVE, WEIGHTS = 0, 1, 2, 3, 4, 5, 6
+DUE, LAST_U, LAST_BOUND, ONSETS, RUN_DUE, ACTIVE = 0, 1, 2, 3, 4, 5
 """Rows of a field (FIELD_ROWS, N) with a number for each point: way at which the point is looked at
 next; distance and bound at the tool's pose, h where it is not near; onset, voxels. RUN_DUE has the
 least DUE of each run of points; ACTIVE has, for each near point in its order, whether it is in
-the contact set, and WEIGHTS how many points push there: 1 but in a proxy (`proxy.evaluate`)."""
-NEAR = 7
+the contact set."""
+NEAR = 6
 """First row with the near points of two poses, in the order of the points: NEAR_ROWS for each."""
 U, BOUND, ALONG, ABOUT = 0, 1, 2, 5
 """Rows from there on: distance and bound, voxels; gradient (3) and its moment about the centre (3),
@@ -145,7 +145,7 @@ def bound_at(payload, slot, mask, at):
 
 
 @leaf
-def bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
+def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
     """Curvatures of a hollow surface across a gradient and their unit directions: c, v, d, w.
 
     The second derivatives are those of the distance. A curvature is 0 where the surface is flat or
@@ -184,7 +184,7 @@ def bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
 
 
 @leaf
-def write_along(field, row, m, lever, x, y, z):
+def _write_along(field, row, m, lever, x, y, z):
     """Write a direction at near point m and its moment about the centre, six rows from `row` on."""
     field[row, m], field[row + 1, m], field[row + 2, m] = x, y, z
     x, y, z = moment(lever[0], lever[1], lever[2], x, y, z)
@@ -192,24 +192,18 @@ def write_along(field, row, m, lever, x, y, z):
 
 
 @leaf
-def write_bends(field, rows, m, lever, bends):
-    """Write both bends of near point m, numbers of `bends_of`, into its rows."""
-    row = rows + BENDS
-    c, vx, vy, vz, d, wx, wy, wz = bends
-    field[row, m], field[row + BEND_ROWS, m] = c, d
-    write_along(field, row + 1, m, lever, vx, vy, vz)
-    write_along(field, row + BEND_ROWS + 1, m, lever, wx, wy, wz)
-
-
-@leaf
 def _bend_at(payload, slot, mask, x, y, z, lever, field, rows, m):
     """Find both bends of near point m, at (x, y, z) voxels."""
-    field[rows + BENDS, m] = field[rows + BENDS + BEND_ROWS, m] = 0.0
+    row = rows + BENDS
+    field[row, m] = field[row + BEND_ROWS, m] = 0.0
     if not (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
         return
     gx, gy, gz = field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m]
     xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
-    write_bends(field, rows, m, lever, bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz))
+    c, vx, vy, vz, d, wx, wy, wz = _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
+    field[row, m], field[row + BEND_ROWS, m] = c, d
+    _write_along(field, row + 1, m, lever, vx, vy, vz)
+    _write_along(field, row + BEND_ROWS + 1, m, lever, wx, wy, wz)
 
 
 @inlined
@@ -226,7 +220,7 @@ def write_near(payload, slot, mask, at, lever, found, is_bent, field, rows, m):
     """
     u, gx, gy, gz, bound = found
     field[rows + U, m], field[rows + BOUND, m] = u, bound
-    write_along(field, rows + ALONG, m, lever, gx, gy, gz)
+    _write_along(field, rows + ALONG, m, lever, gx, gy, gz)
     if is_bent and u < ONSET:
         _bend_at(payload, slot, mask, at[0], at[1], at[2], lever, field, rows, m)
     else:
@@ -443,7 +437,7 @@ def forget(follower, field):
     follower.n_near = follower.n_tried = 0
     for n in range(field.shape[1]):
         field[LAST_U, n] = field[LAST_BOUND, n] = HALF_WIDTH
-        field[ONSETS, n], field[WEIGHTS, n] = ONSET, 1.0
+        field[ONSETS, n] = ONSET
 
 
 @leaf

@@ -18,13 +18,12 @@ from hapticdb.kernels.hand.near_points import (
     NEAR_POINTS,
     NEAR_ROWS,
     ONSETS,
-    WEIGHTS,
     U,
 )
 
 
 @leaf
-def add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
+def _add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
     """Add a row to the step's equations: weight J J^T to the lower triangle, weight d J."""
     matrix, right, row = follower.matrix, follower.right, (jx, jy, jz, ax, ay, az)
     for n in range(6):
@@ -35,7 +34,7 @@ def add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
 
 
 @leaf
-def factor(follower):
+def _factor(follower):
     """Cholesky factor L of the step's matrix, in its lower triangle."""
     matrix = follower.matrix
     for row in range(6):
@@ -50,7 +49,7 @@ def factor(follower):
 
 
 @leaf
-def solve(follower):
+def _solve(follower):
     """Solve the step's equations by the factor L of their matrix: step = L^-T L^-1 right."""
     matrix, right, step = follower.matrix, follower.right, follower.step
     for row in range(6):
@@ -67,7 +66,7 @@ def solve(follower):
 
 
 @leaf
-def begin_equations(follower, extra, turn_extra):
+def _begin_equations(follower, extra, turn_extra):
     """Set the step's equations to the springs alone, and `extra` stiffness that only brakes."""
     matrix, right, pull, pulls = follower.matrix, follower.right, follower.pull, follower.pulls
     for row in range(6):
@@ -116,7 +115,7 @@ def _add_bends(follower, weight, field, rows, m):
     for bend in range(2):
         row = rows + BENDS + bend * BEND_ROWS
         if field[row, m] > 0.0:
-            add_row(
+            _add_row(
                 follower, weight * field[row, m], 0.0,
                 field[row + 1, m], field[row + 2, m], field[row + 3, m],
                 field[row + 4, m], field[row + 5, m], field[row + 6, m],
@@ -128,9 +127,9 @@ def _add_bends(follower, weight, field, rows, m):
 def solve_step(follower, field, met, size, stiffness, extra, turn_extra, rounds):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
-    follower: a record with `records.EQUATIONS`, of which pull has e and theta, and pulls their
-    stiffnesses; stiffness: of a contact, N/m; rounds: most times that the equations are solved
-    until the contact set stays the same.
+    follower: a record of FOLLOWER, of which pull has e and theta, and pulls their stiffnesses;
+    stiffness: of a contact, N/m; rounds: most times that the equations are solved until the contact
+    set stays the same.
     """
     step = follower.step
     base = NEAR + follower.side * NEAR_ROWS
@@ -140,20 +139,19 @@ def solve_step(follower, field, met, size, stiffness, extra, turn_extra, rounds)
         step[axis] = 0.0
     _predict_contacts(follower, field, met, size)
     for _ in range(rounds):
-        begin_equations(follower, extra, turn_extra)
+        _begin_equations(follower, extra, turn_extra)
         for m in range(follower.n_near):
             if field[ACTIVE, m] == 0.0:
                 continue
             depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
-            weight = stiffness * field[WEIGHTS, m]
-            add_row(
-                follower, weight, depth,
+            _add_row(
+                follower, stiffness, depth,
                 field[base + ALONG, m], field[base + ALONG + 1, m], field[base + ALONG + 2, m],
                 field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
             )  # fmt: skip
             if follower.is_bent and depth > 0.0:
-                _add_bends(follower, weight * depth / size, field, base, m)
-        factor(follower)
-        solve(follower)
+                _add_bends(follower, stiffness * depth / size, field, base, m)
+        _factor(follower)
+        _solve(follower)
         if not _predict_contacts(follower, field, met, size):
             return

@@ -1,1 +1,0 @@
-"""Messages between a server and devices on other machines, to the byte."""

@@ -13,9 +13,9 @@ from numpy.typing import NDArray
 
 from hapticdb import Environment
 from hapticdb.grid import Grid
-from hapticdb.query.grouping import object_ranges
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Rows, Store, row_shift
+from hapticdb.store.covering import object_ranges
 
 
 @dataclass(frozen=True)

@@ -26,7 +26,7 @@ import page_tables
 import records
 from awake import awake
 from hapticdb import Environment, GridOptions, ImportOptions
-from hapticdb.query.quantiles import QuantileVector
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout, SupportsCaches
 from hapticdb.store.postgres.address import with_environment

@@ -28,7 +28,7 @@ import records
 from awake import awake
 from copies import Plan, Source, write_copies
 from hapticdb import Environment, PointShell
-from hapticdb.query.frame import Strategy
+from hapticdb.paper.strategies import Strategy
 from hapticdb.sample import write_sample
 from hapticdb.store.connect import create_store
 from hapticdb.store.postgres.address import with_environment

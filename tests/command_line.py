@@ -16,7 +16,7 @@ import trimesh
 import hapticdb
 from children import child
 from hapticdb.cli import main
-from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.paper.cost_model import CostModel, machine_name
 
 PLACES = ((0.0, 0.0, 0.0635), (0.0, 0.0, 0.3), (0.2, 0.0, -0.0635))
 Run = Callable[..., tuple[int, str, str]]

@@ -16,7 +16,7 @@ from assemblies import Mesh, ball, placement, write_obj
 from children import joined
 from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.ingest.files import ImportProgress
-from hapticdb.query.frame import Strategy
+from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.connecting import connection
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries

@@ -28,8 +28,8 @@ from hapticdb.environment import opened
 from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
-from hapticdb.query.cost_model import machine_name
-from hapticdb.query.frame import Strategy
+from hapticdb.paper.cost_model import machine_name
+from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import KINDS
 from mesh_files import gltf

@@ -25,8 +25,8 @@ from hapticdb.grid import CurveName
 from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
-from hapticdb.query.grouping import covering
 from hapticdb.store.base import Band, Layout, Rows
+from hapticdb.store.covering import covering
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.testing import blob, voxel_object, with_distances, write_voxels
 from hapticdb.transfer import CopyReport

@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from dense_frame import dense_bitmap, dense_feel
 from hapticdb import Environment, Query
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
-from hapticdb.query.frame import Strategy, locate
-from hapticdb.query.grouping import cbgroup
-from hapticdb.query.quantiles import QuantileVector
+from hapticdb.paper.grouping import cbgroup
+from hapticdb.paper.quantiles import QuantileVector
+from hapticdb.paper.strategies import Strategy
+from hapticdb.query.frame import locate
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
@@ -93,11 +94,11 @@ def coarsened(finest: QuantileVector, resolution: int) -> QuantileVector:
 def _grouping_us(subject: Subject, vector: QuantileVector, task: Task) -> float:
     """Median time of grouping alone, over frames that differ as a hand's do."""
     query = subject.query(vector)
-    located = [locate(task.shell, pose, query.grid).keys for pose in task.poses[:200]]
+    located = [locate(task.shell, pose, query.query.grid).keys for pose in task.poses[:200]]
     times = []
     for keys in located + located:
         start = time.perf_counter_ns()
-        cbgroup(keys, vector, subject.costs)
+        cbgroup(keys, keys, vector, subject.costs)
         times.append(time.perf_counter_ns() - start)
     return float(np.median(times[len(located) :])) / 1000
 
@@ -191,11 +192,11 @@ def grouping(subject: Subject, budget: Budget) -> list[Cell]:
         shell = sphere_shell(grid.voxel_size, n_points, radius)
         pose = np.eye(4)
         pose[:3, 3] = np.array(grid.origin) + 0.5 * grid.edge
-        keys = locate(shell, pose, query.grid).keys
+        keys = locate(shell, pose, query.query.grid).keys
         us: list[float] = []
         while len(us) < LEAST_GROUPED or sum(us) < 1e6 * budget.cell_s / 4:
             start = time.perf_counter_ns()
-            ranges = cbgroup(keys, subject.quantiles, subject.costs)
+            ranges = cbgroup(keys, keys, subject.quantiles, subject.costs)
             us.append((time.perf_counter_ns() - start) / 1000)
         about = {"engine": subject.env.engine, "layout": subject.env.layout, "points": n_points}
         about |= {"keys": len(keys), "ranges": len(ranges.lows)}

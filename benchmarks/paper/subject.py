@@ -6,13 +6,13 @@ from functools import cached_property
 from typing import Any
 
 from hapticdb import Environment, Query
+from hapticdb.paper.calibration import calibrate
+from hapticdb.paper.cost_model import CostModel
+from hapticdb.paper.grouping import DEFAULT_MAXGAP
+from hapticdb.paper.quantiles import QuantileVector
+from hapticdb.paper.strategies import Strategies, Strategy
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.calibration import calibrate
-from hapticdb.query.cost_model import CostModel
-from hapticdb.query.frame import HapticQuery, Strategy
-from hapticdb.query.grouping import DEFAULT_MAXGAP
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane
-from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.sqlite.store import SQLiteStore
 from paper.measure import Alternative, Cell, Pose
 from paper.workload import Task
@@ -56,10 +56,10 @@ class Subject:
             **({"region": task.region, "density": task.density} if task.region else {}),
         }
 
-    def query(self, quantiles: QuantileVector | None = None) -> HapticQuery:
+    def query(self, quantiles: QuantileVector | None = None) -> Strategies:
         """Frames on this environment, with its quantiles unless others are given."""
         statistics = (quantiles or self.quantiles, self.costs)
-        return HapticQuery(self.env.store, lambda: statistics)
+        return Strategies(self.env.store, lambda: statistics)
 
     def alternative(
         self,
@@ -67,7 +67,7 @@ class Subject:
         strategy: Strategy,
         *,
         gap: int | None = None,
-        query: HapticQuery | None = None,
+        query: Strategies | None = None,
         law: str = "plane",
         **more: Any,  # noqa: ANN401 - what a cell says is JSON's
     ) -> Alternative:
@@ -88,7 +88,7 @@ class Subject:
 
 
 def asking(
-    query: HapticQuery, shell: PointShell, strategy: Strategy, law: str, gap: int | None
+    query: Strategies, shell: PointShell, strategy: Strategy, law: str, gap: int | None
 ) -> Callable[[Pose], Query]:
     """Frames of one shell by one strategy."""
     gap = DEFAULT_MAXGAP if gap is None else gap

@@ -13,8 +13,8 @@ from scipy.spatial.transform import Rotation
 from hapticdb.environment import Environment
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.grouping import box_ranges
 from hapticdb.store.base import row_shift
+from hapticdb.store.covering import box_ranges
 from slide_paths import slide_along
 
 POINTS = 300

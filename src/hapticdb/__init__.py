@@ -49,6 +49,8 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import import_files as import_files
     from hapticdb.ingest.upgrading import UpgradeReport as UpgradeReport
     from hapticdb.ingest.upgrading import upgrade_environment as upgrade_environment
+    from hapticdb.paper.cost_model import CostModel as CostModel
+    from hapticdb.paper.quantiles import QuantileVector as QuantileVector
     from hapticdb.pictures.plots import plot as plot
     from hapticdb.pointshell.shell import PointShell as PointShell
     from hapticdb.pool import Pool as Pool
@@ -56,10 +58,8 @@ if TYPE_CHECKING:
     from hapticdb.poses import write_poses as write_poses
     from hapticdb.proportions import Proportions as Proportions
     from hapticdb.proportions import compare_proportions as compare_proportions
-    from hapticdb.query.cost_model import CostModel as CostModel
     from hapticdb.query.law import DistanceField as DistanceField
     from hapticdb.query.law import TangentPlane as TangentPlane
-    from hapticdb.query.quantiles import QuantileVector as QuantileVector
     from hapticdb.query.touches import Query as Query
     from hapticdb.query.touches import Touch as Touch
     from hapticdb.ready import warm_up as warm_up

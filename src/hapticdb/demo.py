@@ -19,9 +19,9 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import GridError, UsageError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
+from hapticdb.paper.strategies import Strategy
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
-from hapticdb.query.frame import Strategy
 from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample

@@ -13,7 +13,7 @@ from hapticdb.grid import Grid
 from hapticdb.ingest.geometry import bricks_of_object
 from hapticdb.ingest.layout import Bricks
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.query.quantiles import QuantileVector
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.store.base import BRICK_BYTES, Object, Progress, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import Url, is_same_grid, part_of

@@ -19,7 +19,7 @@ from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.geometry import bricks_of_batches, rows_of_object
 from hapticdb.ingest.layout import rows_of_bricks
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Progress, Rows, Store, joined
 from hapticdb.store.connect import create_store, exists, open_store
 from hapticdb.store.parsing import Checksum

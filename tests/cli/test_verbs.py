@@ -13,7 +13,7 @@ import trimesh
 
 import hapticdb
 from command_line import Run, boxes, made, poses, refused, rows_of, run, scene, succeeded, tool  # noqa: F401 - fixtures
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.strategies import STRATEGIES
 
 Scene = Path | str
 """A path or a URL: a file in this module; cli/test_postgres.py runs the same tests on servers."""

@@ -35,6 +35,7 @@ FLOORS: list[set[str]] = [
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
     {"check", "difference", "ingest", "proportions", "transfer"},
+    {"paper"},
     {"cluster", "query"},
     {"pointshell", "mesh", "poses"},
     {"store"},

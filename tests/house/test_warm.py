@@ -28,7 +28,7 @@ import numpy as np
 import hapticdb
 from hapticdb.devices.scripted import Line
 from hapticdb.kernels import _jit, compiling
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable

@@ -22,8 +22,8 @@ from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.kernels.field.lattice import BEYOND
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.mesh import Part, parse_in_process, read_file
-from hapticdb.query.grouping import object_ranges
 from hapticdb.store.base import Layout
+from hapticdb.store.covering import object_ranges
 from mesh_files import text
 
 FACES = "v 0 0 0\nv 1 0 0\nv 0 1 0\nv 0.2 0.3 0.9\nf 1 2 3\nf 1 2 4\n"

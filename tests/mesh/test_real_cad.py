@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, PointShell
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout
 from naive_frame import touch_of_shell

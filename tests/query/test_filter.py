@@ -17,11 +17,11 @@ from hapticdb import Environment, Grid
 from hapticdb.errors import ObjectNotFoundError
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.frame import STRATEGIES
-from hapticdb.query.grouping import covering
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.store.base import Layout, Store
+from hapticdb.store.covering import covering
 from hapticdb.testing import voxel_object
 from naive import Voxel
 from query.test_frame import (  # noqa: F401 - a fixture among them

@@ -14,9 +14,9 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
-from hapticdb.query.frame import STRATEGIES, Strategy
-from hapticdb.query.grouping import covering
+from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
+from hapticdb.store.covering import covering
 from hapticdb.testing import KINDS, blob, write_voxels
 from hapticdb.testing.scenes import EVERYWHERE
 from naive_frame import NaiveTouch, touch_of_shell

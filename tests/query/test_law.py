@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.testing import blob, floor_voxels, write_voxels
 from realtime.worlds import random_shell

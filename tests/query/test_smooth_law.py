@@ -11,9 +11,9 @@ from hapticdb import DistanceField, Environment
 from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
 from hapticdb.kernels.field.packing import pack
-from hapticdb.query.calibration import calibrate
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.calibration import calibrate
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.query.law import LAW_NAMES
 from hapticdb.store.base import Band, Keys, Rows
 from hapticdb.testing import blob, voxel_object, write_voxels

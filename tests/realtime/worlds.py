@@ -14,7 +14,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.law import TangentPlaneLaw
 from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
-from hapticdb.query.cost_model import CostModel, machine_name
+from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.resident.held import counts_of, held_tool
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hapticdb import Environment
-from hapticdb.query.cost_model import CostModel
+from hapticdb.paper.cost_model import CostModel
 from hapticdb.resident import source as module
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.source import ASKED, FAR, costs_at_start

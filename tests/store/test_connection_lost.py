@@ -35,7 +35,7 @@ from crashes import (  # noqa: F401 - fixtures among them
 )
 from hapticdb import Environment, PointShell
 from hapticdb.errors import StuckError
-from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.private_server import PrivateServer

@@ -16,9 +16,9 @@ from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE
 from hapticdb import Grid
 from hapticdb.errors import DatabaseError
-from hapticdb.query.grouping import covering
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Store
+from hapticdb.store.covering import covering
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements

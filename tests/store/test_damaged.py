@@ -13,7 +13,7 @@ from banded import write_points
 from draws import is_every
 from hapticdb import Grid, PointShell
 from hapticdb.grid import CurveName
-from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.testing import blob, write_voxels

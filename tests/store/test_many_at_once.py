@@ -30,9 +30,9 @@ from hapticdb.cli import main
 from hapticdb.errors import StuckError
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
-from hapticdb.query.frame import STRATEGIES
-from hapticdb.query.grouping import covering
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Object, Rows
+from hapticdb.store.covering import covering
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import link
 from servers import Place

@@ -36,7 +36,7 @@ from crashes import (  # noqa: F401 - fixtures among them
 )
 from hapticdb import Grid, PointShell
 from hapticdb.errors import AccessError, ConnectionLostError, EnvironmentExistsError, UsageError
-from hapticdb.query.frame import STRATEGIES, Strategy
+from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import grant
 from hapticdb.store.postgres import schema_of

@@ -39,7 +39,7 @@ from crashes import (  # noqa: F401 - fixtures among them
 )
 from hapticdb import Environment, PointShell
 from hapticdb.ingest.files import ImportProgress
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.tables.server_tables import ServerTables

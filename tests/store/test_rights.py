@@ -28,8 +28,8 @@ from hapticdb import Grid, PointShell
 from hapticdb.cli import app
 from hapticdb.difference import diff_environments
 from hapticdb.errors import AccessError, HapticDBError, ReadOnlyError, UsageError
-from hapticdb.query import cost_model, quantiles
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper import cost_model, quantiles
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.connect import grant
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import parse

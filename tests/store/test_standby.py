@@ -18,7 +18,7 @@ import hapticdb
 from children import finished, until
 from command_line import PLACES, Run, made, refused, run  # noqa: F401 - fixtures
 from hapticdb import PointShell
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.engines import MayLag

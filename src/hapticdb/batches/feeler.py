@@ -19,7 +19,6 @@ from hapticdb.kernels.law import reads_distances
 from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import HapticQuery, as_poses
 from hapticdb.query.law import ForceLaw, frames_by
 from hapticdb.ready import make_ready
@@ -86,7 +85,7 @@ class Feeler(Closes):
         self._is_torn = False
         self._is_closed = False
         self._known_revision: int | None = None
-        self._query = HapticQuery(store, QueryFigures(store).both)
+        self._query = HapticQuery(store)
         self._gpu: GpuFrames | None = None
         has_distances = reads_distances(law.for_kernels)
         budget = DEFAULT_BUDGET if budget_bytes is None else budget_bytes

@@ -16,14 +16,14 @@ from hapticdb.ingest.geometry import shell_of_objects
 from hapticdb.ingest.layout import voxels_of_rows
 from hapticdb.ingest.moving import move_object, restore_object, shift_objects
 from hapticdb.mesh import read_file
+from hapticdb.paper.cost_model import CostModel
+from hapticdb.paper.figures import QueryFigures
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.cost_model import CostModel
-from hapticdb.query.figures import QueryFigures
 from hapticdb.query.frame import as_id
-from hapticdb.query.grouping import covering, object_ranges
 from hapticdb.query.law import inset_of
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, Object, Size, Store
+from hapticdb.store.covering import covering, object_ranges
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.refusals import check_unwritten

@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.paper.figures import QueryFigures
+from hapticdb.paper.grouping import DEFAULT_MAXGAP
+from hapticdb.paper.strategies import Strategies, Strategy
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.figures import QueryFigures
-from hapticdb.query.frame import HapticQuery, Strategy, as_poses
-from hapticdb.query.grouping import DEFAULT_MAXGAP
+from hapticdb.query.frame import as_poses
 from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
 from hapticdb.query.touches import Touch
 from hapticdb.store.base import Store
@@ -30,7 +31,8 @@ class Queries:
         self._store = store
         self.address = address
         """What opens it in another process: the URL as given, or a whole path."""
-        self._query = HapticQuery(store, figures.both)
+        self._strategies = Strategies(store, figures.both)
+        self._query = self._strategies.query
         self._filters = FiltersOfWords()
 
     @overload
@@ -114,7 +116,7 @@ class Queries:
         if pose is not None:
             felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
             chosen = as_law(law) if isinstance(law, str) else law
-            return self._query.touch(shell, pose, strategy, maxgap, felt, chosen)
+            return self._strategies.touch(shell, pose, strategy, maxgap, felt, chosen)
         if strategy != "auto":
             raise UsageError(f"strategy {strategy!r} for many poses: leave it out")
         with self.feeler(shell, where=where, exclude=exclude, law=law, device=device) as feeler:

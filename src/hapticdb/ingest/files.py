@@ -34,10 +34,10 @@ from hapticdb.ingest.planning import (
 from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, read_file
 from hapticdb.mesh.chord import checked_chord
-from hapticdb.query.grouping import covering
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
+from hapticdb.store.covering import covering
 from hapticdb.store.refusals import wants_distances
 
 

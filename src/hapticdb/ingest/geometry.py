@@ -9,10 +9,10 @@ import numpy as np
 from hapticdb.errors import FileError, NoSurfaceError, UsageError
 from hapticdb.ingest.layout import Bricks, bricks_of_rows, merged
 from hapticdb.mesh import Part, packing
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.grouping import Ranges, object_ranges
-from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Object, Rows, Store, joined
+from hapticdb.store.covering import Ranges, object_ranges
 from hapticdb.store.parsing import damaged
 
 AT_ONCE = 16

@@ -13,9 +13,9 @@ from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
-from hapticdb.query.grouping import covering
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Rows, Store
+from hapticdb.store.covering import covering
 from hapticdb.store.finding import MOST_IDS
 
 Floats = NDArray[np.float64]

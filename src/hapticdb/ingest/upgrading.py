@@ -19,10 +19,10 @@ from hapticdb.ingest.geometry import found_parts, packed_surface, rows_of_object
 from hapticdb.ingest.voxelizing import ShareCallback, in_threads, rows_of_part
 from hapticdb.mesh import Part, read_file
 from hapticdb.mesh.chord import MARGIN
-from hapticdb.query.grouping import covering
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Object, Rows, Store, joined
 from hapticdb.store.connect import open_store
+from hapticdb.store.covering import covering
 
 _EARLIER = 1e-5 * MARGIN
 """Chord error, metres, with which STEP files become the triangles of versions without one."""

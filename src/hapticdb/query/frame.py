@@ -5,7 +5,7 @@ import operator
 import time
 from collections.abc import Callable, Iterable, Iterator
 from functools import partial
-from typing import TYPE_CHECKING, Literal, get_args
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,24 +16,18 @@ from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.kernels.field import lattice, packing
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
-from hapticdb.query.grouping import DEFAULT_MAXGAP, Ranges, cbgroup, maxgap
 from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import PLANE, ForceLaw, TangentPlane, frames_by
+from hapticdb.query.law import PLANE, ForceLaw, frames_by
 from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement, row_shift
+from hapticdb.store.base import Keys, Rows, Store, row_shift
+from hapticdb.store.covering import Ranges
 from hapticdb.store.filtering import ALL, Filter
 from hapticdb.store.parsing import damaged
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.query.cost_model import CostModel
-    from hapticdb.query.quantiles import QuantileVector
 
-Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
-STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
-GROUPING = ("maxgap", "cbgroup")
-"""Strategies that always scan ranges."""
 MOST_KEYS = 2048
 """Row keys of successive poses after which one statement is sent for all of them. A larger value
 sends fewer statements, but then there are more rows of other poses among the rows of each pose."""
@@ -50,9 +44,28 @@ KEYS_PER_RANGE = 2
 costs more than a key of a lookup, so ranges of one key each would be slower."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
-
-_Asked = tuple[str, int, int, int]
+Asked = tuple[str, int, int, int]
 """Fields of `Query` without the last, which is known only at the end of a frame."""
+Group = Callable[[Keys, bool], Ranges]
+"""Groups the row keys (U,) of a frame into ranges; whether their distances are read, too."""
+
+
+class Form(Protocol):
+    """Another form of a frame's query: a strategy of `hapticdb.paper.strategies`."""
+
+    def purposes(self, law: ForceLaw) -> list[str]:
+        """Purposes (`kernels.compiling.PURPOSES`) of its kernels."""
+
+    def touch(
+        self,
+        located: "contact.Located",
+        exclude: Keys,
+        law: ForceLaw,
+        started: int,
+        *,
+        distances: bool,
+    ) -> Touch:
+        """Touch of a located shell; started : when, ns; distances : whether the law reads them."""
 
 
 class HapticQuery:
@@ -62,9 +75,8 @@ class HapticQuery:
     ----------
     store : Store
         The opened environment.
-    quantiles_and_costs : callable
-        Returns the quantile vector and the cost model; called for each frame that is grouped by
-        cost.
+    group : callable or None
+        Groups frames of many keys by cost; without it, all keys are looked up.
 
     Attributes
     ----------
@@ -74,28 +86,25 @@ class HapticQuery:
         The environment's grid.
     """
 
-    def __init__(
-        self, store: Store, quantiles_and_costs: "Callable[[], tuple[QuantileVector, CostModel]]"
-    ) -> None:
+    def __init__(self, store: Store, group: Group | None = None) -> None:
         self._store = store
-        self._quantiles_and_costs = quantiles_and_costs
+        self._group = group
         self.known = KnownObjects(store)
         least = getattr(store, "grouping_threshold", LEAST_GROUPED)
         self._least_grouped = math.inf if least is None else least
-        self._ready: dict[tuple[Strategy, type], bool] = {}
+        self._ready: dict[tuple[Form | None, type], bool] = {}
         self.grid = store.grid.for_kernels(row_shift(store.layout))
 
     def touch(
         self,
         shell: "PointShell",
         pose: ArrayLike,
-        strategy: Strategy = "auto",
-        gap: int = DEFAULT_MAXGAP,
         felt: Filter = ALL,
         law: ForceLaw | None = None,
+        form: Form | None = None,
     ) -> Touch:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
-        known, asked = self.known, (shell, pose, strategy, gap)
+        known, asked = self.known, (shell, pose, form)
         try:
             touch = None
             if known.version is not None and (law is None or known.fits(law)):
@@ -115,18 +124,17 @@ class HapticQuery:
         self,
         shell: "PointShell",
         pose: ArrayLike,
-        strategy: Strategy,
-        gap: int,
+        form: Form | None,
         felt: Filter,
         law: ForceLaw | None,
     ) -> Touch:
         """Look a shell up in a snapshot, whose objects are loaded first."""
         known = self.known
         if known.version is None:  # the first frame: kernels may have to be compiled
-            self._get_ready(strategy, self.law_now(law))
+            self._get_ready(form, self.law_now(law))
         with self._store.snapshot():
             chosen = known.law_of_newest(law)
-            return self._frame(shell, pose, strategy, gap, known.left_out(felt), chosen)
+            return self._frame(shell, pose, form, known.left_out(felt), chosen)
 
     def law_now(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame at the newest revision, whose objects are loaded."""
@@ -141,58 +149,56 @@ class HapticQuery:
         self,
         shell: "PointShell",
         pose: ArrayLike,
-        strategy: Strategy,
-        gap: int,
+        form: Form | None,
         exclude: Keys,
         law: ForceLaw,
     ) -> Touch:
         """Look a shell up; the result names the objects that are known."""
-        reads = self._ready.get((strategy, type(law.for_kernels)))
+        reads = self._ready.get((form, type(law.for_kernels)))
         if reads is None:
-            reads = self._get_ready(strategy, law)
+            reads = self._get_ready(form, law)
         started = time.perf_counter_ns()
-        if gap < 0:
-            raise UsageError(f"MAXGAP {gap}: give 0 or more")
         located = locate(shell, pose, self.grid)
-        if strategy == "statement":
-            return self._by_statement(located, exclude, law, started)
-        store, keys, ranges = self._store, located.keys, None
-        if strategy in GROUPING or (strategy == "auto" and len(keys) >= self._least_grouped):
-            ranges = self._ranges_of(located, strategy, gap, distances=reads)
-        if strategy == "points":
-            with store.snapshot():
-                rows = store.lookup_each(keys, distances=reads)
-            asked: _Asked = ("points", len(keys), len(keys), len(rows.keys))
-        elif ranges is None:
-            rows = store.lookup(keys, distances=reads)
-            asked = ("array", 1, len(keys), len(rows.keys))
+        if form is not None:
+            return form.touch(located, exclude, law, started, distances=reads)
+        keys, ranges = located.keys, None
+        if len(keys) >= self._least_grouped and self._group is not None:
+            make_ready("calibrate")
+            ranges = self._group(keys, reads)  # by this frame alone, not by frames before it
+        if ranges is None or KEYS_PER_RANGE * len(ranges.lows) > len(keys):
+            rows = self._store.lookup(keys, distances=reads)
+            asked: Asked = ("array", 1, len(keys), len(rows.keys))
         else:
-            rows = store.scan(*ranges, distances=reads)
-            used = "maxgap" if strategy == "maxgap" else "cbgroup"
-            asked = (used, 1, len(ranges.lows), len(rows.keys))
-        payload = self._distances_of(rows, keys) if reads else None
-        return self._refined(located, rows, payload, exclude, law, asked, started)
+            rows = self._store.scan(*ranges, distances=reads)
+            asked = ("cbgroup", 1, len(ranges.lows), len(rows.keys))
+        return self.refined(located, rows, exclude, law, asked, started, distances=reads)
 
-    def _get_ready(self, strategy: Strategy, law: ForceLaw) -> bool:
-        """Compile and load what frames of a strategy and a law call.
+    def _get_ready(self, form: Form | None, law: ForceLaw) -> bool:
+        """Compile and load what frames of a form and a law call.
 
         Returns whether they read distances.
-
-        Raises
-        ------
-        UsageError
-            If there is no such strategy.
         """
-        if strategy not in STRATEGIES:
-            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
-        purposes = ["statement" if strategy == "statement" else frames_by(law, "touch")]
-        if strategy in GROUPING:
-            purposes.append("calibrate")
+        purposes = [frames_by(law, "touch")] if form is None else form.purposes(law)
         make_ready(*purposes)
         load(entries_for(*purposes))
         numbers = law.for_kernels
-        reads = self._ready[strategy, type(numbers)] = laws.reads_distances(numbers)
+        reads = self._ready[form, type(numbers)] = laws.reads_distances(numbers)
         return reads
+
+    def refined(
+        self,
+        located: "contact.Located",
+        rows: Rows,
+        exclude: Keys,
+        law: ForceLaw,
+        asked: Asked,
+        started: int,
+        *,
+        distances: bool,
+    ) -> Touch:
+        """Result of a frame from the rows fetched for it; started : when it began, ns."""
+        payload = self._distances_of(rows, located.keys) if distances else None
+        return self._refined(located, rows, payload, exclude, law, asked, started)
 
     def _distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
         """Distances (R, 1000) of rows. Rows whose keys are not among `keys` are left unset.
@@ -221,7 +227,7 @@ class HapticQuery:
         payload: NDArray[np.uint8] | None,
         exclude: Keys,
         law: ForceLaw,
-        asked: _Asked,
+        asked: Asked,
         started: int,
     ) -> Touch:
         """Result of a frame from its rows; rows of other poses may lie among them."""
@@ -290,7 +296,7 @@ class HapticQuery:
         keys = np.unique(np.concatenate([located.keys for located in batch]))
         reads = laws.reads_distances(law.for_kernels)
         fetched = self._store.lookup(keys, distances=reads)
-        asked: _Asked = ("array", 1, len(keys), len(fetched))
+        asked: Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
         distances = self._distances_of(fetched, keys) if reads else None
         for located in batch:
@@ -303,63 +309,6 @@ class HapticQuery:
             payload = None if distances is None else distances[low:high]
             yield self._refined(located, rows, payload, exclude, law, asked, started)
             asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
-
-    def _ranges_of(
-        self, located: "contact.Located", strategy: Strategy, gap: int, *, distances: bool
-    ) -> Ranges | None:
-        """Ranges of a frame that is grouped; None where `auto` had better look its keys up.
-
-        The decision depends on the frame alone, not on frames before it.
-        """
-        _, asked, keys = located
-        if strategy == "maxgap":
-            first, last = contact.spans_of_keys(asked, keys, self.grid)
-            return maxgap(keys, first, last, gap)
-        if strategy == "auto":
-            make_ready("calibrate")
-        quantiles, costs = self._quantiles_and_costs()
-        ranges = cbgroup(keys, quantiles, costs.with_distances if distances else costs)
-        is_worth = strategy == "cbgroup" or KEYS_PER_RANGE * len(ranges.lows) <= len(keys)
-        return ranges if is_worth else None
-
-    def _by_statement(
-        self,
-        located: "contact.Located",
-        exclude: Keys,
-        law: ForceLaw,
-        started: int,
-    ) -> Touch:
-        """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
-        store = self._store
-        if not isinstance(law, TangentPlane):
-            raise UsageError(
-                "the strategy 'statement' computes the tangent-plane law alone: give the law "
-                "'plane', or choose another strategy"
-            )
-        if not isinstance(store, SupportsStatement):
-            raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
-        placed, (addresses, _), _ = located
-        frame = LocatedShell(placed, addresses, law.stiffness, exclude)
-        with store.snapshot():
-            wrench = store.statement(frame)
-            ordinals, ids = store.statement_hits(frame)
-        hits = np.unique(ordinals)
-        depths = np.empty(len(hits))
-        refining.wrench_of_addresses(
-            placed, hits, addresses[hits], self.grid, law.for_kernels, depths
-        )
-        elapsed_us = (time.perf_counter_ns() - started) / 1000
-        query = Query("statement", 2, len(addresses), len(ids), elapsed_us)
-        pairs = np.stack([ordinals, ids], axis=1)[np.lexsort((ids, ordinals))]
-
-        def pairs_of(_: ForceLaw, points: NDArray[np.int64]) -> NDArray[np.int64]:
-            return pairs[np.isin(pairs[:, 0], points)]
-
-        apart = NOTHING_EXCLUDED, depths[:0]
-        return Touch(
-            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, query, apart,
-            placed, pairs_of, self.known.by_id,
-        )  # fmt: skip
 
 
 def locate(shell: "PointShell", pose: ArrayLike, grid: NDArray[np.void]) -> "contact.Located":

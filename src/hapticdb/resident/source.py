@@ -10,10 +10,10 @@ from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
-from hapticdb.query.calibration import calibrate
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.grouping import group_spans
-from hapticdb.query.quantiles import QuantileVector
+from hapticdb.paper.calibration import calibrate
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.grouping import cbgroup
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import (
     CELL_SHIFT,
@@ -76,7 +76,7 @@ class CellSource:
         highs = ((on_curve + 1) << (CELL_SHIFT - shift)) - 1
         words, masks, payload = table.cells.words, table.cells.masks, table.cells.payload
         costs = self._costs if payload is None else self._costs.with_distances
-        ranges = group_spans(lows, highs, self._quantiles, costs)
+        ranges = cbgroup(lows, highs, self._quantiles, costs)
         rows = self.store.scan(*ranges, distances=payload is not None)
         cells_of_rows = rows.keys >> (CELL_SHIFT - shift)
         at = np.minimum(np.searchsorted(on_curve, cells_of_rows), len(on_curve) - 1)

@@ -8,9 +8,9 @@ import pytest
 from hapticdb.errors import EnvironmentExistsError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.grouping import covering
 from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
+from hapticdb.store.covering import covering
 from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, voxel_object, with_distances
 
 GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)

@@ -7,7 +7,6 @@ import pytest
 
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.grouping import covering
 from hapticdb.store.base import (
     LocatedShell,
     Store,
@@ -15,6 +14,7 @@ from hapticdb.store.base import (
     SupportsStatement,
     SupportsWatch,
 )
+from hapticdb.store.covering import covering
 from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, everything, kind
 
 STORE_CAPABILITIES: dict[str, Any] = {

@@ -10,8 +10,8 @@ import pytest
 
 from hapticdb.errors import DatabaseError, EnvironmentExistsError, ReadOnlyError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.grouping import covering
 from hapticdb.store.base import Rows, Store, SupportsWatch
+from hapticdb.store.covering import covering
 from hapticdb.store.threads import NOBODY, this_thread
 from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, everything, kind, write_voxels
 

@@ -15,8 +15,8 @@ from hapticdb.errors import (
     ReadOnlyError,
 )
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.query.grouping import covering
 from hapticdb.store.base import Object, Rows, Store
+from hapticdb.store.covering import covering
 from hapticdb.store.pairs import Mark, PairRow
 from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, kind, voxel_object, write_voxels
 

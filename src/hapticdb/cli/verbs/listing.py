@@ -12,7 +12,7 @@ from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.units import length_text, place_text
 
 if TYPE_CHECKING:
-    from hapticdb.query.cost_model import CostModel
+    from hapticdb.paper.cost_model import CostModel
     from hapticdb.store.base import Freshness, Object, Store
     from hapticdb.store.engines import Lag
 
@@ -98,7 +98,7 @@ def info(
 
 def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]:
     """What `info` tells of an environment, as JSON and in words."""
-    from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+    from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
     from hapticdb.store.attributes import scene_bounds
     from hapticdb.store.engines import MayLag
 

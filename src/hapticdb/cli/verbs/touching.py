@@ -48,9 +48,9 @@ if TYPE_CHECKING:
 
     from hapticdb.batches.result import TouchBatch
     from hapticdb.environment import Environment
+    from hapticdb.paper.strategies import Strategy
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.proportions import Misfit
-    from hapticdb.query.frame import Strategy
     from hapticdb.query.law import ForceLaw, LawName
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
@@ -221,7 +221,7 @@ def _output(
 
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
     """`array` in place of `auto` on a short path where no costs are kept, else as wanted."""
-    from hapticdb.query.cost_model import machine_name
+    from hapticdb.paper.cost_model import machine_name
 
     if wanted == "auto" and n_poses < FEW_POSES and not env.store.costs(machine_name()):
         return "array"

@@ -8,8 +8,8 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.frame import STRATEGIES
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Layout, Store
 from hapticdb.testing import floor_voxels, write_voxels
 

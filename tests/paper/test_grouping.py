@@ -10,10 +10,11 @@ from hypothesis import strategies as st
 
 from hapticdb import Grid
 from hapticdb.grid import CurveName
-from hapticdb.query.cost_model import CostModel
-from hapticdb.query.grouping import Ranges, box_ranges, cbgroup, maxgap
-from hapticdb.query.quantiles import QuantileVector
+from hapticdb.paper.cost_model import CostModel
+from hapticdb.paper.grouping import cbgroup, maxgap
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.store.base import Keys, Layout, row_shift
+from hapticdb.store.covering import Ranges, box_ranges
 from hapticdb.testing import KINDS
 
 few = settings(max_examples=100, deadline=None)
@@ -149,7 +150,7 @@ def test_cost_based_grouping_costs_the_least_of_all_groupings(
 ) -> None:
     keys, quantiles = scene
     costs = costs_of(descent, row)
-    found = as_pairs(cbgroup(as_keys(keys), quantiles, costs))
+    found = as_pairs(cbgroup(as_keys(keys), as_keys(keys), quantiles, costs))
     cost = sum(descent + costs.row_scanned * quantiles.rows_between(*pair) for pair in found)
     assert cost == pytest.approx(least_cost(keys, quantiles, costs), rel=1e-9, abs=1e-9)
     assert found in list(all_groupings(keys))
@@ -158,17 +159,17 @@ def test_cost_based_grouping_costs_the_least_of_all_groupings(
 def test_a_gap_covers_the_keys_between_and_not_its_ends() -> None:
     """All rows lie under the keys asked for: the gap is empty, and closed whatever a row costs."""
     quantiles = QuantileVector(as_keys([4, 4, 4, 5, 9, 9, 9]), 60)
-    ranges = cbgroup(as_keys([3, 9]), quantiles, costs_of(1.0, 1.0))
+    ranges = cbgroup(as_keys([3, 9]), as_keys([3, 9]), quantiles, costs_of(1.0, 1.0))
     assert as_pairs(ranges) == [(3, 3), (9, 9)]
-    ranges = cbgroup(as_keys([4, 5]), quantiles, costs_of(0.0, 1.0))
+    ranges = cbgroup(as_keys([4, 5]), as_keys([4, 5]), quantiles, costs_of(0.0, 1.0))
     assert as_pairs(ranges) == [(4, 5)]
 
 
 def test_a_gap_that_costs_as_much_as_a_descent_is_closed() -> None:
     quantiles = QuantileVector(as_keys([0, 8, 16]), 16)  # one row a key
     keys = as_keys([1, 6])  # four keys between
-    assert len(cbgroup(keys, quantiles, costs_of(4.0, 1.0)).lows) == 1
-    assert len(cbgroup(keys, quantiles, costs_of(3.99, 1.0)).lows) == 2
+    assert len(cbgroup(keys, keys, quantiles, costs_of(4.0, 1.0)).lows) == 1
+    assert len(cbgroup(keys, keys, quantiles, costs_of(3.99, 1.0)).lows) == 2
 
 
 # --- boxes --------------------------------------------------------------------------------------

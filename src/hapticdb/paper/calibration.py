@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.query import contact, grouping
+from hapticdb.paper.cost_model import CostModel
+from hapticdb.paper.grouping import cbgroup
+from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.cost_model import CostModel
 from hapticdb.query.frame import locate
-from hapticdb.query.grouping import cbgroup
-from hapticdb.query.quantiles import QuantileVector
 from hapticdb.store.base import Keys, Store, SupportsCaches, row_shift
 
 Floats = NDArray[np.float64]
@@ -182,7 +182,7 @@ def _cautious(
         cautious = replace(model, caution=caution)
         ranges = rows = 0
         for keys in frames:
-            lows, highs = cbgroup(keys, quantiles, cautious)
+            lows, highs = cbgroup(keys, keys, quantiles, cautious)
             ranges += len(lows)
             rows += count(lows, highs)
         # Of two equal costs the greater caution is taken: it reads fewer rows.

@@ -15,10 +15,10 @@ from scipy.optimize import nnls
 import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.errors import UsageError
-from hapticdb.query.calibration import _non_negative, calibrate
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.grouping import cbgroup
-from hapticdb.query.quantiles import MAX_RESOLUTION, QuantileVector
+from hapticdb.paper.calibration import _non_negative, calibrate
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.grouping import cbgroup
+from hapticdb.paper.quantiles import MAX_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, SupportsCaches
 from hapticdb.testing import blob, floor_voxels, write_voxels
 
@@ -84,8 +84,8 @@ def test_figures_that_another_version_has_kept_still_serve() -> None:
 def test_cautious_grouping_closes_fewer_gaps() -> None:
     keys = np.arange(0, 4000, 40, dtype=np.int64)
     quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
-    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
-    assert len(cbgroup(keys, quantiles, replace(MODEL, caution=3.0)).lows) == len(keys)
+    assert len(cbgroup(keys, keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
+    assert len(cbgroup(keys, keys, quantiles, replace(MODEL, caution=3.0)).lows) == len(keys)
 
 
 # --- calibration --------------------------------------------------------------------------------

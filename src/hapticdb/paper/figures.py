@@ -3,9 +3,9 @@
 from contextlib import suppress
 
 from hapticdb.errors import DatabaseError
-from hapticdb.query.calibration import calibrate
-from hapticdb.query.cost_model import CostModel, machine_name
-from hapticdb.query.quantiles import DEFAULT_RESOLUTION, QuantileVector
+from hapticdb.paper.calibration import calibrate
+from hapticdb.paper.cost_model import CostModel, machine_name
+from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Store
 
 STALE = 0.2

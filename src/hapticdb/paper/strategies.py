@@ -1,0 +1,159 @@
+"""The strategies of a frame's query (the paper, sections 4.2 and 5), beside the product's own."""
+
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Literal, get_args
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.query import contact, refining
+from hapticdb.paper.cost_model import CostModel
+from hapticdb.paper.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
+from hapticdb.paper.quantiles import QuantileVector
+from hapticdb.query.frame import NOTHING_EXCLUDED, Asked, HapticQuery
+from hapticdb.query.law import ForceLaw, TangentPlane, frames_by
+from hapticdb.query.touches import Query, Touch
+from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement
+from hapticdb.store.covering import Ranges
+from hapticdb.store.filtering import ALL, Filter
+
+if TYPE_CHECKING:
+    from hapticdb.pointshell.shell import PointShell
+
+Strategy = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
+STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
+
+
+class Strategies:
+    """Frames against one store by any strategy; `auto` is `HapticQuery`'s own.
+
+    Parameters
+    ----------
+    store : Store
+        The opened environment.
+    quantiles_and_costs : callable
+        Returns the quantile vector and the cost model; called for each frame that is grouped by
+        cost.
+    """
+
+    def __init__(
+        self, store: Store, quantiles_and_costs: Callable[[], tuple[QuantileVector, CostModel]]
+    ) -> None:
+        self.store = store
+        self.query = HapticQuery(store, self.grouped)
+        self._quantiles_and_costs = quantiles_and_costs
+        self._forms: dict[tuple[Strategy, int], _Form | None] = {}
+
+    def touch(
+        self,
+        shell: "PointShell",
+        pose: ArrayLike,
+        strategy: Strategy = "auto",
+        gap: int = DEFAULT_MAXGAP,
+        felt: Filter = ALL,
+        law: ForceLaw | None = None,
+    ) -> Touch:
+        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        asked = strategy, gap
+        form = self._forms[asked] if asked in self._forms else self._form(*asked)
+        return self.query.touch(shell, pose, felt, law, form)
+
+    def _form(self, strategy: Strategy, gap: int) -> "_Form | None":
+        if strategy not in STRATEGIES:
+            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+        if gap < 0:
+            raise UsageError(f"MAXGAP {gap}: give 0 or more")
+        form = None if strategy == "auto" else _Form(self, strategy, gap)
+        return self._forms.setdefault((strategy, gap), form)
+
+    def grouped(self, keys: Keys, distances: bool) -> Ranges:  # noqa: FBT001 - as `Group`
+        """Ranges of row keys (U,) at the least cost; distances : whether these are read, too."""
+        quantiles, costs = self._quantiles_and_costs()
+        return cbgroup(keys, keys, quantiles, costs.with_distances if distances else costs)
+
+
+@dataclass(frozen=True, eq=False)
+class _Form:
+    """Frames by one strategy, and MAXGAP where it is ``maxgap``."""
+
+    frames: Strategies
+    strategy: Strategy
+    gap: int
+
+    def purposes(self, law: ForceLaw) -> list[str]:
+        """Purposes (`kernels.compiling.PURPOSES`) of its kernels."""
+        if self.strategy == "statement":
+            return ["statement"]
+        grouping = ["calibrate"] if self.strategy in {"maxgap", "cbgroup"} else []
+        return [frames_by(law, "touch"), *grouping]
+
+    def touch(
+        self,
+        located: contact.Located,
+        exclude: Keys,
+        law: ForceLaw,
+        started: int,
+        *,
+        distances: bool,
+    ) -> Touch:
+        """Touch of a located shell; started : when, ns; distances : whether the law reads them."""
+        if self.strategy == "statement":
+            return self._by_statement(located, exclude, law, started)
+        rows, statements, n_ranges = self._fetched(located, distances=distances)
+        asked: Asked = (self.strategy, statements, n_ranges, len(rows.keys))
+        return self.frames.query.refined(
+            located, rows, exclude, law, asked, started, distances=distances
+        )
+
+    def _fetched(self, located: contact.Located, *, distances: bool) -> tuple[Rows, int, int]:
+        """Rows of a frame, and the numbers of statements and of ranges."""
+        store, keys = self.frames.store, located.keys
+        if self.strategy == "points":
+            with store.snapshot():
+                return store.lookup_each(keys, distances=distances), len(keys), len(keys)
+        if self.strategy == "array":
+            return store.lookup(keys, distances=distances), 1, len(keys)
+        if self.strategy == "maxgap":
+            first, last = contact.spans_of_keys(located.asked, keys, self.frames.query.grid)
+            ranges = maxgap(keys, first, last, self.gap)
+        else:
+            ranges = self.frames.grouped(keys, distances)
+        return store.scan(*ranges, distances=distances), 1, len(ranges.lows)
+
+    def _by_statement(
+        self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int
+    ) -> Touch:
+        """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
+        store, query = self.frames.store, self.frames.query
+        if not isinstance(law, TangentPlane):
+            raise UsageError(
+                "the strategy 'statement' computes the tangent-plane law alone: give the law "
+                "'plane', or choose another strategy"
+            )
+        if not isinstance(store, SupportsStatement):
+            raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
+        placed, (addresses, _), _ = located
+        frame = LocatedShell(placed, addresses, law.stiffness, exclude)
+        with store.snapshot():
+            wrench = store.statement(frame)
+            ordinals, ids = store.statement_hits(frame)
+        hits = np.unique(ordinals)
+        depths = np.empty(len(hits))
+        refining.wrench_of_addresses(
+            placed, hits, addresses[hits], query.grid, law.for_kernels, depths
+        )
+        elapsed_us = (time.perf_counter_ns() - started) / 1000
+        asked = Query("statement", 2, len(addresses), len(ids), elapsed_us)
+        pairs = np.stack([ordinals, ids], axis=1)[np.lexsort((ids, ordinals))]
+
+        def pairs_of(_: ForceLaw, points: Keys) -> Keys:
+            return pairs[np.isin(pairs[:, 0], points)]
+
+        apart = NOTHING_EXCLUDED, depths[:0]
+        return Touch(
+            wrench[:3], wrench[3:], hits, depths, np.unique(ids).tolist(), law, asked, apart,
+            placed, pairs_of, query.known.by_id,
+        )  # fmt: skip

@@ -1,4 +1,4 @@
-"""Grouping keys into ranges: MaxGap as defined, CBGroup against brute force (case 10), boxes."""
+"""Grouping keys into ranges: MaxGap as defined, CBGroup against brute force (case 10)."""
 
 from collections.abc import Iterator
 from itertools import pairwise, product
@@ -8,14 +8,11 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hapticdb import Grid
-from hapticdb.grid import CurveName
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.grouping import cbgroup, maxgap
 from hapticdb.paper.quantiles import QuantileVector
-from hapticdb.store.base import Keys, Layout, row_shift
-from hapticdb.store.covering import Ranges, box_ranges
-from hapticdb.testing import KINDS
+from hapticdb.store.base import Keys
+from hapticdb.store.covering import Ranges
 
 few = settings(max_examples=100, deadline=None)
 LARGEST = 2**63 - 2
@@ -156,62 +153,8 @@ def test_cost_based_grouping_costs_the_least_of_all_groupings(
     assert found in list(all_groupings(keys))
 
 
-def test_a_gap_covers_the_keys_between_and_not_its_ends() -> None:
-    """All rows lie under the keys asked for: the gap is empty, and closed whatever a row costs."""
-    quantiles = QuantileVector(as_keys([4, 4, 4, 5, 9, 9, 9]), 60)
-    ranges = cbgroup(as_keys([3, 9]), as_keys([3, 9]), quantiles, costs_of(1.0, 1.0))
-    assert as_pairs(ranges) == [(3, 3), (9, 9)]
-    ranges = cbgroup(as_keys([4, 5]), as_keys([4, 5]), quantiles, costs_of(0.0, 1.0))
-    assert as_pairs(ranges) == [(4, 5)]
-
-
 def test_a_gap_that_costs_as_much_as_a_descent_is_closed() -> None:
     quantiles = QuantileVector(as_keys([0, 8, 16]), 16)  # one row a key
     keys = as_keys([1, 6])  # four keys between
     assert len(cbgroup(keys, keys, quantiles, costs_of(4.0, 1.0)).lows) == 1
     assert len(cbgroup(keys, keys, quantiles, costs_of(3.99, 1.0)).lows) == 2
-
-
-# --- boxes --------------------------------------------------------------------------------------
-
-triples = st.lists(st.integers(-3, 34), min_size=3, max_size=3)
-
-
-@pytest.mark.parametrize(("layout", "curve"), KINDS)
-@settings(max_examples=40, deadline=None)
-@given(a=triples, b=triples)
-def test_the_ranges_of_a_box_hold_every_row_of_its_voxels(
-    layout: Layout, curve: CurveName, a: list[int], b: list[int]
-) -> None:
-    """Ranges ascend, are disjoint, merged where they touch, and cut to the grid."""
-    grid = Grid(1.0, (0, 0, 0), 5, curve)
-    low, high = np.minimum(a, b).astype(np.int64), np.maximum(a, b).astype(np.int64)
-    pairs = as_pairs(box_ranges(grid, layout, low, high))
-    axes = [range(max(lo, 0), min(hi, 31) + 1) for lo, hi in zip(low, high, strict=True)]
-    voxels = np.array(list(product(*axes)), dtype=np.int64)
-    held = {key for first, last in pairs for key in range(first, last + 1)}
-    assert set((grid.encode(voxels) >> row_shift(layout)).tolist()) <= held
-    assert all(first <= last for first, last in pairs)
-    assert all(before + 1 < after for (_, before), (after, _) in pairwise(pairs))
-    assert min(held) >= 0
-    assert max(held) < 8**5 >> row_shift(layout)
-
-
-@pytest.mark.parametrize("curve", ["z", "hilbert"])
-@settings(max_examples=30, deadline=None)
-@given(
-    ends=st.lists(
-        st.lists(st.integers(0, 2**21 - 1), min_size=3, max_size=3), min_size=2, max_size=2
-    )
-)
-def test_a_box_of_any_size_has_a_bounded_number_of_ranges(
-    curve: CurveName, ends: list[list[int]]
-) -> None:
-    """17 cubes lie along the longest edge at most; the outer two layers are not merged."""
-    grid = Grid(1.0, (0, 0, 0), 21, curve)
-    low, high = np.min(ends, axis=0), np.max(ends, axis=0)
-    ranges = box_ranges(grid, "brick", low, high)
-    assert 1 <= len(ranges.lows) <= 17**3 - 13**3
-    corners = grid.encode(np.array(list(product(*zip(low, high, strict=True))))) >> 9
-    at = np.searchsorted(ranges.lows, corners, side="right") - 1
-    assert (ranges.highs[at] >= corners).all()

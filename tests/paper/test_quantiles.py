@@ -54,17 +54,6 @@ def test_expected_rows_are_off_by_two_buckets_at_most(
     assert abs(quantiles.rows_between(left, right) - counted) <= bound
 
 
-@few
-@given(keys=KEYS, resolution=st.integers(1, 250))
-def test_all_rows_lie_between_the_lowest_and_the_highest_key(
-    keys: list[int], resolution: int
-) -> None:
-    quantiles = vector_of(keys, resolution)
-    assert quantiles.rows_between(min(keys), max(keys)) == pytest.approx(len(keys), rel=1e-12)
-    assert quantiles.rows_between(max(keys) + 1, 2**62 + 9) == 0.0
-    assert quantiles.rows_between(-1, min(keys) - 1) == 0.0
-
-
 @pytest.mark.parametrize("resolution", [0, -1, MAX_RESOLUTION + 1])
 def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: int) -> None:
     with pytest.raises(UsageError, match=f"{resolution} quantiles"):
@@ -74,11 +63,6 @@ def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: in
 # --- the cost model -----------------------------------------------------------------------------
 
 MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0)
-
-
-def test_figures_that_another_version_has_kept_still_serve() -> None:
-    older = {k: v for k, v in MODEL.figures().items() if k != "distances"}
-    assert CostModel.from_figures(older | {"lookup": 7.0, "lookup.spread": 0.5}) == MODEL
 
 
 def test_cautious_grouping_closes_fewer_gaps() -> None:

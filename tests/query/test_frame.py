@@ -178,23 +178,6 @@ def test_an_unknown_strategy_is_refused(tmp_path: Path) -> None:
     env = make_scene(tmp_path / "e.db", "brick", "z")
     with pytest.raises(hapticdb.errors.UsageError, match="choose one of auto"):
         env.touch(random_shell(1, 3), np.eye(4), "fastest")  # type: ignore[call-overload]
-    with pytest.raises(hapticdb.errors.UsageError, match="MAXGAP -1"):
-        env.touch(random_shell(1, 3), np.eye(4), "maxgap", maxgap=-1)
-
-
-def test_a_touch_reads_one_revision_though_objects_come_and_go(tmp_path: Path) -> None:
-    """The objects named are those of the revision whose voxels were hit."""
-    env = make_scene(tmp_path / "e.db", "brick", "z")
-    other = hapticdb.open(tmp_path / "e.db")
-    shell, pose = random_shell(5, 300), random_pose(5)
-    before = env.touch(shell, pose)
-    touched = before.objects[0].id
-    other.remove(touched)
-    after = env.touch(shell, pose)
-    assert touched not in [o.id for o in after.objects]
-    new = write_voxels(other.store, scene_voxels()[touched - 1], "again")
-    assert new in [o.id for o in env.touch(shell, pose).objects]
-    assert [o.name for o in env.touch(shell, pose).objects if o.id == new] == ["again"]
 
 
 @pytest.mark.parametrize("is_file", [True, False])

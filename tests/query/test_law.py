@@ -1,4 +1,4 @@
-"""The wrench against closed forms: cases 1, 2, 4 to 6, 8, 11 and 12, averaging, bounds of depth.
+"""The wrench against closed forms: cases 1, 2, 5 and 8, averaging.
 
 The scene of most is the floor: every voxel below the plane z = 0 is solid, eight layers deep. Its
 voxels measure 2^-8 m where a point must lie exactly on a border, 5 mm elsewhere.
@@ -88,11 +88,6 @@ def at(x: float = 0.0, y: float = 0.0, z: float = 0.0) -> Array:
     return pose
 
 
-def unit(vectors: Array) -> Array:
-    lengths: Array = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return vectors / lengths
-
-
 # --- case 1 -------------------------------------------------------------------------------------
 
 
@@ -174,30 +169,6 @@ def test_the_average_counts_hits_and_not_contacts(
     np.testing.assert_allclose(touch.torque, [0, -0.0012 * force, 0], atol=ROUNDING)
 
 
-# --- case 4 -------------------------------------------------------------------------------------
-
-
-@pytest.mark.parametrize("axis", [0, 1, 2])
-@pytest.mark.parametrize("sign", [-1.0, 1.0])
-def test_the_force_averaged_over_a_shift_of_one_voxel_is_an_eighth_of_k_s(
-    floor: Environment, axis: int, sign: float
-) -> None:
-    """Nine points with one normal along an axis: the law averages from 10 hits on."""
-    rng = np.random.default_rng(axis)
-    points = rng.uniform(-3, 3, (9, 3)) * SIZE
-    steps = 64
-    points[:, axis] = (rng.integers(-128, 128, 9) + 0.5) * SIZE / steps
-    normal = sign * np.eye(3)[axis]
-    shell, total = shell_of(points, normal), np.zeros(3)
-    for n in range(steps):
-        shift = np.array([0, 0, -4 * SIZE])
-        shift[axis] += n * SIZE / steps
-        touch = floor.touch(shell, at(*shift), "points")
-        assert len(touch.hits) == 9
-        total += touch.force
-    np.testing.assert_allclose(total / steps, 9 * K * SIZE / 8 * normal, atol=ROUNDING)
-
-
 # --- case 5 -------------------------------------------------------------------------------------
 
 
@@ -226,36 +197,6 @@ def test_a_peg_centred_in_a_hole_feels_no_lateral_force_and_no_torque(tmp_path: 
         np.testing.assert_allclose(touch.torque, 0, atol=ROUNDING)
         aside = env.touch(shell, at(x=0.1 * SIZE), strategy)
         assert aside.force[0] < -1e-3  # pushed back to the middle
-
-
-@unplanned
-def test_a_wedge_on_its_axis_feels_a_force_along_it_alone(
-    floor: Environment, strategy: Strategy
-) -> None:
-    rng = np.random.default_rng(6)
-    x, y = rng.uniform(0.05, 3, 80) * SIZE, rng.uniform(0, 9, 80) * SIZE
-    points = np.stack([x, y, 2 * x - 4.3 * SIZE], axis=1)  # its edge points down, along y
-    normals = np.broadcast_to(unit(np.array([-2.0, 0.0, 1.0])), points.shape)
-    shell = shell_of(mirrored(points), mirrored(normals), (0, 0, 2 * SIZE))
-    touch = floor.touch(shell, np.eye(4), strategy)
-    assert touch.force[2] > 0.1
-    np.testing.assert_allclose(touch.force[:2], 0, atol=ROUNDING)
-    np.testing.assert_allclose(touch.torque, 0, atol=ROUNDING)
-
-
-# --- case 6 -------------------------------------------------------------------------------------
-
-
-@strategies
-def test_free_points_feel_exactly_nothing(
-    floor: Environment, sphere: PointShell, strategy: Strategy
-) -> None:
-    """Above the floor, beside it, below it, and outside the grid."""
-    for pose in (at(z=0.0121), at(x=0.1), at(z=-0.08), at(y=7.0)):
-        touch = floor.touch(sphere, pose, strategy)
-        assert (touch.force == 0).all()
-        assert (touch.torque == 0).all()
-        assert len(touch.hits) == len(touch.contacts) == len(touch.objects) == 0
 
 
 # --- case 8 -------------------------------------------------------------------------------------
@@ -307,6 +248,3 @@ def test_a_turned_scene_turns_the_wrench(tmp_path: Path, axis: int) -> None:
         assert np.abs(plain.force).max() > 1e-3
         np.testing.assert_allclose(moved.force, turn @ plain.force, atol=ROUNDING)
         np.testing.assert_allclose(moved.torque, turn @ plain.torque, atol=ROUNDING)
-
-
-# --- cases 11 and 12 ----------------------------------------------------------------------------

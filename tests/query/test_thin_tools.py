@@ -158,20 +158,3 @@ def test_nothing_jumps_in_a_concave_corner_or_over_a_convex_edge(
         change, most = steepest(scene, start, np.array([last, 30.3, 20.0 + height]), normal)
         assert most > 0.3
         assert change <= STEEPEST * STEP
-
-
-def test_a_wedge_on_its_axis_feels_no_lateral_force() -> None:
-    """Points and normals mirrored in the plane x = 32, over the sheet, whose centres are, too."""
-    rng = np.random.default_rng(3)
-    right = np.column_stack([rng.uniform(0.1, 4.0, 30), rng.uniform(20, 40, 30), np.zeros(30)])
-    right[:, 2] = PLANE_AT + 0.6 + 0.3 * right[:, 0]
-    normal = np.array([-0.3, 0.0, 1.0]) / np.hypot(0.3, 1.0)
-    left = right * [-1.0, 1, 1]
-    points = np.concatenate([left, right]) + np.array([32.0, 0, 0])
-    normals = np.concatenate(
-        [(normal * [-1.0, 1, 1])[None].repeat(30, 0), normal[None].repeat(30, 0)]
-    )
-    felt = frame(sheet(), points, normals)
-    assert felt[2] > K_S
-    assert abs(felt[0]) < 1e-9 * felt[2]
-    assert felt[1] == 0.0

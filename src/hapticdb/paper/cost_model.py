@@ -79,10 +79,9 @@ class CostModel:
 
     @classmethod
     def from_figures(cls, figures: Mapping[str, float]) -> "CostModel":
-        """Rebuild from `figures`; other versions have kept fewer figures, or more."""
-        known = cls.__dataclass_fields__.keys() - {"spread"}
-        plain = {name: figures[name] for name in known if name in figures}
-        spread = {n: figures[f"{n}.spread"] for n in known if f"{n}.spread" in figures}
+        """Rebuild from `figures`."""
+        plain = {name: value for name, value in figures.items() if "." not in name}
+        spread = {n: figures[f"{n}.spread"] for n in plain if f"{n}.spread" in figures}
         return cls(**plain, spread=spread)
 
 

@@ -5,7 +5,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-from feel.measures import table_of
 from page_tables import NONE, facts, listed, table, us_text
 from paper.cells import (
     Cell,
@@ -279,12 +278,6 @@ def exactness(results: Results) -> str:
     )
 
 
-def feel(results: Results) -> str:
-    """What a hand notices, under both laws."""
-    shown = ("touch_ripple", "touch_step", "session_force", "session_edge_step", "tap")
-    return table_of([cell for cell in results["feel"]["cells"] if cell["measure"] in shown])
-
-
 EVALUATION: dict[str, Callable[[Results], str]] = {
     "claim": claim,
     "claim-laws": claim_laws,
@@ -293,7 +286,6 @@ EVALUATION: dict[str, Callable[[Results], str]] = {
     "figure10-counts": figure_10,
     "grouping": grouping,
     "many": many,
-    "evaluation-feel": feel,
     "exactness": exactness,
     "speed": speed,
     "costs": costs,

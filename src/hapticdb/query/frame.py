@@ -146,12 +146,7 @@ class HapticQuery:
                 return self.known.law_of_newest(law)
 
     def _frame(
-        self,
-        shell: "PointShell",
-        pose: ArrayLike,
-        form: Form | None,
-        exclude: Keys,
-        law: ForceLaw,
+        self, shell: "PointShell", pose: ArrayLike, form: Form | None, exclude: Keys, law: ForceLaw
     ) -> Touch:
         """Look a shell up; the result names the objects that are known."""
         reads = self._ready.get((form, type(law.for_kernels)))
@@ -266,11 +261,7 @@ class HapticQuery:
         )
 
     def run_many(
-        self,
-        shell: "PointShell",
-        poses: NDArray[np.float64],
-        exclude: Keys,
-        law: ForceLaw,
+        self, shell: "PointShell", poses: NDArray[np.float64], exclude: Keys, law: ForceLaw
     ) -> Iterator[Touch]:
         """Touches at rigid poses (n, 4, 4), in their order; one statement reads rows of several.
 

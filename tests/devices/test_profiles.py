@@ -18,7 +18,7 @@ from hapticdb.devices.profiles import (
     profile_named,
     profile_of,
 )
-from hapticdb.devices.scripted import Line, RandomHand
+from hapticdb.devices.scripted import RandomHand
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.devices.vendors.force_dimension import ForceDimensionDevice
 from hapticdb.devices.vendors.haply import HaplyDevice
@@ -46,7 +46,7 @@ def test_a_profile_is_found_by_its_name_however_it_is_written() -> None:
 
 
 def test_every_device_of_ours_has_a_profile_before_it_is_opened() -> None:
-    assert profile_of(Line((0, 0, 0), (1, 0, 0))) is SCRIPTED
+    assert profile_of(RandomHand((0, 0, 0))) is SCRIPTED
     assert profile_of(OpenHapticsDevice()) == PROFILES["touch"]
     assert profile_of(OpenHapticsDevice(profile=PROFILES["desktop"])).cap == 7.9
     omega = profile_of(ForceDimensionDevice(profile=PROFILES["omega"]))

@@ -9,7 +9,7 @@ import pytest
 
 from hapticdb import PointShell, Session
 from hapticdb.devices.protocol import Reader, Reading
-from hapticdb.devices.scripted import Line
+from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import DeviceError, UsageError
 from realtime.hands import Odd, still
@@ -101,7 +101,7 @@ class Rows:
         ([np.eye(4)], r"of the type list .*Player\(times, poses\)$"),
         ("path.csv", r"of the type str .*Path\(file\)$"),
         (Rows(), r"of the type Rows .*Player\(\*recording\.poses\(\)\)$"),
-        (Line, r"Line is a class"),
+        (Player, r"Player is a class"),
         (Mute(), r"of the type Mute is none, it has no apply; see hapticdb\.devices\.scripted"),
         (None, r"None is none, it has no read and no apply"),
     ],

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from hapticdb import write_poses
 from hapticdb.devices.protocol import Device, Reading
-from hapticdb.devices.scripted import CYCLE, Line, Path, Player, RandomHand, capped, pose_at
+from hapticdb.devices.scripted import CYCLE, Path, Player, RandomHand, capped, pose_at
 from hapticdb.errors import UsageError
 from hapticdb.poses import quaternion_of, rotation_of
 
@@ -42,7 +42,6 @@ TURNED[:3, 3] = 0.2, -0.1, 0.4
 
 MAKERS: dict[str, Callable[[SetClock], Device]] = {
     "player": lambda clock: Player([0.0, 0.5, 2.0], [np.eye(4), TURNED, quarter(0)], clock=clock),
-    "line": lambda clock: Line((0, 0, 0), TURNED, 0.3, clock=clock),
     "random": lambda clock: RandomHand(TURNED, 3, 0.5, 4.0, clock=clock),
 }
 
@@ -101,7 +100,9 @@ def test_a_device_goes_on_alike_in_another_process(name: str) -> None:
 
 def test_a_script_starts_at_its_first_read() -> None:
     clock = SetClock(100.0)
-    line = Line((1, 2, 3), (2, 2, 3), 0.5, clock=clock)
+    ends = np.tile(np.eye(4), (2, 1, 1))
+    ends[:, :3, 3] = (1.0, 2.0, 3.0), (2.0, 2.0, 3.0)
+    line = Player([0.0, 2.0], ends, clock=clock)
     clock.now = 5000.0
     assert line.read().pose[:3, 3].tolist() == [1.0, 2.0, 3.0]
     clock.now = 5001.0
@@ -204,8 +205,6 @@ def test_a_file_with_times_keeps_them_unless_told(tmp_path: FilePath) -> None:
         lambda: Player([0.0, 0.0], [np.eye(4)] * 2),
         lambda: Player([], np.empty((0, 4, 4))),
         lambda: Player([0.0, math.nan], [np.eye(4)] * 2),
-        lambda: Line((0, 0, 0), (0, 0, 0)),
-        lambda: Line((0, 0, 0), (0, 0, 1), speed=0.0),
     ],
 )
 def test_scripts_that_cannot_be_are_refused(make: Callable[[], Device]) -> None:

@@ -201,34 +201,6 @@ def _times_at(
     return np.concatenate([[0.0], np.cumsum(ways[kept[1:]])]) / speed, poses[kept]
 
 
-class Line(Player):
-    """A hand that moves straight from one place to another.
-
-    Parameters
-    ----------
-    start, end : array_like
-        Points (3,) or poses (4, 4), metres.
-    speed : float
-        Metres a second; a turn counts as in `Path`.
-    clock
-        As for `Player`.
-    """
-
-    def __init__(
-        self,
-        start: ArrayLike,
-        end: ArrayLike,
-        speed: float = 0.1,
-        *,
-        clock: Clock = time.perf_counter,
-    ) -> None:
-        places = np.array([pose_at(start), pose_at(end)])
-        times, poses = _times_at(places, _positive("speed", speed))
-        if len(times) == 1:
-            raise UsageError("a line needs two different places")
-        super().__init__(times, poses, clock=clock)
-
-
 class RandomHand(_Scripted):
     """Smooth random motion about a place, like a hand's; the same seed gives the same motion.
 

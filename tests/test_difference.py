@@ -1,4 +1,4 @@
-"""`diff_environments` reports every difference between two environments, and nothing else."""
+"""`diff_environments` finds every difference between two environments, and nothing else."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -11,12 +11,13 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import hapticdb
-from assemblies import PAIRS, Kind, make, placement, voxel_set
-from hapticdb import Environment, Grid, diff_environments
+from assemblies import PAIRS, Kind, box, make, placement, small_grid, voxel_set
+from hapticdb import Environment, Grid, diff_environments, difference
 from hapticdb.difference import farthest_corner, moved_by
 from hapticdb.grid import CurveName
-from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.mesh import Part
+from hapticdb.mesh.packing import pack
 from hapticdb.store.base import Band
 from hapticdb.testing import blob, voxel_object, with_distances
 
@@ -30,87 +31,93 @@ def write(env: Environment, ijk: NDArray[np.int64], name: str, **fields: object)
     return env.store.add(replace(record, **fields), rows)  # type: ignore[arg-type]
 
 
-@pytest.mark.parametrize("most_rows", [1, 1 << 19])
+@pytest.mark.parametrize("rows_at_once", [1, 1 << 14])
 @pytest.mark.parametrize(("kind", "other"), PAIRS, ids=str)
-def test_every_voxel_that_differs_is_counted(
-    monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, most_rows: int
+def test_rows_are_equal_where_python_sets_of_voxels_are(
+    monkeypatch: pytest.MonkeyPatch, kind: Kind, other: Kind, rows_at_once: int
 ) -> None:
-    """Counts equal those of Python sets, in one batch and in many; another object shares voxels."""
-    monkeypatch.setattr(geometry, "MOST_ROWS", most_rows)
+    """On every layout and curve, in one batch and in many; another object shares voxels."""
+    monkeypatch.setattr(difference, "ROWS_AT_ONCE", rows_at_once)
 
     @settings(max_examples=3, deadline=None)
-    @given(bits=st.integers(1, 7), seed=st.integers(0, 2**32 - 1), share=st.floats(0, 1))
-    def counted(bits: int, seed: int, share: float) -> None:
+    @given(
+        bits=st.integers(1, 7),
+        seed=st.integers(0, 2**32 - 1),
+        n_more=st.sampled_from([(0, 0), (1, 0), (1, 1)]),
+    )
+    def compared(bits: int, seed: int, n_more: tuple[int, int]) -> None:
         rng = np.random.default_rng(seed)
         every = np.unique(rng.integers(0, 1 << bits, (80, 3)), axis=0)
-        chosen = [every[:1], every[:1]]
-        for n in range(2):
-            chosen[n] = np.concatenate([every[:1], every[1:][rng.random(len(every) - 1) < share]])
+        chosen = [every[: len(every) - n] for n in n_more]
         with TemporaryDirectory() as folder:
             urls = Path(folder) / "a.db", Path(folder) / "b.db"
             for url, ijk, of_kind in zip(urls, chosen, (kind, other), strict=True):
                 with make(url, of_kind, bits) as env:
                     write(env, every, "beside")
-                    write(env, ijk, "one")
+                    write(env, ijk, "one", bounds=np.zeros((2, 3)))
             found = diff_environments(*urls)
         in_a, in_b = map(voxel_set, chosen)
         assert found.is_equal == (in_a == in_b)
-        assert [(v.a.id, v.only_in_a, v.only_in_b) for v in found.voxels] == (
-            [] if in_a == in_b else [(2, len(in_a - in_b), len(in_b - in_a))]
-        )
-        assert [v.shared for v in found.voxels] == ([] if in_a == in_b else [len(in_a & in_b)])
-        assert found.totals == (
-            len(in_a - in_b),
-            len(in_b - in_a),
-            len(every) + len(in_a & in_b),
-            int(in_a != in_b),
-        )
+        assert [(a.id, b.id) for a, b in found.voxels] == ([] if in_a == in_b else [(2, 2)])
         assert found.compared == 2
 
-    counted()
+    compared()
 
 
-def test_parts_are_told_apart_by_what_differs(tmp_path: Path) -> None:
+@pytest.mark.parametrize("kind", [("brick", "z"), ("voxel", "hilbert")], ids=str)
+def test_parts_are_told_apart_by_what_differs(tmp_path: Path, kind: Kind) -> None:
     ijk = blob(1, PLACE)
+    changed: dict[str, dict[str, object]] = {
+        "surfaces": {"digest": "other"},
+        "moved": {"transform": placement(1, 0, 0)},
+        "attributes": {"attributes": {"paint": "green"}},
+        "boxes": {"bounds": np.zeros((2, 3))},
+        "renumbered": {"id": 60},
+    }
     with make(tmp_path / "a.db") as env:
-        for name in ("same", "gone", "changed", "moved", "described", "renumbered"):
+        for name in ("same", "gone", *changed):
             write(env, ijk, name)
-    with make(tmp_path / "b.db", ("voxel", "hilbert")) as env:
+    with make(tmp_path / "b.db", kind) as env:
         write(env, ijk, "same", id=1)
-        write(env, ijk, "changed", id=3, digest="other", transform=placement(1, 0, 0))
-        write(env, ijk, "moved", id=4, transform=placement(1, 0, 0))
-        write(env, ijk, "described", id=5, attributes={"paint": "green"})
-        write(env, ijk, "renumbered", id=60)
-        write(env, ijk, "new", id=61)
+        for n, (name, fields) in enumerate(changed.items(), start=3):
+            write(env, ijk, name, **({"id": n} | fields))
         write(env, ijk, "same", id=62, link="of another file")
     found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
     assert [obj.name for obj in found.only_in_a] == ["gone"]
-    assert [obj.name for obj in found.only_in_b] == ["new", "same"]
-    for word in ("changed", "moved", "described", "renumbered"):
-        assert [pair[0].name for pair in getattr(found, word)] == [word]
-    assert (found.voxels, found.compared) == ((), 3)
+    assert [obj.link for obj in found.only_in_b] == ["of another file"]
+    for name in changed:
+        assert [pair[0].name for pair in getattr(found, name)] == [name]
+    assert (found.voxels, found.compared, found.n_voxels) == ((), 4, 4 * len(ijk))
     assert not found.is_equal
-    assert found.n_voxels == 3 * len(ijk)
-    assert [(one.a.name, one.only_in_a, one.shared) for one in found.elsewhere] == [
-        ("changed", 0, len(ijk)),
-        ("moved", 0, len(ijk)),
-    ]
-    assert found.totals == (len(ijk), 2 * len(ijk), 5 * len(ijk), 5)
+    ((a, b),) = found.moved
+    assert moved_by(a, b).tolist() == [0.0, 0.0, 0.0]
 
 
-def test_ids_and_attributes_are_felt_by_nobody(tmp_path: Path) -> None:
-    """The difference is reported, and the environments still count as equal."""
-    ijk = blob(1, PLACE)
+@pytest.mark.parametrize("kept", ["other", "gone"])
+def test_an_altered_surface_is_found_under_its_old_digest(tmp_path: Path, kept: str) -> None:
+    vertices, faces = box((0, 0, 0), (0.05, 0.05, 0.05))
+    part = Part("box", vertices, faces, np.eye(4))
+    other = pack(2.0 * vertices, faces) if kept == "other" else None
+    record = replace(voxel_object(small_grid(), blob(1, PLACE)), digest=part.digest)
+    for name, surface in (("a", pack(vertices, faces)), ("b", other)):
+        with make(tmp_path / f"{name}.db") as env:
+            env.store.add(record, rows_of_voxels(blob(1, PLACE), env.grid, env.layout), surface)
+    found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
+    assert [pair[0].digest for pair in found.surfaces] == [part.digest]
+    assert not found.is_equal
+
+
+def test_ids_alone_make_no_difference(tmp_path: Path) -> None:
     for n, name in enumerate(("a", "b"), start=1):
         with make(tmp_path / f"{name}.db") as env:
-            write(env, ijk, "part", id=n, attributes={"n": n})
+            write(env, blob(1, PLACE), "part", id=n)
     found = diff_environments(tmp_path / "a.db", tmp_path / "b.db")
     assert found.is_equal
-    assert len(found.renumbered) == len(found.described) == 1
+    assert len(found.renumbered) == 1
 
 
 def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
-    """The way of its bounding box in metres, and the voxels that only one environment has."""
+    """The way of its bounding box in metres."""
     ijk = blob(1, PLACE)
     shift = np.array([3, 0, -2])
     for name, voxels, transform in (
@@ -123,20 +130,16 @@ def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
     ((a, b),) = found.moved
     np.testing.assert_allclose(moved_by(a, b), 0.01 * shift, atol=1e-12)
     assert farthest_corner(a, b) == pytest.approx(0.01 * 13**0.5)
-    (one,) = found.elsewhere
-    here, there = voxel_set(ijk), voxel_set(ijk + shift)
-    assert one[2:] == (len(here - there), len(there - here), len(here & there))
-    assert one.share == pytest.approx(len(here & there) / len(here | there))
-    assert found.voxels == ()
+    assert found.voxels == found.boxes == ()
 
 
-@pytest.mark.parametrize("most_rows", [1, 1 << 19])
+@pytest.mark.parametrize("rows_at_once", [1, 1 << 14])
 @pytest.mark.parametrize("curve", ["z", "hilbert"])
 def test_distances_are_compared_where_both_have_them(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: CurveName, most_rows: int
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, curve: CurveName, rows_at_once: int
 ) -> None:
     """On any curve. Objects that have them on one side alone do not differ."""
-    monkeypatch.setattr(geometry, "MOST_ROWS", most_rows)
+    monkeypatch.setattr(difference, "ROWS_AT_ONCE", rows_at_once)
     ijk = blob(3, PLACE)
     rows = with_distances(ijk, Grid(0.01, (-0.1, 0.2, -0.3), 5), "brick", seed=1)
     assert rows.distances is not None
@@ -157,9 +160,9 @@ def test_distances_are_compared_where_both_have_them(
         assert found[name].voxels == ()
     assert found["a"].is_equal
     assert (found["a"].with_distances, found["a"].distances) == ((1, 1), ())
-    assert [one.n_rows for one in found["b"].distances] == [2]
+    assert len(found["b"].distances) == 1
     assert not found["b"].is_equal
     assert (found["c"].with_distances, found["c"].distances) == ((1, 0), ())
     assert found["c"].is_equal
     assert len(fewer) < len(rows)
-    assert [one.n_rows for one in found["d"].distances] == [len(rows) - len(fewer)]
+    assert len(found["d"].distances) == 1

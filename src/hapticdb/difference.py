@@ -1,57 +1,25 @@
-"""Compares two environments: grids, objects, and every voxel, whatever their layouts and curves."""
+"""Compares what two environments hold, whatever their engines, layouts and curves."""
 
+import zlib
 from collections.abc import Iterator, Sequence
 from contextlib import closing
 from dataclasses import dataclass
-from operator import eq
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.grid import Grid
-from hapticdb.ingest.geometry import bricks_of_object
-from hapticdb.ingest.layout import Bricks
-from hapticdb.kernels.surfaces import voxelize
-from hapticdb.paper.quantiles import QuantileVector
-from hapticdb.store.base import BRICK_BYTES, Object, Progress, Store
+from hapticdb.errors import DamagedError
+from hapticdb.grid import BRICK_BITS, Grid
+from hapticdb.ingest.geometry import unpacked_part
+from hapticdb.kernels import curves
+from hapticdb.store.base import BRICK_BYTES, Object, Progress, Rows, Store
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import Url, is_same_grid, part_of
 
 Pair = tuple[Object, Object]
-
-
-class VoxelDifference(NamedTuple):
-    """One part in both environments: voxels that only one has, and voxels that both have."""
-
-    a: Object
-    b: Object
-    only_in_a: int
-    only_in_b: int
-    shared: int
-
-    @property
-    def share(self) -> float:
-        """Share of the voxels of either that both have, 0 .. 1; 1 if neither has a voxel."""
-        total = self.only_in_a + self.only_in_b + self.shared
-        return self.shared / total if total else 1.0
-
-
-class DistanceDifference(NamedTuple):
-    """One part in both environments, with other distances to its surface in each."""
-
-    a: Object
-    b: Object
-    n_rows: int  # bricks whose distances differ, or that only one environment has
-
-
-class _Totals(NamedTuple):
-    """Numbers of voxels summed over all objects; a voxel with two objects counts twice."""
-
-    only_in_a: int
-    only_in_b: int
-    shared: int
-    n_changed: int  # objects that only one environment has, or that differ between them
+Hashes = NDArray[np.uint64]
+ROWS_AT_ONCE = 1 << 14
+"""Rows that are read at a time, 512 bytes each when they are unpacked."""
 
 
 def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
@@ -71,38 +39,33 @@ class Difference:
     a: str
     b: str
     grids: tuple[Grid, Grid]
-    """Voxels are compared only if `is_same_grid`."""
     only_in_a: tuple[Object, ...]
     only_in_b: tuple[Object, ...]
     """Parts that the other environment lacks."""
-    changed: tuple[Pair, ...]
-    """The same part with another geometry (`digest`)."""
+    surfaces: tuple[Pair, ...]
+    """The same part with another surface: geometry, colours or chord error."""
     moved: tuple[Pair, ...]
-    """The same geometry in another place (`transform`)."""
-    voxels: tuple[VoxelDifference, ...]
-    """The same geometry in the same place, but with other voxels."""
-    elsewhere: tuple[VoxelDifference, ...]
-    """The voxels of the changed and moved parts; empty if the grids are not the same."""
+    """The same part in another place (`transform`)."""
+    attributes: tuple[Pair, ...]
+    boxes: tuple[Pair, ...]
+    voxels: tuple[Pair, ...]
+    distances: tuple[Pair, ...]
+    """Other attributes; other bounding boxes, voxels and distances of the same surface in the same
+    place. Distances are compared where both environments have them, and rows on the same grid."""
     renumbered: tuple[Pair, ...]
-    described: tuple[Pair, ...]
-    """The same part with another id, or with other attributes or another bounding box, which change
-    no wrench."""
+    """The same part with another id, which is no difference."""
     compared: int
     n_voxels: int
-    """Objects with the same geometry in the same place, whose voxels were compared, and these."""
-    n_shared: int
-    """Voxels of all compared objects that both environments have."""
-    distances: tuple[DistanceDifference, ...]
-    """The same geometry in the same place, with distances in both environments that differ."""
+    """Objects with the same surface in the same place, whose rows were compared, and their
+    voxels."""
     with_distances: tuple[int, int]
-    """Compared objects that have distances in a, and in b. An object that has them in one
-    environment alone is no difference: its voxels are the same."""
+    """Compared objects that have distances in a, and in b."""
 
     def __repr__(self) -> str:
         return (
             f"Difference(only in a: {len(self.only_in_a)}, only in b: {len(self.only_in_b)}, "
-            f"changed: {len(self.changed)}, moved: {len(self.moved)}, "
-            f"other voxels: {len(self.voxels)})"
+            f"other surfaces: {len(self.surfaces)}, moved: {len(self.moved)}, "
+            f"other attributes: {len(self.attributes)}, other voxels: {len(self.voxels)})"
         )
 
     @property
@@ -111,34 +74,20 @@ class Difference:
         return is_same_grid(*self.grids)
 
     @property
-    def totals(self) -> _Totals | None:
-        """Sums over all objects; None if the grids are not the same."""
-        if not self.is_same_grid:
-            return None
-        both = (*self.voxels, *self.elsewhere)
-        lone = [sum(obj.voxels for obj in objects) for objects in (self.only_in_a, self.only_in_b)]
-        return _Totals(
-            lone[0] + sum(one.only_in_a for one in both),
-            lone[1] + sum(one.only_in_b for one in both),
-            self.n_shared,
-            len(self.only_in_a) + len(self.only_in_b) + len(both),
-        )
-
-    @property
     def is_equal(self) -> bool:
-        """Whether both hold the same objects, voxels and distances; ids, attributes may differ."""
-        parts = (self.only_in_a, self.only_in_b, self.changed, self.moved, self.voxels)
-        return self.is_same_grid and not any(parts) and not self.distances
+        """Whether both hold the same; ids may differ."""
+        return self.is_same_grid and not any((
+            self.only_in_a, self.only_in_b, self.surfaces, self.moved, self.attributes, self.boxes,
+            self.voxels, self.distances,
+        ))  # fmt: skip
 
 
 def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = None) -> Difference:
-    """Compare two environments: their grids, their objects, and every voxel of each object.
+    """Compare two environments: grids, objects, attributes, surfaces, and rows by their digests.
 
-    Distances to surfaces are compared where both environments have them for an object in the same
-    place. Engines, layouts and curves may differ. Each environment is read at one revision. The
-    memory needed is proportional to the largest object. `progress` is called after each object
-    whose voxels were compared, with the number of such objects done, and of all. Raises
-    `DatabaseError` when one of them cannot be opened or read.
+    Each environment is read at one revision, surface by surface and in batches of rows, so memory
+    grows with the number of objects alone. `progress` is called with the number of rows read, and
+    of all. Raises `DatabaseError` when one of them cannot be opened or read.
     """
     with (
         closing(open_store(a_url, read_only=True)) as a,
@@ -148,30 +97,27 @@ def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = Non
     ):
         in_a, in_b = ({part_of(obj): obj for obj in store.objects()} for store in (a, b))
         both = [(obj, in_b[part]) for part, obj in in_a.items() if part in in_b]
-        same = [pair for pair in both if pair[0].digest == pair[1].digest]
-        moved = [pair for pair in same if (pair[0].transform != pair[1].transform).any()]
-        changed = [pair for pair in both if pair[0].digest != pair[1].digest]
-        still = [pair for pair in same if (pair[0].transform == pair[1].transform).all()]
-        is_alike = is_same_grid(a.grid, b.grid)
-        compared = still if is_alike else []
-        found = _compared(a, b, [*compared, *(changed + moved if is_alike else [])], progress)
-        voxels, elsewhere = found[: len(compared)], found[len(compared) :]
+        surfaces = _other_surfaces(a, b, both)
+        moved = [pair for pair in both if not np.array_equal(pair[0].transform, pair[1].transform)]
+        changed = {one.id for one, _ in (*surfaces, *moved)}
+        still = [pair for pair in both if pair[0].id not in changed]
+        compared = still if is_same_grid(a.grid, b.grid) else []
+        voxels, distances = _other_rows(a, b, compared, progress)
         return Difference(
             a=a.url,
             b=b.url,
             grids=(a.grid, b.grid),
             only_in_a=tuple(obj for part, obj in in_a.items() if part not in in_b),
             only_in_b=tuple(obj for part, obj in in_b.items() if part not in in_a),
-            changed=tuple(changed),
+            surfaces=tuple(surfaces),
             moved=tuple(moved),
-            voxels=tuple(one for one in voxels if one.only_in_a or one.only_in_b),
-            elsewhere=tuple(elsewhere),
+            attributes=tuple(pair for pair in both if pair[0].attributes != pair[1].attributes),
+            boxes=tuple(p for p in still if not np.array_equal(p[0].bounds, p[1].bounds)),
+            voxels=tuple(voxels),
+            distances=tuple(distances),
             renumbered=tuple(pair for pair in both if pair[0].id != pair[1].id),
-            described=tuple(pair for pair in both if _is_described_otherwise(*pair)),
             compared=len(compared),
             n_voxels=sum(obj.voxels for obj, _ in compared),
-            n_shared=sum(one.shared for one in found),
-            distances=tuple(_distances_apart(a, b, compared)),
             with_distances=(
                 sum(obj.has_distances for obj, _ in compared),
                 sum(obj.has_distances for _, obj in compared),
@@ -179,57 +125,96 @@ def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = Non
         )
 
 
-def _is_described_otherwise(a: Object, b: Object) -> bool:
-    return a.attributes != b.attributes or not np.array_equal(a.bounds, b.bounds)
+def _other_surfaces(a: Store, b: Store, pairs: Sequence[Pair]) -> list[Pair]:
+    """Pairs whose digests or stored surfaces differ; each surface is read once, by itself."""
+    same = {one.digest: (one, other) for one, other in pairs if one.digest == other.digest}
+    apart = {digest for digest, pair in same.items() if not _is_same_surface(a, b, pair)}
+    return [
+        (one, other) for one, other in pairs if one.digest != other.digest or one.digest in apart
+    ]
 
 
-def _compared(
+def _is_same_surface(a: Store, b: Store, pair: Pair) -> bool:
+    digest = pair[0].digest
+    in_a, in_b = (store.surfaces([digest]).get(digest) for store in (a, b))
+    if in_a is None or in_b is None or in_a == in_b:
+        return in_a == in_b
+    try:  # packed by another version of zlib
+        for store, obj, surface in zip((a, b), pair, (in_a, in_b), strict=True):
+            unpacked_part(store.url, obj, surface)
+    except DamagedError:
+        return False
+    return True
+
+
+def _other_rows(
     a: Store, b: Store, pairs: Sequence[Pair], progress: Progress | None
-) -> list[VoxelDifference]:
+) -> tuple[list[Pair], list[Pair]]:
+    """Pairs whose voxels differ, and whose distances do."""
+    measured = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
+    done, total = 0, sum(store.size().rows for store in (a, b))
     found = []
-    stores = [(store, QuantileVector.of(store)) for store in (a, b)] if pairs else []
-    for done, pair in enumerate(pairs, start=1):
-        of_a, of_b = (bricks_of_object(s, obj, q) for (s, q), obj in zip(stores, pair, strict=True))
-        found.append(VoxelDifference(*pair, *_count_apart(of_a, of_b)))
-        if progress is not None:
-            progress(done, len(pairs))
-    return found
+    for distances, some in ((False, pairs), (True, measured)):
+        sums: tuple[dict[int, int], dict[int, int]] = {}, {}
+        for store, of in zip((a, b), sums, strict=True) if some else ():
+            for rows in _batches(store, distances=distances):
+                hashes = _hashes_of_bands(rows, store) if distances else _hashes_of(rows, store)
+                _add(of, rows, hashes)
+                done += 0 if distances else len(rows)
+                if progress is not None:
+                    progress(min(done, total), total)
+        found.append([(x, y) for x, y in some if sums[0].get(x.id, 0) != sums[1].get(y.id, 0)])
+    return found[0], found[1]
 
 
-def _distances_apart(a: Store, b: Store, pairs: Sequence[Pair]) -> Iterator[DistanceDifference]:
-    """Objects whose distances differ, of those that have some in both environments."""
-    both = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
-    stores = [(store, QuantileVector.of(store)) for store in (a, b)] if both else []
-    for pair in both:
-        a_bricks, b_bricks = (
-            bricks_of_object(store, obj, quantiles, distances=True)
-            for (store, quantiles), obj in zip(stores, pair, strict=True)
-        )
-        if n_rows := _count_rows_apart(a_bricks, b_bricks):
-            yield DistanceDifference(*pair, n_rows)
+def _batches(store: Store, *, distances: bool) -> Iterator[Rows]:
+    key, object_id = -1, 0
+    while len(rows := store.rows_after(key, object_id, ROWS_AT_ONCE, distances=distances)):
+        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+        yield rows
 
 
-def _count_rows_apart(a: Bricks, b: Bricks) -> int:
-    """How many bricks differ in their packed distances, or are only in one of the two."""
-    both, at_a, at_b = np.intersect1d(a.keys, b.keys, assume_unique=True, return_indices=True)
-    # row by row: a comparison by sets of all rows took a quarter more memory and half more time
-    n_alike: int = sum(map(eq, _packed_rows(a, at_a), _packed_rows(b, at_b)))
-    return len(a.keys) + len(b.keys) - len(both) - n_alike
+def _add(sums: dict[int, int], rows: Rows, hashes: Hashes) -> None:
+    """Add the hashes (R,) of rows to the sums of their objects: the order does not matter."""
+    ids, of = np.unique(rows.ids, return_inverse=True)
+    added = np.zeros(len(ids), np.uint64)
+    np.add.at(added, of, hashes)
+    for object_id, value in zip(ids.tolist(), added.tolist(), strict=True):
+        sums[object_id] = (sums.get(object_id, 0) + value) & (1 << 64) - 1
 
 
-def _packed_rows(bricks: Bricks, which: NDArray[np.int64]) -> Iterator[bytes]:
-    """Packed distances of the bricks at the given places, in their order."""
-    assert bricks.distances is not None  # noqa: S101 - read with distances
-    data, ends = bricks.distances.data.tobytes(), bricks.distances.ends[which]
-    for start, end in zip(ends - bricks.distances.lengths[which], ends, strict=True):
-        yield data[start:end]
+def _hashes_of(rows: Rows, store: Store) -> Hashes:
+    """Sums (R,) of the hashes of each row's voxels, the same on each layout and curve."""
+    keys = _z_keys(rows, store)
+    if store.layout == "voxel":
+        return _mixed(keys)
+    held = np.unpackbits(rows.occupancy, bitorder="little")
+    at = np.flatnonzero(held)
+    sums = np.zeros(len(rows), np.uint64)
+    of, bit = np.divmod(at, 8 * BRICK_BYTES)
+    np.add.at(sums, of, _mixed(keys[of] << 3 * BRICK_BITS | bit))
+    return sums
 
 
-def _count_apart(a: Bricks, b: Bricks) -> tuple[int, int, int]:
-    """How many voxels are only in a, only in b, and in both."""
-    keys = np.union1d(a.keys, b.keys)
-    bits = np.zeros((2, len(keys), BRICK_BYTES), dtype=np.uint8)
-    for side, bricks in zip(bits, (a, b), strict=True):
-        side[np.searchsorted(keys, bricks.keys)] = bricks.occupancy
-    count = voxelize.count_voxels
-    return count(bits[0] & ~bits[1]), count(bits[1] & ~bits[0]), count(bits[0] & bits[1])
+def _hashes_of_bands(rows: Rows, store: Store) -> Hashes:
+    """Hashes (R,) of the packed distances of bricks."""
+    assert rows.distances is not None  # noqa: S101 - read with distances
+    data, ends = rows.distances.data.tobytes(), rows.distances.ends.tolist()
+    crcs = [zlib.crc32(data[at:end]) for at, end in zip([0, *ends], ends, strict=False)]
+    return _mixed(_mixed(_z_keys(rows, store)).view(np.int64) ^ np.array(crcs, np.int64))
+
+
+def _z_keys(rows: Rows, store: Store) -> NDArray[np.int64]:
+    """Keys of rows (R,) in Z-order."""
+    grid, lower = store.grid, BRICK_BITS if store.layout == "brick" else 0
+    level = max(grid.bits - lower, 0)
+    places = curves.decode(rows.keys, level, grid.curve_code)
+    return np.asarray(curves.encode(places, level, curves.Z_ORDER))
+
+
+def _mixed(keys: NDArray[np.int64]) -> Hashes:
+    """Hashes (n,) of 64 bits (splitmix64, Steele et al. 2014)."""
+    found = keys.astype(np.uint64) + np.uint64(0x9E3779B97F4A7C15)
+    for shift, factor in ((30, 0xBF58476D1CE4E5B9), (27, 0x94D049BB133111EB)):
+        found = (found ^ found >> np.uint64(shift)) * np.uint64(factor)
+    return np.asarray(found ^ found >> np.uint64(31))

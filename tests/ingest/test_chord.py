@@ -67,7 +67,7 @@ def test_a_finer_tessellation_replaces_the_surface(tmp_path: Path, file: Path) -
     assert imported(url, file, replace=True).replaced == 1
     fine = part_in(url)
     assert fine.chord < 0.2 * coarse.chord
-    assert len(diff_environments(url, other).changed) == 1
+    assert len(diff_environments(url, other).surfaces) == 1
     with closing(open_store(url)) as store:
         assert store.surface_digests() == {fine.digest}
     assert imported(url, file).status == "complete"

@@ -6,8 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb import Object
-from hapticdb.proportions import Proportions
-from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
+from hapticdb.sweeps.result import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
@@ -63,7 +62,5 @@ def swept(path: Way | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - f
         "looks": 40,
         "revision": 1,
         "elapsed": 0.1,
-        "proportions": Proportions(None, 0.02, None, None, ()),
-        "profile": Profile(np.linspace(0.0, 1.0, 5), np.array([0.4, 0.3, 0.1, 0.0, np.inf])),
     }
     return Swept(**(fields | changed))

@@ -10,7 +10,6 @@ import pytest
 
 import hapticdb
 from command_line import Run, made, poses, run, scene  # noqa: F401 - fixtures
-from hapticdb.errors import UsageError
 from hapticdb.page.tools import from_files, middle_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import limit_text
@@ -50,7 +49,7 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
     with hapticdb.open(scene) as env:
         tool = env.tool("tool.stl")
         path = hapticdb.read_poses("path.csv")
-        swept = hapticdb.sweep(env, tool, path[:2], profile=True)
+        swept = hapticdb.sweep(env, tool, path[:2])
         felt = env.touch(tool, poses=path)
         touch = env.touch(tool, path[0])
         obj = env.object(2)
@@ -67,16 +66,11 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
     most = float(np.linalg.norm(felt.forces, axis=1).max())
     assert f"at most {most:.4g} N" in repr(felt)
     assert f"<td>{most:.4g}</td>" in felt._repr_html_()
-    assert hapticdb.plot(felt).get_xlabel() == "pose"
-    assert "mm" in hapticdb.plot(touch).get_ylabel()
-    assert hapticdb.plot(swept).get_title() == swept.verdict
-    with pytest.raises(UsageError, match="no plot of Object"):
-        hapticdb.plot(obj)  # type: ignore[arg-type]
 
 
 def test_help_begins_with_the_names_that_matter() -> None:
     first = str(hapticdb.__doc__).split("Errors")[0]
     for name in ("import_files", "open", "create", "Environment", "PointShell", "read_poses",
-                 "sweep", "extract", "Session", "plot"):  # fmt: skip
+                 "sweep", "extract", "Session"):  # fmt: skip
         assert name in first
         assert hasattr(hapticdb, name)

@@ -1,6 +1,6 @@
 """Feel a virtual environment too large for memory: haptic queries on an SQL database.
 
-The ten names to begin with; `dir(hapticdb)` lists the others:
+The nine names to begin with; `dir(hapticdb)` lists the others:
 
 - import_files(url, files): files into an environment, which is made if it does not exist
 - open(url): an environment; create(url, grid): an empty one
@@ -9,7 +9,6 @@ The ten names to begin with; `dir(hapticdb)` lists the others:
 - read_poses(path): a path of a tool, (n, 4, 4), world_from_tool, metres
 - sweep(env, shell, poses): is the path free? extract(env, words): a way out
 - Session(url, shell, device): feel it in real time
-- plot(result): touches and sweeps, in a notebook
 
 Errors are in `hapticdb.errors`.
 
@@ -51,13 +50,10 @@ if TYPE_CHECKING:
     from hapticdb.ingest.upgrading import upgrade_environment as upgrade_environment
     from hapticdb.paper.cost_model import CostModel as CostModel
     from hapticdb.paper.quantiles import QuantileVector as QuantileVector
-    from hapticdb.pictures.plots import plot as plot
     from hapticdb.pointshell.shell import PointShell as PointShell
     from hapticdb.pool import Pool as Pool
     from hapticdb.poses import read_poses as read_poses
     from hapticdb.poses import write_poses as write_poses
-    from hapticdb.proportions import Proportions as Proportions
-    from hapticdb.proportions import compare_proportions as compare_proportions
     from hapticdb.query.law import DistanceField as DistanceField
     from hapticdb.query.law import TangentPlane as TangentPlane
     from hapticdb.query.touches import Query as Query

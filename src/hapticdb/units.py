@@ -30,8 +30,6 @@ NAMES = {
     "yd": "yards",
 }
 """Each unit in words."""
-UNITLESS = {".stl", ".obj", ".ply", ".off", ".las", ".laz"}
-"""Suffixes of files whose unit an option says."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
 

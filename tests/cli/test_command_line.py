@@ -107,7 +107,7 @@ def modules_after(program: str, *names: str) -> list[str]:
     return sorted({*names} & {*done.stdout.splitlines()[-1].split()})
 
 
-SLOW_TO_LOAD = ("numba", "scipy", "matplotlib", "trimesh", "cascadio", "psycopg")
+SLOW_TO_LOAD = ("numba", "scipy", "PIL", "trimesh", "cascadio", "psycopg")
 
 
 @pytest.mark.parametrize(

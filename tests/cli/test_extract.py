@@ -56,8 +56,7 @@ def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> No
 
 def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     url = enclosed(tmp_path)
-    words = ("--motions", 0, "--path", "out.csv", "--picture", "out.png")
-    code, out, err = run("extract", url, "block", *words)
+    code, out, err = run("extract", url, "block", "--motions", 0, "--path", "out.csv")
     assert (code, err) == (1, "")
     first, heading, _, row, *_ = [line for line in out.splitlines() if line]
     assert first.startswith("no way found in ")
@@ -65,7 +64,6 @@ def test_what_blocks_is_a_table(run: Run, tmp_path: Path) -> None:
     assert heading.split() == ["id", "in", "the", "way", "of", "pulls"]
     assert row.split()[1] == "cage"
     assert not Path("out.csv").exists()
-    assert not Path("out.png").exists()
     found = json.loads(run("extract", url, "block", "--motions", 0, "--json")[1])
     assert (found["way"], found["blockers"][0]["name"]) == (None, "cage")
 
@@ -76,7 +74,6 @@ def test_wrong_arguments_are_refused(run: Run, scene: Path) -> None:
     refused(run("extract", scene, "box0", "--seconds", 0), "seconds")
     refused(run("extract", scene, "box0", "--seed", -1), "seed -1")
     refused(run("extract", scene, "box*"), "nothing stands")
-    refused(run("extract", scene, "box0", "--picture", "a.jpg"), ".png")
     refused(run("extract", "missing.db", "box0"), "missing.db")
     refused(run("extract", scene, "box0", "--to", "0,0,1"), "--to '0,0,1'")
     refused(run("extract", scene, "box0", "--to", "0,0,1,0,0,0,0"), "no rotation")

@@ -3,18 +3,15 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
-import os
 import re
-import signal
 from pathlib import Path
 
-import matplotlib.image
 import numpy as np
 import pytest
+import trimesh
 
 import hapticdb
 from assemblies import write_obj
-from children import finished
 from command_line import Run, command, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
 from contact_scenes import box, imported, shell_of
 from hapticdb.cli.csv_files import SWEPT
@@ -143,20 +140,6 @@ def test_a_wrong_file_of_sweeps_is_one_line(run: Run, scene: Path, text: str, to
     refused(run("sweep", scene, "--batch", "many.csv"), told)
 
 
-@pytest.mark.long
-@pytest.mark.usefixtures("free")
-def test_the_picture_is_drawn_although_nobody_reads_on(scene: Path) -> None:
-    args = command("sweep", scene.name, *TOOL, "--path", "free.csv", "--picture", "out.png")
-    reading, writing = os.pipe()
-    os.close(reading)
-    try:
-        done = finished(args, cwd=scene.parent, stdout=writing)
-    finally:
-        os.close(writing)
-    assert (done.returncode, done.stderr) == (128 + signal.SIGPIPE, "")
-    assert matplotlib.image.imread(scene.parent / "out.png").shape[:2] == (1000, 1600)
-
-
 @pytest.mark.usefixtures("free")
 def test_others_who_write_meanwhile_are_told_of(
     run: Run, scene: Path, monkeypatch: pytest.MonkeyPatch
@@ -175,26 +158,20 @@ def test_others_who_write_meanwhile_are_told_of(
     assert "was written meanwhile; this is of revision 3" in err
 
 
-@pytest.mark.usefixtures("free")
-@pytest.mark.parametrize("name", ["scene.db", ".png"])
-def test_a_picture_that_is_none_by_its_name_overwrites_nothing(
-    run: Run, scene: Path, name: str
+@pytest.mark.parametrize(
+    ("lengths", "told"), [((20.0,), "longer than the scene"), ((1e-4,), "shorter than a voxel")]
+)
+@pytest.mark.parametrize("args", [("touch", "--poses"), ("sweep", "--path")])
+def test_a_tool_of_the_wrong_size_is_noted(
+    run: Run, scene: Path, args: tuple[str, str], lengths: tuple[float], told: str
 ) -> None:
-    before = {path.name: path.read_bytes() for path in scene.parent.iterdir()}
-    refused(run("sweep", scene, *TOOL, "--path", "free.csv", "--picture", name), "--picture")
-    assert {path.name: path.read_bytes() for path in scene.parent.iterdir()} == before
-
-
-@pytest.mark.parametrize("place", [(5000.0, 0.0, 0.0), (1e8, 1e8, 1e8)])
-def test_a_path_beside_the_environment_is_told(
-    run: Run, scene: Path, place: tuple[float, float, float]
-) -> None:
-    poses(scene.parent / "mm.csv", place, (place[0] + 0.1, *place[1:]))
-    code, out, err = run("sweep", scene, *TOOL, "--path", "mm.csv")
-    assert (code, out.startswith("clear ")) == (3, True)
-    (line,) = err.splitlines()
-    assert line.startswith("hapticdb: the path never comes within ")
-    assert run("sweep", scene, *TOOL, "--path", "mm.csv", "--as-given")[0] == 0
+    trimesh.creation.box(lengths * 3).export(scene.parent / "wrong.stl")
+    words = (args[0], scene, args[1], "path.csv", "--tool", "wrong.stl")
+    (line,) = run(*words)[2].splitlines()
+    assert line.startswith("hapticdb: the tool is ")
+    assert told in line
+    assert line.endswith("is --tool-unit right?")
+    assert run(*words, "--tool-unit", "m")[2] == ""
 
 
 def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
@@ -208,7 +185,6 @@ def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     refused(run("sweep", scene, *path, *TOOL, "--exclude", "9"), "no object 9")
     refused(run("sweep", scene, *path, *TOOL, "--exclude", "x"), "--exclude")
     refused(run("sweep", scene, *path, *TOOL, "--seconds", -1), "second")
-    refused(run("sweep", scene, *path, *TOOL, "--picture", "no/folder.png"), "cannot write")
     refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
     refused(run("sweep", "none.db", *path, *TOOL), "none.db")
 

@@ -34,7 +34,7 @@ FLOORS: list[set[str]] = [
     {"clashes", "extraction", "realtime", "sweeps"},
     {"recording", "devices"},
     {"batches", "environment", "resident", "sample", "testing"},
-    {"check", "difference", "ingest", "proportions", "transfer"},
+    {"check", "difference", "ingest", "transfer"},
     {"paper"},
     {"cluster", "query"},
     {"pointshell", "mesh", "poses"},

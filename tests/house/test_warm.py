@@ -26,7 +26,7 @@ import json, sys
 from pathlib import Path
 import numpy as np
 import hapticdb
-from hapticdb.devices.scripted import Line
+from hapticdb.devices.scripted import RandomHand
 from hapticdb.kernels import _jit, compiling
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.frames import ResidentFrames
@@ -64,7 +64,7 @@ for n, (layout, curve) in enumerate(KINDS):
                 if env.has_distances and strategy != "statement":
                     env.touch(each, np.eye(4), strategy).contact_pairs
         env.calibrate()
-        hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)], profile=True)
+        hapticdb.sweep(env, shell, [np.diag([-1.0, -1.0, 1.0, 1.0]), np.eye(4)])
         env.move(1, np.eye(4))
         env.voxels(1)
         env.remove(1)
@@ -80,7 +80,7 @@ for n, (layout, curve) in enumerate(KINDS):
                 env.touch(each, poses=[np.eye(4)], objects=True)
                 env.clearance(each, [np.eye(4)])
                 env.collides(each, [np.eye(4)])
-hand = Line(np.zeros(3), np.ones(3), 0.1)
+hand = RandomHand(np.zeros(3))
 smooth = folder / "smooth.db"
 hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))
 for url, law in ((folder / "0.db", "plane"), (smooth, "smooth")):
@@ -131,7 +131,7 @@ VERBS: tuple[tuple[str, str], ...] = (
     ("shell,touch by distance", "touch a.db --tool s/wrench.stl --poses s/path.csv"),
     ("feel,coupling,recording", FEEL),
     ("frames by distance", "replay a.hdbrec a.db"),
-    ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv --picture s.png"),
+    ("sweep", "sweep a.db --tool s/wrench.stl --path s/path.csv"),
     ("extract", "extract a.db 12 --motions 0 --out 100"),
     ("move", "move a.db 12 --translate 0,0,0.001"),
     ("copy", "copy a.db b.db --layout voxel --curve hilbert"),

@@ -265,16 +265,7 @@ def test_the_points_of_a_cloud_are_met_and_never_touched(tmp_path: Path) -> None
         assert resting.verdict == "hits"
 
 
-# --- profile, limits, revisions, wrong use -------------------------------------------------------
-
-
-def test_the_profile_tells_the_distance_along_the_path(env: Environment) -> None:
-    found = sweep(
-        env, TOOL, line((0.0, 0.0, 0.05), (0.0, 0.0, 0.09)), where=["plate"], profile=True
-    )
-    profile = found.profile
-    assert profile is not None
-    assert np.allclose(profile.gaps, 0.03 + 0.04 * profile.fractions, atol=1e-9)
+# --- limits, revisions, wrong use -------------------------------------------------------
 
 
 def test_a_limit_ends_what_is_told(env: Environment) -> None:

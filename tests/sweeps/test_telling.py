@@ -86,7 +86,7 @@ def test_json_has_the_documented_keys_and_no_infinity() -> None:
     assert set(record) == {
         "verdict", "gap", "gap_at_most", "chord_error", "nearest", "line", "comes_out", "hits",
         "touching", "undecided", "enclosed", "contact", "overlap", "objects", "looks", "revision",
-        "elapsed", "is_stopped", "poses", "profile", "tool", "proportions",
+        "elapsed", "is_stopped", "poses", "tool",
     }  # fmt: skip
     assert set(record["hits"][0]) == {
         "id", "name", "fraction", "segment", "pose", "on_tool", "on_object", "at_least",
@@ -97,7 +97,6 @@ def test_json_has_the_documented_keys_and_no_infinity() -> None:
     assert [one["start"] for one in record["touching"]] == [5e-5, None]
     assert (record["verdict"], record["gap"], record["nearest"]["name"]) == ("hits", 4e-4, "bolt")
     assert record["tool"] == {"parts": [7], "excluded": [7, 8]}
-    assert record["profile"]["gaps"][-1] is None
     nothing = sweep_record(swept(), TOOL, [], [])
     assert (nothing["verdict"], nothing["gap"], nothing["nearest"]) == ("clear", None, None)
 

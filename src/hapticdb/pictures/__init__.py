@@ -1,1 +1,1 @@
-"""Pictures: splatted voxels, the demo's picture, the picture of a sweep."""
+"""Pictures: the demo's, and the page of clashes."""

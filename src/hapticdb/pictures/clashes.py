@@ -7,23 +7,13 @@ from collections import Counter
 from collections.abc import Iterator, Sequence
 
 import numpy as np
-from matplotlib.image import imsave
 from numpy.typing import NDArray
+from PIL import Image, ImageDraw
 
 from hapticdb.clashes.result import GRAVITY, Clash, Clashes
 from hapticdb.environment import Environment
 from hapticdb.ingest.geometry import found_parts
-from hapticdb.pictures.demo import TOWARDS, shortened
-from hapticdb.pictures.splat import (
-    DEPTH_STEPS,
-    FAR,
-    NUMBER_BITS,
-    Camera,
-    Depths,
-    Image,
-    empty_depths,
-    shade,
-)
+from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.units import length_text
@@ -41,10 +31,10 @@ NAME = 40
 REST = "all others"
 SIZE = (400, 300)
 """Pixels of a picture."""
-SAMPLES = 2
-"""Pixels drawn for each pixel shown, an axis."""
-TINTS = ((0.92, 0.41, 0.08), (0.14, 0.39, 0.63), (1.0, 0.93, 0.2))
-"""Colours of the first part, of the second one, and of the place."""
+TINTS = ((0.92, 0.41, 0.08), (0.14, 0.39, 0.63))
+"""Colours of the first part and of the second one, 0 to 1."""
+MARK = "#ffed33"
+"""Colour of the circle at the place."""
 PAPER = (0.94, 0.95, 0.96)
 STYLE = """
 body{font:14px/1.45 system-ui,sans-serif;color:#1c2530;margin:2em auto;max-width:80em;padding:0 1em}
@@ -128,8 +118,14 @@ def _matrix(told: Sequence[Clash]) -> str:
     rows = ""
     for n, row in enumerate(units, 1):
         cells = "".join(_cell(deep[row, column], near[row, column]) for column in units)
-        rows += f"<tr><th>{n} {_text(shortened(row, NAME))}{cells}"
+        rows += f"<tr><th>{n} {_text(_shortened(row))}{cells}"
     return f"<table class=matrix><tr><th>{head}{rows}</table>"
+
+
+def _shortened(name: str) -> str:
+    """A name of at most `NAME` letters; the middle of a longer one is left out."""
+    half = (NAME - 1) // 2
+    return name if len(name) <= NAME else f"{name[:half].rstrip()}…{name[-half:].lstrip()}"
 
 
 def _common(paths: Sequence[Sequence[str]]) -> int:
@@ -164,7 +160,7 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
         parts = [part for _, part in found_parts(env.store, [a, b])]
         surfaces = [part.surface() for part in parts if part is not None]
         picture = io.BytesIO()
-        imsave(picture, _drawn(one, (a, b), surfaces, up), format="png")
+        _drawn(one, (a, b), surfaces, up).save(picture, "PNG")
         data = base64.b64encode(picture.getvalue()).decode()
         yield (
             f'<figure><img alt="" src="data:image/png;base64,{data}"><figcaption>'
@@ -176,52 +172,20 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
             return
 
 
-def _drawn(one: Clash, pair: tuple[Object, Object], surfaces: Sequence[Floats], up: int) -> Image:
-    """Draw both surfaces around the place where they meet; an image (height, width, 3), 0 to 1."""
+def _drawn(
+    one: Clash, pair: tuple[Object, Object], surfaces: Sequence[Floats], up: int
+) -> Image.Image:
+    """Draw both surfaces around the place where they meet."""
     places = np.array(one.place).reshape(2, 3)
     middle = places.mean(axis=0)
     edge = min(float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) for obj in pair)
     radius = max(0.4 * edge, 2.0 * float(np.linalg.norm(places[1] - places[0])), 1e-6)
-    size = (SIZE[0] * SAMPLES, SIZE[1] * SAMPLES)
-    window = np.array([[0.0, 0.0], size])
     box = np.stack([middle - radius, middle + radius])[None]
-    camera = Camera.looking_at(box, np.array(TOWARDS), size, window, up)
-    depths = empty_depths(camera)
-    for number, triangles in enumerate(surfaces):
-        _fill(depths, camera, _flat(camera, triangles), number)
-    image = shade(depths, camera, np.array(TINTS), np.array(PAPER), radius / size[1])
-    at = _flat(camera, places)[:, :2]
-    rows, columns = np.mgrid[: size[1], : size[0]] + 0.5
-    for x, y in at:
-        away = np.abs(np.hypot(columns - x, rows - y) - 9.0 * SAMPLES)
-        image[away < SAMPLES] = TINTS[2]
-    small = image.reshape(SIZE[1], SAMPLES, SIZE[0], SAMPLES, 3).mean(axis=(1, 3))
-    return np.asarray(np.clip(small, 0.0, 1.0))
-
-
-def _flat(camera: Camera, points: Floats) -> Floats:
-    """Pixels across and down, and metres ahead, of points (..., 3), seen from far away."""
-    seen = (points - camera.eye) @ camera.axes.T
-    scale = camera.focal / (0.5 * (camera.near + camera.far))
-    seen[..., :2] = seen[..., :2] * scale + camera.middle
-    return np.asarray(seen)
-
-
-def _fill(depths: Depths, camera: Camera, triangles: Floats, number: int) -> None:
-    """Put triangles (T, 3, 3), pixels and metres ahead, into a buffer of depths, in place."""
-    low = np.maximum(np.ceil(triangles[..., :2].min(axis=1) - 0.5), 0.0).astype(np.int64)
-    high = np.minimum(np.floor(triangles[..., :2].max(axis=1) + 0.5), camera.size).astype(np.int64)
-    edges = triangles[:, 1:] - triangles[:, :1]
-    areas = edges[:, 0, 0] * edges[:, 1, 1] - edges[:, 0, 1] * edges[:, 1, 0]
-    steps = DEPTH_STEPS / (camera.far - camera.near)
-    for n in np.flatnonzero((high > low).all(axis=1) & (np.abs(areas) > 1e-12)).tolist():
-        (x0, y0), (x1, y1), first = low[n], high[n], triangles[n, 0]
-        (ax, ay, az), (bx, by, bz) = edges[n]
-        x, y = np.arange(x0, x1) + 0.5 - first[0], (np.arange(y0, y1) + 0.5 - first[1])[:, None]
-        u, v = (x * by - y * bx) / areas[n], (y * ax - x * ay) / areas[n]
-        ahead = first[2] + u * az + v * bz
-        is_in = (u >= 0.0) & (v >= 0.0) & (u + v <= 1.0)
-        is_in &= (ahead > camera.near) & (ahead < camera.far)
-        entry = ((np.where(is_in, ahead, camera.near) - camera.near) * steps).astype(np.int64)
-        block = depths[y0:y1, x0:x1]
-        np.minimum(block, np.where(is_in, entry << NUMBER_BITS | number, FAR), out=block)
+    canvas = Canvas(box, SIZE, np.array([[0.0, 0.0], SIZE]), np.array(PAPER), up)
+    for triangles, tint in zip(surfaces, TINTS, strict=False):
+        canvas.fill(triangles, np.array(tint))
+    picture = canvas.picture()
+    draw = ImageDraw.Draw(picture)
+    for x, y, _ in canvas.project(places).tolist():
+        draw.circle((x, y), 9.0, outline=MARK)
+    return picture

@@ -5,14 +5,13 @@ import math
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.devices.protocol import Device, Reading
-from hapticdb.devices.scripted import Player, RandomHand, pose_at
-from hapticdb.devices.simulated import SimulatedDevice
+from hapticdb.devices.protocol import Reading
+from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.handle import follow
 from hapticdb.kernels.records import HANDLE, pose_numbers
 from hapticdb.kernels.rigid import is_rigid
-from hapticdb.poses import quaternion_of, rotation_of
+from hapticdb.poses import quaternion_of
 
 Floats = NDArray[np.float64]
 Hand = NDArray[np.void]
@@ -21,10 +20,6 @@ MOST_SCALE = 1e6
 """Greatest scale: a millimetre of the hand is a kilometre of the scene."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
 """Position and unit quaternion of no move and no turn."""
-
-SWAY = 1.0
-"""Greatest distance (m) of a `RandomHand` from its centre. Larger: fewer misfits of the path are
-reported."""
 
 
 class Handle:
@@ -70,11 +65,6 @@ class Handle:
             self.record["starts_elsewhere"] = True
             self.record["start"] = (*pose[:3, 3], *quaternion_of(pose[:3, :3])[0])
 
-    @property
-    def starts_elsewhere(self) -> bool:
-        """Whether the handle starts at a given place and not at the hand."""
-        return bool(self.record["starts_elsewhere"])
-
     def start(self, reading: Reading, hand: Hand) -> None:
         """Place the handle for a reading, at rest; writes `hand`, except its `is_stale`.
 
@@ -88,24 +78,3 @@ class Handle:
     def follow(self, reading: Reading, hand: Hand) -> None:
         """Move the handle as far as the reading says; writes `hand`."""
         follow(self.record, reading.pose, reading.velocity, reading.buttons, hand)
-
-
-def path_of_hand(device: Device, handle: Handle) -> tuple[Floats | None, float]:
-    """Poses (M, 4, 4) that the tool will take, and how far it may leave them; metres of the scene.
-
-    None and 0 if the path is not known in advance: a real device, or a handle with its own start.
-    """
-    hand = device.hand if isinstance(device, SimulatedDevice) else device
-    if isinstance(hand, Player):
-        poses = np.tile(np.eye(4), (len(hand._knots), 1, 1))  # noqa: SLF001 - same room
-        poses[:, :3, 3] = hand._knots[:, 1:4]  # noqa: SLF001
-        poses[:, :3, :3] = rotation_of(hand._knots[:, 4:8])  # noqa: SLF001
-        sway = 0.0
-    elif isinstance(hand, RandomHand):
-        poses, sway = hand._center[None].copy(), SWAY * handle.scale  # noqa: SLF001
-    else:
-        return None, 0.0
-    if handle.starts_elsewhere:
-        return None, 0.0
-    poses[:, :3, 3] *= handle.scale
-    return poses, sway

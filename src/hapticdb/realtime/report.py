@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.records import TIME_BIN, TIME_BINS
-from hapticdb.proportions import Proportions
 from hapticdb.realtime.coupling import DirectRendering
 from hapticdb.realtime.resident_cells import CacheFigures
 
@@ -113,8 +112,6 @@ class Report:
         One line: why the recording ended before the session; None if it did not.
     database_lost : str or None
         One line: why the database could not be read at the end; None if it could.
-    proportions : Proportions
-        Sizes and places of tool, path and scene at the start, and their misfits.
     hit_frames, contact_frames, unknown_frames, held_frames, stale_frames : int
         Numbers of frames: with a hit (a point in a voxel or, with distances, near a surface); with
         a contact (a point below its tangent plane or, with distances, below the onset); with a
@@ -158,7 +155,6 @@ class Report:
     lost_records: int
     recording_ended: str | None
     database_lost: str | None
-    proportions: Proportions
     hit_frames: int
     contact_frames: int
     unknown_frames: int
@@ -197,7 +193,6 @@ class Report:
                 plain[name][times] = getattr(part, times)._asdict()
         plain["cache"] = self.cache._asdict()
         plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
-        plain["proportions"] = self.proportions.record()
         return plain
 
 

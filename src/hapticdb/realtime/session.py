@@ -12,12 +12,11 @@ from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell, checked_budget
-from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, radius_of
-from hapticdb.realtime.handle import Handle, path_of_hand
+from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report, counts_of
@@ -149,7 +148,6 @@ class Session(Closes):
         self.law = as_law(law) or SMOOTH
         self._check_distances(law)
         self.coupling = self._settled(coupling or Coupling(), device)
-        self.proportions = self._compared(device)
         self._pid, self._row = os.getpid(), -1
         self._board: Board | None = None
         self._process: Process | None = None
@@ -190,14 +188,6 @@ class Session(Closes):
         if is_smooth(self.law):
             return coupling.settled(profile, self.timing.rate, scale, radius)
         return coupling.direct(profile, scale, radius)
-
-    def _compared(self, device: Device) -> Proportions:
-        poses, sway = path_of_hand(device, self.handle)
-        cells = self.cells
-        return compare_proportions(
-            cells.first_objects, cells.grid.voxel_size, self.shell, poses,
-            exclude=cells.left_out, margin=sway,
-        )  # fmt: skip
 
     def _begin(
         self,
@@ -373,7 +363,6 @@ class Session(Closes):
             recording_ended=self.recording_ended,
             database_lost=self.database_lost,
             lost_records=0 if recording is None else recording.n_lost,
-            proportions=self.proportions,
             law="smooth" if is_smooth(self.law) else "plane",
             coupling=self.coupling,
             budget_points=self.budget_points,

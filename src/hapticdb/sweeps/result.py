@@ -6,7 +6,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.proportions import Proportions
 from hapticdb.store.base import Object
 from hapticdb.sweeps.way import Way
 from hapticdb.units import length_text, notebook_html
@@ -69,13 +68,6 @@ class TouchedObject(NamedTuple):
     is_sliding: bool
 
 
-class Profile(NamedTuple):
-    """The distance along the path: at fractions (W,), gaps (W,), the limit if nothing is nearer."""
-
-    fractions: Floats
-    gaps: Floats
-
-
 @dataclass(frozen=True, eq=False)
 class Swept:
     """Result of a sweep.
@@ -107,10 +99,6 @@ class Swept:
         Revision of the database that was read.
     elapsed : float
         Seconds.
-    proportions : Proportions
-        Sizes and places of tool, path and scene; if there is a misfit, "clear" has no meaning.
-    profile : Profile or None
-        The distance along the path, if it was requested.
     is_stopped : bool
         Whether the time ended the sweep before all was decided.
     """
@@ -127,8 +115,6 @@ class Swept:
     looks: int
     revision: int
     elapsed: float
-    proportions: Proportions
-    profile: Profile | None = None
     is_stopped: bool = False
 
     def __repr__(self) -> str:

@@ -18,13 +18,12 @@ from hapticdb.mesh import Part
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.proportions import Proportions, compare_proportions
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import Contact
 from hapticdb.sweeps.gap import Least, OverTimeError, Pair, box_gaps, error_of
-from hapticdb.sweeps.result import Gap, PathPlace, Profile, Swept, TouchedObject
+from hapticdb.sweeps.result import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.sweeps.separation import SAME, Separation
 from hapticdb.sweeps.way import Way
 
@@ -34,8 +33,6 @@ FIRST_SHARE, LATER = 1 / 64, 4.0
 """Share of the path on which contacts are followed first, and the factor of each later share."""
 BEYOND = 4.0
 """Chord errors beyond a meeting at which it is looked whether the true surfaces overlap."""
-WINDOWS = 256
-"""Places of a path's profile. Larger: a finer profile, more time."""
 
 Floats = NDArray[np.float64]
 
@@ -50,8 +47,7 @@ def sweep(
     contact: float = CONTACT, overlap: float = 0.0, seated: bool = False,
     about: ArrayLike | None = None,
     limit: float | None = None, seconds: float | None = None,
-    profile: bool = False, until_hit: bool = False,
-    proportions: Proportions | None = None,
+    until_hit: bool = False,
     progress: Progress | None = None,
 ) -> Swept:  # fmt: skip
     """Move a tool along a path; say what it hits and where, or how near it comes.
@@ -79,10 +75,8 @@ def sweep(
         middle of the tool's box unless given.
     limit, seconds : float or None
         Greatest distance that is told, metres; time after which the sweep ends undecided.
-    profile, until_hit : bool
-        Compute the distance along the path, too; end at the first hit.
-    proportions : Proportions or None
-        Of the same tool, path and scene; compared here in metres unless given.
+    until_hit : bool
+        End at the first hit.
     progress : callable or None
         Called with the number of objects decided, and of all near the path.
 
@@ -93,13 +87,13 @@ def sweep(
     ObjectNotFoundError, NoSurfaceError
         If a word chooses no object; if an object's surface is not in the database.
     """
-    asked = _Asked(contact, overlap, seated, profile, until_hit, progress).begun(limit, seconds)
+    asked = _Asked(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
     make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, center_of(tool, about))
     with suppress(ConnectionLostError):
-        return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
-    return _Sweep(env, shell, tool, way, asked).swept(where, exclude, proportions)
+        return _Sweep(env, tool, way, asked).swept(where, exclude)
+    return _Sweep(env, tool, way, asked).swept(where, exclude)
 
 
 class _Asked(NamedTuple):
@@ -108,7 +102,6 @@ class _Asked(NamedTuple):
     contact: float
     overlap: float
     seated: bool
-    profile: bool
     until_hit: bool
     progress: Progress | None
     limit: float = np.inf
@@ -150,10 +143,8 @@ class _Touched(NamedTuple):
 class _Sweep:
     """State of one sweep."""
 
-    def __init__(
-        self, env: Environment, shell: PointShell, tool: MovingSurface, way: Way, asked: _Asked
-    ) -> None:
-        self._env, self._shell, self._tool = env, shell, tool
+    def __init__(self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked) -> None:
+        self._env, self._tool = env, tool
         self._way, self._asked = way, asked
         self._looks = 0
         self._best = asked.limit
@@ -164,19 +155,13 @@ class _Sweep:
         self._enclosed: list[Object] = []
         self._undecided: list[Object] = []
         self._error = 0.0  # chord errors where the gap was measured
-        self._fractions = np.linspace(0.0, 1.0, WINDOWS)
-        self._gaps = np.full(WINDOWS, asked.limit)
 
-    def swept(self, where: Words, exclude: Words, proportions: Proportions | None) -> Swept:
+    def swept(self, where: Words, exclude: Words) -> Swept:
         """Sweep, in one snapshot."""
         began, is_stopped = time.monotonic(), False
         with self._env.store.snapshot():
             revision = self._env.store.revision()
             objects = self._env.felt(where, exclude)
-            if proportions is None:
-                proportions = compare_proportions(
-                    objects, self._env.grid.voxel_size, self._shell, self._way.poses
-                )
             try:
                 near = self._decide(objects)
                 self._follow()
@@ -196,8 +181,7 @@ class _Sweep:
             contact=self._asked.contact, overlap=self._asked.overlap, objects=near,
             looks=self._looks + sum(one.pair.looks for one in self._contacts),
             revision=revision, elapsed=time.monotonic() - began,
-            proportions=proportions, is_stopped=is_stopped,
-            profile=Profile(self._fractions, self._gaps) if self._asked.profile else None,
+            is_stopped=is_stopped,
         )  # fmt: skip
 
     def _decide(self, objects: list[Object]) -> int:
@@ -209,7 +193,7 @@ class _Sweep:
         parts = parts_of(self._env.store, [objects[i] for i in order])
         for n, i in enumerate(order):
             least = float(nearest[i])
-            if least >= self._wanted() and not self._is_profiled(least):
+            if least >= self._wanted():
                 self._closed = min(self._closed, least)
                 return n
             obj, part = next(parts)
@@ -232,9 +216,6 @@ class _Sweep:
         if self._hits or self._enclosed:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
-
-    def _is_profiled(self, least: float) -> bool:
-        return self._asked.profile and least < float(self._gaps.max())
 
     def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
         """Decide about one object; is_inside : whether its box meets the tool's at the start.
@@ -324,8 +305,6 @@ class _Sweep:
 
         What was touched begins to be near, so it has no part in the gap: is it met again?
         """
-        if self._asked.profile:
-            self._note_profile(pair, begin)
         is_counted = not (begin or self._hits or self._enclosed)
         best = self._best if is_counted else 2.0 * MEETING + pair.error
         least, closed = pair.least(begin, best)
@@ -346,12 +325,6 @@ class _Sweep:
         way = min(least.way + BEYOND * pair.error, self._way.length)
         found = Separation(shape, self._tool, pair.check_time)
         return found.depth(self._way.at([way])[0], pair.error)[0] > 0.0
-
-    def _note_profile(self, pair: Pair, begin: float) -> None:
-        ways = self._fractions * self._way.length
-        at = np.flatnonzero(ways >= begin)
-        near = pair.measure(ways[at], self._gaps[at])
-        self._gaps[at] = np.minimum(self._gaps[at], near.at_most)
 
     def _place(
         self, obj: Object, way: float, on_tool: Floats, on_object: Floats, depth: float = 0.0

@@ -177,9 +177,7 @@ def sweep_record(
         "line": verdict_line(found, shell),
         **{name: plain(getattr(found, name)) for name in FOUND},
         "poses": len(found.path.poses),
-        "profile": plain(found.profile),
         "tool": {"parts": parts, "excluded": excluded},
-        "proportions": found.proportions.record(),
     }
 
 

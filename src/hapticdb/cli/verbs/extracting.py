@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, NamedTuple
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
 
 import typer
 
@@ -18,15 +18,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.values import budget_bytes, numbers_of
-from hapticdb.cli.verbs.sweeping import (
-    MM,
-    ContactOption,
-    OverlapOption,
-    PictureOption,
-    UpName,
-    UpOption,
-    check_picture,
-)
+from hapticdb.cli.verbs.sweeping import MM, ContactOption, OverlapOption
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -44,6 +36,7 @@ EXIT_CODES = {
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way, and of the table of searches that failed."""
 
+UpName = Literal["x", "y", "z"]
 SecondsOption = Annotated[
     float | None,
     typer.Option(
@@ -98,6 +91,10 @@ AnimationOption = Annotated[
     str | None,
     typer.Option(metavar="HTML", help="Write a page that shows how the parts come out."),
 ]
+UpOption = Annotated[
+    UpName | None,
+    typer.Option(help="Axis that points up in the animation.", show_default="the files'"),
+]
 
 HELP = """Search a path on which parts come out, judged by a sweep of their surfaces.
 
@@ -130,7 +127,7 @@ install viser).
 The exit code is 0 when it comes out or slides, 4 when it overlaps, 3 when it is
 not decided, 1 when no path is found.
 
-Example: hapticdb extract car.db body/hood --path out.csv --picture out.png
+Example: hapticdb extract car.db body/hood --path out.csv
 """
 """The verb's help text: longer than a function of this house may be."""
 
@@ -155,23 +152,22 @@ def extract(
     budget: BudgetOption = 256.0,
     on: ClusterOption = None,
     path: WayOption = None,
-    picture: PictureOption = None, animation: AnimationOption = None,
+    animation: AnimationOption = None,
     up: UpOption = None,
     json: JsonOption = False,
-) -> None:  # fmt: skip
+) -> None:
     """Search a path on which parts come out; the help text is `HELP`."""
     import hapticdb
     from hapticdb.extraction import disassembly as orders
     from hapticdb.extraction import run
 
-    check_picture(picture)
     _check_animation(animation)
     if not disassemble and (depth is not None or keep or on):
         raise UsageError("--depth, --keep and --on go with --disassemble")
     if to and (disassemble or out or screw):
         raise UsageError("--to goes with none of --disassemble, --out and --screw")
     goal = _goal(to) if to else None
-    asked = _Outputs(path, picture, animation, up, json)
+    asked = _Outputs(path, animation, up, json)
     options: dict[str, Any] = {
         "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
         "contact": MM * contact, "overlap": MM * overlap, "budget_bytes": budget_bytes(budget),
@@ -220,19 +216,16 @@ class _Outputs(NamedTuple):
     """What is written beside the printed lines: names of files, or None."""
 
     path: str | None
-    picture: str | None
     animation: str | None
     up: UpName | None
     json: bool
 
     def of_step(self, step: int) -> "_Outputs":
         """Files of a step of an order: ``out.csv`` is ``out-1.csv`` for the first step, 0."""
-
-        def numbered(file: str | None) -> str | None:
-            path = Path(file or "")
-            return file and str(path.with_name(f"{path.stem}-{step + 1}{path.suffix}"))
-
-        return self._replace(path=numbered(self.path), picture=numbered(self.picture))
+        if self.path is None:
+            return self
+        path = Path(self.path)
+        return self._replace(path=str(path.with_name(f"{path.stem}-{step + 1}{path.suffix}")))
 
 
 class _Way(NamedTuple):
@@ -255,7 +248,7 @@ def _check_animation(animation: str | None) -> None:
 
 
 def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: _Outputs) -> None:
-    """Print the verdict; write path, picture and animation of a path that was found."""
+    """Print the verdict; write path and animation of a path that was found."""
     from hapticdb.extraction.verdict import extraction_record
 
     ways = [] if found.way is None else [_Way(found, left_out, asked)]
@@ -268,7 +261,7 @@ def _report(env: "Environment", found: "Extraction", left_out: list[int], asked:
 
 
 def _report_order(env: "Environment", found: "Disassembly", asked: _Outputs) -> None:
-    """Print an order or why there is none; write a path and a picture a step, and an animation."""
+    """Print an order or why there is none; write a path a step, and an animation."""
     from hapticdb.extraction.verdict import disassembly_record
 
     steps = found.steps if found.is_found else ()
@@ -290,24 +283,7 @@ def _write_paths(ways: Sequence[_Way]) -> None:
 
 
 def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
-    """Draw the pictures and the animation that were asked for."""
-    from hapticdb.extraction.verdict import extraction_line
-
-    for found, excluded, files in ways:
-        if files.picture is not None and found.way is not None:
-            from hapticdb.pictures.demo import save
-            from hapticdb.pictures.sweep import compose_sweep
-            from hapticdb.sweeps.run import sweep
-
-            swept = sweep(
-                env, found.shell, found.way.poses, exclude=excluded, profile=True,
-                contact=found.way.swept.contact, overlap=found.way.swept.overlap, seated=True,
-            )  # fmt: skip
-            figure = compose_sweep(
-                env, found.shell, swept, exclude=excluded, verdict=extraction_line(found),
-                up=asked.up,
-            )  # fmt: skip
-            save(figure, files.picture)
+    """Draw the animation if it was asked for."""
     if asked.animation is not None and ways:
         from hapticdb.page.animation import animate
 
@@ -338,7 +314,7 @@ def _show(found: "Extraction", asked: _Outputs) -> None:
     ]
     if found.way is not None:
         files = asked._asdict()
-        facts += [(name, files[name]) for name in ("path", "picture", "animation") if files[name]]
+        facts += [(name, files[name]) for name in ("path", "animation") if files[name]]
     render.facts(facts)
 
 
@@ -360,7 +336,7 @@ def _show_order(found: "Disassembly", ways: Sequence[_Way]) -> None:
         ends = [way.files._asdict() for way in (ways[0], ways[-1])]
         facts += [
             (name, " ... ".join(dict.fromkeys(end[name] for end in ends)))
-            for name in ("path", "picture", "animation")
+            for name in ("path", "animation")
             if ends[0][name]
         ]
     render.facts(facts)

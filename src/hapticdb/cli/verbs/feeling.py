@@ -198,6 +198,8 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
+    from hapticdb.query.law import inset_of
+
     began = perf_counter()
     kernels = _begin_loop(law, processor, budget_points, frames_on, is_recorded=record is not None)
     profile = None if device_profile is None else profile_named(device_profile)
@@ -206,8 +208,11 @@ def feel(
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, *kernels)
-    felt, inset = _looked_at(url, where, exclude, law or "smooth")
-    shell = _shell(tool, tool_unit, points, seed, device, 0.0 if conservative else inset)
+    with hapticdb.open(url, read_only=True) as env:
+        felt = felt_objects(env, where, exclude)
+        inset = 0.0 if conservative else inset_of(env.grid.voxel_size, law or "smooth")
+        shell = _shell(tool, tool_unit, points, seed, device, inset)
+        fitting.warn_of_size(env, shell, felt.left_out)
     begin = partial(
         hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
         law=chosen, coupling=coupling, budget_points=budget_points, frames_on=frames_on,
@@ -216,7 +221,7 @@ def feel(
     )  # fmt: skip
     with _begun(begin, url, budget_bytes(budget), felt, law) as session:
         with ended_by_signals(session.ask_to_end) as signals:
-            report = _waited_for(session, tool, stiffness, seconds)
+            report = _waited_for(session, stiffness, seconds)
         session_page.show(report, session.cells, shell, record, speed, None if json else began)
     _exit_after(signals, report)
 
@@ -289,16 +294,6 @@ def _begin_loop(
     return purposes
 
 
-def _looked_at(
-    url: str, where: Sequence[str] | None, exclude: Sequence[str] | None, law: LawName
-) -> tuple[Felt, float]:
-    """Words of the options, checked before a process is started; where contact begins, metres."""
-    from hapticdb.query.law import inset_of
-
-    with hapticdb.open(url, read_only=True) as env:
-        return felt_objects(env, where, exclude), inset_of(env.grid.voxel_size, law)
-
-
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
     """Leave with the exit code of the signal that ended the session, or 1 without a database."""
     if signal.SIGTERM in signals:
@@ -310,14 +305,11 @@ def _exit_after(signals: Sequence[int], report: "Report") -> None:
         raise typer.Exit(1)
 
 
-def _waited_for(
-    session: "Session", tool: str, stiffness: float | None, seconds: float | None
-) -> "Report":
+def _waited_for(session: "Session", stiffness: float | None, seconds: float | None) -> "Report":
     """Wait for a session's end; what a person should know at once is told at once."""
     lowered = getattr(session.coupling, "lowered", None)
     if stiffness is not None and lowered is not None:
         render.note(lowered)
-    fitting.tell(session.proportions, tool, "--scale")
     report, notes = None, session_page.Notes()
     with render.bar("feeling; Ctrl-C ends it", "s") as progress:
         while report is None:

@@ -2,9 +2,8 @@
 
 import math
 from collections.abc import Sequence
-from pathlib import Path
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, Literal, NamedTuple
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
@@ -37,18 +36,13 @@ if TYPE_CHECKING:
     from hapticdb.sweeps.result import Swept
 
 EXIT_CODES = {"clear": 0, "slides": 0, "hits": 1, "not decided": 3, "overlaps": 4}
-DOUBTFUL = 3
-"""Exit code where nothing is hit, too, but tool, path and scene do not fit."""
 WORST = (1, 3, 4, 0)
 """Exit codes, the worst first: the code of a batch is the first that a sweep of it has."""
 MM = 1e-3
 """Metres of a millimetre: all lengths among the options are in millimetres."""
-DRAWN_POINTS = 3000
-"""Points of the tool in a picture. More: a denser tool."""
 MOST_OBJECTS = 20
 """Rows of the table of what is hit or touched; the other objects are counted below it."""
 
-UpName = Literal["x", "y", "z"]
 PartsOption = Annotated[
     list[str] | None,
     typer.Option(
@@ -93,19 +87,6 @@ BatchOption = Annotated[
     str | None,
     typer.Option(metavar="CSV", help="Many sweeps, one a line; see above."),
 ]
-AsGivenOption = Annotated[
-    bool,
-    typer.Option(
-        "--as-given", help="The sizes and places are right: exit code 0 when nothing is hit."
-    ),
-]
-PictureOption = Annotated[
-    str | None, typer.Option(metavar="PNG", help="Draw the path, what it hits, and the gap.")
-]
-UpOption = Annotated[
-    UpName | None,
-    typer.Option(help="Axis that points up in the picture.", show_default="the files'"),
-]
 
 HELP = """Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
@@ -133,11 +114,9 @@ does not free it at the first pose, it starts inside.
 where, exclude and contact (mm). Several words in a cell stand with ; between.
 
 The exit code is 0 when it is clear or slides, 4 when it overlaps, 1 when it hits,
-3 when it is not decided or, without --as-given, when the sizes or places of tool,
-path and scene do not fit together; a line then says so. A batch has the worst: 1
-before 3 before 4 before 0.
+3 when it is not decided. A batch has the worst: 1 before 3 before 4 before 0.
 
-Example: hapticdb sweep car.db --part 17 --path out.csv --picture out.png
+Example: hapticdb sweep car.db --part 17 --path out.csv
 """
 """The verb's help text: longer than a function of this house may be."""
 
@@ -146,13 +125,10 @@ class _Options(NamedTuple):
     """Options that all sweeps of a command share; about, overlap : metres."""
 
     tool_unit: str | None
-    path_unit: str | None
     about: "list[float] | None"
     overlap: float
     seconds: float | None
     until_hit: bool
-    is_drawn: bool
-    as_given: bool
 
 
 class _Job(NamedTuple):
@@ -190,23 +166,20 @@ def sweep(
     batch: BatchOption = None,
     seconds: SweepSecondsOption = None,
     until_hit: UntilHitOption = False,
-    as_given: AsGivenOption = False,
     csv: CsvOption = None,
-    picture: PictureOption = None,
-    up: UpOption = None,
     json: JsonOption = False,
 ) -> None:
     """Sweep a tool or parts along a path; the help text is `HELP`."""
     import hapticdb
 
     one = Asked(tool, part or [], path or "", where or [], exclude or [], contact, "")
-    _check(one, tool_unit, batch, csv, picture)
+    _check(one, tool_unit, batch, csv)
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
     center = None if about is None else numbers_of(about, 3, "--about", "X,Y,Z in millimetres")
     options = _Options(
-        tool_unit, path_unit, center and [MM * x for x in center], MM * overlap, seconds,
-        until_hit, picture is not None, as_given,
+        tool_unit, center and [MM * x for x in center], MM * overlap, seconds,
+        until_hit,
     )  # fmt: skip
     asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
@@ -218,30 +191,17 @@ def sweep(
         told = _swept(env, jobs[0], options)
         if table:
             table.write(rows_of_sweep(told.found))
-        try:
-            if json:
-                _say_json(told)
-            elif csv != STDOUT:
-                _show(told)
-        finally:  # also when who reads, such as head, has enough
-            began = perf_counter()
-            if picture is not None:
-                with render.bar("drawing", "pictures"):
-                    _draw(picture, env, told, up)
-    if picture is not None and not json and csv != STDOUT:
-        render.say(f"picture: {picture}, drawn in {perf_counter() - began:.2f} s")
+        if json:
+            _say_json(told)
+        elif csv != STDOUT:
+            _show(told)
     raise typer.Exit(told.code)
 
 
-def _check(
-    one: Asked, tool_unit: str | None, batch: str | None, csv: str | None, picture: str | None
-) -> None:
+def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
     """Refuse options that contradict one another."""
     if batch is not None:
-        given = {
-            "--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv,
-            "--picture": picture,
-        }  # fmt: skip
+        given = {"--tool": one.tool, "--part": one.part, "--path": one.path, "--csv": csv}
         for name, value in given.items():
             if value:
                 raise UsageError(f"--batch and {name}: give only one of them")
@@ -254,13 +214,6 @@ def _check(
         raise UsageError(
             "--tool-unit belongs to --tool: a part has the unit that it was imported in"
         )
-    check_picture(picture)
-
-
-def check_picture(picture: str | None) -> None:
-    """Refuse a name that is no PNG's."""
-    if picture is not None and Path(picture).suffix.lower() != ".png":
-        raise UsageError(f"--picture {picture!r}: give a name that ends with .png")
 
 
 def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
@@ -278,30 +231,24 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
 
     asked, felt = job.asked, job.felt
     began = perf_counter()
-    points = DRAWN_POINTS if options.is_drawn else 1  # only a picture shows them
     with naming(asked.line):
         if asked.tool is None:
             with render.bar("sampling the parts", "points"):
-                shell = env.shell(*job.parts, points=points, inset=0.0)
+                shell = env.shell(*job.parts, points=1, inset=0.0)
         else:
             is_saved = asked.tool.lower().endswith(".npz")
-            shell = shell_of(asked.tool, options.tool_unit, None if is_saved else points, None)
-        fit = fitting.compare(
-            env, shell, job.poses, exclude=felt.left_out, tool=asked.tool,
-            tool_unit=options.tool_unit, path_unit=options.path_unit, is_moving=True,
-        )  # fmt: skip
+            shell = shell_of(asked.tool, options.tool_unit, None if is_saved else 1, None)
+            fitting.warn_of_size(env, shell, felt.left_out)
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
-                env, shell, job.poses, where=felt.where, exclude=felt.exclude, proportions=fit,
+                env, shell, job.poses, where=felt.where, exclude=felt.exclude,
                 contact=MM * asked.contact, overlap=options.overlap, seated=asked.tool is None,
-                about=options.about, seconds=options.seconds, profile=options.is_drawn,
+                about=options.about, seconds=options.seconds,
                 until_hit=options.until_hit, progress=progress,
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-    is_doubtful = bool(fit.misfits) and not options.as_given
-    code = DOUBTFUL if found.is_free and is_doubtful else EXIT_CODES[found.verdict]
-    return _Told(job, shell, found, code, perf_counter() - began)
+    return _Told(job, shell, found, EXIT_CODES[found.verdict], perf_counter() - began)
 
 
 def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, json: bool) -> int:
@@ -318,9 +265,8 @@ def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, j
         found = told.found
         place = found.hits[0] if found.hits else found.gap.place
         name, at = ("", "") if place is None else (place.object.name, percent(place.fraction))
-        doubt = ", but sizes do not fit" if told.code == DOUBTFUL and found.is_free else ""
         gap = gap_text(found) if found.is_free else "-"
-        rows.append((job.asked.name, job.asked.path, found.verdict + doubt, gap, name, at))
+        rows.append((job.asked.name, job.asked.path, found.verdict, gap, name, at))
     if rows:
         render.table(("part or tool", "path", "verdict", "gap>", "nearest or hit", "at>"), rows)
     return next(code for code in WORST if code in codes)
@@ -332,18 +278,6 @@ def _say_json(told: _Told) -> None:
     job = told.job
     record = sweep_record(told.found, told.shell, job.parts, job.felt.left_out)
     render.say_json({"moved": job.asked.name, "path": job.asked.path} | record)
-
-
-def _draw(picture: str, env: "Environment", told: _Told, up: UpName | None) -> None:
-    from hapticdb.pictures.demo import save
-    from hapticdb.pictures.sweep import compose_sweep
-    from hapticdb.sweeps.verdict import verdict_line
-
-    verdict = verdict_line(told.found, told.shell)
-    figure = compose_sweep(
-        env, told.shell, told.found, exclude=told.job.felt.left_out, verdict=verdict, up=up
-    )
-    save(figure, picture)
 
 
 def _show(told: _Told) -> None:

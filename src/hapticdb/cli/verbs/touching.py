@@ -1,7 +1,7 @@
 """The verb touch."""
 
 from collections import Counter
-from collections.abc import Generator, Iterator, Sequence
+from collections.abc import Generator, Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass, field
 from functools import partial
@@ -50,15 +50,12 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.paper.strategies import Strategy
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.proportions import Misfit
     from hapticdb.query.law import ForceLaw, LawName
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
 MOST_TOUCHED = 8
 """Objects in the table of those that were touched in most frames."""
-MOST_COMPARED = 10_000
-"""Poses of a batch whose places are compared with the scene's. Larger: a stray pose is seen."""
 FEW_POSES = 500
 """Poses of a path below which it does not pay to measure the database's costs.
 
@@ -126,9 +123,6 @@ def touch(
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
 
-    Where the sizes or places of tool, path and scene do not fit together, a line
-    says what is wrong, and by which factor. A path without hits then means little.
-
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
@@ -143,11 +137,7 @@ def touch(
         render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
-        step = 1 if out is None else max(1, len(path) // MOST_COMPARED)
-        fit = fitting.compare(
-            env, shell, path[::step], exclude=felt.left_out, tool=tool, tool_unit=tool_unit,
-            path_unit=path_unit, is_moving=False, reach=reach,
-        )  # fmt: skip
+        fitting.warn_of_size(env, shell, felt.left_out)
         if out is not None:
             pieces = env.touch_pieces(
                 shell, path, where=felt.where, exclude=felt.exclude, law=chosen, on=on
@@ -160,7 +150,7 @@ def touch(
         )  # fmt: skip
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
-            output.add(index, touch_at(pose), shell, pose, fit.misfits)
+            output.add(index, touch_at(pose), shell, pose)
     output.finish(shell)
 
 
@@ -238,12 +228,7 @@ class _Output:
     summary: "_Summary | None"
 
     def add(
-        self,
-        index: int,
-        touched: "Touch",
-        shell: "PointShell",
-        pose: "NDArray[np.float64]",
-        misfits: "Sequence[Misfit]",
+        self, index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
     ) -> None:
         """Write the touch at one pose of the path."""
         if self.poses is not None:
@@ -251,9 +236,7 @@ class _Output:
         if self.contacts is not None:
             self.contacts.write(rows_of_contacts(index, touched, shell, pose))
         if self.is_json:
-            found = [misfit._asdict() for misfit in misfits]
-            record = {"misfits": found, "shell": shell_record(shell)}
-            render.say_json(_record(index, touched) | record)
+            render.say_json(_record(index, touched) | {"shell": shell_record(shell)})
         if self.summary is not None:
             self.summary.add(touched)
 

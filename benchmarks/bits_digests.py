@@ -18,8 +18,6 @@ from numpy.typing import ArrayLike
 
 import hapticdb
 from bits_inputs import Place, Tool, command
-from hapticdb.kernels.rigid import poses_of
-from hapticdb.recording.file import State
 
 Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
 STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
@@ -45,7 +43,7 @@ def perf_counter():
 time.perf_counter_ns, time.perf_counter = perf_counter_ns, perf_counter
 '''
 COLUMNS = (
-    *("time", "dt", "hand", "hand_velocity", "tool", "wrench", "applied"),
+    *("time", "dt", "hand", "hand_velocity", "tool", "applied"),
     *("hits", "contacts", "unknown", "deepest", "revision", "state"),
 )
 """Columns of a recorded frame that are compared: all but measured times."""
@@ -135,35 +133,25 @@ def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
         modules = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
         words = ["--tool", tool.mesh, "--device", tool.hand, *SESSION.split(), file]
         command("feel", place.url, "--law", "plane", *words, PYTHONPATH=modules)
-    columns = hapticdb.Recording(file).columns(*COLUMNS)
-    (digest := Digest()).feed(*columns)
-    hits = columns[COLUMNS.index("hits")]
+    frames = hapticdb.Recording(file).frames()
+    (digest := Digest()).feed(*(frames[name] for name in COLUMNS))
+    hits = frames["hits"]
     results[f"{place.name}/session"] = digest.entry(
         int(np.count_nonzero(hits)), f"of {len(hits)} frames hit"
     )
 
 
 def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Results) -> None:
-    """Feel a recording's frames together, and replay it in this process and by the verb."""
-    recording, digest = hapticdb.Recording(file), Digest()
-    header = recording.header
-    tools, unknown, state = recording.columns("tool", "unknown", "state")
-    is_known = (unknown == 0) & (np.asarray(state, np.int64) & State.HELD.value == 0)
-    known = np.ascontiguousarray(tools[is_known], np.float64)
-    poses = np.empty((len(known), 4, 4))
-    poses_of(known, poses)
-    felt = env.touch(header.shell, poses=poses, exclude=header.exclude, law=header.law)
-    of = f"of {len(recording)} recorded frames compared"
+    """Replay a recording in this process and by the verb."""
+    recording = hapticdb.Recording(file)
+    of, n_frames = f"of {len(recording)} recorded frames compared", len(recording)
     found = hapticdb.replay(recording, env)
-    digest.feed(np.column_stack([felt.forces, felt.torques, felt.hits]))
-    results[f"{place.name}/replay"] = digest.entry(found.n_compared, of, found.n_differing)
-    found = hapticdb.replay(recording, env)
-    (digest := Digest()).feed(found.n_compared, found.n_skipped)
-    results[f"{place.name}/replay singly"] = digest.entry(found.n_compared, of, found.n_differing)
-    cells = command("replay", file, place.url)
-    (digest := Digest()).feed(cells["compared"], cells["skipped"])
-    results[f"{place.name}/replay in cells"] = digest.entry(
-        cells["compared"], of, cells["differing"]
+    (digest := Digest()).feed(n_frames)
+    results[f"{place.name}/replay"] = digest.entry(found.n_frames, of, found.n_differing)
+    told = command("replay", file, place.url)
+    (digest := Digest()).feed(told["frames"])
+    results[f"{place.name}/replay by the verb"] = digest.entry(
+        told["frames"], of, told["differing"]
     )
 
 

@@ -187,7 +187,7 @@ def _ours(folder: Path) -> list[tuple[str, bytes]]:
     shell, poses, recording = (folder / f"seed{suffix}" for suffix in OTHERS)
     PointShell.sphere(0.1, 20).save(shell)
     write_poses(poses, np.tile(np.eye(4), (5, 1, 1)))
-    write(recording, motion(30), motion(20, 30))
+    write(recording, motion(50))
     return [
         (".npz", shell.read_bytes()),
         (".npz", repacked(shell.read_bytes())),

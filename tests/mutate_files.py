@@ -64,7 +64,7 @@ def _read_ours(path: Path) -> None:
     else:
         from hapticdb.recording.file import Recording  # noqa: PLC0415
 
-        Recording(path).columns("time", "hand", "wrench", until_damage=True)
+        Recording(path).poses()
 
 
 def _size_of(file: MeshFile) -> int:

@@ -61,12 +61,12 @@ if TYPE_CHECKING:
     from hapticdb.ready import warm_up as warm_up
     from hapticdb.realtime.coupling import Coupling as Coupling
     from hapticdb.realtime.handle import Handle as Handle
+    from hapticdb.realtime.replay import Replayed as Replayed
+    from hapticdb.realtime.replay import replay as replay
     from hapticdb.realtime.report import Report as Report
     from hapticdb.realtime.resident_cells import ResidentCells as ResidentCells
     from hapticdb.realtime.session import Session as Session
     from hapticdb.recording.file import Recording as Recording
-    from hapticdb.recording.replay import Replayed as Replayed
-    from hapticdb.recording.replay import replay as replay
     from hapticdb.store.base import Object as Object
     from hapticdb.store.connect import backup_environment as backup_environment
     from hapticdb.store.connect import restore_environment as restore_environment

@@ -25,9 +25,9 @@ def seconds_of(names: Collection[str]) -> float:
     return max(sum(each) / min(os.cpu_count() or 1, len(each)), *each)
 
 
-def session_purposes(*, is_smooth: bool, is_recorded: bool) -> list[str]:
+def session_purposes(*, is_smooth: bool) -> list[str]:
     """Purposes of a session under the smooth or the plane law."""
-    return ["feel", *(["coupling"] + ["recording"] * is_recorded if is_smooth else ["direct"])]
+    return ["feel", "coupling" if is_smooth else "direct"]
 
 
 _READY: set[str] = set()

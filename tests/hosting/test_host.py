@@ -23,9 +23,9 @@ from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.poses import row_of_pose
 from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.replay import replay
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
-from hapticdb.recording.replay import replay
 from hapticdb.resident.table import is_alive
 from realtime.hands import at
 from realtime.sessions import floored, recorded, standing_plate
@@ -126,17 +126,20 @@ def test_a_recording_replays_bit_for_bit(
     session.record(path)
     with pytest.raises(UsageError, match="recorded already"):
         session.record(tmp_path / "second.hdbrec")
-    for z in np.linspace(0.004, 0.0, 20):
+    for n, z in enumerate(np.linspace(0.004, 0.0, 20)):
         session.move(row_of_pose(at(0.001, 0.0, z)))
         run_frames(session, 10)
+        if n == 10:
+            session.set_coupling(Coupling(stiffness=300.0))
     n_frames = session.stop_recording()
     frames = recorded(path)
     assert len(frames) == n_frames > 100
     assert frames["time"][0] == 0.0
     assert frames["contacts"].max() > 0
+    assert sorted(set(frames["spring"][:, 0])) == [300.0, 1000.0]
+    assert not frames["state"][0] & State.ANEW  # the state of the running session was taken over
     result = replay(Recording(path), env)
-    assert result.n_compared > 0
-    assert result.is_equal
+    assert result.is_equal, result.describe()
 
 
 def test_objects_that_a_session_leaves_out_are_not_felt(

@@ -20,7 +20,7 @@ from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.channel import Channel
-from hapticdb.recording.ring import SessionRecording
+from hapticdb.recording.file import Recorder
 from realtime.hands import at
 
 ABOVE = at(0.0, 0.0, 0.02)
@@ -40,7 +40,7 @@ def session(host: SessionHost, sphere: PointShell) -> Iterator[HostedSession]:
     begun.end()
 
 
-def recording_of(host: SessionHost, session: HostedSession) -> SessionRecording:
+def recording_of(host: SessionHost, session: HostedSession) -> Recorder:
     """The recording of a session, in the host."""
     found = host._running[session.id]._recording
     assert found is not None

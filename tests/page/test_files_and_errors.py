@@ -22,12 +22,11 @@ from hapticdb.page.process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
-from hapticdb.recording.file import Recorder
 from hapticdb.sweeps.result import Gap
 from hapticdb.sweeps.way import Way
 from made_sweeps import place_at, swept
 from page_person import PagePerson
-from recordings import HEADER
+from recordings import begun
 from serving import PROTOCOL
 
 WAY = np.eye(4)
@@ -44,7 +43,7 @@ class NoHost:
 
     def record(self, path: Path) -> None:
         """Begin a recording, as a session does."""
-        Recorder(path, HEADER).close()
+        begun(path).close()
 
     def nothing(self, *_: object) -> None: ...
 

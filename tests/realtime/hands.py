@@ -117,14 +117,23 @@ class Unplugged(Slow):
 
 
 class Noted(Slow):
-    """A hand whose driver writes the latest wrench into a file."""
+    """A hand whose driver adds each wrench that it receives to a file."""
 
     def __init__(self, hand: Player, path: Path) -> None:
         super().__init__(hand, 1 << 30, 0.0)
         self.path = path
 
     def apply(self, wrench: Floats) -> None:
-        self.path.write_bytes(wrench.tobytes())
+        with self.path.open("ab") as file:
+            file.write(wrench.tobytes())
+
+
+class NotedClutched(Noted, Clutched):
+    """One whose button changes between down and up every 100 reads; it ends after 500."""
+
+    def __init__(self, hand: Player, path: Path) -> None:
+        Clutched.__init__(self, hand)
+        self.path = path
 
 
 class Beckoned(Slow):

@@ -15,7 +15,6 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
 from hapticdb.realtime.stations import LARGE_FROM
 from hapticdb.recording.file import Recording
-from hapticdb.recording.replay import touching
 from hapticdb.testing import floor_voxels, write_voxels
 
 RATE = 500.0
@@ -65,7 +64,7 @@ def standing_plate() -> PointShell:
 
 
 def recorded(path: Path) -> Recorded:
-    return np.concatenate(list(Recording(path).frames()))
+    return np.array(Recording(path).frames())
 
 
 def felt_at(
@@ -74,4 +73,5 @@ def felt_at(
     """Wrenches (n, 6) of touches at the tool's recorded poses."""
     poses = np.empty((len(frames), 4, 4))
     poses_of(np.ascontiguousarray(frames["tool"]), poses)
-    return touching(env, shell, law)(poses)[0]
+    touches = (env.touch(shell, pose, "array", law=law) for pose in poses)
+    return np.array([(*touch.force, *touch.torque) for touch in touches])

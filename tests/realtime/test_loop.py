@@ -93,7 +93,6 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
 
         def ran(device: Device, **options: object) -> Ran:
             board = Board.create(1, N_RING)
-            board.seats["is_recorded"] = True
             rate = float(str(options.pop("rate", 500.0)))
             request = LoopRequest(
                 table=cells.table, row=row, board=board, grid=cells.grid, shell=sphere,
@@ -140,7 +139,7 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 def test_a_users_law_may_have_numbers_of_any_kind_and_raise(run: Run) -> None:
     def felt_by(law: object) -> Floats:
         frames = run(still(0.010), law=law, seconds=0.1, has_baseline=False).frames
-        return np.asarray(frames["wrench"][-1])
+        return np.asarray(frames["applied"][-1])
 
     numbers = Numbers(750.0, True, Depth(2.0, np.array([np.nan, 0.5])))
     plain = felt_by(TangentPlane(750.0))

@@ -96,7 +96,6 @@ def requested(world: World, hand: Pressing, seconds: float = 1.0) -> LoopRequest
         law = DistanceField()
         coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
     board = Board.create(1, N_RING)
-    board.seats["is_recorded"] = True
     return LoopRequest(
         table=world.table,
         row=world.table.join(),
@@ -147,7 +146,7 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     loop._step(1e-3)
     noted = loop.board.rings[0, 0]
     assert noted["hits"] == loop.board.seats["hit_frames"][0] == 0
-    assert not noted["wrench"].any()
+    assert not noted["applied"].any()
 
 
 class Ended(SystemExit):

@@ -11,11 +11,11 @@ from numpy.typing import NDArray
 
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
+from hapticdb.realtime.replay import replay
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
-from hapticdb.recording.replay import replay
 from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, at, still
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
@@ -113,10 +113,8 @@ def test_unknown_cells_hold_and_fade(sphere: PointShell, tmp_path: Path) -> None
                     os.kill(cells.pid, signal.SIGCONT)
                 until(lambda: not is_unknown(session) and is_pushed(session), session)
                 report = session.stop()
-        replayed = replay(Recording(tmp_path / "a"), env)
-    assert replayed.is_equal, replayed.describe()
-    assert replayed.n_skipped == report.held_frames
     frames = recorded(tmp_path / "a")
+    assert report.held_frames == np.count_nonzero(frames["state"] & State.HELD)
     check_falling(frames)
     unknown = frames[frames["unknown"] > 0]
     assert len(unknown)

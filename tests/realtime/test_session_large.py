@@ -9,16 +9,15 @@ import pytest
 
 from banded import write_points
 from children import PATIENCE
-from hapticdb import Environment, Grid, PointShell
+from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import UsageError
-from hapticdb.query.law import LawName
+from hapticdb.query.law import PLANE, LawName
+from hapticdb.realtime.replay import replay
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
-from hapticdb.recording.header import Header
-from hapticdb.recording.replay import replay
 from realtime.hands import at, still
 from realtime.sessions import NEVER_STALE, felt_at, floor_points, floored, recorded, standing_plate
 from realtime.worlds import SIZE, make
@@ -77,17 +76,18 @@ def felt(ground: Ground, shell: PointShell, path: Path, budget: int | None = Non
 def test_clusters_of_a_large_tool_sleep_and_change_no_bit(
     ground: Ground, plate: PointShell, tmp_path: Path
 ) -> None:
-    """The recorded wrenches are those of touches at the recorded poses."""
     report = felt(ground, plate, tmp_path / "s.hdbrec")
     assert report.contact_frames > 0
     assert report.budget_points is None
     assert (report.left_out_frames, report.most_left_out) == (0, 0)
-    recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
-    known = frames[(frames["unknown"] == 0) & (frames["state"] & State.HELD == 0)]
-    assert known["wrench"].any()
-    flat = felt_at(ground.env, plate, known, recording.header.law)
-    np.testing.assert_array_equal(flat, known["wrench"])
-    assert replay(recording, ground.env).is_equal
+    frames = recorded(tmp_path / "s.hdbrec")
+    assert frames["applied"].any()
+    if ground.law == "plane":  # of which the device gets the force of a touch, once it has risen
+        known = frames[(frames["time"] > 0.1) & (frames["state"] & State.HELD == 0)]
+        flat = felt_at(ground.env, plate, known, PLANE)
+        np.testing.assert_array_equal(flat[:, :3], known["applied"][:, :3])
+    found = replay(Recording(tmp_path / "s.hdbrec"), ground.env)
+    assert found.is_equal, found.describe()
 
 
 def test_a_budget_is_kept_reported_recorded_and_replayed_bit_for_bit(
@@ -100,10 +100,9 @@ def test_a_budget_is_kept_reported_recorded_and_replayed_bit_for_bit(
     recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
     assert recording.header.budget_points == BUDGET
     assert (frames["hits"] <= BUDGET).all()
-    assert frames["wrench"].any()
+    assert frames["applied"].any()
     replayed = replay(recording, ground.env)
     assert replayed.is_equal, replayed.describe()
-    assert replayed.n_compared > report.loop.frames // 2
 
 
 @pytest.mark.parametrize("budget", [0, 1.5, True])
@@ -111,12 +110,3 @@ def test_a_budget_that_is_no_number_of_points_is_refused(budget: object) -> None
     """Before the environment is looked for."""
     with pytest.raises(UsageError, match=f"a budget of {budget} points"):
         Session("none.db", PointShell.sphere(0.01, 10), still(0.03), budget_points=budget)  # type: ignore[arg-type]
-
-
-def test_headers_with_another_budget_differ() -> None:
-    shell = PointShell.sphere(0.01, 10)
-    grid = Grid(SIZE, (0.0, 0.0, 0.0), 6)
-    with_one, other, without = (
-        Header("a.db", grid, 1, shell, 100.0, budget_points=n) for n in (5, 6, None)
-    )
-    assert with_one.differing(other) == with_one.differing(without) == ["budget_points"]

@@ -34,7 +34,7 @@ def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
 
 
 def force_in(path: Path) -> float:
-    return float(np.abs(np.frombuffer(path.read_bytes())).sum())
+    return float(np.abs(np.frombuffer(path.read_bytes()[-48:])).sum()) if path.exists() else 0.0
 
 
 @pytest.mark.long
@@ -51,10 +51,10 @@ def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
     assert n_memories() == n_before + 2 * len(("cells", "frames"))  # a mapping has one, too
     sessions.clear()
     gc.collect()
-    assert path.read_bytes() == bytes(48)
+    assert path.read_bytes().endswith(bytes(48))
     assert not any(map(is_alive, pids))
     assert n_memories() == n_before
-    assert sum(map(len, Recording(record).frames())) >= n_frames
+    assert len(Recording(record)) >= n_frames
 
 
 def n_memories() -> int:
@@ -110,7 +110,7 @@ def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
         report = session.stop()
         assert is_alive(cells.pid)
     assert report.recorded_frames == report.loop.frames
-    assert sum(map(len, Recording(path).frames())) == report.loop.frames
+    assert len(Recording(path)) == report.loop.frames
 
 
 def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(

@@ -14,8 +14,8 @@ import hapticdb
 from assemblies import drop_surfaces
 from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.mesh import read_file
-from hapticdb.recording.file import Recorder, Recording
-from recordings import header
+from hapticdb.recording.file import Recording
+from recordings import header, motion, write
 
 NAMED = (
     "ws://127.0.0.1:{port}", "wss://127.0.0.1:{port}/?token=x", "http://127.0.0.1:{port}/scene.db",
@@ -77,7 +77,7 @@ def test_a_recording_opens_nothing_but_a_file_beside_it(
         grid = env.grid
     for named in NAMED:
         name = named.format(port=listening.getsockname()[1], folder=scene.parent)
-        Recorder(scene.with_name("s.hdbrec"), header(environment=name, grid=grid)).close()
+        write(scene.with_name("s.hdbrec"), motion(0), header(environment=name, grid=grid))
         refused(run("replay", "s.hdbrec"), "s.hdbrec names the environment", "replay FILE URL")
         with pytest.raises(hapticdb.errors.UsageError, match="no file beside it"):
             Recording("s.hdbrec").environment_beside()
@@ -90,11 +90,10 @@ def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
 ) -> None:
     with hapticdb.open(scene) as env:
         made = header(environment=scene.name, grid=env.grid)
-    recording = scene.with_name("s.hdbrec")
-    Recorder(recording, made).close()
+    recording = write(scene.with_name("s.hdbrec"), motion(0), made)
     monkeypatch.chdir("/")
     code, out, err = run("replay", recording)
-    assert (code, out) == (1, "nothing to compare: 0 skipped (unknown or held)\n")
+    assert (code, out) == (1, "nothing to compare: the recording has no frames\n")
     assert err == f"hapticdb: {recording} names {scene}, which is opened\n"
 
 

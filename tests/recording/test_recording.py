@@ -1,9 +1,13 @@
-"""Recordings: frames are read as they were written, bit for bit."""
+"""Recordings: frames are read as they were written, and a file that is cut off up to its end."""
 
+import io
 import json
-import struct
+import os
+import resource
+import signal
+import time
 import zlib
-from dataclasses import asdict
+from dataclasses import asdict, fields
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -14,13 +18,21 @@ from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from hypothesis.extra.numpy import arrays
 
+from children import PATIENCE, exit_code, until
+from draws import drawn
 from hapticdb import Coupling, PointShell
 from hapticdb.devices.profiles import PROFILES
 from hapticdb.errors import FileError, UsageError
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DistanceField
-from hapticdb.recording.file import CHUNK, FRAME, Frames, Recorder, Recording, State
-from recordings import HEADER, header, motion, read, write
+from hapticdb.realtime.session import Session
+from hapticdb.recording import file as module
+from hapticdb.recording.file import FRAME, LEFT_FREE, Frames, Recorder, Recording, State
+from hapticdb.recording.header import OLDER, Start
+from realtime.hands import still
+from realtime.sessions import RATE, floored, recorded
+from realtime.worlds import make
+from recordings import HEADER, begun, header, motion, write
 
 repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 
@@ -33,104 +45,66 @@ repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture
 def test_frames_return_bit_for_bit(tmp_path: Path, frames: Frames, n: int) -> None:
     """Also infinities, signed zeros and NaN."""
     path = tmp_path / "s.hdbrec"
-    with Recorder(path, header(), replace=True) as recorder:
+    with begun(path, replace=True) as recorder:
         recorder.append(frames[:n])
-        recorder.flush()
         recorder.append(frames[n:])
-    assert read(path) == frames.tobytes()
-    assert len(Recording(path)) == len(frames)
+    assert recorded(path).tobytes() == frames.tobytes()
+    assert len(Recording(path)) == len(frames) == len(recorder)
 
 
 def test_the_header_returns(tmp_path: Path, sphere: PointShell) -> None:
-    changes: dict[str, Any] = {
-        "law": DistanceField(800.0),
-        "coupling": asdict(Coupling().settled(PROFILES["omni"], 1000.0, 2.0, 0.1)),
-        "where": ["wheel*", 3],
-        "exclude": ["material=steel"],
-        "budget_points": 500,
-    }
-    given = header(sphere, **changes)
-    Recorder(tmp_path / "s.hdbrec", given).close()
-    found = Recording(tmp_path / "s.hdbrec").header
-    assert found.differing(given) == []
-    assert set(found.differing(HEADER)) == {"shell", *changes}
-    assert (found.law, found.coupling) == (changes["law"], changes["coupling"])
-    for name in ("grid", "revision", "rate", "where", "exclude", "version", "started"):
-        assert getattr(found, name) == getattr(given, name)
+    head = header(
+        sphere,
+        law=DistanceField(800.0),
+        coupling=asdict(Coupling().settled(PROFILES["omni"], 1000.0, 2.0, 0.1)),
+        where=["wheel*", 3],
+        exclude=["material=steel"],
+        rendering="coupled",
+        frames_on="cuda",
+        start=Start(b"\n\0", b"", b"1" * 300, b"2"),
+    )
+    found = Recording(write(tmp_path / "s.hdbrec", motion(2), head)).header
+    for name in (field.name for field in fields(head) if field.name != "shell"):
+        assert getattr(found, name) == getattr(head, name)
     for name in ("points", "normals", "center"):
         assert getattr(found.shell, name).tobytes() == getattr(sphere, name).tobytes()
 
 
 def test_a_session_without_frames_is_a_recording(tmp_path: Path) -> None:
-    Recorder(tmp_path / "s.hdbrec", HEADER).close()
-    found = Recording(tmp_path / "s.hdbrec")
-    assert (len(found), list(found.frames()), found.n_torn) == (0, [], 0)
+    found = Recording(write(tmp_path / "s.hdbrec", motion(0)))
+    assert (len(found), len(found.frames()), found.n_torn) == (0, 0, 0)
     times, poses = found.poses()
     assert (times.shape, poses.shape) == ((0,), (0, 4, 4))
 
 
-def test_small_appends_wait_for_a_chunk(tmp_path: Path) -> None:
-    frames = motion(CHUNK + 10)
-    with Recorder(tmp_path / "s.hdbrec", HEADER) as recorder:
-        for start in range(0, len(frames), 7):
-            recorder.append(frames[start : start + 7])
-        assert len(recorder) == CHUNK + 10
-        assert len(Recording(tmp_path / "s.hdbrec")) == CHUNK
-        recorder.flush()
-        assert len(Recording(tmp_path / "s.hdbrec")) == CHUNK + 10
-    assert [len(f) for f in Recording(tmp_path / "s.hdbrec").frames()] == [CHUNK, 10]
-
-
-def test_columns_and_poses_are_those_of_the_frames(tmp_path: Path) -> None:
+def test_poses_are_those_of_the_hand(tmp_path: Path) -> None:
     frames = motion(500)
-    found = Recording(write(tmp_path / "s.hdbrec", frames[:200], frames[200:]))
-    hits, tools = found.columns("hits", "tool")
-    np.testing.assert_array_equal(hits, frames["hits"])
-    np.testing.assert_array_equal(tools, frames["tool"])
-    times, poses = found.poses()
+    times, poses = Recording(write(tmp_path / "s.hdbrec", frames)).poses()
     np.testing.assert_array_equal(times, frames["time"])
     np.testing.assert_array_equal(poses[:, :3, 3], frames["hand"][:, :3])
     np.testing.assert_array_equal(poses[:, :3, :3], rotation_of(frames["hand"][:, 3:]))
-    with pytest.raises(UsageError, match="columns heat: choose of time, dt"):
-        found.columns("time", "heat")
 
 
 def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
     """The file is read as docs/format.md describes, with NumPy alone."""
     frames = motion(9)
-    content = write(tmp_path / "s.hdbrec", frames[:5], frames[5:]).read_bytes()
-    magic, number, n_text, n_points, crc = struct.unpack_from("<8sIIII", content)
-    end = 24 + n_text + 48 * n_points + 24
-    assert (magic, number, n_points) == (b"HDBREC\r\n", 4, 1)
-    assert zlib.crc32(content[24:end], zlib.crc32(content[:20])) == crc
-    told = json.loads(content[24 : 24 + n_text])
+    path = write(tmp_path / "s.hdbrec", frames)
+    content = path.read_bytes()
+    first, text, rest = content.split(b"\n", 2)
+    words = first.split()
+    number, rows_at, crc = int(words[2]), int(words[3]), int(words[4], 16)
+    assert (words[:2], number, rows_at % 64) == ([b"hapticdb", b"recording"], 1, 0)
+    assert zlib.crc32(content[len(first) + 1 : rows_at]) == crc
+    told = json.loads(text)
     assert (told["grid"]["curve"], told["stiffness"], told["exclude"]) == ("hilbert", 700, [2, 5])
-    numbers = np.frombuffer(content[24 + n_text : end], "<f8")
+    assert (told["shell"]["points"], told["start"]) == (1, [0, 0, 0, 0])
+    numbers = np.frombuffer(rest[: 48 * 1 + 24], "<f8")
     assert numbers.tolist() == [0.1, 0.2, 0.3, 0, 0, 1, 0.01, 0, 0]
-
-    found: list[Frames] = []
-    at = end
-    while at < len(content):
-        mark, n, first, size, payload_crc, head_crc = struct.unpack_from("<4sIQIII", content, at)
-        payload = content[at + 28 : at + 28 + size]
-        assert (mark, zlib.crc32(content[at : at + 24])) == (b"HDBC", head_crc)
-        assert (zlib.crc32(payload), first) == (payload_crc, sum(len(rows) for rows in found))
-        at += 28 + size
-        rows = np.zeros(n, FRAME)
-        start = 4 * 16
-        for name, length in zip(
-            FRAME.names or (), np.frombuffer(payload[:start], "<u4"), strict=n > 0
-        ):
-            dtype = FRAME[name].base
-            planes = np.frombuffer(zlib.decompress(payload[start : start + length]), np.uint8)
-            zigzag = np.ascontiguousarray(planes.reshape(-1, n).T).view(f"<u{dtype.itemsize}")
-            steps = np.where(zigzag & 1, ~(zigzag >> 1), zigzag >> 1)
-            bits = steps.cumsum(0, steps.dtype).cumsum(0, steps.dtype)
-            rows[name] = bits.view(dtype).reshape(rows[name].shape)
-            start += length
-        found.append(rows)
-    assert np.concatenate(found).tobytes() == frames.tobytes()
-    assert [len(rows) for rows in found] == [5, 4, 0]
+    row = np.dtype([(name, kind, *map(tuple, shape)) for name, kind, *shape in told["row"]])
+    assert row == FRAME
+    assert np.memmap(path, row, "r", rows_at).tobytes() == frames.tobytes()
+    assert FRAME.itemsize == 336
+    assert list(State) == [1, 2, 4, 8, 16, 32]
 
 
 # --- files that exist ---------------------------------------------------------------------------
@@ -139,116 +113,203 @@ def test_the_file_is_as_the_format_says(tmp_path: Path) -> None:
 def test_a_file_is_not_replaced_unasked(tmp_path: Path) -> None:
     path = tmp_path / "s.hdbrec"
     path.write_text("a letter")
-    with pytest.raises(
-        UsageError, match=r"is there already: append to it \(--append\), replace it"
-    ):
-        Recorder(path, header())
+    with pytest.raises(UsageError, match=r"is there already: replace it \(--replace\)"):
+        Recorder(path).open()
     with pytest.raises(FileError, match="is no recording of hapticdb"):
-        Recorder(path, header(), append=True)
+        Recorder(path, replace=True).open()
     assert path.read_text() == "a letter"
-    with pytest.raises(FileError, match="is no recording of hapticdb"):
-        Recorder(path, header(), replace=True)
-    assert path.read_text() == "a letter"
-    path.write_bytes(b"")
-    with Recorder(path, header(), replace=True) as recorder:
-        recorder.append(motion(3))
-    assert len(Recording(path)) == 3
+    for old in (b"", OLDER + b"older"):
+        path.write_bytes(old)
+        with begun(path, replace=True) as recorder:
+            recorder.append(motion(3))
+        assert len(Recording(path)) == 3
     assert [file.name for file in tmp_path.iterdir()] == [path.name]
 
 
 def test_a_recording_is_replaced_by_the_first_frames_of_another(tmp_path: Path) -> None:
-    path = tmp_path / "s.hdbrec"
-    write(path, motion(10))
-    before = path.read_bytes()
-    Recorder(path, header(), replace=True).close()  # no frame was recorded
-    assert path.read_bytes() == before
-    with Recorder(path, header(), replace=True) as recorder:
-        recorder.append(motion(4))
-        assert path.read_bytes() == before
-        recorder.flush()
-        assert len(Recording(path)) == 4
-    assert read(path) == motion(4).tobytes()
-    assert [file.name for file in tmp_path.iterdir()] == [path.name]
-
-
-def test_a_recording_goes_on(tmp_path: Path) -> None:
-    frames = motion(30)
-    write(tmp_path / "s.hdbrec", frames[:10])
-    for start in (10, 20):
-        later = header(revision=9, started="2031-01-01T00:00:00+00:00")
-        with Recorder(tmp_path / "s.hdbrec", later, append=True) as recorder:
-            assert (len(recorder), recorder.header.revision) == (start, 3)
-            recorder.append(frames[start : start + 10])
-    assert read(tmp_path / "s.hdbrec") == frames.tobytes()
-
-
-def test_a_recorder_that_appends_begins_where_nothing_is(tmp_path: Path) -> None:
-    (tmp_path / "empty.hdbrec").touch()
-    for name in ("new.hdbrec", "empty.hdbrec"):
-        with Recorder(tmp_path / name, header(), append=True) as recorder:
-            recorder.append(motion(3))
-        assert read(tmp_path / name) == motion(3).tobytes()
-
-
-def test_another_session_is_not_appended(tmp_path: Path, sphere: PointShell) -> None:
     path = write(tmp_path / "s.hdbrec", motion(10))
-    content = path.read_bytes()
-    for other, named in (
-        (header(sphere, rate=5000.0), "rate, shell"),
-        (header(environment="other.db"), "environment"),
-        (header(coupling={"stiffness": 1500.0}), "coupling"),
-    ):
-        with pytest.raises(UsageError, match=f"recorded with another {named}: give another name"):
-            Recorder(path, other, append=True)
-    assert path.read_bytes() == content
-
-
-def test_one_recorder_at_a_time(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "s.hdbrec", HEADER) as recorder:
-        recorder.append(motion(3))
-        for how in ({"append": True}, {"replace": True}):
-            with pytest.raises(UsageError, match="is being recorded"):
-                Recorder(tmp_path / "s.hdbrec", header(), **how)
-    assert read(tmp_path / "s.hdbrec") == motion(3).tobytes()
+    before = path.read_bytes()
+    with begun(path, replace=True):
+        pass
+    assert path.read_bytes() == before
+    with begun(path, replace=True) as recorder:
+        assert path.read_bytes() == before
+        recorder.append(motion(4))
+        assert len(Recording(path)) == 4
+        with begun(path, replace=True), pytest.raises(UsageError, match="is being recorded"):
+            Recorder(path, replace=True).open()
+    assert recorded(path).tobytes() == motion(4).tobytes()
 
 
 def test_no_password_is_written(tmp_path: Path) -> None:
     url = "postgresql://ann:secret@127.0.0.1/plant?password=secret"
-    Recorder(tmp_path / "s.hdbrec", header(environment=url)).close()
-    assert b"secret" not in (tmp_path / "s.hdbrec").read_bytes()
-    assert Recording(tmp_path / "s.hdbrec").header.environment.startswith("postgresql://ann")
+    path = write(tmp_path / "s.hdbrec", motion(1), header(environment=url))
+    assert b"secret" not in path.read_bytes()
+    assert Recording(path).header.environment.startswith("postgresql://ann")
 
 
 @pytest.mark.parametrize(
     "changes",
-    [{"rate": 0.0}, {"rate": float("nan")}, {"coupling": {"k": {1}}}, {"law": SimpleNamespace()}],
+    [
+        {"rate": 0.0},
+        {"rate": float("nan")},
+        {"coupling": {"k": {1}}},
+        {"coupling": {"k": float("inf")}},
+        {"law": SimpleNamespace()},
+    ],
 )
 def test_a_header_that_cannot_be_is_refused(changes: dict[str, Any]) -> None:
     with pytest.raises(UsageError):
         header(**changes)
-    with pytest.raises(UsageError, match="finite numbers"):
-        header(coupling={"k": float("inf")})
 
 
-def test_what_is_no_frame_is_refused(tmp_path: Path) -> None:
-    with Recorder(tmp_path / "s.hdbrec", HEADER) as recorder:
-        with pytest.raises(UsageError, match="of FRAME"):
-            recorder.append(np.zeros((2, 2), FRAME))
-        with pytest.raises(UsageError, match="of FRAME"):
-            recorder.append(np.zeros(3))  # type: ignore[arg-type]
-    with pytest.raises(UsageError, match="the recorder is closed"):
-        recorder.append(motion(1))
-    recorder.close()
-
-
-def test_what_is_no_recording_is_told(tmp_path: Path) -> None:
+def test_what_is_no_recording_of_this_version_is_told(tmp_path: Path) -> None:
+    path = tmp_path / "s.hdbrec"
     with pytest.raises(FileError, match="no recording at"):
-        Recording(tmp_path / "none.hdbrec")
+        Recording(path)
     with pytest.raises(FileError, match="is no file"):
         Recording(tmp_path)
     with pytest.raises(FileError, match="cannot write"):
-        Recorder(tmp_path / "no" / "s.hdbrec", header())
+        Recorder(tmp_path / "no" / "s.hdbrec").open()
+    for version in (1, 2, 3, 4):
+        path.write_bytes(OLDER + version.to_bytes(4, "little") + bytes(500))
+        with pytest.raises(FileError, match=r"s\.hdbrec was made before 0\.1: record it again$"):
+            Recording(path)
+    path.write_bytes(b"hapticdb recording 2 000000000064 00000000\n" + bytes(100))
+    with pytest.raises(FileError, match="format 2, this hapticdb reads 1"):
+        Recording(path)
 
 
-def test_bits_of_the_state_are_as_the_format_says() -> None:
-    assert list(State) == [1, 2, 4, 8]
+# --- files that were cut off --------------------------------------------------------------------
+
+
+def test_a_file_cut_anywhere_is_read_up_to_its_last_whole_frame(tmp_path: Path) -> None:
+    content = write(tmp_path / "whole.hdbrec", motion(4)).read_bytes()
+    start = len(content) - 4 * FRAME.itemsize
+    path = tmp_path / "cut.hdbrec"
+    for cut in [*drawn(range(len(content)), 150), 0, start - 1, start]:
+        path.write_bytes(content[:cut])
+        if cut < start:
+            with pytest.raises(FileError, match="cut off in its header"):
+                Recording(path)
+            continue
+        found = Recording(path)
+        assert (len(found), found.n_torn) == divmod(cut - start, FRAME.itemsize)
+        assert recorded(path).tobytes() == motion(len(found)).tobytes()
+
+
+@repeatedly
+@given(place=st.floats(0, 1, exclude_max=True), flip=st.integers(1, 255))
+def test_a_changed_header_is_refused_in_one_line(tmp_path: Path, place: float, flip: int) -> None:
+    content = bytearray(write(tmp_path / "s.hdbrec", motion(0)).read_bytes())
+    content[int(place * len(content))] ^= flip
+    (tmp_path / "s.hdbrec").unlink()
+    (tmp_path / "f.hdbrec").write_bytes(content)
+    with pytest.raises(FileError) as raised:
+        Recording(tmp_path / "f.hdbrec")
+    assert "\n" not in str(raised.value)
+
+
+def test_a_killed_recorder_leaves_whole_frames(tmp_path: Path) -> None:
+    rng = np.random.default_rng(5)
+    for n in range(4):
+        path = tmp_path / f"{n}.hdbrec"
+        child = os.fork()
+        if child == 0:
+            try:
+                recorder = begun(path)
+                while True:
+                    recorder.append(motion(97, len(recorder)))
+            finally:
+                os._exit(1)
+        until(lambda p=path: p.exists() and p.stat().st_size > 10_000, every=0.001)  # type: ignore[misc]
+        time.sleep(rng.uniform(0.0, 0.05))
+        os.kill(child, signal.SIGKILL)
+        assert exit_code(child) == -signal.SIGKILL
+        found = recorded(path)
+        assert len(found) > 0
+        assert found.tobytes() == motion(len(found)).tobytes()
+
+
+# --- limits -------------------------------------------------------------------------------------
+
+
+def test_a_full_disk_leaves_whole_frames(tmp_path: Path) -> None:
+    path = tmp_path / "s.hdbrec"
+    child = os.fork()
+    if child == 0:  # the file size limit holds for the child process only
+        code = 1
+        try:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (20_000, 20_000))
+            recorder = begun(path)
+            try:
+                for n in range(1000):
+                    recorder.append(motion(20, 20 * n))
+            except FileError as error:
+                told = f"cannot write {path}: File too large; its first {len(recorder)} frames"
+                code = 0 if str(error).startswith(told) else 2
+        finally:
+            os._exit(code)
+    assert exit_code(child) == 0
+    found = Recording(path)
+    assert (len(found) > 20, found.n_torn) == (True, 0)
+    assert recorded(path).tobytes() == motion(len(found)).tobytes()
+
+
+def test_a_recording_ends_at_its_limit_and_leaves_room_on_its_disk(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    size = write(tmp_path / "whole.hdbrec", motion(500)).stat().st_size
+    for limit, n_frames in ((size, 500), (size - 1, 499)):
+        with begun(tmp_path / f"{limit}.hdbrec", limit_bytes=limit) as recorder:
+            recorder.append(motion(500))
+        assert (recorder.ended is None) == (n_frames == 500)
+        assert len(Recording(recorder.path)) == n_frames == len(recorder)
+    assert "ends after 499 frames, at its limit of 0.1" in str(recorder.ended)
+
+    def shrinking(file: io.FileIO) -> int:
+        return LEFT_FREE + size - 1 - file.tell()
+
+    monkeypatch.setattr(module, "free_bytes", shrinking)
+    for given_limit in (None, 1 << 30):
+        with begun(tmp_path / f"{given_limit}.hdbrec", limit_bytes=given_limit) as recorder:
+            recorder.append(motion(500))
+        assert str(recorder.ended).endswith("since its disk has no more than 64 MiB left")
+        assert len(Recording(recorder.path)) == 499
+
+
+@pytest.mark.parametrize("limit", [0, -5, float("nan")])
+def test_a_limit_that_makes_no_sense_is_refused(tmp_path: Path, limit: Any) -> None:  # noqa: ANN401
+    with pytest.raises(UsageError, match="bytes at most: give 1 or more"):
+        Recorder(tmp_path / "s.hdbrec", limit_bytes=limit)
+
+
+def test_where_no_frame_would_fit_nothing_is_begun(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recorder = Recorder(tmp_path / "s.hdbrec", limit_bytes=400)
+    recorder.open()
+    with pytest.raises(UsageError, match="400 bytes at most, and its header and a frame take"):
+        recorder.begin(HEADER)
+    recorder.discard()
+    monkeypatch.setattr(module, "free_bytes", lambda _: 20 << 20)
+    recorder = Recorder(tmp_path / "s.hdbrec")
+    with pytest.raises(FileError, match="its disk has 20 MiB left, of which a recording leaves 64"):
+        recorder.open()
+    recorder.discard()
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_session_goes_on_without_its_recording(sphere: PointShell, tmp_path: Path) -> None:
+    path = tmp_path / "short.hdbrec"
+    with floored(make(tmp_path, bits=6)) as env, Session(
+        env.url, sphere, still(0.010), law="plane", rate=RATE, seconds=2.0,
+        record=path, record_limit_bytes=50_000,
+    ) as session:  # fmt: skip
+        assert session.recording_ended is None
+        report = session.wait(PATIENCE)
+    assert report is not None
+    n_frames = len(recorded(path))
+    assert f"ends after {n_frames:,} frames, at its limit" in str(report.recording_ended)
+    assert 0 < n_frames == report.recorded_frames < report.loop.frames
+    assert report.lost_records == 0

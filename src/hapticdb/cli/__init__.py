@@ -47,7 +47,7 @@ VERBS: dict[Callable[..., None], str] = {
     feel: "Feel in real time with a device.",
     view: "See and feel in a browser.",
     serve: "Let others see and feel, in browsers and with devices.",
-    replay: "Compute a recorded session's wrenches again.",
+    replay: "Run a recorded session again.",
     sweep: "Say whether a tool or part comes out along a path.",
     clashes: "Say which parts meet, and which are near.",
     extract: "Search a path on which parts come out.",

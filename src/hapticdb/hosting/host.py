@@ -7,6 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -25,7 +26,6 @@ from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
-from hapticdb.query.law import SMOOTH
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
@@ -206,11 +206,10 @@ class SessionHost(Closes):
         asked = running.request
         settled = self._settled(coupling, running.cells, asked.shell, asked.coupling.scale)
         running.worker.ask("set_coupling", asked.seat, settled)
+        running.request = replace(asked, coupling=settled)
 
     def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
-        asked = running.request
-        header = running.cells.header(asked.shell, self.rate, SMOOTH, asked.coupling)
-        running.record(path, header, self._board, replace=replace)
+        running.record(path, self.rate, replace=replace)
 
     def _end(self, running: Running) -> Recorded:
         """End a session, whatever of it still works; returns what its recording has."""

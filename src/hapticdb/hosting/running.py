@@ -1,23 +1,15 @@
 """Running: what a host keeps of a session while it runs."""
 
 import threading
-import time
-from pathlib import Path
 
-from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import WorkerProcess
+from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.resident_cells import ResidentCells
-from hapticdb.recording.file import DEFAULT_LIMIT
-from hapticdb.recording.header import Header
-from hapticdb.recording.ring import SessionRecording
-
-FRAMES_UNTIL_RECORDED = 2
-"""Frames after which every frame has what a recording needs."""
-FRAME_PATIENCE = 5.0
-"""Seconds in which a worker must run those frames; normally milliseconds."""
+from hapticdb.recording.file import Recorder
 
 
 class Running:
@@ -28,11 +20,11 @@ class Running:
     ) -> None:
         self.request, self.session, self.cells, self.worker = request, session, cells, worker
         self.seat = request.seat
-        self._recording: SessionRecording | None = None
+        self._recording: Recorder | None = None
         self._taking = threading.Lock()
 
-    def record(self, path: str, header: Header, board: Board, *, replace: bool) -> None:
-        """Begin a recording.
+    def record(self, path: str, rate: float, *, replace: bool) -> None:
+        """Begin a recording at the next frame.
 
         Raises
         ------
@@ -45,26 +37,16 @@ class Running:
             raise UsageError(
                 f"the hosted session {self.session} is recorded already: stop it first"
             )
-        recording = SessionRecording(
-            Path(path), limit_bytes=DEFAULT_LIMIT, append=False, replace=replace
-        )
-        board.seats["is_recorded"][self.seat] = 1
+        asked, recording = self.request, Recorder(path, replace=replace)
         try:
-            recording.begin(header, self._first_frame(board))
+            recording.open()
+            first, start = self.worker.ask("state", self.seat)
+            header = self.cells.header(asked.shell, rate, SMOOTH, asked.coupling, start)
+            recording.begin(header, first)
         except BaseException:
-            board.seats["is_recorded"][self.seat] = 0
+            recording.discard()
             raise
         self._recording = recording
-
-    def _first_frame(self, board: Board) -> int:
-        """Number of the first frame that has what a recording needs."""
-        first = int(board.seats["n_frames"][self.seat]) + FRAMES_UNTIL_RECORDED
-        until = time.monotonic() + FRAME_PATIENCE
-        while int(board.seats["n_frames"][self.seat]) < first:
-            if time.monotonic() > until or not self.worker.is_alive:
-                raise HapticDBError("a worker runs no frames: end the session and begin another")
-            time.sleep(1e-3)
-        return first
 
     def take_frames(self, board: Board) -> None:
         """Copy new frames from the board into the recording, if there is one; in any thread."""
@@ -84,7 +66,6 @@ class Running:
         finally:
             with self._taking:
                 recording, self._recording = self._recording, None
-            board.seats["is_recorded"][self.seat] = 0
             if recording is not None:
                 recording.finish()
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)

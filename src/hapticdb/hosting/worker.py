@@ -23,10 +23,11 @@ from hapticdb.realtime.coupling import SettledCoupling
 from hapticdb.realtime.processes import MessageSender, parent_is_gone, reply_to_parent
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.timing import undisturbed
+from hapticdb.recording.header import Start
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
 
-ENTRIES = tuple(f"period.loop.{name}" for name in ("run", "move_by_coupling", "feel@distances"))
+ENTRIES = tuple(f"period.loop.{name}" for name in ("run", "move_by_coupling"))
 """Kernels that a worker calls, and those that they call."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""
@@ -71,7 +72,7 @@ class Worker:
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         self._board = board = request.board
-        self._stations = Stations(SMOOTH, board.seats, board.rings, is_recorded=True)
+        self._stations = Stations(SMOOTH, board.seats, board.rings)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------
@@ -86,17 +87,20 @@ class Worker:
         finally:
             self._stations.stop()
 
-    def _do(self, ask: Message, descriptors: list[int]) -> None:
+    def _do(self, ask: Message, descriptors: list[int]) -> object:
         word, content = ask
         if word == "begin":
             self._begin(content[0], descriptors[0])
         elif word == "end":
             self._end(content[0])
+        elif word == "state":
+            return self._state(content[0])
         elif word == "set_coupling":
             seat, coupling = content
             self._running[seat][1].set_spring(coupling.spring())
         else:
             raise UsageError(f"a worker does not know the command {word!r}")
+        return None
 
     def _begin(self, request: SeatRequest, descriptor: int) -> None:
         if request.table not in self._tables:
@@ -117,8 +121,17 @@ class Worker:
         self._running[request.seat] = request, station
         row["is_running"] = 1
 
-    def _end(self, seat: int) -> None:
-        request, station = self._running[seat]
+    def _state(self, seat: int) -> tuple[int, Start]:
+        """Number of a session's next frame, and its state before that frame."""
+        station = self._running[seat][1]
+        self._pause(station)
+        try:
+            return int(self._board.seats["n_frames"][seat]), station.state()
+        finally:
+            station.row["is_running"] = 1
+
+    def _pause(self, station: Station) -> None:
+        """Take a session out of the loop."""
         station.row["is_running"] = 0
         periods = self._stations.pace["periods"]
         last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
@@ -126,6 +139,10 @@ class Worker:
             if time.monotonic() > until:
                 raise HapticDBError("a worker's loop hangs: end the host")
             time.sleep(0.5 / self._rate)
+
+    def _end(self, seat: int) -> None:
+        request, station = self._running[seat]
+        self._pause(station)
         station.session["told"]["is_active"] = False
         del self._running[seat]
         used = {request.table for request, _ in self._running.values()}

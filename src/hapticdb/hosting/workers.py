@@ -1,6 +1,7 @@
 """The worker processes of a host, started when sessions need them."""
 
 from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
@@ -27,9 +28,9 @@ class WorkerProcess(Process):
         self.await_ready("worker's", START_PATIENCE)
         self._channel.sock.settimeout(ANSWER_PATIENCE)
 
-    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> None:
-        """Tell the worker to do something, and wait until it is done; see `Channel.ask`."""
-        self._channel.ask(word, *content, descriptors=descriptors)
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Tell the worker to do something, and wait for its answer; see `Channel.ask`."""
+        return self._channel.ask(word, *content, descriptors=descriptors)
 
 
 class Workers:

@@ -26,7 +26,7 @@ from pathlib import Path
 from types import ModuleType
 from typing import NamedTuple
 
-from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
+from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER, sources_digest
 
 LONGEST = (
     *("period.loop", "surfaces.distances", "surfaces.voxelize"),
@@ -93,7 +93,6 @@ _RESIDENT = (
 )
 _FRAMES = "resident.budget.feel_kernel"
 _COUPLING = ("period.loop.run", "period.loop.move_by_coupling")
-_FELT = "period.loop.feel@distances"
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "points": ("curves.encode_kernel",),
@@ -121,9 +120,8 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "hand.handle.*", "motion.*", "rigid.*"),
     "coupling": _COUPLING,
-    "recording": (_FELT,),
     "direct": ("period.loop.run", "period.loop.move_directly", "period.loop.feel"),
-    "host": (*_RESIDENT, *_COUPLING, _FELT),
+    "host": (*_RESIDENT, *_COUPLING),
     "frames": (*_RESIDENT, _FRAMES, "rigid.poses_of"),
     "frames by distance": (*_RESIDENT, _FRAMES + "@distances", "rigid.poses_of"),
     "clashes": ("surfaces.sides.*", "triangles.*", "curves.encode_kernel"),
@@ -298,6 +296,11 @@ def _target() -> str:
         os.environ.get("NUMBA_CPU_NAME", ""), os.environ.get("NUMBA_CPU_FEATURES", ""),
     )  # fmt: skip
     return hashlib.sha256("\0".join(map(str, words)).encode()).hexdigest()[:16]
+
+
+def build() -> str:
+    """Digests of the kernels' sources, and of compiler and processor: equal ones, equal bits."""
+    return f"{sources_digest(Path(__file__).parent)}-{_target()}"
 
 
 def _mark_of(name: str) -> Path:

@@ -215,8 +215,8 @@ FRAME: Layout = np.dtype(
         ("hand", "<f8", (7,)),  # the handle: position m, unit quaternion, scalar first
         ("hand_velocity", "<f8", (6,)),  # m/s, rad/s
         ("tool", "<f8", (7,)),  # the simulated body, likewise
-        ("wrench", "<f8", (6,)),  # contact wrench at `tool`, about its centre: N, N m
         ("applied", "<f8", (6,)),  # sent to the device, about the handle's origin: N, N m
+        ("spring", "<f8", (9,)),  # between hand and tool: `kernels.hand.device_spring`
         ("hits", "<i4"),
         ("contacts", "<i4"),
         ("unknown", "<i4"),  # points in cells that were not resident
@@ -226,7 +226,9 @@ FRAME: Layout = np.dtype(
         ("state", "<i4"),  # bits of `hapticdb.recording.frame.State`
     ]
 )
-"""One recorded frame of the loop. It is part of the file format and never changes."""
+"""One frame of the loop, and a row of a recording: 336 bytes. Inputs of the frame: dt, hand,
+hand_velocity, spring, and of the state that the hand is stale, the clutch, and new cells. Outputs:
+tool, applied, hits, contacts, deepest and the rest of the state."""
 
 TOLD: Layout = _record(
     [
@@ -292,7 +294,6 @@ SEAT: Layout = _record(
         ("state", "<i8"),  # named in `hapticdb.realtime.board`
         ("id", "<i8"),  # of the session
         ("worker", "<i8"),  # number of the worker process
-        ("is_recorded", "<i8"),  # frames have the law's wrench, for a recording
         ("is_asked_to_end", "<i8"),
         # written by the process that moves a hosted session's hand
         ("hand_sequence", "<i8"),  # odd while the next fields are written
@@ -378,7 +379,8 @@ STATION: Layout = _record(
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code
-        ("coupling", "<i8"),  # which of the two rows is used: the other one may be written
+        ("coupling", "<i8"),  # which of the two rows the next period uses
+        ("used_coupling", "<i8"),  # which one this period uses
         ("springs", "<f8", (2, 9)),  # fields of DeviceSpring
         # of a device's hand
         ("handle", HANDLE),

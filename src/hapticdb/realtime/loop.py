@@ -91,10 +91,7 @@ class Loop:
         self.reader = Reader(request.device)
         self.table, self.board = request.table, request.board
         self.session = self.table.desk.sessions[request.row, ...]
-        self.stations = Stations(
-            request.law, self.board.seats, self.board.rings,
-            is_recorded=bool(self.board.seats["is_recorded"].any()),
-        )  # fmt: skip
+        self.stations = Stations(request.law, self.board.seats, self.board.rings)
         has_distances = isinstance(request.coupling, SettledCoupling)
         cells = self.table.cells if has_distances else self.table.cells.without_distances()
         tool = held_tool(request.shell, request.grid.voxel_size, request.budget_points)
@@ -307,7 +304,7 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
                 empty = empty_loop(request.law, request.timing.rate, seconds)
             loop.prepare()
             compiled = n_compiled()
-            sender.send("running")
+            sender.send("running", loop.station.state())
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")

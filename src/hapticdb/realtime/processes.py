@@ -97,8 +97,8 @@ class Process:
             raise message.content
         return message
 
-    def await_ready(self, name: str, seconds: float) -> None:
-        """Wait for the first message; where none comes the process is ended.
+    def await_ready(self, name: str, seconds: float) -> Any:  # noqa: ANN401 - what was sent
+        """Content of the first message; where none comes the process is ended.
 
         Raises
         ------
@@ -106,12 +106,12 @@ class Process:
             That says why, or with which the process ended.
         """
         try:
-            is_ready, is_slow = self.receive(seconds) is not None, self.is_alive
+            ready, is_slow = self.receive(seconds), self.is_alive
         except BaseException:
             self.end()
             raise
-        if is_ready:
-            return
+        if ready is not None:
+            return ready.content
         self.end()
         raise HapticDBError(
             f"the {name} process was not ready after {seconds:g} s: the database or this machine "

@@ -15,11 +15,11 @@ from hapticdb.kernels.records import FIGURES
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
 from hapticdb.ready import make_ready
-from hapticdb.realtime.coupling import DirectRendering
+from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.fork_server import prepare
 from hapticdb.realtime.processes import Process
-from hapticdb.recording.header import Header
+from hapticdb.recording.header import Header, Start
 from hapticdb.resident.residency import check_cells, check_distances
 from hapticdb.resident.table import DEFAULT_BUDGET, HEARTBEAT, LOST, STOP, CellTable
 from hapticdb.store.connect import open_store
@@ -260,12 +260,16 @@ class ResidentCells(Closes):
         rate: float,
         law: ForceLaw,
         coupling: DirectRendering,
+        start: Start,
         budget_points: int | None = None,
+        frames_on: str = "cpu",
     ) -> Header:
         """Header of a recording of a session in these cells, at their revision now."""
         return Header(
             self.url, self.grid, self.table.revision, shell, rate, law, self.filter.exclude,
-            asdict(coupling), where=self.filter.where, budget_points=budget_points,
+            asdict(coupling), where=self.filter.where, budget_points=budget_points, start=start,
+            rendering="coupled" if isinstance(coupling, SettledCoupling) else "direct",
+            frames_on=frames_on,
         )  # fmt: skip
 
     def close(self) -> None:

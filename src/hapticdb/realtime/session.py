@@ -23,9 +23,8 @@ from hapticdb.realtime.report import LoopAnswer, Report, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import FOREVER, without_surface
 from hapticdb.realtime.timing import Timing
-from hapticdb.recording.file import DEFAULT_LIMIT
+from hapticdb.recording.file import DEFAULT_LIMIT, Recorder
 from hapticdb.recording.frame import Frames, State
-from hapticdb.recording.ring import SessionRecording
 
 if TYPE_CHECKING:
     from hapticdb.batches.feeler import BatchDevice
@@ -86,9 +85,8 @@ class Session(Closes):
         for tools of millions of points (docs/realtime.md, Large tools).
     record : path or None
         A file for the recording; see `hapticdb.recording.file.Recorder`.
-    append_recording, replace_recording : bool
-        Append to an existing recording of the same tool, scene and law; or replace it when the
-        first frame is recorded.
+    replace_recording : bool
+        Replace an existing recording when the first frame is recorded.
     record_limit_bytes : int or None
         Greatest size of the recording, 4 GiB unless given; None: no limit of its own. 64 MiB of the
         disk always stay free. At the limit, or if the disk fails, the recording ends and stays
@@ -127,7 +125,6 @@ class Session(Closes):
         budget_points: int | None = None,
         frames_on: "BatchDevice" = "cpu",
         record: str | os.PathLike[str] | None = None,
-        append_recording: bool = False,
         replace_recording: bool = False,
         record_limit_bytes: int | None = DEFAULT_LIMIT,
         processor: int | None = None,
@@ -155,12 +152,11 @@ class Session(Closes):
         self._loose_objects: set[int] = set()
         self._n_drained, self._has_touched = 0, False  # touched since it last lay in something
         self._answer: LoopAnswer | None = None
-        self._recording: SessionRecording | None = None
+        self._recording: Recorder | None = None
         if record is not None:
-            self._recording = SessionRecording(
-                record, limit_bytes=record_limit_bytes, append=append_recording,
-                replace=replace_recording,
-            )  # fmt: skip
+            self._recording = Recorder(
+                record, limit_bytes=record_limit_bytes, replace=replace_recording
+            )
         try:
             self._begin(device, staleness, seconds)
         except BaseException:
@@ -168,7 +164,7 @@ class Session(Closes):
                 self.close()
             finally:  # runs even if a second signal interrupts the closing
                 if self._recording is not None:
-                    self._recording.remove_new_file()
+                    self._recording.discard()
             raise
 
     def _check_distances(self, asked: ForceLaw | LawName | None) -> None:
@@ -195,18 +191,13 @@ class Session(Closes):
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = session_purposes(
-            is_smooth=is_smooth(self.law), is_recorded=self._recording is not None
-        )
+        purposes = session_purposes(is_smooth=is_smooth(self.law))
         make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
-            law, budget = self.law, self.budget_points
-            header = self.cells.header(self.shell, self.timing.rate, law, self.coupling, budget)
-            self._recording.begin(header)
+            self._recording.open()
         n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
         self._board = board = Board.create(1, n_ring)
-        board.seats["is_recorded"] = self._recording is not None
         self._row = table.join()
         request = LoopRequest(
             table=table,
@@ -232,7 +223,14 @@ class Session(Closes):
             purposes,
         )
         table.desk.pids[self._row] = self._process.pid
-        self._process.await_ready("loop's", START_PATIENCE)
+        start = self._process.await_ready("loop's", START_PATIENCE)
+        if self._recording is not None:
+            self._recording.begin(
+                self.cells.header(
+                    self.shell, self.timing.rate, self.law, self.coupling, start,
+                    self.budget_points, self.frames_on,
+                )
+            )  # fmt: skip
 
     def __del__(self) -> None:
         with suppress(Exception):

@@ -18,6 +18,7 @@ from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, is_smooth
 from hapticdb.recording.frame import Frames
+from hapticdb.recording.header import Start
 from hapticdb.resident.held import PreparedTool
 from hapticdb.resident.table import HEARTBEAT
 
@@ -126,6 +127,24 @@ class Station:
         tool[()] = np.zeros((), tool.dtype)
         pose_numbers(tool)[:] = pose_numbers(hand)[:] = pose
 
+    def state(self) -> Start:
+        """What the next period depends on, beside its cells and the hand."""
+        tool = self.servo["tool"]
+        of_points = (self.field, self.met) if tool["version"] else ()
+        parts = (self.servo, self.follower, *of_points)
+        return Start(*(part.tobytes() for part in parts))
+
+    def restore(self, state: Start) -> None:
+        """Continue from a state that a station of this tool and this build has had."""
+        looker, parts = (
+            self.follower["looker"].copy(),
+            (self.servo, self.follower, self.field, self.met),
+        )
+        for part, content in zip(parts, state, strict=True):
+            if content:
+                part[...] = np.frombuffer(content, part.dtype).reshape(part.shape)
+        self.follower["looker"] = looker
+
     def arrive_at(self, pose: NDArray[np.float64]) -> None:
         """Take the hand from the board, where it has arrived at a pose (7,)."""
         way = self.record["way"]
@@ -137,24 +156,18 @@ class Stations:
     """Stations of a process, and the call of their periods.
 
     law : that all sessions feel; seats, rings : of the board (`realtime.board.Board`), and for each
-    seat a station; unless given, of one session alone; is_recorded : whether frames may be
-    recorded, for which the smooth law is felt beside its coupling.
+    seat a station; unless given, of one session alone.
     """
 
     def __init__(
-        self,
-        law: ForceLaw,
-        seats: Record | None = None,
-        rings: Frames | None = None,
-        *,
-        is_recorded: bool = False,
+        self, law: ForceLaw, seats: Record | None = None, rings: Frames | None = None
     ) -> None:
         self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
         self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
         mover = loop.move_by_coupling if is_smooth(law) else loop.move_directly
         self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
-        if is_recorded or not is_smooth(law):
+        if not is_smooth(law):
             self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
         self._arguments = (self.rows, seats, rings, self.pace)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]

@@ -1,1 +1,1 @@
-"""Recorded sessions: the file format, its writer and reader, and replay."""
+"""Recorded sessions: the file format, its writer and reader."""

@@ -23,4 +23,8 @@ class State(enum.IntFlag):
     """The handle did not follow the hand."""
     IN_OBJECT = 8
     """The tool lay in an object, from the start or since a part was put upon it, and felt nothing;
-    only with the smooth law."""
+    only with a coupling."""
+    STALE = 16
+    """The database had not answered for too long, so the tool and the wrench were held."""
+    ANEW = 32
+    """The cells had changed, so the coupling evaluated the distances of all points."""

@@ -5,34 +5,53 @@ import io
 import json
 import math
 import os
-import struct
+import re
 import zlib
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass, field
 from importlib.metadata import version
 from operator import index
-from typing import Any, Self
+from typing import Any, Literal, NamedTuple, Self
 
 import numpy as np
 
 from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
+from hapticdb.kernels.compiling import build
+from hapticdb.kernels.records import FRAME
 from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane, law_named
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.store.urls import redact
 
-MAGIC = b"HDBREC\r\n"
-"""First bytes of each recording."""
-FORMAT_VERSION = 4
-"""Version of the format; files of later versions are refused. Earlier ones lack some keys."""
-PREAMBLE = struct.Struct("<8sIIII")
-"""First fields of a header: magic, format version, bytes of JSON, points, CRC-32 of the header."""
-MOST_TEXT = 1 << 24
-"""Greatest size of a header's JSON text, bytes. Larger: more words of a filter fit."""
+FORMAT_VERSION = 1
+"""Version of the format; files of other versions are refused."""
+FIRST_LINE = re.compile(rb"hapticdb recording (\d{1,9}) (\d{12}) ([0-9a-f]{8})\n")
+"""First line of a recording: format, offset of the rows in bytes, CRC-32 of the header's rest."""
+LINE_BYTES = 43
+"""Bytes of the first line, while the format has one digit."""
+OLDER = b"HDBREC\r\n"
+"""First bytes of recordings that were made before the first release."""
+MOST_BYTES = 1 << 32
+"""Greatest size of a header, bytes. Larger: tools with more points fit."""
+ROWS_AT = 64
+"""Rows begin at a multiple of this, bytes: a cache line."""
 
 Value = str | int | float | bool | None | list[Any] | dict[str, Any]
+
+
+class Start(NamedTuple):
+    """State of a session before its first recorded frame: memory of the loop (`kernels.records`).
+
+    servo, follower : a record of SERVO and of FOLLOWER; field, met : the coupling's numbers of each
+    point, empty where the tool has just been placed.
+    """
+
+    servo: bytes = b""
+    follower: bytes = b""
+    field: bytes = b""
+    met: bytes = b""
 
 
 def _now() -> str:
@@ -58,15 +77,21 @@ class Header:
     law: ForceLaw = field(default_factory=TangentPlane)
     exclude: Words = ()
     coupling: Mapping[str, Value] = field(default_factory=dict)
-    """Parameters of the virtual coupling by their names."""
+    """Parameters of the rendering by their names, when the session began."""
     version: str = field(default_factory=lambda: version("hapticdb"))
     started: str = field(default_factory=_now)
-    """When the session began: ISO 8601, UTC. The frames' times count from this instant."""
+    """When the recording began: ISO 8601, UTC."""
     where: Words = ()
     """With `exclude`, which objects were felt: words as of `hapticdb.store.filtering.Filter`, since
     others may have added objects during the session that the words do not choose."""
     budget_points: int | None = None
     """Most points near something that a frame looked at; None: all."""
+    rendering: Literal["coupled", "direct"] = "direct"
+    frames_on: str = "cpu"
+    """What computed the frames: "cpu" or "cuda"."""
+    build: str = field(default_factory=build)
+    """Digest of the kernels' sources, of the compiler and of the processor."""
+    start: Start = field(default_factory=Start)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "budget_points", checked_budget(self.budget_points))
@@ -90,79 +115,91 @@ class Header:
         object.__setattr__(self, "revision", int(self.revision))
         object.__setattr__(self, "rate", float(self.rate))
 
-    def differing(self, other: "Header") -> list[str]:
-        """Names of the fields that differ from another header's; time, revision, version aside."""
-        fields = "environment grid law rate where exclude coupling budget_points"
-        names = [name for name in fields.split() if getattr(self, name) != getattr(other, name)]
-        return names if _arrays(self.shell) == _arrays(other.shell) else [*names, "shell"]
-
     def packed(self) -> bytes:
-        """Return the header's bytes; `UsageError` if the JSON is longer than `MOST_TEXT`."""
+        """Return the header's bytes."""
         shell = self.shell
         text = json.dumps(
             {
                 "environment": self.environment,
                 "grid": asdict(self.grid),
                 "revision": self.revision,
-                "shell": {"is_closed": shell.is_closed, "link": shell.link, "seed": shell.seed},
-                "law": "plane" if isinstance(self.law, TangentPlane) else "smooth",
+                "shell": {
+                    "points": len(shell), "is_closed": shell.is_closed, "link": shell.link,
+                    "seed": shell.seed,
+                },
+                "law": self.law.name,  # type: ignore[attr-defined]
                 "stiffness": self.law.stiffness,
+                "rendering": self.rendering,
                 "rate": self.rate,
                 "where": self.where,
                 "exclude": self.exclude,
                 "budget_points": self.budget_points,
                 "coupling": self.coupling,
+                "frames_on": self.frames_on,
                 "version": self.version,
+                "build": self.build,
                 "started": self.started,
+                "start": [len(part) for part in self.start],
+                "row": FRAME.descr,
             }
-        ).encode("ascii")
-        if len(text) > MOST_TEXT:
-            raise UsageError(
-                f"a recording's header of {len(text)} bytes: filter objects by fewer words"
-            )
-        body = text + _arrays(self.shell)
-        counts = PREAMBLE.pack(MAGIC, FORMAT_VERSION, len(text), len(shell), 0)[:-4]
-        return counts + struct.pack("<I", zlib.crc32(body, zlib.crc32(counts))) + body
+        ).encode("ascii")  # fmt: skip
+        arrays = [array.astype("<f8").tobytes() for array in (shell.points, shell.normals)]
+        blobs = b"".join([*arrays, shell.center.astype("<f8").tobytes(), *self.start])
+        spaces = -(LINE_BYTES + len(text) + 1 + len(blobs)) % ROWS_AT
+        body = text + b" " * spaces + b"\n" + blobs
+        end = LINE_BYTES + len(body)
+        return b"hapticdb recording %d %012d %08x\n" % (
+            FORMAT_VERSION, end, zlib.crc32(body)
+        ) + body  # fmt: skip
 
     @classmethod
     def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
-        """Read the header of an open recording; return it and the start of the chunks (bytes).
+        """Read the header of an open recording; return it and the offset of the rows, bytes.
 
-        Raises `FileError` if the file is no recording, has a newer format, or is cut off or damaged
+        Raises `FileError` if the file is no recording, has another format, or is cut off or damaged
         in its header.
         """
         size = file.seek(0, os.SEEK_END)
         file.seek(0)
-        preamble = file.read(PREAMBLE.size) or b""
-        if preamble[: len(MAGIC)] != MAGIC[: len(preamble)]:
+        line = file.read(LINE_BYTES) or b""
+        if line.startswith(OLDER):
+            raise FileError(f"{where} was made before 0.1: record it again")
+        found = FIRST_LINE.fullmatch(line)
+        if found is None and line and not b"hapticdb recording ".startswith(line[:19]):
             raise FileError(f"{where} is no recording of hapticdb")
-        if len(preamble) < PREAMBLE.size:
+        if len(line) == LINE_BYTES and found is None:
+            raise FileError(f"{where}: its header is damaged; nothing of it can be read")
+        number, rows_at, crc = (1, size + 1, b"") if found is None else found.groups()
+        if int(number) != FORMAT_VERSION:
+            raise FileError(f"{where}: format {int(number)}, this hapticdb reads {FORMAT_VERSION}")
+        rows_at = int(rows_at)
+        if rows_at > size:
             raise FileError(f"{where}: cut off in its header, nothing was recorded; delete it")
-        _, number, n_text, n_points, crc = PREAMBLE.unpack(preamble)
-        if number > FORMAT_VERSION:
-            raise FileError(f"{where}: format {number}, and this hapticdb reads {FORMAT_VERSION}")
-        n_bytes = n_text + 48 * n_points + 24
-        if n_text <= MOST_TEXT and n_points <= MAX_POINTS and PREAMBLE.size + n_bytes > size:
-            raise FileError(f"{where}: cut off in its header, nothing was recorded; delete it")
-        if n_text <= MOST_TEXT and n_points <= MAX_POINTS:
-            body = file.read(n_bytes) or b""
-            if zlib.crc32(body, zlib.crc32(preamble[:-4])) == crc:
-                return cls._parse(body, n_text, n_points, where), PREAMBLE.size + n_bytes
-        raise FileError(f"{where}: its header is damaged; nothing of it can be read")
+        body = file.read(rows_at - LINE_BYTES) if rows_at <= MOST_BYTES else None
+        if body is None or b"%08x" % zlib.crc32(body) != crc:
+            raise FileError(f"{where}: its header is damaged; nothing of it can be read")
+        return cls._parse(body, where), rows_at
 
     @classmethod
-    def _parse(cls, body: bytes, n_text: int, n_points: int, where: str) -> Self:
-        points, normals, center = np.split(
-            np.frombuffer(body[n_text:], dtype="<f8").reshape(-1, 3), [n_points, 2 * n_points]
-        )
+    def _parse(cls, body: bytes, where: str) -> Self:
+        text, _, blobs = body.partition(b"\n")
         try:
-            told = json.loads(body[:n_text])
-            grid = told["grid"]
-            made = told["shell"]
+            given = json.loads(text)
+            grid, made = given["grid"], given["shell"]
+            n_points = index(made["points"])
+            if not 0 < n_points <= MAX_POINTS:
+                raise ValueError(f"{n_points} points")  # noqa: TRY301 - as below
+            at = 48 * n_points + 24
+            numbers = np.frombuffer(blobs[:at], dtype="<f8").reshape(-1, 3)
+            points, normals, center = np.split(numbers, [n_points, 2 * n_points])
+            start = []
+            for length in map(index, given["start"]):
+                start.append(blobs[at : at + length])
+                at += length
             return cls(
-                environment=told["environment"],
+                environment=given["environment"],
                 grid=Grid(grid["voxel_size"], grid["origin"], index(grid["bits"]), grid["curve"]),
-                revision=told["revision"],
+                revision=given["revision"],
                 shell=PointShell(
                     points,
                     normals,
@@ -171,20 +208,18 @@ class Header:
                     str(made["link"]),
                     index(made["seed"]),
                 ),
-                rate=told["rate"],
-                law=law_named(told.get("law", "plane"), told["stiffness"]),
-                where=told.get("where", ()),
-                exclude=told["exclude"],
-                coupling=told["coupling"],
-                version=str(told["version"]),
-                started=str(told["started"]),
-                budget_points=told.get("budget_points"),
+                rate=given["rate"],
+                law=law_named(given["law"], given["stiffness"]),
+                where=given["where"],
+                exclude=given["exclude"],
+                coupling=given["coupling"],
+                version=str(given["version"]),
+                started=str(given["started"]),
+                budget_points=given["budget_points"],
+                rendering="coupled" if given["rendering"] == "coupled" else "direct",
+                frames_on=str(given["frames_on"]),
+                build=str(given["build"]),
+                start=Start(*start),
             )
         except (ValueError, TypeError, LookupError, OverflowError, RecursionError) as error:
             raise FileError(f"{where}: its header cannot be used: {error}") from error
-
-
-def _arrays(shell: PointShell) -> bytes:
-    """Bytes of points, normals and centre in the file's form."""
-    arrays = (shell.points, shell.normals, shell.center)
-    return b"".join(array.astype("<f8").tobytes() for array in arrays)

@@ -82,7 +82,6 @@ ClutchOption = Annotated[
 RecordOption = Annotated[
     str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
 ]
-AppendOption = Annotated[bool, typer.Option("--append", help="Add to a recording that exists.")]
 ReplaceOption = Annotated[
     bool,
     typer.Option("--replace", help="Replace a recording that exists, once there is a first frame."),
@@ -175,7 +174,6 @@ def feel(
     where: WhereOption = None,
     exclude: ExcludeOption = None,
     record: RecordOption = None,
-    append: AppendOption = False,
     replace: ReplaceOption = False,
     record_limit: RecordLimitOption = None,
     budget: BudgetOption = 256.0,
@@ -201,10 +199,10 @@ def feel(
     from hapticdb.query.law import inset_of
 
     began = perf_counter()
-    kernels = _begin_loop(law, processor, budget_points, frames_on, is_recorded=record is not None)
+    kernels = _begin_loop(law, processor, budget_points, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
-    limit_bytes = _recording_limit(record, record_limit, is_continued=append or replace)
+    limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, *kernels)
@@ -216,7 +214,7 @@ def feel(
     begin = partial(
         hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
         law=chosen, coupling=coupling, budget_points=budget_points, frames_on=frames_on,
-        processor=processor, record=record, append_recording=append, replace_recording=replace,
+        processor=processor, record=record, replace_recording=replace,
         record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
     )  # fmt: skip
     with _begun(begin, url, budget_bytes(budget), felt, law) as session:
@@ -253,13 +251,13 @@ def _shell(
     return shell_of(tool, unit, points, seed, inset=inset)
 
 
-def _recording_limit(record: str | None, limit: str | None, *, is_continued: bool) -> int:
+def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool) -> int:
     """Bytes at which a recording ends; refuses options of a recording where there is none."""
     from hapticdb.recording.file import DEFAULT_LIMIT
 
     limit_bytes = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
-    if record is None and (is_continued or limit is not None):
-        raise UsageError("--append, --replace and --record-limit belong to --record: give it, too")
+    if record is None and (is_replaced or limit is not None):
+        raise UsageError("--replace and --record-limit belong to --record: give it, too")
     return limit_bytes
 
 
@@ -268,8 +266,6 @@ def _begin_loop(
     processor: int | None,
     budget_points: int | None,
     frames_on: FramesOn,
-    *,
-    is_recorded: bool,
 ) -> list[str]:
     """Have what forks the processes load kernels while the tool is sampled here.
 
@@ -282,7 +278,7 @@ def _begin_loop(
         check_frames(frames_on, as_law(law), budget_points)
     from hapticdb.ready import session_purposes
 
-    purposes = session_purposes(is_smooth=law != "plane", is_recorded=is_recorded)
+    purposes = session_purposes(is_smooth=law != "plane")
     prepare("hapticdb.realtime.loop:work", ["resident", *purposes])
 
     with render.bar("loading", ""):

@@ -10,8 +10,11 @@ from hapticdb.cli.csv_files import FRAME_COLUMNS, STDOUT, open_csv, rows_of_fram
 from hapticdb.cli.options import CsvOption, JsonOption
 
 if TYPE_CHECKING:
+    from hapticdb.realtime.replay import Replayed
     from hapticdb.recording.file import Recording
-    from hapticdb.recording.replay import Replayed
+
+PIECE = 4096
+"""Frames that are written to CSV at once. Larger: more memory."""
 
 
 def replay(
@@ -24,20 +27,15 @@ def replay(
         ),
     ] = None,
     *,
-    until_damage: Annotated[
-        bool,
-        typer.Option(
-            "--until-damage", help="Take a damaged recording to end where the damage begins."
-        ),
-    ] = False,
     csv: CsvOption = None,
     json: JsonOption = False,
 ) -> None:
-    """Compute a recorded session's contact wrenches again, and say whether they are equal.
+    """Run a recorded session again, and say whether tool, wrench and contacts are equal.
 
-    Ends with exit code 0 when all are equal bit for bit, 1 when some differ
-    or there was none to compare. With --csv, the recorded frames are written
-    and nothing is compared; no environment is needed.
+    Ends with exit code 0 when all frames are equal bit for bit, 1 when some
+    differ or there was none to compare; the first one is named with the
+    reason. With --csv, the recorded frames are written and nothing is
+    compared; no environment is needed.
 
     Example: hapticdb replay session.hdbrec car.db
     """
@@ -51,23 +49,22 @@ def replay(
     session = Recording(recording)
     if session.n_torn:
         render.note(
-            f"{recording}: the last {session.n_torn:,} bytes are an incomplete chunk, since the "
-            "recorder was cut off; everything before them is whole"
+            f"{recording}: its last frame is torn, since the recorder was cut off; "
+            f"{session.n_torn:,} bytes are left out"
         )
     if csv is not None:
-        _write_frames(session, csv, until_damage=until_damage)
+        _write_frames(session, csv)
         return
-    replayed = _replayed(session, url, until_damage=until_damage)
+    replayed = _replayed(session, url)
     if json:
         parting = replayed.parting
         render.say_json(
             {
-                "compared": replayed.n_compared,
-                "skipped": replayed.n_skipped,
+                "frames": replayed.n_frames,
                 "differing": replayed.n_differing,
                 "revision": replayed.revision,
-                "is_same_revision": replayed.is_same_revision,
                 "parts_at": None if parting is None else parting.frame,
+                "reason": None if parting is None else parting.reason,
             }
         )
     else:
@@ -76,10 +73,10 @@ def replay(
         raise typer.Exit(1)
 
 
-def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "Replayed":
-    """Compute a recording's wrenches again."""
+def _replayed(session: "Recording", url: str | None) -> "Replayed":
+    """Run a recording's frames again."""
     import hapticdb
-    from hapticdb.query.law import frames_by
+    from hapticdb.realtime.replay import purposes_of
 
     place: str | Path
     if url is None:
@@ -88,18 +85,17 @@ def _replayed(session: "Recording", url: str | None, *, until_damage: bool) -> "
     else:
         place = url
     with hapticdb.open(place, read_only=True) as env:
-        render.compile_kernels(frames_by(session.header.law))
-        return hapticdb.replay(session, env, until_damage=until_damage)
+        render.compile_kernels(*purposes_of(session))
+        return hapticdb.replay(session, env)
 
 
-def _write_frames(session: "Recording", target: str, *, until_damage: bool) -> None:
-    """Write recorded frames as CSV, chunk by chunk."""
+def _write_frames(session: "Recording", target: str) -> None:
+    """Write recorded frames as CSV, piece by piece."""
     columns = [name for names in FRAME_COLUMNS.values() for name in names]
-    n_frames = 0
+    frames = session.frames()
     with open_csv(target, "--csv", columns) as rows:
         assert rows is not None  # noqa: S101 - a target was given
-        for frames in session.frames(until_damage=until_damage):
-            rows.write(rows_of_frames(frames))
-            n_frames += len(frames)
+        for at in range(0, len(frames), PIECE):
+            rows.write(rows_of_frames(frames[at : at + PIECE]))
     if target != STDOUT:
-        render.say(f"{target}: {render.counted(n_frames, 'frame')}")
+        render.say(f"{target}: {render.counted(len(frames), 'frame')}")

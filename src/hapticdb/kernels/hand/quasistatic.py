@@ -67,9 +67,9 @@ from hapticdb.kernels.hand.step import solve_step
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, WRENCH
 from hapticdb.kernels.rigid import numbers_of, pose_of_quaternion
 
-IS_LOOSE, IS_SOFTER, IS_SNAPPING = 64, 128, 256
+IS_LOOSE, IS_SOFTER, IS_SNAPPING, IS_ANEW = 64, 128, 256, 512
 """Marks of a period, beside those of `holding`: the tool lies in something and feels nothing; the
-guard has lowered the stiffness; the change of the force is softened."""
+guard has lowered the stiffness; the change of the force is softened; the cells have changed."""
 
 STEPS = 3
 """Most Gauss-Newton steps of a period. Larger: sharper corners are followed in one period, and the

@@ -22,9 +22,8 @@ from hapticdb.kernels.field.law import DISTANCE_FIELD, DistanceFieldLaw
 from hapticdb.kernels.hand.calling import address_of_kernel, call, call_kernel
 from hapticdb.kernels.hand.direct import render
 from hapticdb.kernels.hand.handle import follow_reading
-from hapticdb.kernels.hand.holding import IS_HELD
 from hapticdb.kernels.hand.near_points import Grasp
-from hapticdb.kernels.hand.quasistatic import IS_LOOSE, advance
+from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, advance
 from hapticdb.kernels.law import TANGENT_PLANE
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
@@ -49,12 +48,11 @@ from hapticdb.kernels.period.telling import (
     show_objects,
     tell,
 )
-from hapticdb.kernels.records import FRAME, PACE, RESULTS, SEAT, SESSION, STATION
+from hapticdb.kernels.records import FRAME, PACE, SEAT, SESSION, STATION
 from hapticdb.kernels.resident.budget import LEFT_OUT, LOOKED_AT, felt_within
 from hapticdb.kernels.resident.cells import (
     FELT_REVISION,
     READER_STRIDE,
-    UNKNOWNS,
     begin_frame,
     end_frame,
 )
@@ -82,25 +80,17 @@ PLANE, DISTANCE = types.CPointer(TANGENT_PLANE), types.CPointer(DISTANCE_FIELD)
 
 @entry(*MOVER, by_address=True)
 def move_by_coupling(station, seat, pace):
-    """Move the tool of a session; for a recording, feel the law where it is then.
-
-    `tool.felt` then has the law's frame, which a replay computes again: the coupling itself has
-    contacts of its own stiffness.
-    """
+    """Move the tool of a session to where spring and contacts balance."""
     shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
     cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
     tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
-    _, felt, missed, met, field = memory
+    _, _, missed, met, field = memory
     which = begin_frame(cells, station.reader)
     grasp = Grasp(cells, which, shell, place, follower, field, met, missed)
+    is_anew = tool.version != cells.readers[at]
     advance(grasp, cells.readers[at], spring, servo, pace.dt)
+    sent.marks |= IS_ANEW if is_anew else 0
     pose_of_quaternion(*numbers_of(tool), memory.pose)
-    if seat.is_recorded and not sent.marks & IS_HELD:
-        left_out = call_kernel(pace.feeler, station, which, pace.law)
-        for n in range(RESULTS):
-            tool.felt[n] = felt[n]
-        sent.left_out = max(sent.left_out, left_out)
-        sent.unknown += np.int64(felt[UNKNOWNS])
     sent.revision = cells.readers[at + FELT_REVISION]
     end_frame(cells, station.reader)
     if station.begun - station.shown_at >= SHOW_EVERY_NS:
@@ -217,6 +207,7 @@ def _run_period(station, seat, ring, pace):
     session = array_at(station.session, (), SESSION)[()]
     heartbeat = array_at(station.control, (station.n_control,), np.int64)[station.heartbeat]
     station.begun, reading = begun, station.reading
+    station.used_coupling = station.coupling
     if station.source == BOARD:
         follow_arrivals(station, seat, hand, begun)
     elif station.source == DEVICE:
@@ -244,10 +235,8 @@ def _run_period(station, seat, ring, pace):
         )  # fmt: skip
     station.last = begun
     elapsed = 1e-9 * (now_ns(pace.moment) - begun)
-    note(
-        ring, seat.n_frames, 1e-9 * (begun - station.began), pace.dt, lateness, elapsed, servo,
-        reading.buttons,
-    )  # fmt: skip
+    time = 1e-9 * (begun - station.began)
+    note(ring, seat.n_frames, time, pace.dt, lateness, elapsed, station)
     count(seat, servo, station.follower)
     count_times(seat, lateness, elapsed)
     fence()

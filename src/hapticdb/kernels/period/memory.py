@@ -32,7 +32,7 @@ from hapticdb.kernels.resident.cells import (
 
 TOUCHING, FELT, PERIOD_ROWS = MET_ROWS, MET_ROWS + 1, MET_ROWS + 2
 """Rows of a session's `met`, after those of the coupling: the indices of the points that lie in
-something; those of the frame of a recording."""
+something; those of a frame that is rendered directly."""
 
 if config.DISABLE_JIT:
 
@@ -162,5 +162,5 @@ def grid_of(station):
 @leaf
 def spring_of(station):
     """Coupling of a session."""
-    n = station.springs[station.coupling]
+    n = station.springs[station.used_coupling]
     return DeviceSpring(n[0], n[1], n[2], n[3], n[4], n[5], n[6], n[7], n[8])

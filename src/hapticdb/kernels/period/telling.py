@@ -18,14 +18,14 @@ from hapticdb.kernels.hand.near_points import (
     ONSETS,
     U,
 )
-from hapticdb.kernels.hand.quasistatic import IS_LOOSE, IS_SOFTER
+from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, IS_SOFTER
 from hapticdb.kernels.period.memory import TOUCHING
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
-from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, LISTED, WRENCH, in_voxels
+from hapticdb.kernels.resident.cells import LISTED, in_voxels
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import length_at, moved, transform_of, turned
 
-HELD, FADING, CLUTCH_OPEN, IN_OBJECT = 1, 2, 4, 8
+HELD, FADING, CLUTCH_OPEN, IN_OBJECT, STALE, ANEW = 1, 2, 4, 8, 16, 32
 """Bits of a frame's state, as `hapticdb.recording.frame.State` names them."""
 
 
@@ -96,8 +96,9 @@ def list_touching(follower, field, met, n_hits):
 
 
 @leaf
-def note(ring, at, time, dt, lateness, elapsed, servo, buttons):
+def note(ring, at, time, dt, lateness, elapsed, station):
     """Record frame number `at` in its row of the ring buffer (capacity,) of FRAME."""
+    servo, spring = station.servo, station.springs[station.used_coupling]
     tool, hand, sent = servo.tool, servo.hand, servo.sent
     row = ring[at % ring.shape[0]]
     row.time = time
@@ -112,17 +113,18 @@ def note(ring, at, time, dt, lateness, elapsed, servo, buttons):
         row.tool[3 + n] = tool.quaternion[n]
     for n in range(6):
         row.hand_velocity[n] = hand.velocity[n]
-        row.wrench[n] = tool.felt[WRENCH + n]
         row.applied[n] = sent.wrench[n]
-    row.hits = np.int64(tool.felt[HITS])
-    row.contacts = np.int64(tool.felt[CONTACTS])
-    row.unknown = sent.unknown  # at the pose that was tried; the frame at `tool` has none
-    row.deepest = tool.felt[DEEPEST]
+    for n in range(spring.shape[0]):
+        row.spring[n] = spring[n]
+    row.hits, row.contacts, row.deepest = sent.hits, sent.contacts, sent.deepest
+    row.unknown = sent.unknown  # at the pose that was tried
     row.revision = sent.revision
-    row.buttons = buttons
+    row.buttons = station.reading.buttons
     state = CLUTCH_OPEN if hand.is_open else 0
     state |= HELD if sent.marks & IS_HELD else 0
     state |= FADING if sent.marks & IS_FADING else 0
+    state |= STALE if hand.is_stale else 0
+    state |= ANEW if sent.marks & IS_ANEW else 0
     row.state = state | (IN_OBJECT if sent.marks & IS_LOOSE else 0)
 
 

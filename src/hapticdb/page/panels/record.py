@@ -122,8 +122,8 @@ class RecordPanel:
         recording = Recording(checked_file(self._browser.site.recordings, name))
         if not 0 < len(recording) <= LONGEST_REPLAY:
             raise FileError(f"{name}: {len(recording):,} frames; 1 to {LONGEST_REPLAY:,} are shown")
-        times, poses, wrenches = recording.columns("time", "tool", "applied", until_damage=True)
-        times, poses, wrenches = (np.asarray(x, np.float64) for x in (times, poses, wrenches))
+        frames = recording.frames()
+        times, poses, wrenches = (np.array(frames[x]) for x in ("time", "tool", "applied"))
         self._replay = Replay(times - times[0], poses, wrenches)
         self._draw(recording)
         put(self._time, 0.0)

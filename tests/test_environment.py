@@ -342,7 +342,7 @@ def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointS
         assert reader._figures.both()[1] == costs
         reader.calibrate()  # a reader measures, and stores nothing
     assert env.store.costs(machine_name()) == costs.figures()
-    env.calibrate(seed=1, keep=False)
+    env.calibrate(keep=False)
     assert env.store.costs(machine_name()) == costs.figures()
 
 

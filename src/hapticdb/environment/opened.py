@@ -356,20 +356,18 @@ class Environment(Queries, Closes):
         self._check_writable()
         return self._figures.analyze()
 
-    def calibrate(self, *, seed: int = 0, keep: bool = True, cold: bool = False) -> CostModel:
+    def calibrate(self, *, keep: bool = True, cold: bool = False) -> CostModel:
         """Measure the cost of queries on this database; the figures are used and stored.
 
         Parameters
         ----------
-        seed : int
-            Seed of the random choice of the measured places.
         keep : bool
             Write the figures into the database, if it can be written.
         cold : bool
             Measure with empty caches, if this process can empty them: for environments that are
             larger than memory.
         """
-        return self._figures.calibrate(seed=seed, keep=keep, cold=cold)
+        return self._figures.calibrate(keep=keep, cold=cold)
 
     def _forget(self) -> None:
         """Drop cached values that an edit of this environment has made stale."""

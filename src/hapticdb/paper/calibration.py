@@ -37,7 +37,7 @@ class _Probe(NamedTuple):
 
 
 def calibrate(
-    store: Store, *, seed: int = 0, repeats: int = 5, budget: float = 0.5, cold: bool = False
+    store: Store, *, repeats: int = 5, budget: float = 0.5, cold: bool = False
 ) -> CostModel:
     """Measure what queries cost on this database, in real scans around its own surface.
 
@@ -49,8 +49,6 @@ def calibrate(
     ----------
     store : Store
         An environment with at least one row.
-    seed : int
-        Seed of the random places.
     repeats : int
         Timings of each statement, after an untimed run. Their median is used.
     budget : float
@@ -80,7 +78,7 @@ def calibrate(
     has_distances = size.band_rows > 0
     trials = _Trials(store, quantiles, 1 if cold else repeats, before, has_distances=has_distances)
     started = time.perf_counter()
-    for n, probe in enumerate(_probes(store, quantiles, seed)):
+    for n, probe in enumerate(_probes(store, quantiles)):
         trials.measure(probe)
         took = time.perf_counter() - started
         if (n >= 11 and took > budget) or (n >= 3 and took > 8 * budget):
@@ -231,9 +229,9 @@ def _non_negative(design: Floats, wanted: Floats) -> tuple[Floats, float]:
     return best, least
 
 
-def _probes(store: Store, quantiles: QuantileVector, seed: int) -> list[_Probe]:
+def _probes(store: Store, quantiles: QuantileVector) -> list[_Probe]:
     """Spheres of shell points on occupied voxels, small and large ones in turn."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     grid = store.grid
     shift = row_shift(store.layout)
     places = rng.choice(quantiles.bounds, size=64)

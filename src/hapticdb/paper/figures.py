@@ -39,9 +39,9 @@ class QueryFigures:
         self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
         return self._quantiles
 
-    def calibrate(self, *, seed: int, keep: bool, cold: bool) -> CostModel:
+    def calibrate(self, *, keep: bool, cold: bool) -> CostModel:
         """Measure the costs; see `hapticdb.environment.Environment.calibrate`."""
-        costs = calibrate(self._store, seed=seed, cold=cold)
+        costs = calibrate(self._store, cold=cold)
         if keep and not self._store.is_read_only:
             self._store.save_costs(machine_name(), costs.figures())
         self._costs = costs

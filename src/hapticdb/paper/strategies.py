@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticdb.errors import UsageError
+from hapticdb.kernels.law import reads_distances
 from hapticdb.kernels.query import contact, refining
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
@@ -45,7 +46,7 @@ class Strategies:
         self.store = store
         self.query = HapticQuery(store, self.grouped)
         self._quantiles_and_costs = quantiles_and_costs
-        self._forms: dict[tuple[Strategy, int], _Form | None] = {}
+        self._forms: dict[tuple[Strategy, int], _Form] = {}
 
     def touch(
         self,
@@ -57,17 +58,14 @@ class Strategies:
         law: ForceLaw | None = None,
     ) -> Touch:
         """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
-        asked = strategy, gap
-        form = self._forms[asked] if asked in self._forms else self._form(*asked)
-        return self.query.touch(shell, pose, felt, law, form)
-
-    def _form(self, strategy: Strategy, gap: int) -> "_Form | None":
-        if strategy not in STRATEGIES:
-            raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
-        form = None if strategy == "auto" else _Form(self, strategy, gap)
-        return self._forms.setdefault((strategy, gap), form)
+        form = None
+        if strategy != "auto":
+            if strategy not in STRATEGIES:
+                raise UsageError(f"strategy {strategy!r}: choose one of {', '.join(STRATEGIES)}")
+            form = self._forms.setdefault((strategy, gap), _Form(self, strategy, gap))
+        return self.query.touch(shell, pose, felt, law, form)
 
     def grouped(self, keys: Keys, distances: bool) -> Ranges:  # noqa: FBT001 - as `Group`
         """Ranges of row keys (U,) at the least cost; distances : whether these are read, too."""
@@ -90,23 +88,15 @@ class _Form:
         grouping = ["calibrate"] if self.strategy in {"maxgap", "cbgroup"} else []
         return [frames_by(law, "touch"), *grouping]
 
-    def touch(
-        self,
-        located: contact.Located,
-        exclude: Keys,
-        law: ForceLaw,
-        started: int,
-        *,
-        distances: bool,
-    ) -> Touch:
-        """Touch of a located shell; started : when, ns; distances : whether the law reads them."""
+    def touch(self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int) -> Touch:
+        """Touch of a located shell; started : when the frame began, ns."""
         if self.strategy == "statement":
             return self._by_statement(located, exclude, law, started)
-        rows, statements, n_ranges = self._fetched(located, distances=distances)
+        query, reads = self.frames.query, reads_distances(law.for_kernels)
+        rows, statements, n_ranges = self._fetched(located, distances=reads)
         asked: Asked = (self.strategy, statements, n_ranges, len(rows.keys))
-        return self.frames.query.refined(
-            located, rows, exclude, law, asked, started, distances=distances
-        )
+        payload = query.distances_of(rows, located.keys) if reads else None
+        return query.refined(located, rows, payload, exclude, law, asked, started)
 
     def _fetched(self, located: contact.Located, *, distances: bool) -> tuple[Rows, int, int]:
         """Rows of a frame, and the numbers of statements and of ranges."""

@@ -57,15 +57,9 @@ class Form(Protocol):
         """Purposes (`kernels.compiling.PURPOSES`) of its kernels."""
 
     def touch(
-        self,
-        located: "contact.Located",
-        exclude: Keys,
-        law: ForceLaw,
-        started: int,
-        *,
-        distances: bool,
+        self, located: "contact.Located", exclude: Keys, law: ForceLaw, started: int
     ) -> Touch:
-        """Touch of a located shell; started : when, ns; distances : whether the law reads them."""
+        """Touch of a located shell; started : when the frame began, ns."""
 
 
 class HapticQuery:
@@ -155,7 +149,7 @@ class HapticQuery:
         started = time.perf_counter_ns()
         located = locate(shell, pose, self.grid)
         if form is not None:
-            return form.touch(located, exclude, law, started, distances=reads)
+            return form.touch(located, exclude, law, started)
         keys, ranges = located.keys, None
         if len(keys) >= self._least_grouped and self._group is not None:
             make_ready("calibrate")
@@ -166,7 +160,8 @@ class HapticQuery:
         else:
             rows = self._store.scan(*ranges, distances=reads)
             asked = ("cbgroup", 1, len(ranges.lows), len(rows.keys))
-        return self.refined(located, rows, exclude, law, asked, started, distances=reads)
+        payload = self.distances_of(rows, keys) if reads else None
+        return self.refined(located, rows, payload, exclude, law, asked, started)
 
     def _get_ready(self, form: Form | None, law: ForceLaw) -> bool:
         """Compile and load what frames of a form and a law call.
@@ -180,22 +175,7 @@ class HapticQuery:
         reads = self._ready[form, type(numbers)] = laws.reads_distances(numbers)
         return reads
 
-    def refined(
-        self,
-        located: "contact.Located",
-        rows: Rows,
-        exclude: Keys,
-        law: ForceLaw,
-        asked: Asked,
-        started: int,
-        *,
-        distances: bool,
-    ) -> Touch:
-        """Result of a frame from the rows fetched for it; started : when it began, ns."""
-        payload = self._distances_of(rows, located.keys) if distances else None
-        return self._refined(located, rows, payload, exclude, law, asked, started)
-
-    def _distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
+    def distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
         """Distances (R, 1000) of rows. Rows whose keys are not among `keys` are left unset.
 
         Raises
@@ -215,7 +195,7 @@ class HapticQuery:
         except ValueError as error:
             raise damaged(self._store.url, str(error)) from error
 
-    def _refined(
+    def refined(
         self,
         located: "contact.Located",
         rows: Rows,
@@ -225,7 +205,11 @@ class HapticQuery:
         asked: Asked,
         started: int,
     ) -> Touch:
-        """Result of a frame from its rows; rows of other poses may lie among them."""
+        """Result of a frame from its rows, among which rows of other poses may lie.
+
+        payload : distances (R, 1000) of the rows, None for a law that reads none; started : when
+        the frame began, ns.
+        """
         row_keys, row_ids, occupancy, _ = rows
         total = located.asked.shape[1]
         felt = np.empty(6 + 2 * total)
@@ -254,7 +238,7 @@ class HapticQuery:
         reads = laws.reads_distances(law.for_kernels)
         law = law if reads else PLANE  # every law that reads none feels the objects of hits
         make_ready(frames_by(law, "pairs"))
-        payload = self._distances_of(rows, located.keys) if reads else None
+        payload = self.distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_points(  # type: ignore[no-any-return]
             *located, keys, ids, occupancy, payload, exclude, self.grid, law.for_kernels, points
@@ -289,7 +273,7 @@ class HapticQuery:
         fetched = self._store.lookup(keys, distances=reads)
         asked: Asked = ("array", 1, len(keys), len(fetched))
         row_keys = fetched.keys
-        distances = self._distances_of(fetched, keys) if reads else None
+        distances = self.distances_of(fetched, keys) if reads else None
         for located in batch:
             low = high = 0
             if located.keys.size:
@@ -298,7 +282,7 @@ class HapticQuery:
                 high = int(row_keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
             payload = None if distances is None else distances[low:high]
-            yield self._refined(located, rows, payload, exclude, law, asked, started)
+            yield self.refined(located, rows, payload, exclude, law, asked, started)
             asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
 
 

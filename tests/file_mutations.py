@@ -31,64 +31,49 @@ _ELEMENT = re.compile(rb"<(\w+)[^<>]*(?:/>|>[^<]*</\1>)")
 
 def mutated(random: Random, suffix: str, content: bytes, other: bytes) -> bytes:
     """Content with one to three damages. `other` is a file of the same format."""
+    choices: list[Callable[[Random, bytes], bytes]] = [_bytes_changed, _cut_or_grown]
+    choices += [_numbers_changed, _lines_changed] * (2 * (suffix in TEXTS))
+    choices += [_json_changed] * (4 * (suffix in {".gltf", ".glb"}))
+    choices += [_elements_changed] * (2 * (suffix in {".dae", ".3mf"}))
+    choices += [_archive_changed] * (5 * (suffix in {".3mf", ".npz"}))
+    choices += [_header_changed] * (2 * (suffix in {".las", ".laz", ".stl", ".hdbrec", ".glb"}))
     for _ in range(random.choice((1, 1, 1, 2, 3))):
-        choices: list[Callable[[Random, bytes], bytes]] = [_bytes_changed, _cut_or_grown]
-        if suffix in TEXTS:
-            choices += [_numbers_changed, _lines_changed, _numbers_changed, _lines_changed]
-        if suffix in {".gltf", ".glb"}:
-            choices += [_json_changed] * 4
-        if suffix in {".dae", ".3mf"}:
-            choices += [_elements_changed] * 2
-        if suffix in {".3mf", ".npz"}:
-            choices += [_archive_changed] * 5
-        if suffix in {".las", ".laz", ".stl", ".hdbrec", ".glb"}:
-            choices += [_header_changed] * 2
-        chosen = random.choice(choices)
-        if random.random() < 0.04:
-            content = _spliced(random, content, other)
-        content = chosen(random, content)
+        if random.random() < 0.04:  # spliced
+            cut = random.randrange(len(content) + 1)
+            content = content[:cut] + other[random.randrange(len(other) + 1) :]
+        content = random.choice(choices)(random, content)
     return content
 
 
 def _bytes_changed(random: Random, content: bytes) -> bytes:
     found = bytearray(content)
-    for _ in range(random.choice((1, 1, 2, 8))):
-        if found:
-            at = random.randrange(len(found))
-            if random.random() < 0.5:
-                found[at] ^= 1 << random.randrange(8)
-            else:
-                extreme = random.choice(BYTES)
-                found[at : at + len(extreme)] = extreme
+    for _ in range(random.choice((1, 1, 2, 8)) if content else 0):
+        at = random.randrange(len(found))
+        if random.random() < 0.5:
+            found[at] ^= 1 << random.randrange(8)
+        else:
+            extreme = random.choice(BYTES)
+            found[at : at + len(extreme)] = extreme
     return bytes(found)
 
 
 def _header_changed(random: Random, content: bytes) -> bytes:
-    at = random.randrange(min(len(content), 400) or 1)
-    extreme = random.choice(BYTES)
+    at, extreme = random.randrange(min(len(content), 400) or 1), random.choice(BYTES)
     return content[:at] + extreme + content[at + len(extreme) :]
 
 
 def _cut_or_grown(random: Random, content: bytes) -> bytes:
     first, last = sorted(random.randrange(len(content) + 1) for _ in range(2))
-    kind = random.randrange(4)
-    if kind == 0:
-        return content[:first]
-    if kind == 1:
-        return content[:first] + content[last:]
-    if kind == 2:
-        return content[:last] + content[first:]
-    return content[:first] + random.randbytes(random.choice((1, 4, 100))) + content[first:]
-
-
-def _spliced(random: Random, content: bytes, other: bytes) -> bytes:
-    return content[: random.randrange(len(content) + 1)] + other[random.randrange(len(other) + 1) :]
+    grown = random.randbytes(random.choice((1, 4, 100)))
+    return content[:first] + random.choice(
+        (b"", content[last:], content[first:last] + content[first:], grown + content[first:])
+    )
 
 
 def _numbers_changed(random: Random, content: bytes) -> bytes:
     places = list(_NUMBER.finditer(content))
-    for place in sorted(random.sample(places, min(len(places), random.choice((1, 1, 3)))),
-                        key=lambda found: -found.start()):  # fmt: skip
+    chosen = random.sample(places, min(len(places), random.choice((1, 1, 3))))
+    for place in sorted(chosen, key=lambda found: -found.start()):
         word = random.choice(WORDS).encode()
         content = content[: place.start()] + word + content[place.end() :]
     return content
@@ -97,23 +82,16 @@ def _numbers_changed(random: Random, content: bytes) -> bytes:
 def _lines_changed(random: Random, content: bytes) -> bytes:
     lines = content.split(b"\n")
     n, m = random.randrange(len(lines)), random.randrange(len(lines))
-    kind = random.randrange(7)
-    if kind == 0:
-        del lines[n]
-    elif kind == 1:
-        lines[n:n] = [lines[n]] * random.choice((1, 3, 2000))
-    elif kind == 2:
-        lines[n], lines[m] = lines[m], lines[n]
-    elif kind == 3:
-        words = lines[n].split(b" ")
-        del words[random.randrange(len(words))]
-        lines[n] = b" ".join(words)
-    elif kind == 4:
-        lines[n] += random.choice((b" #c", b"\\", b" 1", b"\r", b"\0", b"\xff", b" " * 5000))
-    elif kind == 5:
-        lines[n] *= random.choice((2, 500))
-    else:
-        lines[n] = b"".join(random.choice((b"(", b"[", b"<a>", b'"')) for _ in range(3000))
+    words = lines[n].split(b" ")
+    del words[random.randrange(len(words))]
+    noise = random.choice((b" #c", b"\\", b" 1", b"\r", b"\0", b"\xff", b" " * 5000))
+    opened = b"".join(random.choice((b"(", b"[", b"<a>", b'"')) for _ in range(3000))
+    lines[n : n + 1] = random.choice(
+        (
+            [], [lines[n]] * random.choice((2, 4, 2000)), [lines[m]], [b" ".join(words)],
+            [lines[n] + noise], [lines[n] * random.choice((2, 500))], [opened],
+        )
+    )  # fmt: skip
     return b"\n".join(lines)
 
 
@@ -122,65 +100,48 @@ def _elements_changed(random: Random, content: bytes) -> bytes:
     if not elements:
         return content
     one, two = random.choice(elements), random.choice(elements)
-    kind = random.randrange(5)
-    if kind == 0:
-        return content[: one.start()] + content[one.end() :]
-    if kind == 1:
-        times = random.choice((2, 1000))
-        return content[: one.start()] + one[0] * times + content[one.end() :]
-    if kind == 2:
-        return content[: one.start()] + two[0] + content[one.end() :]
-    if kind == 3:
+    if random.random() < 0.2:
         depth = random.choice((3, 3000))
         return content[: one.start()] + b"<a>" * depth + one[0] + b"</a>" * depth
-    return (
-        content[: one.start()]
-        + re.sub(rb' \w+="[^"]*"', b"", one[0], count=1)
-        + content[one.end() :]
-    )
+    stripped = re.sub(rb' \w+="[^"]*"', b"", one[0], count=1)
+    new = random.choice((b"", one[0] * random.choice((2, 1000)), two[0], stripped))
+    return content[: one.start()] + new + content[one.end() :]
 
 
 def _json_changed(random: Random, content: bytes) -> bytes:
     is_binary = content[:4] == b"glTF"
+    start = 20 if is_binary else 0
     try:
-        length = int.from_bytes(content[12:16], "little") if is_binary else len(content)
-        start = 20 if is_binary else 0
-        tree = json.loads(content[start : start + length])
+        end = start + int.from_bytes(content[12:16], "little") if is_binary else len(content)
+        tree = json.loads(content[start:end])
     except (ValueError, RecursionError):
         return _bytes_changed(random, content)
-    holder, key = _place(random, tree)
-    _change(random, holder, key)
     if random.random() < 0.02:
         return b'{"asset":{"version":"2.0"},"nodes":' + b"[" * 5000
+    _change(random, tree)
     text = json.dumps(tree, ensure_ascii=True).encode()
     if not is_binary:
         return text
     text += b" " * (-len(text) % 4)
-    rest = content[20 + length :]
-    size = 20 + len(text) + len(rest)
-    return struct.pack("<4s2I2I", b"glTF", 2, size, len(text), 0x4E4F534A) + text + rest
+    size = 20 + len(text) + len(content[end:])
+    return struct.pack("<4s2I2I", b"glTF", 2, size, len(text), 0x4E4F534A) + text + content[end:]
 
 
-def _place(random: Random, tree: Any) -> tuple[Any, Any]:  # noqa: ANN401 - JSON
-    """A list or object somewhere in a JSON tree, and one of its indices or keys."""
+def _change(random: Random, tree: Any) -> None:  # noqa: ANN401 - JSON
+    """Change a value somewhere in a JSON tree."""
     holder: Any = {"": tree}
     key: Any = ""
     while isinstance(holder[key], (dict, list)) and holder[key] and random.random() < 0.8:
         holder = holder[key]
         key = random.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
-    return holder, key
-
-
-def _change(random: Random, holder: Any, key: Any) -> None:  # noqa: ANN401 - JSON
     kind = random.randrange(6)
     if kind == 0:
         del holder[key]
     elif kind == 1 and isinstance(holder[key], list):
         holder[key] = holder[key] * random.choice((2, 2000))
     elif kind == 2 and isinstance(holder, dict):
-        holder[random.choice(("byteStride", "byteOffset", "mode", "sparse", "children"))] = (
-            random.choice(VALUES)
-        )
+        names = ("byteStride", "byteOffset", "mode", "sparse", "children")
+        holder[random.choice(names)] = random.choice(VALUES)
     elif kind == 3 and isinstance(holder[key], int):
         holder[key] += random.choice((-1, 1, 2))
     else:
@@ -192,33 +153,25 @@ def _archive_changed(random: Random, content: bytes) -> bytes:
     try:
         with zipfile.ZipFile(io.BytesIO(content)) as archive:
             entries = [(name, archive.read(name)) for name in archive.namelist()]
+        n = random.randrange(len(entries))
     except Exception:  # noqa: BLE001 - damaged already
         return _bytes_changed(random, content)
-    if not entries:
-        return content
-    n = random.randrange(len(entries))
     name, body = entries[n]
-    kind = random.randrange(12)
+    kind, half = random.randrange(12), len(body) // 2
+    changes = _bytes_changed, _numbers_changed, _elements_changed, _lines_changed, _cut_or_grown
     if kind == 0:
         del entries[n]
     elif kind == 1:
-        entries.append((name, body[: len(body) // 2]))
+        entries.append((name, body[:half]))
     elif kind == 2:
-        entries[n] = (random.choice(("", "../x", "3d/3dmodel.model", "points", "a" * 500)), body)
+        entries[n] = (random.choice(("x", "../x", "3d/3dmodel.model", "points", "a" * 500)), body)
     elif kind == 3 and random.random() < 0.05:
-        entries[n] = (name, body[: len(body) // 2] + b" " * (40 << 20) + body[len(body) // 2 :])
+        entries[n] = (name, body[:half] + b" " * (40 << 20) + body[half:])
     else:
-        changes = (
-            _bytes_changed,
-            _numbers_changed,
-            _elements_changed,
-            _lines_changed,
-            _cut_or_grown,
-        )
         entries[n] = (name, random.choice(changes)(random, body))
     out = io.BytesIO()
     method = random.choice((zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED, zipfile.ZIP_DEFLATED, 12, 14))
     with zipfile.ZipFile(out, "w", method) as archive:
         for name, body in entries:
-            archive.writestr(name or "x", body)
+            archive.writestr(name, body)
     return out.getvalue()

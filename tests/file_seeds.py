@@ -3,11 +3,9 @@
 Libraries are imported where they are used, because each fork copies what its process has loaded.
 """
 
-import io
 import json
 import os
 import struct
-import zipfile
 from pathlib import Path
 
 import numpy as np
@@ -17,7 +15,7 @@ from mesh_files import COLLADA, MESH_3MF, TRIANGLE, glb_of, gltf, threemf
 MOST_BYTES = 20_000
 """Size in bytes of the largest file of HAPTICDB_TEST_DATA that becomes a seed. Larger: slower."""
 OTHERS = (".npz", ".csv", ".hdbrec")
-"""Suffixes of saved shells, paths and recordings. They are read in the caller's own process."""
+"""Suffixes of saved shells, paths and recordings, which the caller's own process reads."""
 
 STEP = """ISO-10303-21;
 HEADER;
@@ -43,34 +41,16 @@ DATA;
 GLOBAL_UNIT_ASSIGNED_CONTEXT((#10,#11,#12))REPRESENTATION_CONTEXT('',''));
 #20=MANIFOLD_SURFACE_SHAPE_REPRESENTATION('',(#21),#14);
 #21=SHELL_BASED_SURFACE_MODEL('',(#22));
-#22=OPEN_SHELL('',(#23));
-#23=ADVANCED_FACE('',(#24),#60,.T.);
-#24=FACE_BOUND('',#25,.T.);
-#25=EDGE_LOOP('',(#26,#27,#28));
-#26=ORIENTED_EDGE('',*,*,#31,.T.);
-#27=ORIENTED_EDGE('',*,*,#32,.T.);
-#28=ORIENTED_EDGE('',*,*,#33,.T.);
-#31=EDGE_CURVE('',#41,#42,#51,.T.);
-#32=EDGE_CURVE('',#42,#43,#52,.T.);
-#33=EDGE_CURVE('',#43,#41,#53,.T.);
-#41=VERTEX_POINT('',#71);
-#42=VERTEX_POINT('',#72);
-#43=VERTEX_POINT('',#73);
-#51=LINE('',#71,#81);
-#52=LINE('',#72,#82);
-#53=LINE('',#73,#83);
-#60=PLANE('',#61);
-#61=AXIS2_PLACEMENT_3D('',#71,#91,#92);
-#71=CARTESIAN_POINT('',(0.,0.,0.));
-#72=CARTESIAN_POINT('',(10.,0.,0.));
-#73=CARTESIAN_POINT('',(0.,10.,0.));
-#81=VECTOR('',#92,1.);
-#82=VECTOR('',#93,1.);
-#83=VECTOR('',#94,1.);
-#91=DIRECTION('',(0.,0.,1.));
-#92=DIRECTION('',(1.,0.,0.));
-#93=DIRECTION('',(-0.70710678118655,0.70710678118655,0.));
-#94=DIRECTION('',(0.,-1.,0.));
+#22=OPEN_SHELL('',(#23));#23=ADVANCED_FACE('',(#24),#60,.T.);#24=FACE_BOUND('',#25,.T.);
+#25=EDGE_LOOP('',(#26,#27,#28));#26=ORIENTED_EDGE('',*,*,#31,.T.);#27=ORIENTED_EDGE('',*,*,#32,.T.);
+#28=ORIENTED_EDGE('',*,*,#33,.T.);#31=EDGE_CURVE('',#41,#42,#51,.T.);
+#32=EDGE_CURVE('',#42,#43,#52,.T.);#33=EDGE_CURVE('',#43,#41,#53,.T.);#41=VERTEX_POINT('',#71);
+#42=VERTEX_POINT('',#72);#43=VERTEX_POINT('',#73);#51=LINE('',#71,#81);#52=LINE('',#72,#82);
+#53=LINE('',#73,#83);#60=PLANE('',#61);#61=AXIS2_PLACEMENT_3D('',#71,#91,#92);
+#71=CARTESIAN_POINT('',(0.,0.,0.));#72=CARTESIAN_POINT('',(10.,0.,0.));
+#73=CARTESIAN_POINT('',(0.,10.,0.));#81=VECTOR('',#92,1.);#82=VECTOR('',#93,1.);
+#83=VECTOR('',#94,1.);#91=DIRECTION('',(0.,0.,1.));#92=DIRECTION('',(1.,0.,0.));
+#93=DIRECTION('',(-0.70710678118655,0.70710678118655,0.));#94=DIRECTION('',(0.,-1.,0.));
 ENDSEC;
 END-ISO-10303-21;
 """
@@ -82,12 +62,8 @@ def seeds(suffix: str, folder: Path) -> list[bytes]:
     Small files of the folder HAPTICDB_TEST_DATA are added, whether sound or not.
     """
     wanted = ".step" if suffix == ".stp" else suffix
-    if wanted in OTHERS:
-        made = _ours(folder)
-    elif wanted in {".las", ".laz"}:
-        made = _clouds(folder)
-    else:
-        made = [*_texts(), *_binaries(folder)]
+    makers = {".las": _clouds, ".laz": _clouds} | dict.fromkeys(OTHERS, _ours)
+    made = makers.get(wanted, _meshes)(folder)
     found = [content for kind, content in made if kind == wanted]
     if real := os.environ.get("HAPTICDB_TEST_DATA"):
         paths = [p for p in sorted(Path(real).rglob("*")) if p.suffix.lower() == suffix]
@@ -95,36 +71,19 @@ def seeds(suffix: str, folder: Path) -> list[bytes]:
     return found
 
 
-def _texts() -> list[tuple[str, bytes]]:
+def _meshes(folder: Path) -> list[tuple[str, bytes]]:
     corners = [(0, 0, 0), (1, 0, 0), (1, 1, 0.5), (0, 1, 0.25), (0.5, 0.5, 2)]
     rows = "".join(f"{x} {y} {z}\n" for x, y, z in corners)
-    vertices = "".join(f"v {x} {y} {z}\n" for x, y, z in corners)
+    faces = "f 1 2 3 4\nf 1/1/1 2//2 5\ng two\nf -1 -2 -3"
     facet = "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1e0 -0.5\n"
     solid = f"solid a\n{facet}endloop\nendfacet\n{facet}endloop\nendfacet\nendsolid a\n"
-    properties = "".join(f"property float {axis}\n" for axis in "xyz")
-    ply = (
-        f"ply\nformat ascii 1.0\ncomment of a test\nelement vertex 5\n{properties}"
-        "property uchar red\nelement face 2\nproperty list uchar int vertex_indices\nend_header\n"
-    )
+    head = "ply\nformat {} 1.0\ncomment of a test\nelement vertex 5\nproperty float x\n"
+    head += "property float y\nproperty float z\nproperty uchar red\nelement face 1\n"
+    head += "property list uchar int vertex_indices\nend_header\n"
     coloured = "".join(f"{x} {y} {z} 200\n" for x, y, z in corners)
-    return [
-        (suffix, content.encode())
-        for suffix, content in (
-            (
-                ".obj",
-                f"# test\no box\n{vertices}g one\nf 1 2 3 4\nf 1/1/1 2//2 5\ng two\nf -1 -2 -3",
-            ),
-            (".off", f"OFF\n5 2 0\n{rows}4 0 1 2 3\n3 0 1 4 255 0 0\n"),
-            (".off", f"COFF 5 1 0\n{rows}3 0 1 4\n"),
-            (".stl", solid + solid.replace(" a\n", " b\n")),
-            (".ply", f"{ply}{coloured}4 0 1 2 3\n3 0 1 4\n"),
-            (".dae", COLLADA),
-            (".step", STEP),
-        )
-    ]
-
-
-def _binaries(folder: Path) -> list[tuple[str, bytes]]:
+    points = b"".join(struct.pack("<3fB", *corner, 200) for corner in corners)
+    facets = np.zeros(3, dtype=[("f", "<f4", 12), ("a", "<u2")])
+    facets["f"] = np.random.default_rng(1).random((3, 12))
     nodes = [
         {"name": "car", "children": [1, 2]},
         {"name": "wheel", "mesh": 0, "translation": [1, 0, 0], "rotation": [0, 0, 0.6, 0.8]},
@@ -132,35 +91,36 @@ def _binaries(folder: Path) -> list[tuple[str, bytes]]:
     ]
     tree = gltf({"nodes": nodes}, folder / "seed.gltf")
     whole = json.loads(tree.read_text())
-    content = np.arange(12, dtype="<f4").tobytes()
     beside = whole | {"buffers": [{"byteLength": 48, "uri": "beside.bin"}] * 2}
     chunked = json.dumps(whole | {"buffers": [{"byteLength": 48}]}).encode()
     chunked += b" " * (-len(chunked) % 4)
     triangle = TRIANGLE.tobytes() + np.arange(3, dtype="<u4").tobytes()
     size = 12 + 8 + len(chunked) + 8 + len(triangle)
     glb = struct.pack("<4s2I2I", b"glTF", 2, size, len(chunked), 0x4E4F534A) + chunked
-    glb += struct.pack("<I4s", len(triangle), b"BIN\0") + triangle
-    facets = np.zeros(3, dtype=[("f", "<f4", 12), ("a", "<u2")])
-    facets["f"] = np.random.default_rng(1).random((3, 12))
     nested = (
         f'<object id="1" name="leaf">{MESH_3MF}</object><object id="2"><components>'
         '<component objectid="1" transform="1 0 0 0 1 0 0 0 1 5 0 0"/><component objectid="1"/>'
         "</components></object>"
     )
-    head = (
-        "ply\nformat binary_little_endian 1.0\nelement vertex 4\nproperty float x\n"
-        "property float y\nproperty float z\nelement face 1\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
     packed = threemf(folder / "seed.3mf", nested, '<item objectid="2"/><item objectid="1"/>')
     return [
+        (".obj", b"# test\no box\nv " + rows.replace("\n", "\nv ")[:-2].encode() + faces.encode()),
+        (".off", f"OFF\n5 2 0\n{rows}4 0 1 2 3\n3 0 1 4 255 0 0\n".encode()),
+        (".off", f"COFF 5 1 0\n{rows}3 0 1 4\n".encode()),
+        (".stl", (solid + solid.replace(" a\n", " b\n")).encode()),
+        (".stl", b"\0" * 80 + struct.pack("<I", 3) + facets.tobytes()),
+        (".ply", f"{head.format('ascii')}{coloured}4 0 1 2 3\n".encode()),
+        (
+            ".ply",
+            head.format("binary_little_endian").encode() + points + struct.pack("<B3i", 3, 0, 1, 2),
+        ),
+        (".dae", COLLADA.encode()),
+        (".step", STEP.encode()),
         (".gltf", tree.read_bytes()),
         (".gltf", json.dumps(beside).encode()),
         (".glb", glb_of(tree, folder / "seed.glb").read_bytes()),
-        (".glb", glb),
-        (".stl", b"\0" * 80 + struct.pack("<I", 3) + facets.tobytes()),
+        (".glb", glb + struct.pack("<I4s", len(triangle), b"BIN\0") + triangle),
         (".3mf", packed.read_bytes()),
-        (".ply", head.encode() + content + struct.pack("<B3i", 3, 0, 1, 2)),
     ]
 
 
@@ -169,8 +129,7 @@ def _clouds(folder: Path) -> list[tuple[str, bytes]]:
 
     found = []
     for version, point_format in (("1.2", 1), ("1.4", 6)):
-        header = laspy.LasHeader(version=version, point_format=point_format)
-        cloud = laspy.LasData(header)
+        cloud = laspy.LasData(laspy.LasHeader(version=version, point_format=point_format))
         cloud.x, cloud.y, cloud.z = np.random.default_rng(2).random((3, 40)) * 9
         for suffix in (".las", ".laz"):
             path = folder / f"seed{version}{suffix}"
@@ -186,24 +145,13 @@ def _ours(folder: Path) -> list[tuple[str, bytes]]:
 
     shell, poses, recording = (folder / f"seed{suffix}" for suffix in OTHERS)
     PointShell.sphere(0.1, 20).save(shell)
+    np.savez_compressed(folder / "packed.npz", **np.load(shell))
     write_poses(poses, np.tile(np.eye(4), (5, 1, 1)))
     write(recording, motion(50))
     return [
         (".npz", shell.read_bytes()),
-        (".npz", repacked(shell.read_bytes())),
+        (".npz", (folder / "packed.npz").read_bytes()),
         (".csv", poses.read_bytes()),
         (".csv", b"t,x,y,z,qw,qx,qy,qz\n0,0,0,0,1,0,0,0\n0.5,1,0,0,0.6,0.8,0,0\n"),
         (".hdbrec", recording.read_bytes()),
     ]
-
-
-def repacked(content: bytes) -> bytes:
-    """Archive with its entries packed."""
-    out = io.BytesIO()
-    with (
-        zipfile.ZipFile(io.BytesIO(content)) as old,
-        zipfile.ZipFile(out, "w", zipfile.ZIP_DEFLATED) as new,
-    ):
-        for name in old.namelist():
-            new.writestr(name, old.read(name))
-    return out.getvalue()

@@ -25,23 +25,18 @@ def gltf(
     indices: Sequence[int] = (0, 1, 2),
 ) -> Path:
     """A glTF file of one mesh (accessor 0: positions, 1: indices); `tree` replaces parts of it."""
-    positions = vertices
     corners = np.asarray(indices, dtype=np.uint32)
-    content = positions.tobytes() + corners.tobytes()
+    content = vertices.tobytes() + corners.tobytes()
+    uri = "data:application/octet-stream;base64," + base64.b64encode(content).decode()
     whole: dict[str, Any] = {
         "asset": {"version": "2.0"},
-        "buffers": [
-            {
-                "byteLength": len(content),
-                "uri": "data:application/octet-stream;base64," + base64.b64encode(content).decode(),
-            }
-        ],
+        "buffers": [{"byteLength": len(content), "uri": uri}],
         "bufferViews": [
-            {"buffer": 0, "byteOffset": 0, "byteLength": positions.nbytes},
-            {"buffer": 0, "byteOffset": positions.nbytes, "byteLength": corners.nbytes},
+            {"buffer": 0, "byteOffset": 0, "byteLength": vertices.nbytes},
+            {"buffer": 0, "byteOffset": vertices.nbytes, "byteLength": corners.nbytes},
         ],
         "accessors": [
-            {"bufferView": 0, "componentType": 5126, "count": len(positions), "type": "VEC3"},
+            {"bufferView": 0, "componentType": 5126, "count": len(vertices), "type": "VEC3"},
             {"bufferView": 1, "componentType": 5125, "count": corners.size, "type": "SCALAR"},
         ],
         "meshes": [{"primitives": [{"attributes": {"POSITION": 0}, "indices": 1}]}],
@@ -50,6 +45,22 @@ def gltf(
         "scene": 0,
     }
     path.write_text(json.dumps(whole | tree))
+    return path
+
+
+def with_arrays(path: Path, tree: dict[str, Any], *arrays: NDArray[Any], **extra: object) -> Path:
+    """A glTF file of one triangle with more accessors, from number 2 on; `extra` goes into each."""
+    whole = json.loads(gltf(tree, path).read_text())
+    kinds = {"f4": 5126, "u1": 5121, "i2": 5122, "u2": 5123}
+    shapes = {1: "SCALAR", 3: "VEC3", 4: "VEC4", 16: "MAT4"}
+    for n, array in enumerate(arrays, 1):
+        uri = "data:;base64," + base64.b64encode(array.tobytes()).decode()
+        whole["buffers"].append({"byteLength": array.nbytes, "uri": uri})
+        whole["bufferViews"].append({"buffer": n, "byteLength": array.nbytes})
+        kind, shape = kinds[array.dtype.str[1:]], shapes[array.shape[1]]
+        view = {"bufferView": n + 1, "componentType": kind, "type": shape, "count": len(array)}
+        whole["accessors"].append(view | extra)
+    path.write_text(json.dumps(whole))
     return path
 
 

@@ -1,7 +1,5 @@
 """Colours of triangles and points, as each format has them; a broken one loses no geometry."""
 
-import base64
-import json
 from pathlib import Path
 
 import laspy
@@ -9,15 +7,15 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from hapticdb.mesh import read_file
-from mesh_files import COLLADA, MESH_3MF, gltf, text, threemf
+from hapticdb.mesh import parse_in_process, read_file
+from mesh_files import COLLADA, MESH_3MF, gltf, text, threemf, with_arrays
 
 RED, GREEN, GLASS = (255, 0, 0, 255), (0, 255, 0, 255), (0, 0, 255, 64)
 
 
 def colours_of(path: Path) -> NDArray[np.uint8]:
-    """Colours of the file's first part, read as users read it."""
-    colours = read_file(path).parts[0].colours
+    """Colours of the file's first part."""
+    colours = parse_in_process(path).parts[0].colours
     assert colours is not None
     return colours
 
@@ -34,22 +32,17 @@ def test_gltf_base_colours_are_light_and_an_opaque_material_has_no_alpha(tmp_pat
         assert second[3] == 255  # of a material that is not there
     for broken in ([None], [{"pbrMetallicRoughness": {"baseColorFactor": "red"}}], "none"):
         path = gltf(tree | {"materials": broken}, tmp_path / "broken.gltf")
-        assert read_file(path).parts[0].colours is None
+        assert parse_in_process(path).parts[0].colours is None
 
 
 def test_gltf_vertex_colours_are_averaged_over_the_corners(tmp_path: Path) -> None:
-    shades = np.array([[255, 0, 0, 255], [255, 0, 0, 255], [255, 0, 0, 255]], dtype=np.uint8)
-    uri = "data:;base64," + base64.b64encode(shades.tobytes()).decode()
-    path = gltf({}, tmp_path / "plain.gltf")
-    tree = json.loads(path.read_text())
-    tree["buffers"].append({"byteLength": shades.nbytes, "uri": uri})
-    tree["bufferViews"].append({"buffer": 1, "byteLength": shades.nbytes})
-    tree["accessors"].append(
-        {"bufferView": 2, "componentType": 5121, "normalized": True, "count": 3, "type": "VEC4"}
-    )
-    tree["meshes"][0]["primitives"][0]["attributes"]["COLOR_0"] = 2
-    path.write_text(json.dumps(tree))
-    np.testing.assert_array_equal(colours_of(path), [RED])
+    """Also where the file is read in another process, as users read it."""
+    shades = np.array([[255, 0, 0, 255]] * 3, dtype=np.uint8)
+    piece = {"attributes": {"POSITION": 0, "COLOR_0": 2}, "indices": 1}
+    tree = {"meshes": [{"primitives": [piece]}]}
+    path = with_arrays(tmp_path / "a.gltf", tree, shades, normalized=True)
+    for colours in (colours_of(path), read_file(path).parts[0].colours):
+        np.testing.assert_array_equal(colours, [RED])
 
 
 def test_obj_materials_come_from_a_file_beside_it(tmp_path: Path) -> None:
@@ -63,7 +56,7 @@ def test_obj_materials_come_from_a_file_beside_it(tmp_path: Path) -> None:
     assert found[3, 3] == 255
     for elsewhere in (f"{tmp_path}/m.mtl", "../m.mtl", "missing.mtl"):
         path = text(tmp_path / "b.obj", f"mtllib {elsewhere}\n" + body + faces)
-        assert read_file(path).parts[0].colours is None
+        assert parse_in_process(path).parts[0].colours is None
 
 
 def test_obj_vertices_may_have_colours(tmp_path: Path) -> None:

@@ -48,14 +48,12 @@ EXPECTED: dict[str, Reads | str] = {
     "assimp_sphereWithHole.stl": Reads(1, 285, (3, 3, 3)),
     "assimp_triangle_with_empty_solid.stl": Reads(1, 1, (2, 2, 0), Defects(empty=1)),
     "assimp_triangle_with_two_solids.stl": Reads(2, 2, (4, 4, 0)),
-    "derived_dup_and_degenerate_faces.obj": Reads(
-        1, 9800, (0.021, 0.021, 0.01), Defects(degenerate=200)
-    ),
+    "derived_dup_and_degenerate_faces.obj": Reads(1, 9800, (0.021, 0.021, 0.01),
+        Defects(degenerate=200)),
     "derived_flat_sheet.stl": Reads(1, 4800, (0.021, 0, 0.01), Defects(degenerate=384)),
     "derived_inside_out.stl": Reads(1, 4800, (0.021, 0.021, 0.01)),
-    "derived_mirrored_singular_scaled_nodes.glb": Reads(
-        5, 4582, (16, 4.8, 8), Defects(degenerate=236)
-    ),
+    "derived_mirrored_singular_scaled_nodes.glb": Reads(5, 4582, (16, 4.8, 8),
+        Defects(degenerate=236)),
     "derived_nan_vertices.ply": Reads(1, 4659, (0.021, 0.021, 0.01), Defects(non_finite=141)),
     "derived_outlier_vertex.ply": Reads(1, 4800, (72.1844, 9.5109, 50.005)),
     "derived_random_winding.stl": Reads(1, 4800, (0.021, 0.021, 0.01)),
@@ -83,7 +81,7 @@ EXPECTED: dict[str, Reads | str] = {
     "trimesh_soup.stl": Reads(1, 100, (0.9974, 0.9965, 0.9929)),
     "trimesh_two_objects_mixed_case_names.stl": Reads(2, 24, (6, 1, 1)),
     "trimesh_wallhole.obj": Reads(1, 66, (10, 15, 10), Defects(degenerate=9)),
-}
+}  # fmt: skip
 
 
 def n_pieces(file: MeshFile) -> int:

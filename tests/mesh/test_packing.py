@@ -34,7 +34,7 @@ def geometries(draw: st.DrawFn) -> Geometry:
     return vertices, faces, draw(arrays(np.uint8, shape, elements=draw(SHADES)))
 
 
-@settings(max_examples=200, deadline=None)
+@settings(max_examples=100, deadline=None)
 @given(geometries(), st.sampled_from([0.0, 1e-5, 5e-324]))
 def test_what_is_packed_returns_bit_for_bit(geometry: Geometry, chord: float) -> None:
     """The chord error is last, so that surfaces without one are as before."""
@@ -45,15 +45,10 @@ def test_what_is_packed_returns_bit_for_bit(geometry: Geometry, chord: float) ->
     without = pack(vertices, faces, colours)
     assert packed[: len(without)] == without
     assert len(packed) - len(without) == (8 if chord else 0)
-    assert (painted is None) == (colours is None)
-    if painted is not None and colours is not None:
-        np.testing.assert_array_equal(painted, colours)
+    np.testing.assert_array_equal(painted, colours)
     assert found.tobytes() == np.ascontiguousarray(vertices).tobytes()
     assert found.shape == vertices.shape
-    if faces is None:
-        assert corners is None
-    else:
-        np.testing.assert_array_equal(corners, faces)
+    np.testing.assert_array_equal(corners, faces)
 
 
 def ball(n: int) -> tuple[Floats, Ints]:
@@ -61,14 +56,11 @@ def ball(n: int) -> tuple[Floats, Ints]:
     u, v = np.meshgrid(np.linspace(0, 2 * np.pi, n), np.linspace(0, np.pi, n), indexing="ij")
     points = np.stack([np.sin(v) * np.cos(u), np.sin(v) * np.sin(u), np.cos(v)], axis=-1)
     first = (np.arange(n - 1)[:, None] * n + np.arange(n - 1)).reshape(-1)
-    corners = np.concatenate(
-        [np.stack([first, first + 1, first + n]), np.stack([first + 1, first + n + 1, first + n])],
-        axis=1,
-    )
-    return points.reshape(-1, 3), corners.T.copy()
+    corners = first[:, None] + np.array([0, 1, n, 1, n + 1, n])
+    return points.reshape(-1, 3), corners.reshape(-1, 3)
 
 
-@settings(max_examples=300, deadline=None)
+@settings(max_examples=150, deadline=None)
 @given(st.data())
 def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObject) -> None:
     """Never a position that is no number, nor a triangle of a vertex that is not there."""

@@ -1,6 +1,7 @@
 """From a CAD file to a force: on real assemblies, or on the sample without them."""
 
 from collections.abc import Iterator
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -48,16 +49,13 @@ def environments(
 ) -> Iterator[dict[Layout, Environment]]:
     folder = tmp_path_factory.mktemp("cad")
     opened: dict[Layout, Environment] = {}
-    for layout in LAYOUTS:
-        options = hapticdb.ImportOptions(
-            grid=hapticdb.GridOptions(bits=BITS, extent=1.6), layout=layout
-        )
-        (report,) = hapticdb.import_files(folder / f"{layout}.db", [assembly[0]], options)
-        assert report.status == "imported"
-        opened[layout] = hapticdb.open(folder / f"{layout}.db")
-    yield opened
-    for env in opened.values():
-        env.close()
+    with ExitStack() as closing:
+        for layout in LAYOUTS:
+            path, grid = folder / f"{layout}.db", hapticdb.GridOptions(bits=BITS, extent=1.6)
+            options = hapticdb.ImportOptions(grid=grid, layout=layout)
+            assert hapticdb.import_files(path, [assembly[0]], options)[0].status == "imported"
+            opened[layout] = closing.enter_context(hapticdb.open(path))
+        yield opened
 
 
 def all_voxels(env: Environment) -> dict[tuple[int, int, int], set[int]]:

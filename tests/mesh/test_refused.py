@@ -8,9 +8,10 @@ from typing import Any
 import numpy as np
 import pytest
 
+from file_seeds import seeds
 from hapticdb.mesh import SUFFIXES, parse_in_process, read_file
 from hapticdb.mesh.raw import UnreadableError, walk
-from mesh_files import MESH_3MF, cause, glb_of, gltf, text, threemf
+from mesh_files import cause, gltf, text, threemf
 
 
 def test_what_is_no_readable_file_is_named_with_its_cause(tmp_path: Path) -> None:
@@ -53,68 +54,43 @@ def test_bytes_of_another_format_end_in_one_line(tmp_path: Path, suffix: str) ->
         cause(path)
 
 
-@pytest.mark.parametrize("kept", [0.5, 0.99])
-def test_a_file_cut_short_is_refused(tmp_path: Path, kept: float) -> None:
-    corners = np.random.default_rng(1).random((60, 3))
-    rows = "".join(f"{x} {y} {z}\n" for x, y, z in corners)
-    faces = "".join(f"3 {i} {i + 1} {i + 2}\n" for i in range(0, 60, 3))
-    properties = "".join(f"property float {axis}\n" for axis in "xyz")
-    header = (
-        f"element vertex 60\n{properties}element face 20\n"
-        "property list uchar int vertex_indices\nend_header\n"
-    )
-    facet = np.zeros(20, dtype=[("f", "<f4", 12), ("a", "<u2")])
-    face = np.zeros(20, dtype=[("n", "u1"), ("i", "<i4", 3)])
-    face["n"], face["i"] = 3, np.arange(60).reshape(20, 3)
-    binary = b"ply\nformat binary_little_endian 1.0\n" + header.encode()
-    solid = "".join(
-        "facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\n"
-        "endfacet\n"
-        for _ in range(20)
-    )
-    whole = {
-        "a.off": f"OFF\n60 20 0\n{rows}{faces}".encode(),
-        "a.ply": f"ply\nformat ascii 1.0\n{header}{rows}{faces}".encode(),
-        "b.ply": binary + corners.astype("<f4").tobytes() + face.tobytes(),
-        "a.stl": b"\0" * 80 + struct.pack("<I", 20) + facet.tobytes(),
-        "b.stl": f"solid a\n{solid}endsolid a".encode(),
-    }
-    whole["a.glb"] = glb_of(gltf({}, tmp_path / "s.gltf"), tmp_path / "s.glb").read_bytes()
-    whole["a.3mf"] = threemf(
-        tmp_path / "s.3mf", f'<object id="1">{MESH_3MF}</object>', '<item objectid="1"/>'
-    ).read_bytes()
-    for name, content in whole.items():
-        path = tmp_path / name
+@pytest.mark.parametrize("suffix", [".off", ".ply", ".stl", ".glb", ".3mf"])
+@pytest.mark.parametrize("kept", [0.45, 0.85])
+def test_a_file_cut_short_is_refused(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, suffix: str, kept: float
+) -> None:
+    monkeypatch.delenv("HAPTICDB_TEST_DATA", raising=False)
+    path = tmp_path / f"a{suffix}"
+    for content in seeds(suffix, tmp_path):
         path.write_bytes(content)
         parse_in_process(path)
         path.write_bytes(content[: int(len(content) * kept)])
         cause(path)
 
 
-def test_a_glTF_that_would_be_read_wrongly_is_refused(tmp_path: Path) -> None:  # noqa: N802
-    packed = {"extensionsRequired": ["KHR_draco_mesh_compression"]}
-    assert "KHR_draco" in cause(gltf(packed, tmp_path / "a.gltf"))
-    assert "mesh 7" in cause(gltf({"nodes": [{"mesh": 7}]}, tmp_path / "b.gltf"))
-    assert "node 9" in cause(gltf({"scenes": [{"nodes": [9]}]}, tmp_path / "c.gltf"))
-    lost = {"buffers": [{"byteLength": 48, "uri": "lost.bin"}]}
-    assert "lost.bin" in cause(gltf(lost, tmp_path / "d.gltf"))
-    bent = {"nodes": [{"mesh": 0, "matrix": [1, 0, 0, 5, 0, 1, 0, 0, 0, 0, 1, 0, 0, 0, 0, 1]}]}
-    assert "affine" in cause(gltf(bent, tmp_path / "e.gltf"))
-    assert "version 1" in cause(_version_one(tmp_path / "f.glb"))
+@pytest.mark.parametrize(
+    ("tree", "word"),
+    [
+        ({"extensionsRequired": ["KHR_draco_mesh_compression"]}, "KHR_draco"),
+        ({"nodes": [{"mesh": 7}]}, "mesh 7"),
+        ({"scenes": [{"nodes": [9]}]}, "node 9"),
+        ({"buffers": [{"byteLength": 48, "uri": "lost.bin"}]}, "lost.bin"),
+        ({"nodes": [{"mesh": 0, "matrix": [1, 0, 0, 5] * 4}]}, "affine"),
+        ({"nodes": [{"children": [1]}, {"children": [0], "mesh": 0}]}, "own ancestor"),
+    ],
+)
+def test_a_glTF_that_would_be_read_wrongly_is_refused(  # noqa: N802
+    tmp_path: Path, tree: dict[str, Any], word: str
+) -> None:
+    assert word in cause(gltf(tree, tmp_path / "a.gltf"))
 
 
-def _version_one(path: Path) -> Path:
+def test_a_glb_of_version_one_and_a_3mf_that_holds_itself_are_refused(tmp_path: Path) -> None:
+    path = tmp_path / "a.glb"
     path.write_bytes(struct.pack("<4s2I", b"glTF", 1, 20) + b"\0\0\0\0JSON")
-    return path
-
-
-def test_nodes_that_hold_themselves_are_refused(tmp_path: Path) -> None:
-    nodes = [{"children": [1]}, {"children": [0], "mesh": 0}]
-    assert "own ancestor" in cause(gltf({"nodes": nodes}, tmp_path / "cycle.gltf"))
-    resources = (
-        '<object id="1"><components><component objectid="2"/></components></object>'
-        '<object id="2"><components><component objectid="1"/></components></object>'
-    )
+    assert "version 1" in cause(path)
+    holds = '<object id="{}"><components><component objectid="{}"/></components></object>'
+    resources = holds.format(1, 2) + holds.format(2, 1)
     path = threemf(tmp_path / "cycle.3mf", resources, '<item objectid="1"/>')
     assert "own ancestor" in cause(path)
 

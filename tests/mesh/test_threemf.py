@@ -12,6 +12,9 @@ from mesh_files import MESH_3MF, cause, names, threemf
 ITEM = '<item objectid="1"/>'
 
 
+THING = f'<object id="1">{MESH_3MF}</object>'
+
+
 def model_3mf(path: Path, name: str, resources: str, build: str = ITEM, **beside: str) -> Path:
     """An archive with a model of that name; `beside` : other members, '_' in names for '/'."""
     threemf(path, resources, build)
@@ -25,12 +28,11 @@ def model_3mf(path: Path, name: str, resources: str, build: str = ITEM, **beside
 
 
 def test_a_3mf_file_says_which_model_is_missing(tmp_path: Path) -> None:
-    thing = f'<object id="1">{MESH_3MF}</object>'
-    path = model_3mf(tmp_path / "a.3mf", "3D/other.model", thing)
+    path = model_3mf(tmp_path / "a.3mf", "3D/other.model", THING)
     assert "its root model 3d/3dmodel.model is missing; 3D/other.model is in it" in cause(path)
-    path = model_3mf(tmp_path / "b.3mf", "read.me", thing)
+    path = model_3mf(tmp_path / "b.3mf", "read.me", THING)
     assert "it is no 3MF file: a ZIP archive without a model in it" in cause(path)
-    path = model_3mf(tmp_path / "c.3mf", "3D\\3dmodel.model", thing)
+    path = model_3mf(tmp_path / "c.3mf", "3D\\3dmodel.model", THING)
     assert len(parse_in_process(path).parts) == 1
 
 
@@ -49,8 +51,7 @@ def test_volumes_that_a_slicer_subtracts_or_changes_are_told(
     tmp_path: Path, settings: str, kind: str
 ) -> None:
     beside = {f"Metadata__{settings}_DOT_config": f'<a key="support_type"/><b subtype="{kind}"/>'}
-    thing = f'<object id="1">{MESH_3MF}</object>'
-    file = parse_in_process(model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", thing, **beside))
+    file = parse_in_process(model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", THING, **beside))
     assert file.notes == (f"1 object is of the type {kind}, and comes in like any other",)
 
 
@@ -81,7 +82,6 @@ def test_the_root_of_a_3mf_is_the_one_that_its_relationships_name(tmp_path: Path
 
 def test_damage_beside_the_models_of_a_3mf_file_loses_nothing(tmp_path: Path) -> None:
     beside = {"Metadata__model_settings_DOT_config": "settings of a slicer"}
-    thing = f'<object id="1">{MESH_3MF}</object>'
-    path = model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", thing, **beside)
+    path = model_3mf(tmp_path / "a.3mf", "3D/3dmodel.model", THING, **beside)
     path.write_bytes(path.read_bytes().replace(b"settings of a slicer", b"Settings of a slicer"))
     assert len(parse_in_process(path).parts) == 1

@@ -178,25 +178,21 @@ def test_an_object_of_a_3mf_with_a_mesh_and_components_keeps_both(tmp_path: Path
 def test_a_comment_names_the_unit_unless_an_option_does(
     tmp_path: Path, comment: str, metres: float | None
 ) -> None:
+    rows = "0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n"
     ply = f"ply\nformat ascii 1.0\ncomment {comment}\nelement vertex 3\n"
     ply += "".join(f"property float {axis}\n" for axis in "xyz")
     ply += "element face 1\nproperty list uchar int vertex_index\nend_header\n"
-    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4")
+    corners = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0]], dtype="<f4").tobytes()
     contents = {
         "a.obj": f"# {comment}\n{TRIANGLE_OBJ}".encode(),
-        "a.off": f"OFF\n# {comment}\n3 1 0\n0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".encode(),
-        "a.ply": f"{ply}0 0 0\n1 0 0\n0 1 0\n3 0 1 2\n".encode(),
-        "a.stl": comment.encode().ljust(80)
-        + b"\1\0\0\0"
-        + bytes(12)
-        + corners.tobytes()
-        + bytes(2),
+        "a.off": f"OFF\n# {comment}\n3 1 0\n{rows}".encode(),
+        "a.ply": f"{ply}{rows}".encode(),
+        "a.stl": comment.encode().ljust(80) + b"\1\0\0\0" + bytes(12) + corners + bytes(2),
     }
     for name, content in contents.items():
         (tmp_path / name).write_bytes(content)
         file = parse_in_process(tmp_path / name)
-        assert file.names_unit == (metres is not None)
-        assert bool(file.notes) == file.names_unit
+        assert file.names_unit == bool(file.notes) == (metres is not None)
         assert file.bounds[1, 0] == pytest.approx(metres or 1.0)
         assert parse_in_process(tmp_path / name, unit="km").bounds[1, 0] == 1000.0
 

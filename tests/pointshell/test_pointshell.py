@@ -1,11 +1,11 @@
 """A tool's mesh, however damaged, becomes evenly spread points with normals into the tool."""
 
 import itertools
-import struct
 from pathlib import Path
 
 import numpy as np
 import pytest
+import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
@@ -13,7 +13,7 @@ from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.pointshell.shell import PointShell
+from hapticdb.pointshell.shell import PointShell, fibonacci_sphere
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -21,36 +21,24 @@ Mesh = tuple[Floats, Ints]
 
 
 def cube(edge: float = 1.0, at: tuple[float, float, float] = (0.0, 0.0, 0.0)) -> Mesh:
-    """A cube from the corner `at`, two triangles a face, wound outwards."""
-    corners = np.array([[i, j, k] for i in (0, 1) for j in (0, 1) for k in (0, 1)], dtype=float)
-    quads = np.array(
-        [[0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3]]
-    )
-    return corners * edge + at, np.concatenate((quads[:, [0, 1, 2]], quads[:, [0, 2, 3]]))
+    """A cube from the corner `at`."""
+    return hull_of(np.array(list(itertools.product((0.0, edge), repeat=3))) + at)
 
 
-def sphere(radius: float = 1.0, n: int = 600) -> Mesh:
-    """A sphere about the origin: the hull of a Fibonacci lattice, in random winding."""
-    k = np.arange(n) + 0.5
-    z, angle = 1.0 - 2.0 * k / n, np.pi * (1.0 + 5.0**0.5) * k
-    ring = np.sqrt(1.0 - z * z)
-    corners = radius * np.stack((ring * np.cos(angle), ring * np.sin(angle), z), axis=1)
+def hull_of(corners: Floats) -> Mesh:
+    """The convex hull of its corners (n, 3), in random winding."""
     return corners, ConvexHull(corners).simplices.astype(np.int64)
 
 
-def torus(major: float = 1.0, minor: float = 0.4, n: int = 48) -> Mesh:
-    """A torus about the z axis."""
-    u, v = (x.ravel() for x in np.meshgrid(np.arange(n), np.arange(n), indexing="ij"))
-    a, b = 2.0 * np.pi * u / n, 2.0 * np.pi * v / n
-    ring = major + minor * np.cos(b)
-    corners = np.stack((ring * np.cos(a), ring * np.sin(a), minor * np.sin(b)), axis=1)
+def sphere(n: int = 600) -> Mesh:
+    """A sphere of radius 1 about the origin."""
+    return hull_of(fibonacci_sphere(n))
 
-    def at(i: Ints, j: Ints) -> Ints:
-        return (i % n) * n + j % n
 
-    here, there = at(u, v), at(u + 1, v + 1)
-    first = np.stack((here, at(u + 1, v), there), axis=1)
-    return corners, np.concatenate((first, np.stack((here, there, at(u, v + 1)), axis=1)))
+def torus(n: int = 48) -> Mesh:
+    """A torus of radii 1 and 0.4 about the z axis."""
+    made = trimesh.creation.torus(1.0, 0.4, n, n)
+    return np.array(made.vertices), np.array(made.faces)
 
 
 def together(*meshes: Mesh) -> Mesh:
@@ -71,22 +59,14 @@ def tumbled(mesh: Mesh, seed: int = 1) -> Mesh:
 
 
 def write_stl(path: Path, mesh: Mesh) -> Path:
-    corners, faces = mesh
-    record = [struct.pack("<12fH", 0, 0, 0, *corners[face].ravel(), 0) for face in faces]
-    path.write_bytes(b"tool".ljust(80) + struct.pack("<I", len(faces)) + b"".join(record))
+    trimesh.Trimesh(*mesh, process=False).export(path)
     return path
 
 
-def spacing(area: float, n: int) -> float:
-    """Distance of neighbours in a hexagonal lattice of n points over that area."""
-    return float(np.sqrt(2.0 * area / (np.sqrt(3.0) * n)))
-
-
-def cube_inward(points: Floats, edge: float = 1.0) -> Floats:
-    """Inward normals of a cube at the origin, exact, at points on its faces."""
-    offsets = np.concatenate((points, edge - points), axis=1)
-    nearest = np.argmin(np.abs(offsets), axis=1)
-    inward: Floats = np.concatenate((np.eye(3), -np.eye(3)))[nearest]
+def cube_inward(points: Floats) -> Floats:
+    """Inward normals of a cube of edge 1 at the origin, exact, at points on its faces."""
+    offsets = np.concatenate((points, 1.0 - points), axis=1)
+    inward: Floats = np.concatenate((np.eye(3), -np.eye(3)))[np.argmin(np.abs(offsets), axis=1)]
     return inward
 
 
@@ -108,16 +88,12 @@ def test_points_lie_on_the_surface_and_normals_of_a_cube_are_exact() -> None:
     assert np.allclose(shell.center, 0.5, atol=1e-15)
 
 
-@pytest.mark.parametrize("n", [100, 300, 3000, 25_000])
+@pytest.mark.parametrize("n", [100, 3000])
 def test_neighbours_keep_six_tenths_of_the_hexagonal_spacing(n: int) -> None:
-    corners, faces = sphere()
-    points = PointShell.from_mesh(corners, faces, n).points
-    edges = corners[faces]
-    area = np.linalg.norm(
-        np.cross(edges[:, 1] - edges[:, 0], edges[:, 2] - edges[:, 0]), axis=1
-    ).sum()
+    points = PointShell.from_mesh(*sphere(), n).points
     nearest = np.asarray(cKDTree(points).query(points, k=2)[0])[:, 1]
-    assert nearest.min() > 0.6 * spacing(area / 2.0, n)
+    area = ConvexHull(sphere()[0]).area
+    assert nearest.min() > 0.6 * np.sqrt(2.0 * area / (np.sqrt(3.0) * n))
 
 
 def test_both_sides_of_a_thin_wall_get_their_share() -> None:
@@ -149,7 +125,6 @@ def test_equal_seeds_give_equal_shells_and_others_do_not() -> None:
     assert np.array_equal(first.points, again.points)
     assert np.array_equal(first.normals, again.normals)
     assert not np.array_equal(first.points, other.points)
-    assert first.seed == 5
 
 
 def mean_step(points: Floats) -> float:
@@ -242,19 +217,14 @@ def test_an_open_hemisphere_faces_its_hollow_and_says_that_it_is_open() -> None:
 
 
 def test_a_flat_sheet_of_random_winding_faces_one_way() -> None:
-    x, y = (a.ravel() for a in np.meshgrid(np.arange(9.0), np.arange(9.0)))
-    low = np.stack((x, y, 0.0 * x), axis=1)[:, None]
-    triangles = np.concatenate(
-        (
-            low + np.array([[0, 0, 0], [1, 0, 0], [1, 1, 0]]),
-            low + np.array([[0, 0, 0], [1, 1, 0], [0, 1, 0]]),
-        )
-    )
-    mesh = (triangles.reshape(-1, 3), np.arange(3 * len(triangles)).reshape(-1, 3))
-    shell = PointShell.from_mesh(*tumbled(mesh), 300)
+    corners, faces = cube(4.5)
+    for _ in range(3):
+        corners, faces = trimesh.remesh.subdivide(corners, faces)
+    sheet = faces[(corners[faces][:, :, 2] == 0.0).all(axis=1)]
+    shell = PointShell.from_mesh(*tumbled((corners, sheet)), 300)
     assert not shell.is_closed
     assert len(np.unique(shell.normals, axis=0)) == 1
-    assert np.allclose(shell.center, [4.5, 4.5, 0.0])
+    assert np.allclose(shell.center, [2.25, 2.25, 0.0])
 
 
 def test_corners_that_differ_by_a_rounding_are_joined() -> None:

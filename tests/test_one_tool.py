@@ -50,11 +50,8 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
         tool = env.tool("tool.stl")
         path = hapticdb.read_poses("path.csv")
         swept = hapticdb.sweep(env, tool, path[:2])
-        felt = env.touch(tool, poses=path)
-        touch = env.touch(tool, path[0])
-        obj = env.object(2)
-        clashes = hapticdb.find_clashes(env)
-    assert repr(obj) == "Object(2 'box1', 0.1 m long, 488 voxels)"
+        felt, touch = env.touch(tool, poses=path), env.touch(tool, path[0])
+        obj, clashes = env.object(2), hapticdb.find_clashes(env)
     checked, same = hapticdb.check_environment(scene), hapticdb.diff_environments(scene, scene)
     for result in (swept, felt, touch, obj, clashes, checked, same):
         assert len(repr(result).splitlines()) == 1
@@ -66,11 +63,3 @@ def test_results_say_in_a_line_what_they_are_and_can_be_drawn(scene: Path) -> No
     most = float(np.linalg.norm(felt.forces, axis=1).max())
     assert f"at most {most:.4g} N" in repr(felt)
     assert f"<td>{most:.4g}</td>" in felt._repr_html_()
-
-
-def test_help_begins_with_the_names_that_matter() -> None:
-    first = str(hapticdb.__doc__).split("Errors")[0]
-    for name in ("import_files", "open", "create", "Environment", "PointShell", "read_poses",
-                 "sweep", "extract", "Session"):  # fmt: skip
-        assert name in first
-        assert hasattr(hapticdb, name)

@@ -8,15 +8,10 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
-from hapticdb.clashes.run import CONTACT
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.surfaces.sides import triangle_tree
 from hapticdb.mesh import Defects, parse_in_process
-from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.orientation import orient
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
-from point_distances import distances_to
 
 Floats = NDArray[np.float64]
 PLANTED = {
@@ -66,39 +61,6 @@ def test_clashes_finds_the_two_planted_overlaps_alone(files: SampleFiles, tmp_pa
     assert (found.counts()["inside"], found.counts()["not known"]) == (0, 0)
     deep = {(name[one.a], name[one.b]) for one in found.pairs if one.kind == "overlapping"}
     assert deep == PLANTED
-
-
-@pytest.mark.long
-def test_no_place_of_a_part_lies_deep_in_another_but_for_the_planted_overlaps(
-    files: SampleFiles,
-) -> None:
-    """Of corners and middles of triangles: by parity and distance, not by the judge."""
-    triangles = {
-        part.name: moved_points(part.vertices, part.world_from_part[None])[0][part.faces]
-        for part in parse_in_process(files.car).parts
-    }
-    samples = {name: places_on(corners) for name, corners in triangles.items()}
-    ends = {name: (places.min(axis=0), places.max(axis=0)) for name, places in samples.items()}
-    deep = set()
-    for name, corners in triangles.items():
-        interior = Interior(orient(corners))
-        tree = triangle_tree(corners, np.ones(len(corners), dtype=np.int64))
-        low, high = corners.min(axis=(0, 1)) + CONTACT, corners.max(axis=(0, 1)) - CONTACT
-        for other, places in samples.items():
-            if (ends[other][0] > high).any() or (ends[other][1] < low).any():
-                continue
-            near = places[((places > low) & (places < high)).all(axis=1)]
-            held = near[interior.holds(near)]
-            if other != name and distances_to(tree, held).max(initial=0.0) > CONTACT:
-                deep.add(frozenset((name, other)))
-    assert deep == {frozenset(pair) for pair in PLANTED}
-
-
-def places_on(triangles: Floats) -> Floats:
-    """Corners and middles of triangles (F, 3, 3), each place once."""
-    places = np.concatenate([triangles, triangles.mean(axis=1, keepdims=True)], axis=1)
-    distinct: Floats = np.unique(places.reshape(-1, 3), axis=0)
-    return distinct
 
 
 def test_the_wrench_is_one_closed_piece(files: SampleFiles) -> None:

@@ -4,13 +4,11 @@ from types import SimpleNamespace
 from typing import Any
 from unittest.mock import MagicMock
 
-import numpy as np
 import pytest
 
 from hapticdb.page import process
 from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
-from hapticdb.page.drawing import HandDrawing
 
 
 @pytest.mark.parametrize("fails", [False, True])
@@ -56,12 +54,3 @@ def test_what_is_not_seen_is_not_felt_when_it_comes(
     monkeypatch.setattr(browser, "begin_anew", lambda: begun.append(True))
     browser.objects_changed()
     assert len(begun) == n_begun
-
-
-@pytest.mark.parametrize(("far", "is_seen"), [(0.0, True), (500.0, True), (5e6, False)])
-def test_words_at_the_hand_are_left_out_where_float32_scatters_their_letters(
-    far: float, is_seen: bool
-) -> None:
-    client = MagicMock()
-    HandDrawing(client, 50.0, np.full(3, far), 7.0)
-    assert client.scene.add_label.call_args.kwargs["visible"] is is_seen

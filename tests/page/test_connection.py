@@ -76,15 +76,9 @@ def test_a_connection_with_the_secret_is_let_in_under_its_name(page: Page) -> No
     with entered(page, "toucher") as browser:
         assert browser.recv(timeout=PATIENCE)
         assert page.link.visitor(0) == Visitor("Guest 1", "toucher")
-    until(lambda: _is_gone(page.link))
-
-
-def _is_gone(link: PageConnection) -> bool:
-    try:
-        link.visitor(0)
-    except KeyError:
-        return True
-    return False
+        page.ours.sendall(line("ping"))
+        assert said(page.ours)["word"] == "pong"
+    until(lambda: 0 not in page.link._live)
 
 
 @pytest.mark.parametrize(
@@ -110,11 +104,6 @@ def test_whoever_lacks_the_secret_is_sent_away_with_nothing(
         assert closed.value.rcvd.code == LATE
     assert said(page.ours)["word"] == "refused"
     assert page.server.get_clients() == {}
-
-
-def test_the_page_answers_a_ping(page: Page) -> None:
-    page.ours.sendall(line("ping"))
-    assert said(page.ours)["word"] == "pong"
 
 
 def test_what_viser_fails_at_is_one_line_each_and_closes_the_connection(

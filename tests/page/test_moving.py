@@ -2,14 +2,14 @@
 
 import asyncio
 import threading
-from collections.abc import Callable, Iterator
-from contextlib import nullcontext
-from pathlib import Path
+from collections.abc import Iterator
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
+import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
@@ -19,119 +19,65 @@ from hapticdb.page.browser import Browser
 from hapticdb.page.connection import Visitor
 from hapticdb.page.editing import PersonsEdits
 from hapticdb.page.panels.moving import MovingControls
-from hapticdb.sample.write import write_sample
 
 CLIENT = 7
 """Number of the browser's client."""
-
-
-class Widget:
-    """A widget, or a gizmo: it knows its callbacks; `freed` is called when it is removed."""
-
-    def __init__(self, freed: Callable[[], object] = lambda: None, **props: Any) -> None:  # noqa: ANN401
-        self.value, self.position = False, np.zeros(3)
-        self.calls: list[Any] = []
-        self._freed = freed
-        self.__dict__.update(props)
-
-    def on_update(self, call: Any) -> None:  # noqa: ANN401
-        self.calls.append(call)
-
-    on_click = on_update
-
-    def remove(self) -> None:
-        self._freed()
-
-
-class WaitingEdits:
-    """Edits that are done when `work` is called, by the same thread."""
-
-    def __init__(self, env: hapticdb.Environment) -> None:
-        self._env = env
-        self._of: dict[int, PersonsEdits] = {}
-        self.asked: list[tuple[int, Any, Any, Any]] = []
-
-    def ask(self, person: int, *work: Any) -> None:  # noqa: ANN401
-        self.asked.append((person, *work))
-
-    def work(self) -> None:
-        person, job, then, failed = self.asked.pop(0)
-        own = self._of.setdefault(person, PersonsEdits(self._env))
-        try:
-            answer = job(own)
-        except HapticDBError as error:
-            failed(error)
-        else:
-            then(answer)
 
 
 class Table:
     """A person who has chosen the only part, ticked the box, and may be connected or not."""
 
     def __init__(self, env: hapticdb.Environment) -> None:
-        self.env, self.edits = env, WaitingEdits(env)
+        self.env, self._own = env, PersonsEdits(env)
+        self.asked: list[Any] = []
         self.told: list[str] = []
         self.previews: list[Any] = []
+        self.gizmos: list[MagicMock] = []
         self.clients = {CLIENT: None}
-        self.gizmos: list[Widget] = []
-        self.freed: Callable[[], object] = lambda: None
         (part,) = env.objects()
         self.id = part.id
         browser = Browser.__new__(Browser)
         browser.visitor, browser.chosen = Visitor("Ada", "editor"), (part.id,)
         browser._is_closed = False
-        scene = SimpleNamespace(add_transform_controls=self._add)
-        browser.client = SimpleNamespace(  # type: ignore[assignment]
-            client_id=CLIENT,
-            scene=scene,
-            add_notification=lambda title, *_, **__: self._tell(title),
-        )
-        self.site = SimpleNamespace(
-            edits=self.edits,
-            objects={part.id: part},
-            facts=SimpleNamespace(diagonal=1.0),
-            server=SimpleNamespace(get_clients=lambda: self.clients),
-            error_text=str,
-            view=SimpleNamespace(
-                move=lambda _, place: self.previews.append(place),
-                put_back=lambda _: self.previews.append(None),
-            ),
-        )
-        browser.site = self.site  # type: ignore[assignment]
-        made = [Widget() for _ in range(3)]
-        gui: Any = SimpleNamespace(
-            add_folder=lambda *_, **__: nullcontext(),
-            add_checkbox=lambda *_, **__: made[0],
-            add_button_group=lambda *_, **__: made[1],
-            add_button=lambda *_, **__: made[2],
-        )
-        self.controls = MovingControls(browser, gui)
-        made[0].value = True
+        browser.client = MagicMock(client_id=CLIENT)
+        browser.client.scene.add_transform_controls = self._add
+        browser.client.add_notification = lambda title, *_, **__: self.told.append(title)
+        self.site = MagicMock(objects={part.id: part}, error_text=str)
+        self.site.facts.diagonal = 1.0
+        self.site.server.get_clients = lambda: self.clients
+        self.site.edits.ask = lambda *asked: self.asked.append(asked)
+        self.site.view.move = lambda _, place: self.previews.append(place)
+        self.site.view.put_back = lambda _: self.previews.append(None)
+        browser.site = self.site
+        self.controls = MovingControls(browser, MagicMock())  # the box is ticked
         self.controls.follow()
 
-    def _tell(self, title: str) -> None:
-        self.told.append(title)
+    def _add(self, _: str, **props: Any) -> MagicMock:  # noqa: ANN401
+        self.gizmos.append(MagicMock(wxyz=(1.0, 0.0, 0.0, 0.0), **props))
+        return self.gizmos[-1]
 
-    def _add(self, _: str, **props: Any) -> Widget:  # noqa: ANN401
-        gizmo = Widget(self._free, wxyz=(1.0, 0.0, 0.0, 0.0), **props)
-        self.gizmos.append(gizmo)
-        return gizmo
-
-    def _free(self) -> None:
-        self.freed()
+    def work(self) -> None:
+        """Do the first edit that was asked for."""
+        _, job, then, failed = self.asked.pop(0)
+        try:
+            answer = job(self._own)
+        except HapticDBError as error:
+            failed(error)
+        else:
+            then(answer)
 
     @property
     def placement(self) -> NDArray[np.float64]:
         return self.env.object(self.id).transform
 
-    def drag(self, height: float, *phases: str, gizmo: Widget | None = None) -> None:
+    def drag(self, height: float, *phases: str, gizmo: MagicMock | None = None) -> None:
         """Drag the newest gizmo up, metres, with these phases; by default, a whole drag."""
         held = gizmo or self.gizmos[-1]
         for phase in phases or ("start", "update", "end"):
             if phase == "update":
                 held.position = up(height)[:3, 3] + held.position
             event = SimpleNamespace(target=held, phase=phase, client_id=CLIENT)
-            asyncio.run(held.calls[0](event))
+            asyncio.run(held.on_update.call_args.args[0](event))
 
     def see(self) -> None:
         """Follow what was committed."""
@@ -140,19 +86,19 @@ class Table:
 
 
 @pytest.fixture(scope="module")
-def sample(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    folder = tmp_path_factory.mktemp("sample")
-    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=7, extent=1.6))
-    hapticdb.import_files(folder / "car.db", [write_sample(folder, 10).wrench], options)
-    return folder / "car.db"
+def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[hapticdb.Environment]:
+    folder = tmp_path_factory.mktemp("box")
+    trimesh.creation.box((0.1, 0.1, 0.1)).export(folder / "box.stl")
+    with hapticdb.create(folder / "e.db", hapticdb.Grid(0.01, (-0.32, -0.32, -0.32), 6)) as made:
+        made.add(folder / "box.stl")
+        yield made
 
 
 @pytest.fixture
-def table(sample: Path) -> Iterator[Table]:
-    with hapticdb.open(sample) as env:
-        (part,) = env.objects()
-        yield Table(env)
-        env.move(part.id, part.transform)
+def table(env: hapticdb.Environment) -> Iterator[Table]:
+    (part,) = env.objects()
+    yield Table(env)
+    env.move(part.id, part.transform)
 
 
 def up(height: float) -> NDArray[np.float64]:
@@ -164,12 +110,12 @@ def up(height: float) -> NDArray[np.float64]:
 def test_a_move_is_written_when_it_is_let_go_of(table: Table) -> None:
     before = table.placement
     table.drag(0.002, "start", "update")
-    assert table.edits.asked == []
+    assert table.asked == []
     assert np.allclose(table.previews[-1], up(0.002) @ before)
     table.drag(0.0, "end")
-    (asked,) = table.edits.asked
+    (asked,) = table.asked
     assert asked[0] == CLIENT
-    table.edits.work()
+    table.work()
     assert np.allclose(table.placement, up(0.002) @ before)
     assert table.told == ["Done"]
 
@@ -178,7 +124,7 @@ def test_a_connection_that_is_lost_in_a_drag_moves_nothing(table: Table) -> None
     table.drag(0.002, "start", "update")
     table.clients.clear()
     table.drag(0.0, "end")  # as viser ends it
-    assert table.edits.asked == []
+    assert table.asked == []
     assert table.previews[-1] is None
 
 
@@ -192,11 +138,11 @@ def test_a_drag_that_follows_another_goes_on_from_it(table: Table, order: str) -
             table.drag(0.001)
             n_drags += 1
         elif what == "work":
-            table.edits.work()
+            table.work()
         else:
             table.see()
-    while table.edits.asked:
-        table.edits.work()
+    while table.asked:
+        table.work()
         table.see()
     assert len(table.gizmos) <= 2  # it stays while own moves are not written
     assert np.allclose(table.placement, up(0.002 + 0.001 * n_drags) @ before)
@@ -209,13 +155,13 @@ def test_another_persons_move_refuses_the_drag_and_stays(table: Table) -> None:
     table.see()
     assert len(table.gizmos) == 1  # it is being dragged
     table.drag(0.0, "end")
-    table.edits.work()
+    table.work()
     assert table.told == ["Not moved"]
     assert table.previews[-1] is None
     assert np.array_equal(table.placement, theirs.transform)
     assert len(table.gizmos) == 2
     table.drag(0.001)
-    table.edits.work()
+    table.work()
     assert np.allclose(table.placement, up(0.001) @ theirs.transform)
 
 
@@ -226,7 +172,7 @@ def test_a_drag_of_a_gizmo_that_was_replaced_is_dropped(table: Table) -> None:
     table.drag(0.001, "update")  # viser finds gizmos by name: the rest of the drag
     table.drag(0.0, "end", gizmo=table.gizmos[0])
     assert table.previews[-1] is None
-    assert table.edits.asked == []
+    assert table.asked == []
     table.env.move(table.id, up(-0.003) @ table.placement)
     table.see()
     assert len(table.gizmos) == 3
@@ -246,7 +192,7 @@ def test_two_threads_never_change_the_gizmo_at_once(table: Table) -> None:
             others[0].join(0.05)  # it would be inside by now
         n_inside -= 1
 
-    table.freed = free
+    table.gizmos[-1].remove = free
     table.controls.follow()
     joined(others[0])
     assert most == 1

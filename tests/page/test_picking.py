@@ -89,12 +89,12 @@ def test_a_box_is_met_until_its_shape_is_there() -> None:
 def test_thousands_of_shapes_can_be_hit() -> None:
     members: dict[int, Member] = {}
     targets = Targets(members)
-    for number in range(3000):  # Embree crashes when each has a device of its own
+    for number in range(1500):  # Embree crashes when each has a device of its own
         shape = PartShape(SHAPES[1].facets)
         pose = np.eye(4)
         pose[2, 3] = -float(number)
         members[number] = Member(number, pose, shape.bounds(pose), (0, 0, 0), shape)
         assert shape.first_hit(np.array([0.01, 0.02, 5.0]), np.array([0.0, 0, -1])) is not None
-    found = targets.first([0.01, 0.02, 5.0], [0, 0, -1], lambda i: i > 2000)
+    found = targets.first([0.01, 0.02, 5.0], [0, 0, -1], lambda i: i > 1000)
     assert found is not None
-    assert found.id == 2001
+    assert found.id == 1001

@@ -5,6 +5,7 @@ from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
 from types import SimpleNamespace
 from typing import Any
+from unittest.mock import MagicMock
 
 import numpy as np
 import pytest
@@ -22,8 +23,7 @@ class FakeSession:
         self.start = np.array(start)
         self.is_over, self.n_ends, self.lost_frames, self.lost_at_end = False, 0, 0, 0
 
-    def move(self, _: object) -> None:
-        """Nobody feels it."""
+    def move(self, _: object) -> None: ...
 
     def latest(self) -> None:
         """There is no frame yet."""
@@ -59,16 +59,11 @@ class Person(Browser):
         self.visitor, self.number, self.taken = Visitor("Ada", "toucher"), 0, None
         self.told: list[str] = []
         self.said: list[str] = []
-        client = SimpleNamespace(
-            client_id=0, add_notification=lambda *words, **_: self._keep(words)
-        )
-        site = SimpleNamespace(
-            host=host, workers=workers, objects={}, edits=None, free_number=lambda _: None,
-            prepare=lambda: None, connection=SimpleNamespace(preparing=""),
-            view=SimpleNamespace(contents=SimpleNamespace(leave=lambda _: None)),
-            facts=SimpleNamespace(is_smooth=False, diagonal=1.0), error_text=str,
-        )  # fmt: skip
-        self.client, self.site = client, site  # type: ignore[assignment]
+        self.client, self.site = MagicMock(client_id=0), MagicMock(host=host, workers=workers)
+        self.client.add_notification = lambda *words, **_: self.told.append(": ".join(words))
+        self.site.objects, self.site.edits, self.site.error_text = {}, None, str
+        self.site.connection.preparing = ""
+        self.site.facts = SimpleNamespace(is_smooth=False, diagonal=1.0)
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
         self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]
         self.stiffness = 1000.0
@@ -77,9 +72,6 @@ class Person(Browser):
         self._unfelt, self._keeps_tool, self._over, self._is_closed = [], None, [], False
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
         self._holding, self.colour = threading.Lock(), (0, 0, 0)
-
-    def _keep(self, words: tuple[str, ...]) -> None:
-        self.told.append(": ".join(words))
 
     def session_ended(self) -> None:
         self.said.append("session_ended")

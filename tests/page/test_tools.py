@@ -18,6 +18,8 @@ VOXEL = 0.002
 
 @pytest.mark.parametrize("smooth", [True, False])
 def test_probes_are_closed_and_about_their_origin(smooth: bool) -> None:
+    small = tools.built_in(1e-3, VOXEL, smooth=smooth)[0]
+    assert small.radius == pytest.approx(tools.LEAST_VOXELS * VOXEL, rel=0.01)
     probes = tools.built_in(1.0, VOXEL, smooth=smooth)
     assert [probe.name for probe in probes] == ["ball", "peg"]
     for probe in probes:
@@ -28,11 +30,6 @@ def test_probes_are_closed_and_about_their_origin(smooth: bool) -> None:
         assert volume > 0.0  # wound outward
         deepest = float(probe.shell.inset.max())
         assert deepest == pytest.approx(ONSET * VOXEL if smooth else 0.0, rel=0.05)
-
-
-def test_a_probe_is_never_smaller_than_its_voxels() -> None:
-    ball, _ = tools.built_in(1e-3, VOXEL, smooth=True)
-    assert ball.radius == pytest.approx(tools.LEAST_VOXELS * VOXEL, rel=0.01)
 
 
 def test_a_shell_far_from_its_origin_is_centred_with_its_normals_kept() -> None:

@@ -34,14 +34,8 @@ if (!new URLSearchParams(location.search).has("token"))
 """
 """Run before the page's own code. Else viser draws fewer pixels where it finds that it is slow, and
 two pictures of the same scene differ."""
-TWO_PICTURES = """new Promise(done => {
-    setTimeout(done, 20000)
-    requestAnimationFrame(() => requestAnimationFrame(done))
-})"""
 PATIENCE = 120.0
 """Seconds that any wait lasts at most: drawing in software is slow on a busy machine."""
-DRAGGED_STEPS = 6
-"""Places of the pointer on the way of a drag. Larger: each waits for a picture to be drawn."""
 
 
 @contextmanager
@@ -98,22 +92,10 @@ def hand_fields(page: Page) -> list[Locator]:
     return [field(page, f"{axis}, m") for axis in "xyz"]
 
 
-def hand_on(page: Page) -> Floats:
-    """Place of the hand (3,), metres, as its opened folder shows it."""
-    return np.array([float(entry.input_value()) for entry in hand_fields(page)])
-
-
 class Eye:
     """Where a page that was not turned shows places of the scene, in its pixels.
 
-    Parameters
-    ----------
-    page : Page
-        The page.
-    view : View
-        Its first view.
-    up : int
-        Number of the axis that points up.
+    view : its first view; up : number of the axis that points up.
     """
 
     def __init__(self, page: Page, view: View, up: int) -> None:
@@ -135,30 +117,8 @@ class Eye:
     def pixel(self, place: Floats) -> tuple[float, float]:
         """Pixel of a place (3,), metres."""
         way, share = place - self._place, self.pixels_a_metre(place)
-        return (
-            float(self._middle[0] + share * (way @ self._right)),
-            float(self._middle[1] - share * (way @ self._over)),
-        )
-
-
-def drawn(page: Page) -> None:
-    """Wait until two more pictures of the page have been drawn, as long as each may take."""
-    page.evaluate(TWO_PICTURES)
-
-
-def drag(page: Page, eye: Eye, grabbed: Floats, way: Floats) -> None:
-    """Drag what is at a place (3,) by a way (3,), metres, with the pointer."""
-    start, end = np.array(eye.pixel(grabbed)), np.array(eye.pixel(grabbed + way))
-    page.mouse.move(*start)
-    page.wait_for_timeout(400)
-    drawn(page)  # a gizmo notices the pointer when it is drawn next
-    page.mouse.down()
-    drawn(page)
-    for share in np.linspace(0.0, 1.0, DRAGGED_STEPS)[1:]:
-        page.mouse.move(*(start + share * (end - start)))
-        page.wait_for_timeout(60)  # viser sends 20 places of a gizmo a second
-    page.mouse.up()
-    page.wait_for_timeout(300)
+        x, y = self._middle
+        return float(x + share * (way @ self._right)), float(y - share * (way @ self._over))
 
 
 def picture(page: Page, name: str, folder: Path) -> Floats:

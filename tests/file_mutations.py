@@ -26,6 +26,9 @@ VALUES: tuple[Any, ...] = (
     {"a": 1}, float("nan"), [0, 0], "\ud800", "../seed", "data:,x", "data:;base64,AAAA", 3, 9, 100,
 )  # fmt: skip
 _NUMBER = re.compile(rb"-?\d+\.?\d*(?:[eE][-+]?\d+)?")
+_VALUE = re.compile(rb'(?<=: )("[^"]*"|[-\d.e]+|true|false)|(?<=\[)[-\d.e]+')
+_PAIR = re.compile(rb'"\w+": ("[^"]*"|[-\d.e]+|\[[^\[\]]*\]), ')
+_LIST = re.compile(rb"\[([^\[\]]+)\]")
 _ELEMENT = re.compile(rb"<(\w+)[^<>]*(?:/>|>[^<]*</\1>)")
 
 
@@ -109,43 +112,22 @@ def _elements_changed(random: Random, content: bytes) -> bytes:
 
 
 def _json_changed(random: Random, content: bytes) -> bytes:
-    is_binary = content[:4] == b"glTF"
-    start = 20 if is_binary else 0
-    try:
-        end = start + int.from_bytes(content[12:16], "little") if is_binary else len(content)
-        tree = json.loads(content[start:end])
-    except (ValueError, RecursionError):
-        return _bytes_changed(random, content)
-    if random.random() < 0.02:
-        return b'{"asset":{"version":"2.0"},"nodes":' + b"[" * 5000
-    _change(random, tree)
-    text = json.dumps(tree, ensure_ascii=True).encode()
-    if not is_binary:
+    """Value replaced, pair dropped, or list repeated, in a glTF file or the JSON of a GLB file."""
+    start = 20 if content[:4] == b"glTF" else 0
+    end = start + int.from_bytes(content[12:16], "little") if start else len(content)
+    text = content[start:end]
+    places = list(random.choice((_VALUE, _VALUE, _PAIR, _LIST)).finditer(text))
+    if places:
+        one = random.choice(places)
+        values = [json.dumps(value).encode() for value in VALUES]
+        repeated = b"[" + b", ".join([one[one.lastindex or 0]] * random.choice((2, 2000))) + b"]"
+        new = {_VALUE: random.choice(values), _PAIR: b"", _LIST: repeated}[one.re]
+        text = text[: one.start()] + new + text[one.end() :]
+    if not start:
         return text
     text += b" " * (-len(text) % 4)
     size = 20 + len(text) + len(content[end:])
     return struct.pack("<4s2I2I", b"glTF", 2, size, len(text), 0x4E4F534A) + text + content[end:]
-
-
-def _change(random: Random, tree: Any) -> None:  # noqa: ANN401 - JSON
-    """Change a value somewhere in a JSON tree."""
-    holder: Any = {"": tree}
-    key: Any = ""
-    while isinstance(holder[key], (dict, list)) and holder[key] and random.random() < 0.8:
-        holder = holder[key]
-        key = random.choice(list(holder) if isinstance(holder, dict) else range(len(holder)))
-    kind = random.randrange(6)
-    if kind == 0:
-        del holder[key]
-    elif kind == 1 and isinstance(holder[key], list):
-        holder[key] = holder[key] * random.choice((2, 2000))
-    elif kind == 2 and isinstance(holder, dict):
-        names = ("byteStride", "byteOffset", "mode", "sparse", "children")
-        holder[random.choice(names)] = random.choice(VALUES)
-    elif kind == 3 and isinstance(holder[key], int):
-        holder[key] += random.choice((-1, 1, 2))
-    else:
-        holder[key] = random.choice(VALUES)
 
 
 def _archive_changed(random: Random, content: bytes) -> bytes:

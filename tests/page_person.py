@@ -7,17 +7,14 @@ from typing import Any
 from websockets.exceptions import ConnectionClosed
 from websockets.sync.connection import Connection
 
-from children import PATIENCE
+from children import until
 from serving import CAMERA, messages, sent
 
 
 class PagePerson:
     """Knows the widgets of one connection to the page by their labels.
 
-    Parameters
-    ----------
-    connection : Connection
-        As `serving.Running.browser` makes it.
+    connection : as `serving.Running.browser` makes it.
     """
 
     def __init__(self, connection: Connection) -> None:
@@ -25,7 +22,6 @@ class PagePerson:
         self.widgets: dict[str, dict[str, Any]] = {}
         self.told: list[str] = []
         self.received: list[str] = []
-        self.n_messages = 0
         sent(connection, CAMERA)
 
     def look(self, seconds: float = 0.2) -> bool:
@@ -38,7 +34,6 @@ class PagePerson:
         return bool(self.told)
 
     def _take(self, message: dict[str, Any]) -> None:
-        self.n_messages += 1
         kind, uuid = str(message["type"]), message.get("uuid")
         if kind.startswith("Gui") or "Notification" in kind:
             self.received.append(str(message))
@@ -49,19 +44,21 @@ class PagePerson:
         elif "Notification" in kind:
             self.told.append(str(message))
 
+    def wait_for(self, words: str) -> None:
+        """Wait until the page has shown these words."""
+        until(lambda: (self.look(0.05), any(words in text for text in self.received))[1])
+
     def find(self, label: str) -> str:
         """Id of the widget with that label; waits until the page has sent it."""
-        until = time.monotonic() + PATIENCE
-        while True:
-            found = [u for u, one in self.widgets.items() if one.get("label") == label]
-            if found:
-                return found[0]
-            assert time.monotonic() < until, f"no widget {label!r} among {self.labels()}"
-            self.look()
+        found: list[str] = []
 
-    def labels(self) -> list[str]:
-        """Labels of all widgets."""
-        return [str(one.get("label")) for one in self.widgets.values()]
+        def is_there() -> bool:
+            self.look(0.05)
+            found[:] = [u for u, one in self.widgets.items() if one.get("label") == label]
+            return bool(found)
+
+        until(is_there)
+        return found[0]
 
     def press(self, label: str) -> None:
         """Press a button."""
@@ -73,11 +70,8 @@ class PagePerson:
 
     def put(self, uuid: str, value: object) -> None:
         """Send a value of a widget, whatever it is."""
-        self.send({"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}})
-
-    def send(self, message: dict[str, object]) -> None:
-        """Send any message."""
-        sent(self._connection, message)
+        update = {"type": "GuiUpdateMessage", "uuid": uuid, "updates": {"value": value}}
+        sent(self._connection, update)
 
     def put_everything(self) -> None:
         """Send every widget many values, as a client of one's own can."""

@@ -36,11 +36,10 @@ def processes() -> Iterator[tuple[int, list[str], list[str]]]:
     """Id, command line and initial environment of each living process except this one."""
     for path in Path("/proc").glob("[0-9]*"):
         pid = int(path.name)
-        if pid == os.getpid() or identity_of(pid) is None:
-            continue
         with contextlib.suppress(OSError):
             words, variables = ((path / name).read_bytes() for name in ("cmdline", "environ"))
-            yield pid, os.fsdecode(words).split("\0"), os.fsdecode(variables).split("\0")
+            if pid != os.getpid() and identity_of(pid) is not None:
+                yield pid, os.fsdecode(words).split("\0"), os.fsdecode(variables).split("\0")
 
 
 class Leftovers:

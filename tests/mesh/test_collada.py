@@ -8,29 +8,36 @@ import pytest
 from hapticdb.mesh import parse_in_process
 from mesh_files import COLLADA, area_and_volume, names, text
 
+
+def dae(folder: Path, *changes: tuple[str, str]) -> Path:
+    """The file `COLLADA` with texts replaced."""
+    content = COLLADA
+    for old, new in changes:
+        assert old in content
+        content = content.replace(old, new)
+    return text(folder / "a.dae", content)
+
+
 VERTEX = '<input semantic="VERTEX" source="#v" offset="0"/>'
 
 
 def test_a_collada_file_far_away_keeps_its_positions(tmp_path: Path) -> None:
-    far = COLLADA.replace("0 0 0 1 0 0 1 1 0\n0 1 0", "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0")
-    far = far.replace("<translate>100 0 0", "<translate>400000000.25 0 0")
-    file = parse_in_process(text(tmp_path / "far.dae", far))
+    far = "5e8 0 0 500000001 0 0 500000001 1 0 5e8 1 0"
+    moved = "<translate>100 0 0", "<translate>400000000.25 0 0"
+    file = parse_in_process(dae(tmp_path, ("0 0 0 1 0 0 1 1 0\n0 1 0", far), moved))
     np.testing.assert_allclose(file.bounds[:, 0], [14000000.0025, 14000000.0225], rtol=1e-15)
     assert not file.notes
 
 
 @pytest.mark.parametrize("declared", ["undefined", "punycode", "unicode_escape"])
 def test_an_encoding_that_is_none_for_files_is_passed_over(tmp_path: Path, declared: str) -> None:
-    content = COLLADA.replace('"1.0"?', f'"1.0" encoding="{declared}"?', 1)
-    path = text(tmp_path / "a.dae", content.replace("branch", r"\ud800"))
-    assert len(parse_in_process(path).parts) == 1
+    head = '"1.0"?', f'"1.0" encoding="{declared}"?'
+    assert len(parse_in_process(dae(tmp_path, head, ("branch", r"\ud800"))).parts) == 1
 
 
 def test_a_unit_of_a_collada_file_that_is_no_number_is_not_known(tmp_path: Path) -> None:
-    path = text(tmp_path / "a.dae", COLLADA.replace('meter="0.01"', 'meter="0,01"'))
-    assert not parse_in_process(path).names_unit
-    path = text(tmp_path / "b.dae", COLLADA.replace('<unit meter="0.01"/>', '<unit name="m"/>'))
-    assert parse_in_process(path).names_unit
+    assert not parse_in_process(dae(tmp_path, ('meter="0.01"', 'meter="0,01"'))).names_unit
+    assert parse_in_process(dae(tmp_path, ('<unit meter="0.01"/>', '<unit name="m"/>'))).names_unit
 
 
 @pytest.mark.parametrize(
@@ -60,11 +67,13 @@ def test_a_collada_unit_that_contradicts_itself_is_told_and_may_be_given(
 
 
 def test_what_a_collada_reader_cannot_use_is_counted_and_the_rest_stays(tmp_path: Path) -> None:
-    strange = "<linestrips count='1'><p>0 1</p></linestrips></mesh>"
-    spline = "<geometry id='s'><spline/></geometry></library_geometries>"
     gone = "<instance_geometry url='#gone'/><instance_light url='#sun'/></node></node>"
-    content = COLLADA.replace("</mesh>", strange).replace("</library_geometries>", spline)
-    path = text(tmp_path / "odd.dae", content.replace("</node></node>", gone))
+    path = dae(
+        tmp_path,
+        ("</mesh>", "<linestrips count='1'><p>0 1</p></linestrips></mesh>"),
+        ("</library_geometries>", "<geometry id='s'><spline/></geometry></library_geometries>"),
+        ("</node></node>", gone),
+    )
     file = parse_in_process(path)
     assert len(file.parts[0].triangles()) == 4
     assert file.notes == (
@@ -122,22 +131,20 @@ def test_a_collada_geometry_may_be_written_otherwise(tmp_path: Path, old: str, n
         "<translate>1,0 0 0</translate>",
         "<rotate>0 0 1</rotate>",
         "<lookat>0 0 0 0 0 0 0 0 1</lookat>",
+        "",
     ],
 )
 def test_a_damaged_transform_loses_what_it_places_and_no_more(tmp_path: Path, step: str) -> None:
-    node = f"<node name='lost'>{step}<instance_geometry url='#g'/></node>"
+    """Without a step, the matrix with which a skin is bound is damaged."""
     skin = "<skin source='#g'><bind_shape_matrix>1 0</bind_shape_matrix></skin></controller>"
     library = f"<library_controllers><controller id='c'>{skin}</library_controllers><library_geom"
-    content = COLLADA.replace("</visual_scene>", f"{node}</visual_scene>")
-    file = parse_in_process(text(tmp_path / "a.dae", content))
+    placed = "geometry url='#g'" if step else "controller url='#c'"
+    node = f"<node name='lost'>{step}<instance_{placed}/></node></visual_scene>"
+    path = dae(tmp_path, ("</visual_scene>", node), ("<library_geom", library))
+    file = parse_in_process(path)
     assert names(file) == ["tree/branch"]
     assert file.defects.non_finite == 4
-    assert file.notes == ("1 transform is damaged: parts there are left out",)
-    bound = node.replace(step, "").replace("geometry url='#g'", "controller url='#c'")
-    content = COLLADA.replace("</visual_scene>", f"{bound}</visual_scene>")
-    file = parse_in_process(text(tmp_path / "a.dae", content.replace("<library_geom", library)))
-    assert names(file) == ["tree/branch"]
-    assert "1 transform is damaged" in file.notes[0]
+    assert "1 transform is damaged: parts there are left out" in file.notes
 
 
 @pytest.mark.parametrize("source", ["#gone", "#c"])
@@ -145,8 +152,7 @@ def test_a_skin_of_what_is_not_there_is_told(tmp_path: Path, source: str) -> Non
     skin = f"<controller id='c'><skin source='{source}'/></controller>"
     library = f"<library_controllers>{skin}</library_controllers><library_geom"
     node = "<instance_controller url='#c'/></node></node>"
-    content = COLLADA.replace("</node></node>", node).replace("<library_geom", library)
-    file = parse_in_process(text(tmp_path / "a.dae", content))
+    file = parse_in_process(dae(tmp_path, ("</node></node>", node), ("<library_geom", library)))
     assert file.notes[0] == "1 of its 2 placements refers to what is not there"
 
 
@@ -154,10 +160,9 @@ def test_a_collada_accessor_says_where_positions_are(tmp_path: Path) -> None:
     head, _, tail = COLLADA.partition('<source id="p">')
     tail = tail.partition("</source>")[2]
     places = ("7 0 0 0 7 1 0 0 7 1 1 0 7 0 1 0 7", 4, 1), ("9 9 9 0 0 0 1 0 0 1 1 0 0 1 0", 3, 3)
-    for floats, stride, start in places:
-        source = collada_source("p", floats, stride, start)
-        file = parse_in_process(text(tmp_path / "a.dae", head + source + tail))
-        assert area_and_volume(file)[0] == pytest.approx(4 * 2e-4)
+    for place in places:
+        path = text(tmp_path / "a.dae", head + collada_source("p", *place) + tail)
+        assert area_and_volume(parse_in_process(path))[0] == pytest.approx(4 * 2e-4)
 
 
 @pytest.mark.parametrize(
@@ -178,23 +183,31 @@ def test_a_collada_node_far_away_is_turned_in_64_bits(
     assert bool(file.notes) == ("skew" in steps)
 
 
-def test_a_collada_skin_is_where_it_is_bound_and_a_morph_where_its_node_is(tmp_path: Path) -> None:
-    skin = (
-        "<skin source='#{}'><bind_shape_matrix>1 0 0 7 0 1 0 0 0 0 1 0 0 0 0 1"
-        "</bind_shape_matrix></skin>"
+@pytest.mark.parametrize(
+    ("controllers", "low"),
+    [
+        (["<skin source='#g'>{}</skin>"], 0.07),
+        (["<morph source='#g' method='NORMALIZED'/>"], 1.0),
+        (["<skin source='#c1'>{}</skin>", "<morph source='#g' method='NORMALIZED'/>"], 0.07),
+    ],
+)
+def test_a_collada_skin_is_where_it_is_bound_and_a_morph_where_its_node_is(
+    tmp_path: Path, controllers: list[str], low: float
+) -> None:
+    bound = "<bind_shape_matrix>1 0 0 7 0 1 0 0 0 0 1 0 0 0 0 1</bind_shape_matrix>"
+    made = "".join(
+        f"<controller id='c{n}'>{one.format(bound)}</controller>"
+        for n, one in enumerate(controllers)
     )
-    morph = "<morph source='#g' method='NORMALIZED'/>"
-    for inside, low in ((skin.format("g"), 0.07), (morph, 1.0), (morph + skin.format("c"), 0.07)):
-        content = COLLADA.replace("<instance_geometry url='#g'/>", "")
-        content = content.replace('instance_geometry url="#g"', 'instance_controller url="#d"')
-        first, _, second = inside.partition("/><skin")
-        pieces = [first + "/>", "<skin" + second] if second else [inside]
-        ids = ["c", "d"] if second else ["d"]
-        made = [f"<controller id='{i}'>{p}</controller>" for i, p in zip(ids, pieces, strict=True)]
-        library = f"<library_controllers>{''.join(made)}</library_controllers><library_geom"
-        file = parse_in_process(text(tmp_path / "a.dae", content.replace("<library_geom", library)))
-        assert file.bounds[0, 0] == pytest.approx(low)
-        assert "1 geometry with a" in file.notes[0]
+    file = parse_in_process(
+        dae(
+            tmp_path,
+            ('instance_geometry url="#g"', 'instance_controller url="#c0"'),
+            ("<library_geom", f"<library_controllers>{made}</library_controllers><library_geom"),
+        )
+    )
+    assert file.bounds[0, 0] == pytest.approx(low)
+    assert "1 geometry with a" in file.notes[0]
 
 
 def test_damage_in_a_collada_file_loses_no_more_than_its_geometry(tmp_path: Path) -> None:

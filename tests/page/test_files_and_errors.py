@@ -130,10 +130,6 @@ def told(person: PagePerson, *, after: int) -> str:
     return person.told[after]
 
 
-def said_of_sweep(person: PagePerson, words: str) -> None:
-    until(lambda: (person.look(0.05), any(words in text for text in person.received))[1])
-
-
 def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) -> None:
     folder = scene.parent
     recordings = folder / "recorded here"
@@ -151,7 +147,7 @@ def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) ->
         errors.append(told(person, after=0))
         assert "reads it from box.stl" in errors[-1]
         person.press("Run the sweep")
-        said_of_sweep(person, "has no surface")
+        person.wait_for("has no surface")
 
         ask(lambda env: env.object(999))
         errors.append(told(person, after=1))
@@ -235,5 +231,5 @@ def test_a_sweep_is_told_and_shown(
 
         monkeypatch.setattr("hapticdb.page.panels.sweeps.sweep", found)
         person.press("Run the sweep")
-        said_of_sweep(person, told)
+        person.wait_for(told)
         assert not any("sweep failed" in text for text in person.received)

@@ -49,7 +49,7 @@ def test_the_page_is_there_before_the_kernels_and_a_closed_server_compiles_no_mo
         with browser_at(place, Authorization=f"Bearer {token}") as connection:
             person = PagePerson(connection)
             told = "compiling what the hand needs, once: 0 of "
-            until(lambda: (person.look(0.05), any(told in text for text in person.received))[1])
+            person.wait_for(told)
             until(lambda: list(tmp_path.glob("*.pid")))
         process.send_signal(signal.SIGTERM)
         _, said = process.communicate(timeout=PATIENCE)

@@ -129,23 +129,11 @@ def test_a_flood_is_slowed_down_and_then_closed(environment: Path) -> None:
         until(lambda: is_counted(server, 'browser_connections_total{end="flood"} 1.0'))
 
 
-def test_the_page_is_started_again_and_browsers_come_back(environment: Path) -> None:
-    serving = Serving(urls(environment), tokens=TOKENS, prefix="/hapticdb", page="viser_page:work")
-    others = _pages()
-    with running(serving) as server:
-        with server.browser(Role.EDITOR) as browser:
-            sent(browser, CAMERA)
-            text_until(browser, "is a editor")
-            _kill_page(others)
-            assert close_code(browser) in {1001, 1006}
-        until(lambda: _is_back(server))
-
-
-def test_a_machine_without_room_for_the_page_gets_it_later(
+def test_a_page_that_was_killed_is_started_again_when_the_machine_has_room(
     environment: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """Neither a process nor a socket may be had for a moment; nothing stays open of the tries."""
-    serving = Serving(urls(environment), tokens=TOKENS, page="viser_page:work")
+    """No process is to be had for a moment; nothing stays open of the tries, browsers come back."""
+    serving = Serving(urls(environment), tokens=TOKENS, prefix="/hapticdb", page="viser_page:work")
     tries: list[int] = []
     others = _pages()
 
@@ -158,7 +146,12 @@ def test_a_machine_without_room_for_the_page_gets_it_later(
     monkeypatch.setattr(page_keeper, "FIRST_PAUSE", 0.05)
     with running(serving) as server:
         monkeypatch.setattr(page_keeper, "Process", begin)
-        _kill_page(others)
+        with server.browser(Role.EDITOR) as browser:
+            sent(browser, CAMERA)
+            text_until(browser, "is a editor")
+            (pid,) = _pages() - others  # the page of this server; other tests use the others
+            os.kill(pid, signal.SIGKILL)
+            assert close_code(browser) in {1001, 1006}
         until(lambda: len(tries) == 3)
         until(lambda: _is_back(server))
     assert tries[1] <= tries[0]
@@ -167,12 +160,6 @@ def test_a_machine_without_room_for_the_page_gets_it_later(
 def _pages() -> set[int]:
     """Processes of pages, of all servers that run here."""
     return {pid for pid in descendants(os.getpid()) if named(pid) == "hdb-viser_page"}
-
-
-def _kill_page(others: set[int]) -> None:
-    """Kill the page of the newest server; other tests use the others."""
-    (pid,) = _pages() - others
-    os.kill(pid, signal.SIGKILL)
 
 
 def _is_back(server: Running) -> bool:

@@ -16,8 +16,8 @@ from hapticdb.grid import CurveName
 from hapticdb.mesh import Part
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import open_store
-from hapticdb.testing import KINDS
 from naive import Voxel, voxels_of_triangles
+from voxels import KINDS
 
 Mesh = tuple[NDArray[np.float64], NDArray[np.int64]]
 Rows = dict[str, list[tuple[Any, ...]]]

@@ -10,7 +10,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, ROW_SIDE, VOXELS_A_STEP
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows, Store
-from hapticdb.testing import voxel_object
+from voxels import voxel_object
 
 Points = NDArray[np.float64]
 

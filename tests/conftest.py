@@ -11,15 +11,13 @@ import numba
 import numpy as np
 import pytest
 
-import capabilities
 import children
 import draws
 from hapticdb import PointShell
 from hapticdb.kernels.compiling import NAMES, compile_missing
 from hapticdb.pointshell.shell import fibonacci_sphere
-from hapticdb.testing.scenes import KINDS
-from installed import toy_is_installed  # noqa: F401 - a fixture
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
+from voxels import KINDS
 
 NEWEST = {"cli", "house"}
 """Rooms tested on the newest PostgreSQL alone: what is said, not what a server is asked."""
@@ -87,7 +85,6 @@ def pytest_report_header() -> list[str]:
     return [
         f"hapticdb: {where}; SQLite {apsw.sqlite_lib_version()}, {servers}, JIT {jit}",
         draws.header(),
-        *capabilities.header(),
     ]
 
 

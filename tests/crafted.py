@@ -10,7 +10,7 @@ from hapticdb import Grid
 from hapticdb.mesh import packing
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import floor_voxels, write_voxels
+from voxels import floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 NANS = np.full(6, np.nan).tobytes().hex()

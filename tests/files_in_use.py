@@ -9,7 +9,7 @@ import hapticdb
 from children import exit_code
 from hapticdb import Grid
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, floor_voxels, write_voxels
+from voxels import blob, floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 

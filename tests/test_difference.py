@@ -19,7 +19,7 @@ from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.mesh import Part
 from hapticdb.mesh.packing import pack
 from hapticdb.store.base import Band
-from hapticdb.testing import blob, voxel_object, with_distances
+from voxels import blob, voxel_object, with_distances
 
 PLACE = (12, 12, 12)
 

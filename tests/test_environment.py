@@ -31,8 +31,8 @@ from hapticdb.mesh import MeshFile, parse_in_process
 from hapticdb.paper.cost_model import machine_name
 from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
-from hapticdb.testing import KINDS
 from mesh_files import gltf
+from voxels import KINDS
 
 ELSEWHERE = placement(0.03, -0.05, 0.04, 0.7)
 

@@ -12,7 +12,7 @@ import pytest
 import hapticdb
 from children import exit_code, joined
 from hapticdb import Environment, Grid, PointShell
-from hapticdb.testing import floor_voxels, write_voxels
+from voxels import floor_voxels, write_voxels
 
 
 @pytest.fixture

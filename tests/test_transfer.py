@@ -28,8 +28,8 @@ from hapticdb.kernels.field import packing
 from hapticdb.store.base import Band, Layout, Rows
 from hapticdb.store.covering import covering
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, voxel_object, with_distances, write_voxels
 from hapticdb.transfer import CopyReport
+from voxels import blob, voxel_object, with_distances, write_voxels
 
 PLACES = ((10, 10, 10), (13, 10, 10), (11, 14, 9), (22, 22, 22))
 

@@ -51,7 +51,6 @@ if TYPE_CHECKING:
     from hapticdb.paper.cost_model import CostModel as CostModel
     from hapticdb.paper.quantiles import QuantileVector as QuantileVector
     from hapticdb.pointshell.shell import PointShell as PointShell
-    from hapticdb.pool import Pool as Pool
     from hapticdb.poses import read_poses as read_poses
     from hapticdb.poses import write_poses as write_poses
     from hapticdb.query.law import DistanceField as DistanceField

@@ -27,9 +27,9 @@ from hapticdb.kernels.field.law import DistanceFieldLaw
 from hapticdb.kernels.gpu import frames as kernels
 from hapticdb.resident import mirror
 from hapticdb.resident.table import LEAST_BUDGET
-from hapticdb.testing import blob, write_voxels
 from query import test_second_law as second
 from realtime.worlds import cloud, make, poses_in, random_shell
+from voxels import blob, write_voxels
 
 BOUND = 1e-12
 """Largest difference from the processor's sum, relative to it."""

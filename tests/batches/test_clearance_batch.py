@@ -15,9 +15,9 @@ from hapticdb import Environment, GridOptions, ImportOptions, PointShell
 from hapticdb.batches import threads
 from hapticdb.errors import UsageError
 from hapticdb.resident.table import LEAST_BUDGET
-from hapticdb.testing import write_voxels
 from moving_boxes import Boxes, apart, mesh
 from realtime.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
+from voxels import write_voxels
 
 Floats = NDArray[np.float64]
 ROUNDING = 1e-9

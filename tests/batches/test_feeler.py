@@ -8,8 +8,8 @@ import hapticdb
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.resident.residency import Residency
 from hapticdb.store.base import Keys
-from hapticdb.testing import write_voxels
 from realtime.worlds import SIZE, block, cloud, make, move, poses_in, scatter
+from voxels import write_voxels
 
 
 def test_cells_stay_in_memory_between_calls(tmp_path: Path) -> None:

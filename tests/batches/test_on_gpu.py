@@ -11,8 +11,8 @@ from numba import cuda
 from children import finished
 from hapticdb import Environment
 from hapticdb.errors import MissingExtraError, UsageError
-from hapticdb.testing import write_voxels
 from realtime.worlds import SIZE, block, cloud, make, poses_in
+from voxels import write_voxels
 
 CHECKS = (
     "laws_are_those_of_the_processor",

@@ -15,8 +15,8 @@ from hapticdb.batches import threads
 from hapticdb.batches.result import TouchBatch
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.resident.table import LEAST_BUDGET
-from hapticdb.testing import write_voxels
 from realtime.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter
+from voxels import write_voxels
 
 Floats = NDArray[np.float64]
 

@@ -15,8 +15,8 @@ from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401
 from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, CsvWriter, text_cell
 from hapticdb.recording.file import Header, Recording
 from hapticdb.recording.frame import FRAME
-from hapticdb.testing import floor_voxels, write_voxels
 from recordings import write
+from voxels import floor_voxels, write_voxels
 
 TOUCH = ("touch", "scene.db", "--tool", "tool.npz", "--poses", "path.csv")
 

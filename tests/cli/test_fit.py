@@ -14,7 +14,7 @@ from bands import band_rows
 from command_line import Run, poses, run, succeeded, tool  # noqa: F401 - fixtures
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
-from hapticdb.testing import voxel_object
+from voxels import voxel_object
 
 VOXEL = 0.001
 FLOOR = 0.0325

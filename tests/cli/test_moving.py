@@ -25,7 +25,7 @@ from hapticdb import Grid
 from hapticdb.cli.verbs import moving
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.sqlite.tables.file_tables import FileTables
-from hapticdb.testing import write_voxels
+from voxels import write_voxels
 
 # -- copy -----------------------------------------------------------------------------------------
 

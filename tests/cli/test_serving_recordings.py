@@ -15,9 +15,9 @@ from hapticdb import Grid
 from hapticdb.cli.root import TERMINATED
 from hapticdb.realtime.replay import replay
 from hapticdb.recording.file import Recording
-from hapticdb.testing import floor_voxels
 from page_person import PagePerson
 from serving import browser_at
+from voxels import floor_voxels
 
 GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
 

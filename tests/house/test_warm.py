@@ -32,7 +32,7 @@ from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
-from hapticdb.testing import KINDS, floor_voxels, write_voxels
+from voxels import KINDS, floor_voxels, write_voxels
 
 def name(entry):
     module = entry.py_func.__module__.removeprefix("hapticdb.kernels.")

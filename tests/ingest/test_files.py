@@ -37,9 +37,9 @@ from hapticdb.store import base
 from hapticdb.store.base import Layout, Object
 from hapticdb.store.refusals import present_already
 from hapticdb.store.sqlite.tables.file_tables import FileTables
-from hapticdb.testing import KINDS
 from mesh_files import gltf
 from naive import Voxel, voxels_of_points
+from voxels import KINDS
 
 
 @pytest.fixture(scope="module")

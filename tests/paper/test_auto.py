@@ -11,7 +11,7 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Layout, Store
-from hapticdb.testing import floor_voxels, write_voxels
+from voxels import floor_voxels, write_voxels
 
 ONE_RANGE = CostModel(1.0, 1e9, 0.0, 1.0, 100.0)
 NO_GAP_CLOSED = CostModel(1.0, 0.0, 0.0, 1e9, 100.0)

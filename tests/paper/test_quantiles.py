@@ -20,7 +20,7 @@ from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.grouping import cbgroup
 from hapticdb.paper.quantiles import MAX_RESOLUTION, QuantileVector
 from hapticdb.store.base import Layout, SupportsCaches
-from hapticdb.testing import blob, floor_voxels, write_voxels
+from voxels import blob, floor_voxels, write_voxels
 
 few = settings(max_examples=50, deadline=None)
 GRID = Grid(0.005, (-0.16, -0.16, -0.16), 6)

@@ -22,7 +22,6 @@ from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.store.base import Layout, Store
 from hapticdb.store.covering import covering
-from hapticdb.testing import voxel_object
 from naive import Voxel
 from query.test_frame import (  # noqa: F401 - a fixture among them
     BITS,
@@ -36,6 +35,7 @@ from query.test_frame import (  # noqa: F401 - a fixture among them
     scene_voxels,
 )
 from servers import ENGINES, named, url_on
+from voxels import voxel_object
 
 OBJECTS: tuple[tuple[str, dict[str, object]], ...] = (
     ("body/door", {"material": "steel", "mass": 12.5}),

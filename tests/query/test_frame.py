@@ -17,11 +17,10 @@ from hapticdb.grid import CurveName
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.covering import covering
-from hapticdb.testing import KINDS, blob, write_voxels
-from hapticdb.testing.scenes import EVERYWHERE
 from naive_frame import NaiveTouch, touch_of_shell
 from realtime import worlds
 from servers import ENGINES, Place, named, url_on
+from voxels import EVERYWHERE, KINDS, blob, write_voxels
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013

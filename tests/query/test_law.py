@@ -18,8 +18,8 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
-from hapticdb.testing import blob, floor_voxels, write_voxels
 from realtime.worlds import random_shell
+from voxels import blob, floor_voxels, write_voxels
 
 K = 1000.0
 SIZE = 0.005

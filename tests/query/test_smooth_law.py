@@ -16,7 +16,6 @@ from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.query.law import LAW_NAMES
 from hapticdb.store.base import Band, Keys, Rows
-from hapticdb.testing import blob, voxel_object, write_voxels
 from kernels.test_distance_law import (
     expected,
     grid_of,
@@ -27,6 +26,7 @@ from kernels.test_distance_law import (
 )
 from naive_frame import NaiveTouch
 from servers import Place
+from voxels import blob, voxel_object, write_voxels
 
 CURVES = [curve for curve in get_args(CurveName) if curve != "lexicographic"]
 

@@ -15,7 +15,7 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
 from hapticdb.realtime.stations import LARGE_FROM
 from hapticdb.recording.file import Recording
-from hapticdb.testing import floor_voxels, write_voxels
+from voxels import floor_voxels, write_voxels
 
 RATE = 500.0
 """Frames a second of the tests' sessions."""

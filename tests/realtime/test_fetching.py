@@ -30,10 +30,10 @@ from hapticdb.realtime.fetching import (
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.tracking import Wish
 from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
-from hapticdb.testing import write_voxels
 from naive_frame import touch_of_shell
 from realtime.troubled import refuse, refuse_strangely, troubled
 from realtime.worlds import Reader, block, ids_by_voxel, make, move, scatter
+from voxels import write_voxels
 
 RADIUS_M = 0.012
 """Radius of the tool in metres, as a session reports it."""

@@ -25,11 +25,11 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.postgres.schema_of import drop
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.file import remove_file
-from hapticdb.testing import write_voxels
 from naive_frame import touch_of_shell
 from realtime.test_fetching import Side, until
 from realtime.worlds import SIZE, block, ids_by_voxel, make
 from servers import Place
+from voxels import write_voxels
 
 
 @pytest.fixture

@@ -23,9 +23,9 @@ from hapticdb.realtime.report import LoopAnswer, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.timing import Timing
 from hapticdb.recording.frame import State
-from hapticdb.testing import floor_voxels, write_voxels
 from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, at, still, stroking
 from realtime.worlds import make
+from voxels import floor_voxels, write_voxels
 
 N_RING = 4096
 DIRECT = Coupling().direct(SCRIPTED, 1.0, 0.012)

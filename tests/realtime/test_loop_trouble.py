@@ -28,10 +28,10 @@ from hapticdb.realtime.loop import Loop, LoopRequest, work
 from hapticdb.realtime.timing import Timing
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable
-from hapticdb.testing import write_voxels
 from realtime.hands import Heard, at
 from realtime.sessions import floor_points
 from realtime.worlds import block, cells_of
+from voxels import write_voxels
 
 Floats = NDArray[np.float64]
 SIZE = 0.005

@@ -19,11 +19,11 @@ from hapticdb.realtime.replay import Parting, replay
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Frames, Recorder, Recording, State
 from hapticdb.recording.header import Header
-from hapticdb.testing import write_voxels
 from realtime.hands import NotedClutched, at
 from realtime.sessions import NEVER_STALE, RATE, floor_points, recorded, standing_plate
 from realtime.worlds import SIZE, block, make
 from servers import FOUND, named, url_on
+from voxels import write_voxels
 
 LAWS: tuple[LawName, ...] = ("plane", "smooth")
 GRID = Grid(SIZE, (-32 * SIZE,) * 3, 6)

@@ -17,11 +17,11 @@ from hapticdb.realtime.stations import Station, Stations
 from hapticdb.recording.frame import State
 from hapticdb.resident.held import held_tool
 from hapticdb.resident.table import CellTable
-from hapticdb.testing import floor_voxels
 from realtime.hands import stroking
 from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
 from realtime.worlds import SIZE, make, move
 from servers import Place
+from voxels import floor_voxels
 
 
 def test_edits_are_felt_and_no_frame_mixes_two_revisions(

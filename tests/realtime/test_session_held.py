@@ -16,10 +16,10 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
-from hapticdb.testing import write_voxels
 from realtime.hands import Beckoned, at, still
 from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
 from realtime.worlds import block, make
+from voxels import write_voxels
 
 
 @pytest.fixture

@@ -18,8 +18,8 @@ from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.resident.held import counts_of, held_tool
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
-from hapticdb.testing import voxel_object, write_voxels
 from naive import Voxel
+from voxels import voxel_object, write_voxels
 
 Voxels = NDArray[np.int64]
 HIERARCHICAL: list[tuple[Layout, CurveName]] = [

@@ -16,8 +16,8 @@ from hapticdb.query.law import SMOOTH, ForceLaw
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
-from hapticdb.testing import write_voxels
 from realtime.worlds import block, make, move, scatter, turned
+from voxels import write_voxels
 
 Poses = NDArray[np.float64]
 

@@ -20,8 +20,8 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Band, Rows
 from hapticdb.store.connect import open_store
 from hapticdb.store.objects_at import ids_near_voxels
-from hapticdb.testing import write_voxels
 from realtime.worlds import block, cells_of, make
+from voxels import write_voxels
 
 BUDGET = 8 << 20
 """Bytes of a table: room for 190 cells with distances."""

@@ -17,9 +17,9 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import open_store
-from hapticdb.testing import write_voxels
 from naive_frame import touch_of_shell
 from realtime.worlds import HIERARCHICAL, cloud, ids_by_voxel, make, poses_in, scatter
+from voxels import write_voxels
 
 
 @pytest.mark.parametrize("bits", [3, 6])

@@ -17,10 +17,10 @@ from hapticdb.server.access import Role
 from hapticdb.server.served import Serving
 from hapticdb.store.connect import grant
 from hapticdb.store.postgres.address import parse
-from hapticdb.testing import blob, write_voxels
 from page_person import PagePerson
 from servers import PASSWORD, Place, roles, url_as
 from serving import TOKENS, running
+from voxels import blob, write_voxels
 
 GRID = Grid(0.01, (-0.1, -0.1, -0.1), 6)
 

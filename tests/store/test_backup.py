@@ -3,6 +3,7 @@
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
+import os
 import shutil
 import sys
 from collections.abc import Callable
@@ -68,13 +69,14 @@ def test_a_copy_beside_a_writer_in_another_process_is_a_revision_of_it(
     script = (
         "import sys\n"
         "from hapticdb.store.sqlite.store import SQLiteStore\n"
-        "from hapticdb.testing import blob, write_voxels\n"
+        "from voxels import blob, write_voxels\n"
         "store = SQLiteStore.open(sys.argv[1])\n"
         "for n in range(10**6):\n"
         "    write_voxels(store, blob(n, (30, 30, 30)), f'blob {n + 2}')\n"
         "    print(n, flush=True)\n"
     )
-    with child([sys.executable, "-c", script, str(path)]) as writer:
+    paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    with child([sys.executable, "-c", script, str(path)], env=paths) as writer:
         assert writer.stdout is not None
         for n in range(5):
             writer.stdout.readline()

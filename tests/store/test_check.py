@@ -21,8 +21,8 @@ from hapticdb.store.base import Layout
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.raw import PAGE_BYTES
-from hapticdb.testing import KINDS, floor_voxels, write_voxels
 from servers import Place
+from voxels import KINDS, floor_voxels, write_voxels
 
 CASES = [
     *(("brick", name) for name in (CRAFTED | OF_BRICKS)),

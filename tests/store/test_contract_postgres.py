@@ -12,56 +12,29 @@ import pytest
 from psycopg import conninfo
 
 import hapticdb
-from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import PATIENCE
+from contract.store import StoreContract
 from hapticdb import Grid
 from hapticdb.errors import DatabaseError
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.base import Layout, Store
 from hapticdb.store.covering import covering
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.server_tables import SERVER_RESOLUTION
-from hapticdb.testing import (
-    EngineContract,
-    StoreContract,
-    blob,
-    floor_voxels,
-    with_distances,
-    write_voxels,
-)
-from hapticdb.testing.scenes import everything
 from servers import Place
+from voxels import blob, everything, floor_voxels, with_distances, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 6)
 
 
+@pytest.fixture
+def new_url(place: Place) -> Place:
+    return place
+
+
 class TestPostgresStore(StoreContract):
-    lacks = STORE_LACKS["PostgreSQL"]
-
-    @pytest.fixture(autouse=True)
-    def _place(self, place: Place) -> None:
-        self.place = place
-        self.urls: dict[str, str] = {}
-
-    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
-        self.urls[name] = self.place()
-        return PostgresStore.create(self.urls[name], grid, layout)
-
-    def reopen(self, store: Store) -> Store:
-        return PostgresStore.open(store.url, read_only=True)
-
-
-class TestPostgresEngine(EngineContract):
-    lacks = ENGINE_LACKS["PostgreSQL"]
-
-    @pytest.fixture(autouse=True)
-    def _place(self, place: Place) -> None:
-        self.place = place
-
-    def url(self) -> str:
-        return self.place()
+    pass
 
 
 @pytest.fixture

@@ -16,11 +16,9 @@ import numpy as np
 import pytest
 
 import hapticdb
-from capabilities import ENGINE_LACKS, STORE_LACKS
 from children import child, exit_code, finished
+from contract.store import StoreContract
 from files_in_use import GRID, make
-from hapticdb import Grid
-from hapticdb.store.base import Layout, Store
 from hapticdb.store.connect import backup_environment
 from hapticdb.store.schema import FORMAT_VERSION
 from hapticdb.store.sqlite import place
@@ -28,40 +26,20 @@ from hapticdb.store.sqlite.file import named_errors
 from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import (
-    EngineContract,
-    StoreContract,
-    blob,
-    with_distances,
-    write_voxels,
-)
+from voxels import blob, with_distances, write_voxels
 
 ALL_KEYS = np.array([0]), np.array([1 << 9])
 
 
+@pytest.fixture
+def new_url(tmp_path: Path) -> Callable[[], str]:
+    """Gives URLs of files that are not there yet."""
+    numbers = itertools.count()
+    return lambda: f"sqlite:///{tmp_path}/e{next(numbers)}.db"
+
+
 class TestSQLiteStore(StoreContract):
-    lacks = STORE_LACKS["SQLite"]
-
-    @pytest.fixture(autouse=True)
-    def _folder(self, tmp_path: Path) -> None:
-        self.folder = tmp_path
-
-    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
-        return SQLiteStore.create(self.folder / f"{name}.db", grid, layout)
-
-    def reopen(self, store: Store) -> Store:
-        return SQLiteStore.open(store.url, read_only=True)
-
-
-class TestSQLiteEngine(EngineContract):
-    lacks = ENGINE_LACKS["SQLite"]
-
-    @pytest.fixture(autouse=True)
-    def _folder(self, tmp_path: Path) -> None:
-        self.paths = (tmp_path / f"e{n}.db" for n in itertools.count())
-
-    def url(self) -> str:
-        return f"sqlite:///{next(self.paths)}"
+    pass
 
 
 @pytest.fixture

@@ -11,7 +11,7 @@ from hapticdb import Grid
 from hapticdb.grid import CurveName
 from hapticdb.store.base import Layout, row_shift
 from hapticdb.store.covering import box_ranges
-from hapticdb.testing import KINDS
+from voxels import KINDS
 
 triples = st.lists(st.integers(-3, 34), min_size=3, max_size=3)
 

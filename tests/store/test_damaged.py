@@ -16,7 +16,7 @@ from hapticdb.grid import CurveName
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.sqlite.raw import PAGE_BYTES
-from hapticdb.testing import blob, write_voxels
+from voxels import blob, write_voxels
 
 KINDS: tuple[tuple[Layout, CurveName, bool], ...] = (
     ("brick", "z", True),

@@ -10,7 +10,7 @@ from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import blob, write_voxels
+from voxels import blob, write_voxels
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 

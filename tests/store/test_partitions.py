@@ -18,8 +18,8 @@ import pytest
 
 import hapticdb
 from assemblies import ball
-from capabilities import STORE_LACKS
 from command_line import Run, refused, run  # noqa: F401 - a fixture
+from contract.store import StoreContract
 from crashes import (  # noqa: F401 - fixtures among them
     EDITS,
     N_PARTS,
@@ -37,7 +37,7 @@ from crashes import (  # noqa: F401 - fixtures among them
 from hapticdb import Grid, PointShell
 from hapticdb.errors import AccessError, ConnectionLostError, EnvironmentExistsError, UsageError
 from hapticdb.paper.strategies import STRATEGIES, Strategy
-from hapticdb.store.base import Layout, Store
+from hapticdb.store.base import Layout
 from hapticdb.store.connect import grant
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import wire
@@ -47,8 +47,7 @@ from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.server_tables import ServerTables
 from hapticdb.store.urls import redact, with_partitions
-from hapticdb.testing import StoreContract
-from servers import SETTINGS, kill
+from servers import SETTINGS, Place, kill
 from validity import Contents, contents, valid_contents
 
 pytestmark = pytest.mark.long
@@ -88,22 +87,21 @@ def made(spread: Spread, file: Path) -> Iterator[str]:
     dropped(url)
 
 
+@pytest.fixture
+def new_url(spread: Spread) -> Iterator[Place]:
+    urls: list[str] = []
+
+    def new() -> str:
+        urls.append(spread.url(f"environment_{len(urls)}"))
+        return urls[-1]
+
+    yield new
+    for url in urls:
+        dropped(url)
+
+
 class TestPartitionedStore(StoreContract):
-    lacks = STORE_LACKS["PostgreSQL"]
-
-    @pytest.fixture(autouse=True)
-    def _spread(self, spread: Spread) -> Iterator[None]:
-        self.spread, self.urls = spread, list[str]()
-        yield
-        for url in self.urls:
-            dropped(url)
-
-    def make(self, grid: Grid, layout: Layout, name: str = "environment") -> Store:
-        self.urls.append(self.spread.url(f"{name}_{len(self.urls)}"))
-        return PostgresStore.create(self.urls[-1], grid, layout)
-
-    def reopen(self, store: Store) -> Store:
-        return PostgresStore.open(store.url, read_only=True)
+    pass
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])

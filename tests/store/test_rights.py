@@ -36,9 +36,9 @@ from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.urls import redact
-from hapticdb.testing import floor_voxels, write_voxels
 from hapticdb.transfer import copy_environment
 from servers import SETTINGS, Place
+from voxels import floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 PASSWORD = 'no\' "secret" %40'  # noqa: S105 - of roles that live as long as a test

@@ -24,8 +24,8 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.engines import MayLag
 from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
-from hapticdb.testing import is_noticed, write_voxels
 from servers import FOUND, SETTINGS, kill, named
+from voxels import is_noticed, write_voxels
 
 
 class Pair(NamedTuple):

@@ -24,8 +24,8 @@ from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.sqlite import place as sqlite_place
 from hapticdb.store.sqlite.store import SQLiteStore
-from hapticdb.testing import is_noticed, write_voxels
 from servers import Place, roles
+from voxels import is_noticed, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)
 VOXEL = np.array([[1, 2, 3]])

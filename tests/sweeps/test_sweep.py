@@ -18,7 +18,7 @@ from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.poses import rotation_of
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import CONTACT, sweep
-from hapticdb.testing import write_voxels
+from voxels import write_voxels
 
 Floats = NDArray[np.float64]
 

@@ -17,7 +17,7 @@ from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.query.frame import NOTHING_EXCLUDED, Asked, HapticQuery
 from hapticdb.query.law import ForceLaw, TangentPlane, frames_by
 from hapticdb.query.touches import Query, Touch
-from hapticdb.store.base import Keys, LocatedShell, Rows, Store, SupportsStatement
+from hapticdb.store.base import Keys, LocatedShell, Rows, Store
 from hapticdb.store.covering import Ranges
 from hapticdb.store.filtering import ALL, Filter
 
@@ -123,8 +123,6 @@ class _Form:
                 "the strategy 'statement' computes the tangent-plane law alone: give the law "
                 "'plane', or choose another strategy"
             )
-        if not isinstance(store, SupportsStatement):
-            raise UsageError(f"{store.url} cannot compute force() inside: choose another strategy")
         placed, (addresses, _), _ = located
         frame = LocatedShell(placed, addresses, law.stiffness, exclude)
         with store.snapshot():

@@ -25,7 +25,7 @@ from hapticdb.resident.table import (
     STOP,
     CellTable,
 )
-from hapticdb.store.base import NO_KEYS, Store, SupportsWatch
+from hapticdb.store.base import NO_KEYS, Store
 from hapticdb.store.connect import open_store
 from hapticdb.store.engines import MayLag
 from hapticdb.store.filtering import ALL, Filter
@@ -50,12 +50,9 @@ MOST_IDLE = 1e-2
 sessions more of the processor is left to loops, and a moving hand is noticed later."""
 ASK_EVERY = 5e-3
 """Seconds between queries for the objects that a tool touches. Larger: names come later."""
-POLL_EVERY = 0.02
-"""Seconds between queries for the revision if the engine does not report commits. Larger: the
-writes of others are felt later."""
 CONFIRM_EVERY = 0.1
-"""Seconds between queries for the revision if the engine reports commits. Such a report may need no
-round trip, so only a query shows that the database still answers."""
+"""Seconds between queries for the revision. A store reports commits without a round trip, so only a
+query shows that the database still answers."""
 RELEASE_EVERY = 1.0
 """Seconds between checks for sessions whose processes have ended, and between questions to a
 standby for its lag. Larger: rows stay longer, the lag that is told is older."""
@@ -138,8 +135,7 @@ class Fetcher:
         if self.request.wrap:
             store = self.request.wrap(store)
         try:
-            if isinstance(store, SupportsWatch):
-                store.watch()
+            store.watch()
         except BaseException:
             store.close()
             raise
@@ -198,10 +194,9 @@ class Fetcher:
 
     def _has_changed(self) -> bool:
         """Whether others have written; queries the database only as often as the engine needs."""
-        is_watched = isinstance(self.store, SupportsWatch)
-        if isinstance(self.store, SupportsWatch) and self.store.has_changed():
+        if self.store.has_changed():
             return True
-        if self._now - self._confirmed_at < (CONFIRM_EVERY if is_watched else POLL_EVERY):
+        if self._now - self._confirmed_at < CONFIRM_EVERY:
             return False
         self._is_confirmed = True
         return self.store.revision() != self.residency.revision

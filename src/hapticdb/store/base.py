@@ -388,6 +388,20 @@ class _IsChecked(Protocol):
         """
 
 
+class LocatedShell(NamedTuple):
+    """A shell at its pose, as `Store.statement` takes it: arrays in the order of the points.
+
+    placed (N + 1, 6) float64: points in metres and normals, world frame; the last row is the tool's
+    centre; addresses (N,) int64, -1 outside the grid; `kernels.query.contact` computes both;
+    stiffness in N/m; exclude (E,) int64: ids of objects that are not felt.
+    """
+
+    placed: NDArray[np.float64]
+    addresses: Keys
+    stiffness: float
+    exclude: Keys
+
+
 class Store(
     _ReadsRows, _ReadsObjects, _WritesObjects, KeepsPairs, _KeepsStatistics, _IsChecked, Protocol
 ):
@@ -429,18 +443,8 @@ class Store(
     def identity(self) -> object:
         """A value that differs for another environment made later in the same place."""
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called; a lost connection that comes back by itself is not closed."""
-
     def close(self) -> None:
         """Close the connection."""
-
-    def give_to(self, thread: int) -> None:
-        """Give the store to another thread (`this_thread`), or to `NOBODY`.
-
-        Any thread may call it, while no other call is under way.
-        """
 
     def discard(self) -> None:
         """Close the environment, and delete it if nothing was ever written to it."""
@@ -448,43 +452,11 @@ class Store(
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision."""
 
-
-class LocatedShell(NamedTuple):
-    """A shell at its pose, as `SupportsStatement` needs it: arrays in the order of the points.
-
-    placed (N + 1, 6) float64: points in metres and normals, world frame; the last row is the tool's
-    centre; addresses (N,) int64, -1 outside the grid; `kernels.query.contact` computes both;
-    stiffness in N/m; exclude (E,) int64: ids of objects that are not felt.
-    """
-
-    placed: NDArray[np.float64]
-    addresses: Keys
-    stiffness: float
-    exclude: Keys
-
-
-@runtime_checkable
-class SupportsStatement(Protocol):
-    """An engine that computes the wrench inside one statement (the paper's Figure 3)."""
-
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
-        """Wrench (6,) of the frame, N and N m about its centre."""
+        """Wrench (6,) of the frame, N and N m about its centre, by one statement: Figure 3."""
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Every hit with every object in its voxel: points' ordinals (P,) and object ids (P,)."""
-
-
-@runtime_checkable
-class SupportsCaches(Protocol):
-    """An engine whose caches belong to this process, which can empty them."""
-
-    def drop_caches(self) -> None:
-        """Empty the connection's cache, and the operating system's cache of the file."""
-
-
-@runtime_checkable
-class SupportsWatch(Protocol):
-    """An engine that can tell at little cost whether others have committed."""
 
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
@@ -496,3 +468,11 @@ class SupportsWatch(Protocol):
         first call without a `watch`. It is not false when a commit came before the call, but on
         a server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
         """
+
+
+@runtime_checkable
+class SupportsCaches(Protocol):
+    """An engine whose caches belong to this process, which can empty them."""
+
+    def drop_caches(self) -> None:
+        """Empty the connection's cache, and the operating system's cache of the file."""

@@ -1,18 +1,11 @@
-"""Which engine a URL means: a registry from URL schemes to engines.
-
-The engines of this package are listed in `BUILT_IN`. Another distribution adds its own engine by
-an entry point of the group `hapticdb.engines`: its name is the scheme, its object an `Engine`
-(docs/extending.md). The command line and the processes of a session find an entry point, too; a
-function that registers an engine would have to be called in each of them.
+"""Which engine a URL means.
 
 An engine's module is imported when a URL first names it, so that a verb on a file loads no driver
 of a server.
 """
 
 import os
-from functools import cache
 from importlib import import_module
-from importlib.metadata import entry_points
 from typing import Literal, NamedTuple, Protocol, cast, runtime_checkable
 
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
@@ -23,8 +16,6 @@ from hapticdb.store.urls import redact, scheme_of
 Url = str | os.PathLike[str]
 Right = Literal["viewer", "toucher", "editor", "nobody"]
 """Rights of a role: read and touch; also keep cost figures; also edit; nothing."""
-GROUP = "hapticdb.engines"
-"""Entry points of other distributions that name an engine."""
 
 
 class BackupReport(NamedTuple):
@@ -118,26 +109,8 @@ class SupportsBackup(Protocol):
         """Put a copy in an environment's place, whole or not at all."""
 
 
-class _BuiltIn(NamedTuple):
-    """An engine of this package, not imported yet.
-
-    module : its attribute `ENGINE` is the engine; driver : module that it needs and that may be
-    missing, or empty; extra : name of the extra that installs that driver.
-    """
-
-    module: str
-    driver: str = ""
-    extra: str = ""
-
-
-FILE_SCHEME = "sqlite"
-"""The engine of paths, which have no scheme."""
-POSTGRES = _BuiltIn("hapticdb.store.postgres.store", "psycopg", "postgres")
-BUILT_IN = {
-    FILE_SCHEME: _BuiltIn("hapticdb.store.sqlite.store"),
-    "postgresql": POSTGRES,
-    "postgres": POSTGRES,
-}
+FOLDERS = {"": "sqlite", "sqlite": "sqlite", "postgresql": "postgres", "postgres": "postgres"}
+"""Folder of an engine's modules, by the scheme of a URL; a path has no scheme."""
 
 
 def engine_of(url: Url) -> Engine:
@@ -152,26 +125,17 @@ def engine_of(url: Url) -> Engine:
     """
     # a Path object is a path, whatever its name looks like
     scheme = scheme_of(url) if isinstance(url, str) else ""
-    built_in = BUILT_IN.get(scheme or FILE_SCHEME)
-    if built_in is None:
-        return _installed(scheme)
-    if built_in.driver:
+    if scheme not in FOLDERS:
+        raise unknown_scheme(scheme)
+    folder = FOLDERS[scheme]
+    if folder == "postgres":
         try:
-            import_module(built_in.driver)
+            import_module("psycopg")
         except ImportError as error:  # the driver is missing, or does not find its own library
             raise MissingExtraError(
-                f"{redact(os.fspath(url))} needs {built_in.driver}: install it with "
-                f"{pip_line(built_in.extra)}"
+                f"{redact(os.fspath(url))} needs psycopg: install it with {pip_line('postgres')}"
             ) from error
-    return cast("Engine", import_module(built_in.module).ENGINE)
-
-
-@cache
-def _installed(scheme: str) -> Engine:
-    """Engine of another distribution; looked for only when a URL has an unknown scheme."""
-    for found in entry_points(group=GROUP, name=scheme):
-        return cast("Engine", found.load())
-    raise unknown_scheme(scheme)
+    return cast("Engine", import_module(f"hapticdb.store.{folder}.store").ENGINE)
 
 
 def unknown_scheme(scheme: str) -> UsageError:

@@ -92,11 +92,9 @@ def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int
 class _Connection(Protocol):
     """What the connection of any engine does."""
 
-    is_closed: bool
     is_read_only: bool
 
     def close(self) -> None: ...
-    def give_to(self, thread: int) -> None: ...
     def snapshot(self) -> AbstractContextManager[None]: ...
 
 
@@ -197,18 +195,9 @@ class Tables(ABC):
 
     # -- the connection --------------------------------------------------------------------------
 
-    @property
-    def is_closed(self) -> bool:
-        """Whether `close` was called."""
-        return self._connection.is_closed
-
     def close(self) -> None:
         """Close the connection."""
         self._connection.close()
-
-    def give_to(self, thread: int) -> None:
-        """Give the store to another thread, or to `NOBODY`; only while nobody uses it."""
-        self._connection.give_to(thread)
 
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision. May be nested."""

@@ -5,8 +5,6 @@ from threading import get_ident
 
 from hapticdb.errors import UsageError
 
-NOBODY = 0
-"""Owner of a store that no thread may use: no thread has this number."""
 _forked_as = 0
 """Process id, in a process that was forked after this module was loaded; 0 in any other."""
 

@@ -9,7 +9,7 @@ from hapticdb.environment import open as open_environment
 from hapticdb.errors import HapticDBError
 from hapticdb.grid import Grid
 from hapticdb.resident.changes import writes_since
-from hapticdb.store.base import Object, SupportsWatch
+from hapticdb.store.base import Object
 
 LOOK_EVERY_S = 0.02
 """Seconds between two looks for commits of others. A larger value shows an edit later and asks the
@@ -53,8 +53,7 @@ class Follower:
         try:
             with open_environment(self._url, read_only=True) as env:
                 self.grid = env.grid
-                if isinstance(env.store, SupportsWatch):
-                    env.store.watch()
+                env.store.watch()
                 self._catch_up(env)
                 self._opened.set_result(None)
                 self._follow(env)
@@ -67,7 +66,7 @@ class Follower:
         pause = LOOK_EVERY_S
         while not self._ended.wait(pause):
             try:
-                if _may_have_changed(env):
+                if env.store.has_changed():
                     self._catch_up(env)
                 pause = LOOK_EVERY_S
             except HapticDBError:
@@ -93,8 +92,3 @@ class Follower:
         self._revisions.update({obj.id: obj.revision for obj in written})
         self._revision = revision
         self._tell(written, removed, revision)
-
-
-def _may_have_changed(env: Environment) -> bool:
-    """Whether something may have been committed since the last look."""
-    return env.store.has_changed() if isinstance(env.store, SupportsWatch) else True

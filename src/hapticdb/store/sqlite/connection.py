@@ -36,19 +36,13 @@ class FileConnection:
         self.path = path
         self.url = str(path)
         self.is_read_only = read_only
-        self.is_closed = False
         self._depth = 0
         self._seen = self._noticed = -1
         self._thread = this_thread()
 
     def close(self) -> None:
         """Close the connection. Only the last one folds the write-ahead log into its file."""
-        self.is_closed = True
         self.file.close()
-
-    def give_to(self, thread: int) -> None:
-        """Give the connection to another thread, or to `NOBODY`."""
-        self._thread = thread
 
     def check_thread(self) -> None:
         """Refuse a call from any thread but the connection's owner."""

@@ -68,10 +68,6 @@ class ServerConnection(Link, Closes):
             else:
                 return
 
-    def give_to(self, thread: int) -> None:
-        """Give the connection to another thread, or to `NOBODY`. No call may be under way."""
-        self._thread = thread
-
     def check_thread(self) -> None:
         """Refuse a call from any thread but the connection's owner."""
         check_thread(self._thread, self.shown)

@@ -1,29 +1,14 @@
-"""Tests of reading: rows by key and by object, statistics, and what only some engines can do."""
-
-from typing import Any
+"""Tests of reading: rows by key and by object, statistics, Figure 3."""
 
 import numpy as np
 import pytest
 
+from contract.case import StoreCase
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
-from hapticdb.store.base import (
-    LocatedShell,
-    Store,
-    SupportsCaches,
-    SupportsStatement,
-    SupportsWatch,
-)
+from hapticdb.store.base import LocatedShell, Store
 from hapticdb.store.covering import covering
-from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, everything, kind
-
-STORE_CAPABILITIES: dict[str, Any] = {
-    "statement": SupportsStatement,
-    "caches": SupportsCaches,
-    "watch": SupportsWatch,
-}
-"""Capabilities that only some stores have: the protocol of each, by its name in
-`StoreContract.lacks`."""
+from voxels import EVERYWHERE, blob, kind
 
 
 class ReadingContract(StoreCase):
@@ -32,7 +17,6 @@ class ReadingContract(StoreCase):
     def test_lookup_finds_every_row_of_a_key_and_no_other(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
-        """Tests `lookup` and, with fewer keys, `lookup_each`, which asks once for each."""
         spread = np.linspace(0, max(plain) + 3, 20_000, dtype=np.int64)
         known = np.array(sorted(plain), dtype=np.int64)[::3]
         keys = np.unique(np.concatenate([spread, known, known + 1]))
@@ -44,7 +28,6 @@ class ReadingContract(StoreCase):
     def test_scan_reads_closed_ranges_in_order(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:
-        """Ranges of a single key and many ranges at once are tested, too."""
         known = sorted(plain)
         cuts = np.array(known, dtype=np.int64)
         lows, highs = cuts[::5].copy(), cuts[2::5].copy()
@@ -62,7 +45,6 @@ class ReadingContract(StoreCase):
         assert store.count(lows, highs) == len(expected)
 
     def test_occupancy_returns_as_written(self, store: Store) -> None:
-        """All 512 bits of each brick return."""
         if store.layout == "voxel":
             assert not store.lookup(np.zeros(1, dtype=np.int64)).occupancy.size
             return
@@ -72,13 +54,11 @@ class ReadingContract(StoreCase):
         np.testing.assert_array_equal(mine, written.occupancy.reshape(-1, 64))
 
     def test_nothing_asked_is_nothing_found(self, store: Store) -> None:
-        """Some engines cannot bind empty arrays."""
         none = np.empty(0, dtype=np.int64)
         assert len(store.lookup(none)) == len(store.scan(none, none)) == 0
         assert len(store.lookup_each(none)) == store.count(none, none) == 0
 
     def test_rows_of_leaves_the_others_out(self, store: Store) -> None:
-        """The two objects overlap."""
         written = rows_of_voxels(blob(2, (24, 20, 20)), *kind(store))
         rows = store.rows_of(2, *EVERYWHERE)
         np.testing.assert_array_equal(rows.keys, written.keys)
@@ -87,7 +67,6 @@ class ReadingContract(StoreCase):
         assert not len(store.rows_of(3, *EVERYWHERE))
 
     def test_an_empty_environment_answers(self) -> None:
-        """It has no rows and no objects, and its revision is 0."""
         store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
         assert store.revision() == store.size().rows == len(store.objects()) == 0
         assert not list(store.changes())
@@ -105,7 +84,6 @@ class ReadingContract(StoreCase):
         assert bounds.tolist() == [int(keys[rank - 1]) for rank in ranks]
 
     def test_kept_quantiles_are_never_stale(self, store: Store) -> None:
-        """After a write they are computed again."""
         store.analyze(10)
         kept = store.quantiles(10)
         assert kept.source == "kept"
@@ -115,7 +93,6 @@ class ReadingContract(StoreCase):
         assert anew.n_rows < kept.n_rows
 
     def test_freshness_counts_the_writes_since(self, store: Store) -> None:
-        """The age is unknown before `analyze`, 0 right after it, and 1 after a removal."""
         assert store.freshness(10).revision is None
         store.analyze(10)
         assert store.freshness(10) == (2, 0)
@@ -125,24 +102,12 @@ class ReadingContract(StoreCase):
         assert store.freshness(10) == (3, 0)
 
     def test_costs_are_kept_by_machine(self, store: Store) -> None:
-        """Figures return as saved."""
         assert store.costs("here") is None
         store.save_costs("here", {"row": 0.25, "row.spread": 0.5})
         assert store.costs("here") == {"row": 0.25, "row.spread": 0.5}
         assert store.costs("there") is None
 
-    @pytest.mark.parametrize("capability", sorted(STORE_CAPABILITIES))
-    def test_the_engine_has_what_it_does_not_say_to_lack(self, capability: str) -> None:
-        """The engine also lacks what `lacks` names, so no test is skipped without need."""
-        store = self.make(Grid(0.01, (0, 0, 0), 5), "brick")
-        has_it = isinstance(store, STORE_CAPABILITIES[capability])
-        store.discard()
-        assert has_it != (capability in self.lacks)
-
     def test_figure_3_finds_the_hits_and_leaves_out_the_excluded(self, store: Store) -> None:
-        """The statements use EXISTS and force() inside the engine, if it has the capability."""
-        self.need("statement")
-        assert isinstance(store, SupportsStatement)
         both = np.array([[22, 20, 20], [16, 20, 20], [60, 60, 60]], dtype=np.int64)
         keys = store.grid.encode(both)
         if store.layout == "brick":
@@ -168,12 +133,3 @@ class ReadingContract(StoreCase):
         nothing = frame._replace(exclude=np.array([1, 2], dtype=np.int64))
         assert not store.statement(nothing).any()
         assert not len(store.statement_hits(nothing)[0])
-
-    def test_caches_are_emptied_without_a_row_lost(self, store: Store) -> None:
-        """Reads return the same rows."""
-        self.need("caches")
-        assert isinstance(store, SupportsCaches)
-        before = everything(store)
-        store.drop_caches()
-        for found, expected in zip(everything(store), before, strict=True):
-            np.testing.assert_array_equal(found, expected)

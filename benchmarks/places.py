@@ -1,20 +1,10 @@
-"""Private servers of PostgreSQL for as long as a benchmark needs them."""
+"""The tests' servers of PostgreSQL, which benchmarks use, too."""
 
-import contextlib
-from collections.abc import Iterator, Mapping
+import sys
 from pathlib import Path
 
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer
+sys.path.append(str(Path(__file__).resolve().parent.parent / "tests"))
 
+from postgres_servers import Binaries, find_binaries, serving
 
-@contextlib.contextmanager
-def serving(
-    folder: Path, binaries: Binaries, settings: Mapping[str, str]
-) -> Iterator[PrivateServer]:
-    """A server in a folder, with the given settings, that runs inside the block."""
-    server = PrivateServer.at(folder, binaries, settings)
-    server.start()
-    try:
-        yield server
-    finally:
-        server.stop()
+__all__ = ["Binaries", "find_binaries", "serving"]

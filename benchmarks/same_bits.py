@@ -23,6 +23,7 @@ commits.
 """
 
 import argparse
+import contextlib
 import json
 import platform
 import subprocess
@@ -52,15 +53,20 @@ def measure(folder: Path, given: list[Path], n_poses: int) -> Results:
     """Compute all entries on the databases of a folder."""
     folder = folder.resolve()
     folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as servers:
+        return measure_all(folder, import_car(folder, servers), given, n_poses)
+
+
+def measure_all(folder: Path, places: list[Place], given: list[Path], n_poses: int) -> Results:
+    """Compute all entries on these environments."""
     results = Results()
-    places = import_car(folder)
     tool = sample_tool(folder, places[0], n_poses)
     (digest := Digest()).feed(tool.shell.points, tool.shell.normals, tool.shell.center, tool.poses)
     results["tool and poses"] = digest.entry(len(tool.poses), "poses")
     recordings = recordings_of(places, given)
     for place in places:
         own = folder.with_name(f"{folder.name}-{place.name}.rec")
-        with hapticdb.open(place.url, read_only=True) as env:  # keeps the private server running
+        with hapticdb.open(place.url, read_only=True) as env:
             stored(place, env, results)
             touched(place, env, tool, results)
             recorded(place, tool, own, results)

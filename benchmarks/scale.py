@@ -32,12 +32,11 @@ from hapticdb.paper.strategies import Strategy
 from hapticdb.sample import write_sample
 from hapticdb.store.connect import create_store
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import find_binaries
 from paper.measure import Alternative, Cell, in_turns
 from paper.plots import draw
 from paper.subject import with_papers_cache
 from paper.workload import SEED, random_poses, slide_poses, sphere_shell
-from places import serving
+from places import find_binaries, serving
 
 EXTENT = 1.6
 """Edge of one car's grid as a multiple of the car's longest side."""

@@ -22,10 +22,10 @@ from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import LAYOUTS
-from hapticdb.store.postgres.private_server import find_binaries
 from paper.experiments import Budget
 from paper.plots import draw
 from paper.tables import EVALUATION
+from places import find_binaries
 
 TINY = Budget(0.05, 10, 1, 10, (0, 500), (10, 1000), (30, 300))
 

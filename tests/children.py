@@ -78,20 +78,10 @@ def _end_run(dog: "subprocess.Popen[bytes]", pid: int) -> None:
         dog.wait(PATIENCE)
 
 
-def end_servers_below(folder: Path) -> None:
-    """Have servers that run below a folder end with this run."""
-    _tell(f"folder {folder}")
-
-
 def end_forked(pid: int) -> None:
     """Have a process that was forked without `exec` end with this run."""
-    _tell(f"process {pid}")
-
-
-def _tell(words: str) -> None:
-    line = _line[0]
-    line.write(os.fsencode(words) + b"\n")
-    line.flush()
+    _line[0].write(b"%d\n" % pid)
+    _line[0].flush()
 
 
 @contextlib.contextmanager

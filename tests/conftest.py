@@ -100,11 +100,6 @@ def _signals_are_left_as_they_were() -> Iterator[None]:
     assert after == before
 
 
-@pytest.fixture(scope="session", autouse=True)
-def _servers_end_with_the_run(tmp_path_factory: pytest.TempPathFactory) -> None:
-    children.end_servers_below(tmp_path_factory.getbasetemp())
-
-
 @pytest.fixture(scope="session")
 def test_data() -> Path | None:
     return real_folder()

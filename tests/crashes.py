@@ -19,8 +19,8 @@ from hapticdb.ingest.files import ImportProgress
 from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres.connecting import connection
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
-from servers import kill
+from postgres_servers import Binaries, Server
+from servers import FOUND, kill, named
 from validity import Contents, contents, valid_contents
 
 N_PARTS = 30
@@ -53,23 +53,23 @@ def undisturbed(file: Path) -> dict[Layout, Contents]:
     return found
 
 
-@pytest.fixture(scope="module", params=find_binaries(), ids=lambda found: f"postgres{found.major}")
+@pytest.fixture(scope="module", params=FOUND, ids=named)
 def template(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> tuple[Path, Binaries]:
     """The folder of a server that was set up and never started."""
     folder = tmp_path_factory.mktemp("template")
-    PrivateServer.at(folder, request.param)
+    Server(folder, request.param, {})
     return folder, request.param
 
 
 @contextlib.contextmanager
 def running(
     template: tuple[Path, Binaries], settings: Mapping[str, str] | None = None
-) -> Iterator[PrivateServer]:
+) -> Iterator[Server]:
     place = Path(tempfile.mkdtemp(prefix="crash-")).resolve()
     shutil.copytree(template[0], place / "server", symlinks=True)
-    made = PrivateServer.at(place / "server", template[1], settings)
+    made = Server(place / "server", template[1], settings or {})
     made.start()
     try:
         yield made
@@ -79,23 +79,21 @@ def running(
 
 
 @pytest.fixture
-def server(template: tuple[Path, Binaries]) -> Iterator[PrivateServer]:
+def server(template: tuple[Path, Binaries]) -> Iterator[Server]:
     """A running server for one test."""
     with running(template) as made:
         yield made
 
 
 @pytest.fixture(scope="module")
-def crashing(
-    template: tuple[Path, Binaries], file: Path
-) -> Iterator[tuple[PrivateServer, Environment]]:
+def crashing(template: tuple[Path, Binaries], file: Path) -> Iterator[tuple[Server, Environment]]:
     """A server that several tests crash, and an environment on it."""
     with running(template) as made, small(made.conninfo(), file) as env:
         yield made, env
 
 
 @pytest.fixture
-def url(server: PrivateServer) -> str:
+def url(server: Server) -> str:
     return server.conninfo()
 
 
@@ -131,7 +129,7 @@ class Killer:
             joined(self._timer)
 
 
-def crash(server: PrivateServer) -> None:
+def crash(server: Server) -> None:
     """Kill the server and start it again, so that clients that wait for it can go on."""
     kill(server)
     server.start()

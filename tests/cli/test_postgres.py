@@ -4,16 +4,12 @@
 
 import re
 import shutil
-import signal
-from contextlib import AbstractContextManager
 from pathlib import Path
-from subprocess import Popen
 
 import psycopg
 import pytest
 from psycopg import sql
 
-from children import PATIENCE, child, finished
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
     test_calibrate_prints_figures_with_their_spread,
     test_info_json_has_the_documented_keys,
@@ -23,7 +19,6 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
 from hapticdb.demo import prepare
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.urls import redact
 from servers import Place
 
@@ -77,68 +72,6 @@ def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> 
     url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", parse(database).conninfo)
     refused(run("info", url), '"nowhere" does not exist', "createdb")
     refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")
-
-
-# -- a private server -----------------------------------------------------------------------------
-
-PRIVATE = "postgresql:///local?data=server"
-
-
-def started(tmp_path: Path, *args: object) -> AbstractContextManager["Popen[str]"]:
-    """The command line in its own process, which releases a private server when it ends."""
-    return child(command(*args), cwd=tmp_path)
-
-
-@pytest.mark.long
-def test_a_private_server_comes_and_goes_with_the_commands(made: Path, tmp_path: Path) -> None:
-    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
-    done = finished(importing, cwd=tmp_path)
-    assert (done.returncode, done.stderr) == (0, "")
-    assert f"{PRIVATE}: 3 objects" in done.stdout
-    folder = tmp_path / "server"
-    assert folder.is_dir()
-    args = ("touch", PRIVATE, "--tool", made / "tool.npz", "--poses", made / "path.csv", "--json")
-    with started(tmp_path, *args) as one, started(tmp_path, *args) as other:
-        ended = [process.communicate(timeout=PATIENCE) for process in (one, other)]
-    assert [one.returncode, other.returncode] == [0, 0], ended
-    assert {out.count('"pose"') for out, _ in ended} == {len(PLACES)}
-    assert not PrivateServer.at(folder).is_running
-
-
-@pytest.mark.long
-def test_a_private_server_goes_with_a_command_that_the_system_ends(
-    made: Path, tmp_path: Path
-) -> None:
-    importing = command("import", PRIVATE, made / "boxes.glb", "--bits", 6)
-    finished(importing, cwd=tmp_path, check=True)
-    stl = tool(tmp_path / "tool.stl")
-    many = poses(tmp_path / "many.csv", *[(0.0, 0.0, 0.055)] * 20_000)
-    args = ("touch", PRIVATE, "--tool", stl, "--poses", many, "--json")
-    with started(tmp_path, *args) as process:
-        assert process.stdout is not None
-        assert process.stdout.readline()
-        assert PrivateServer.at(tmp_path / "server").is_running
-        process.terminate()
-        _, err = process.communicate(timeout=PATIENCE)
-    assert (process.returncode, err) == (128 + signal.SIGTERM, "")
-    assert not PrivateServer.at(tmp_path / "server").is_running
-
-
-def test_reading_sets_no_server_up(run: Run, tmp_path: Path) -> None:
-    for verb, *rest in (("info",), ("move", "1", "--translate", "0,0,1")):
-        refused(run(verb, PRIVATE, *rest), "no environment", "hapticdb import URL FILE")
-    (tmp_path / "empty.obj").write_bytes(b"")
-    refused(run("import", PRIVATE, "empty.obj"), "empty.obj")
-    assert not (tmp_path / "server").exists()
-
-
-def test_a_private_server_has_no_host(run: Run, tmp_path: Path) -> None:
-    refused(run("info", "postgresql://host/x?data=server"), "leave host")
-    refused(run("info", "postgresql:///x?data=server&user=me"), "leave host")
-    refused(run("info", "postgresql:///x?data="), "names no folder")
-    (tmp_path / "server").mkdir()
-    (tmp_path / "server" / "mine").touch()
-    refused(run("info", PRIVATE), "holds something else")
 
 
 # -- the demo -------------------------------------------------------------------------------------

@@ -17,13 +17,13 @@ HOLDING = """
 import os, subprocess, sys, time
 import children, servers
 children.begin_run()
-server = servers.private_server(next(b for b in servers.FOUND if not isinstance(b, str)))
+server = servers.shared_server(servers.FOUND[0])
 asleep = [sys.executable, "-c", "import time; time.sleep(600)"]
 apart = subprocess.Popen(asleep, start_new_session=True)
 forked = os.fork()
 if forked:
     children.end_forked(forked)
-    print(server._postmaster(), apart.pid, forked, os.environ[children.RUN], flush=True)
+    print(server.pid, apart.pid, forked, os.environ[children.RUN], flush=True)
 time.sleep(600)
 """
 
@@ -33,8 +33,8 @@ import sys
 from pathlib import Path
 import children, servers
 children.begin_run(Path(sys.argv[1]))
-server = servers.private_server(next(b for b in servers.FOUND if not isinstance(b, str)))
-print(server._postmaster(), flush=True)
+server = servers.shared_server(servers.FOUND[0])
+print(server.pid, flush=True)
 """
 
 

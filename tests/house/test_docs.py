@@ -3,6 +3,7 @@
 import os
 import re
 import sys
+import tempfile
 from pathlib import Path
 from urllib.parse import parse_qs, urlsplit
 
@@ -10,10 +11,10 @@ import pytest
 
 from children import finished
 from hapticdb.store.postgres.connecting import link
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables import ranges as sqlite_ranges
+from postgres_servers import Binaries, serving
 from servers import FOUND, SETTINGS, named
 
 ROOT = Path(__file__).parent.parent.parent
@@ -51,27 +52,22 @@ def test_every_block_of_the_pages_runs(tmp_path: Path, pages: tuple[str, ...]) -
 
 
 @pytest.mark.long
-@pytest.mark.parametrize("binaries", [b for b in FOUND if not isinstance(b, str)], ids=named)
+@pytest.mark.parametrize("binaries", FOUND, ids=named)
 def test_every_block_of_the_postgresql_page_runs(tmp_path: Path, binaries: Binaries) -> None:
-    """The blocks use a private server, named by libpq's environment variables, and its pg_dump."""
-    server = PrivateServer.at(tmp_path / "plant", binaries, SETTINGS)
-    server.start()
-    server.create_database("plant")
-    options = parse_qs(urlsplit(server.conninfo("plant")).query)
+    """The blocks use a server that libpq's environment variables name, and its pg_dump."""
     tools = f"{Path(sys.executable).parent}{os.pathsep}{binaries.bindir}{os.pathsep}"
-    variables = {
-        "PATH": tools + os.environ["PATH"],
-        **{f"PG{name.upper()}": value for name, (value,) in options.items()},
-    }
-    try:
+    with serving(Path(tempfile.mkdtemp(prefix="plant-")), binaries, SETTINGS) as server:
+        options = parse_qs(urlsplit(server.conninfo()).query)
+        variables = {
+            "PATH": tools + os.environ["PATH"],
+            **{f"PG{name.upper()}": value for name, (value,) in options.items()},
+        }
         found = ""
-        for block in blocks("sh", "docs/postgresql.md"):
+        for block in ["createdb plant", *blocks("sh", "docs/postgresql.md")]:
             bash = ["bash", "-euo", "pipefail", "-c", block]
             done = finished(bash, cwd=tmp_path, env=os.environ | variables, patience=LONG)
             assert done.returncode == 0, done.stderr
             found = done.stdout
-    finally:
-        server.stop()
     assert "postgresql:///plant and postgresql:///restored hold the same" in found
 
 

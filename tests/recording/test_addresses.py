@@ -19,7 +19,7 @@ from recordings import header, motion, write
 
 NAMED = (
     "ws://127.0.0.1:{port}", "wss://127.0.0.1:{port}/?token=x", "http://127.0.0.1:{port}/scene.db",
-    "postgresql://ann@127.0.0.1:{port}/car", "postgresql:///car?data=beside", "sqlite:///scene.db",
+    "postgresql://ann@127.0.0.1:{port}/car", "sqlite:///scene.db",
     "scene.db?token=x", "../other/scene.db", "{folder}/scene.db", "./scene.db", "away.db", "beside",
     "gone.db", "scene.db\0", "scene.db\n", "", ".", "x" * 5000,
 )  # fmt: skip

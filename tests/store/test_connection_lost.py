@@ -38,7 +38,7 @@ from hapticdb.errors import StuckError
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.private_server import PrivateServer
+from postgres_servers import Server
 from servers import Place
 from validity import Contents, assert_valid, contents
 
@@ -50,8 +50,8 @@ class Proxy:
     COMMIT; late : the server gets the COMMIT long after the client was cut off.
     """
 
-    def __init__(self, server: PrivateServer, folder: Path) -> None:
-        self._target = str((server.folder / "socket").resolve() / ".s.PGSQL.5432")
+    def __init__(self, server: Server, folder: Path) -> None:
+        self._target = str(server.folder / ".s.PGSQL.5432")
         self.url = f"postgresql:///postgres?host={folder}&port=5432&user=hapticdb"
         self.cut: str | None = None
         self.n_cuts = 0
@@ -113,7 +113,7 @@ class Proxy:
 @pytest.mark.long
 @pytest.mark.parametrize("how", ["forwarded", "not forwarded", "late"])
 def test_a_write_whose_commit_is_not_answered_counts_once(
-    server: PrivateServer, file: Path, edited: list[Contents], how: str
+    server: Server, file: Path, edited: list[Contents], how: str
 ) -> None:
     proxy = Proxy(server, server.folder.parent)
     with small(proxy.url, file) as env:
@@ -137,7 +137,7 @@ def test_a_write_whose_commit_is_not_answered_counts_once(
 
 
 def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
-    server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Our write is lost at its COMMIT; before we reconnect, another writer moves the object."""
     proxy = Proxy(server, server.folder.parent)
@@ -160,13 +160,11 @@ def test_another_write_under_the_same_number_is_not_taken_for_ones_own(
 
 
 def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
-    server: PrivateServer, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
+    server: Server, url: str, file: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The server and its children are stopped: the connection stays, and nothing answers."""
     with small(url, file) as env:
-        pid = server._postmaster()
-        assert pid is not None
-        family = [pid, *descendants(pid)]
+        family = [server.pid, *descendants(server.pid)]
         try:
             for member in family:
                 os.kill(member, signal.SIGSTOP)

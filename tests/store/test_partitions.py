@@ -42,11 +42,11 @@ from hapticdb.store.connect import grant
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.partitions import ends
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.server_tables import ServerTables
 from hapticdb.store.urls import redact, with_partitions
+from postgres_servers import Binaries, Server
 from servers import SETTINGS, Place, kill
 from validity import Contents, contents, valid_contents
 
@@ -56,8 +56,8 @@ pytestmark = pytest.mark.long
 class Spread(NamedTuple):
     """A server, and three more for the rows of its environments."""
 
-    server: PrivateServer
-    partitions: tuple[PrivateServer, ...]
+    server: Server
+    partitions: tuple[Server, ...]
 
     def url(self, name: str) -> str:
         """URL of an environment that is to be made on the partitions."""

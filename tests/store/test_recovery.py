@@ -41,8 +41,8 @@ from hapticdb import Environment, PointShell
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Layout
-from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.tables.server_tables import ServerTables
+from postgres_servers import Server
 from servers import kill
 from validity import Contents, assert_valid, contents, valid_contents
 
@@ -53,7 +53,7 @@ from validity import Contents, assert_valid, contents, valid_contents
 @pytest.mark.usefixtures("_impatient")
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
-    server: PrivateServer,
+    server: Server,
     url: str,
     file: Path,
     undisturbed: dict[Layout, Contents],
@@ -78,7 +78,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
 @pytest.mark.long
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_goes_on_by_itself_when_the_server_comes_back(
-    server: PrivateServer,
+    server: Server,
     url: str,
     file: Path,
     undisturbed: dict[Layout, Contents],
@@ -101,7 +101,7 @@ def test_an_import_goes_on_by_itself_when_the_server_comes_back(
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
-    server: PrivateServer, url: str, file: Path, edited: list[Contents]
+    server: Server, url: str, file: Path, edited: list[Contents]
 ) -> None:
     with small(url, file) as env:
         before = contents(env)
@@ -123,7 +123,7 @@ def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
 
 @pytest.mark.parametrize(("name", "step"), [(n, s) for n, _ in EDITS for s in steps_of(n)])
 def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
-    crashing: tuple[PrivateServer, Environment], name: str, step: str
+    crashing: tuple[Server, Environment], name: str, step: str
 ) -> None:
     server, env = crashing
     before = env.store.revision()
@@ -150,7 +150,7 @@ def path() -> list[np.ndarray[Any, np.dtype[np.float64]]]:
 
 
 def test_a_long_touch_goes_on_through_a_crash(
-    server: PrivateServer,
+    server: Server,
     url: str,
     file: Path,
     sphere: PointShell,
@@ -175,7 +175,7 @@ def test_a_long_touch_goes_on_through_a_crash(
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afterwards(
-    server: PrivateServer, url: str, file: Path, sphere: PointShell
+    server: Server, url: str, file: Path, sphere: PointShell
 ) -> None:
     small(url, file).close()
     with hapticdb.open(url, read_only=True) as env:

@@ -6,6 +6,7 @@ import contextlib
 import json
 import os
 import socket
+import tempfile
 import threading
 import traceback
 from collections.abc import Iterator
@@ -33,11 +34,11 @@ from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.connect import grant
 from hapticdb.store.engines import Right
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.private_server import PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.urls import redact
 from hapticdb.transfer import copy_environment
-from servers import SETTINGS, Place
+from postgres_servers import Server, serving
+from servers import FOUND, SETTINGS, Place
 from voxels import floor_voxels, write_voxels
 
 GRID = Grid(0.005, (0, 0, 0), 7)
@@ -340,7 +341,6 @@ def urls_with(password: str) -> Iterator[str]:
         yield f"postgresql://anna@{UNREACHABLE}/plant?{key}={escaped}&connect_timeout=5"
         if "&" not in password:
             yield f"postgresql://anna@{UNREACHABLE}?environment=a&{key}={password}"
-    yield f"postgresql:///plant?data=/nowhere&user=anna&password={escaped}"
     yield f"postgresql:anna:{password}@{UNREACHABLE}/plant"
     yield f"host=127.0.0.1 port=1 password={password}"
 
@@ -413,23 +413,21 @@ def test_no_verb_prints_a_password_when_all_goes_well(run: Run, place: Place) ->
 
 
 @pytest.fixture(scope="module")
-def guarded(tmp_path_factory: pytest.TempPathFactory) -> Iterator[PrivateServer]:
+def guarded() -> Iterator[Server]:
     """A server that asks the role `anna` for her password."""
-    server = PrivateServer.at(tmp_path_factory.mktemp("guarded") / "server", settings=SETTINGS)
-    server.start()
-    rules = server.folder / "data" / "pg_hba.conf"
-    rules.write_text(f"local all anna scram-sha-256\n{rules.read_text()}")
-    with psycopg.connect(server.conninfo(), autocommit=True) as connection:
-        connection.execute(sql.SQL("CREATE ROLE anna LOGIN PASSWORD {}").format(PASSWORD))
-        connection.execute("SELECT pg_reload_conf()")
-    hapticdb.create(server.conninfo(), GRID).close()
-    grant(server.conninfo(), "anna", "viewer")
-    yield server
-    server.stop()
+    with serving(Path(tempfile.mkdtemp(prefix="guarded-")), FOUND[0], SETTINGS) as server:
+        rules = server.data / "pg_hba.conf"
+        rules.write_text(f"local all anna scram-sha-256\n{rules.read_text()}")
+        with psycopg.connect(server.conninfo(), autocommit=True) as connection:
+            connection.execute(sql.SQL("CREATE ROLE anna LOGIN PASSWORD {}").format(PASSWORD))
+            connection.execute("SELECT pg_reload_conf()")
+        hapticdb.create(server.conninfo(), GRID).close()
+        grant(server.conninfo(), "anna", "viewer")
+        yield server
 
 
 def test_a_password_comes_from_where_libpq_takes_it(
-    guarded: PrivateServer, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
+    guarded: Server, monkeypatch: pytest.MonkeyPatch, tmp_path: Path
 ) -> None:
     url = guarded.conninfo().replace("user=hapticdb", "user=anna")
     with pytest.raises(AccessError, match="no password"):

@@ -15,16 +15,16 @@ import psycopg
 import pytest
 
 import hapticdb
-from children import finished, until
+from children import until
 from command_line import PLACES, Run, made, refused, run  # noqa: F401 - fixtures
 from hapticdb import PointShell
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.engines import MayLag
-from hapticdb.store.postgres.private_server import Binaries, PrivateServer
 from hapticdb.store.postgres.store import PostgresStore
-from servers import FOUND, SETTINGS, kill, named
+from postgres_servers import Server, serving
+from servers import FOUND, SETTINGS, named
 from voxels import is_noticed, write_voxels
 
 
@@ -36,19 +36,16 @@ class Pair(NamedTuple):
     both: str
 
 
-@pytest.fixture(scope="module", params=[b for b in FOUND if not isinstance(b, str)][:1], ids=named)
+@pytest.fixture(scope="module", params=FOUND[:1], ids=named)
 def pair(request: pytest.FixtureRequest, made: Path) -> Iterator[Pair]:
     """A primary with an environment of three boxes, and a standby that has replayed it."""
     with contextlib.ExitStack() as ends:
         folder = Path(tempfile.mkdtemp(prefix="standby-")).resolve()
         ends.callback(shutil.rmtree, folder, ignore_errors=True)
-        primary = PrivateServer.at(folder / "primary", request.param, SETTINGS)
-        ends.callback(kill, primary)
-        primary.start()
+        primary = ends.enter_context(serving(folder / "primary", request.param, SETTINGS))
         hapticdb.copy_environment(made / "scene.db", primary.conninfo())
-        standby = standby_of(primary, folder / "standby", request.param)
-        ends.callback(kill, standby)
-        standby.start()
+        copy_server(primary, folder / "standby" / "data")
+        standby = ends.enter_context(serving(folder / "standby", request.param, SETTINGS))
         urls = primary.conninfo(), standby.conninfo()
         hosts = ",".join(parse_qs(urlsplit(url).query)["host"][0] for url in urls)
         both = (
@@ -59,15 +56,10 @@ def pair(request: pytest.FixtureRequest, made: Path) -> Iterator[Pair]:
         yield Pair(*urls, both)
 
 
-def standby_of(primary: PrivateServer, folder: Path, binaries: Binaries) -> PrivateServer:
-    """A copy of a server that is to follow it."""
-    folder.mkdir(mode=0o700)
-    (folder / "lock").touch(mode=0o600)
-    copied = [binaries.path("pg_basebackup"), "--write-recovery-conf", "--checkpoint=fast"]
-    copied += ["--no-sync", f"--pgdata={folder / 'data'}", f"--dbname={primary.conninfo()}"]
-    finished(copied, check=True)
-    (folder / "data").chmod(0o700)
-    return PrivateServer.at(folder, binaries, SETTINGS)
+def copy_server(primary: Server, data: Path) -> None:
+    """Copy a server's data into a folder, for a standby that follows it."""
+    words = ["--write-recovery-conf", "--checkpoint=fast", "--no-sync", f"--pgdata={data}"]
+    primary.binaries.run("pg_basebackup", *words, f"--dbname={primary.conninfo()}")
 
 
 def await_replay(pair: Pair) -> None:

@@ -110,8 +110,7 @@ def root(
       hapticdb touch car.db --tool wrench.stl --poses path.csv
 
     Instead of a file's path, a URL names an environment on PostgreSQL:
-    'postgresql://user@host/database?environment=NAME', or
-    'postgresql:///local?data=DIR', a private server in a folder.
+    'postgresql://user@host/database?environment=NAME'.
 
     'hapticdb VERB --help' shows what a verb takes, with an example.
     """  # noqa: D301 - the help text's mark of lines that stay as they are

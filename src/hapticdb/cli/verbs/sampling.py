@@ -68,7 +68,7 @@ def demo(
 
     Example: hapticdb demo demo --bits 11
 
-    Example: hapticdb demo --url 'postgresql:///local?data=DIR'
+    Example: hapticdb demo --url postgresql:///plant
     """
     from shlex import quote
 

@@ -2,8 +2,7 @@
 
 ``postgresql://user@host:port/database?environment=NAME`` and everything else that libpq takes in a
 URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
-libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?data=FOLDER`` asks for a private
-server in a folder (see `hapticdb.store.postgres.private_server`). ``?partitions=A,B`` names the
+libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?partitions=A,B`` names the
 servers of the rows of an environment that is to be made (`hapticdb.store.postgres.partitions`).
 """
 
@@ -23,14 +22,12 @@ LONGEST_NAME = 63
 class Address(NamedTuple):
     """A URL taken apart.
 
-    conninfo : for libpq, without hapticdb's own parameters; environment : the schema; data : folder
-    of the private server, if one is meant; shown : the whole URL as messages may show it;
-    partitions : servers that get the rows, as `partition_urls` reads them.
+    conninfo : for libpq, without hapticdb's own parameters; environment : the schema; shown : the
+    whole URL as messages may show it; partitions : servers of the rows, for `partition_urls`.
     """
 
     conninfo: str
     environment: str
-    data: str | None
     shown: str
     partitions: tuple[str, ...] = ()
 
@@ -44,7 +41,6 @@ def parse(url: str) -> Address:
     parts = _split(url)
     _check_login(parts, url)
     named: list[str] = []
-    data: list[str] = []
     partitions: list[str] = []
     others: list[str] = []
     found: str | None = None
@@ -52,8 +48,6 @@ def parse(url: str) -> Address:
         key, _, value = pair.partition("=")
         if key == "environment":
             named.append(unquote(value))
-        elif key == "data":
-            data.append(unquote(value))
         elif key == PARTITIONS:
             partitions += [unquote(one) for one in value.split(",")]
         else:
@@ -63,16 +57,14 @@ def parse(url: str) -> Address:
                 found = match[1] or match[2]
     if found is not None:
         named.append(found)
-    if len(set(named)) > 1 or len(data) > 1:
-        raise UsageError(f"{redact(url)}: name one environment, and one folder at most")
+    if len(set(named)) > 1:
+        raise UsageError(f"{redact(url)}: name one environment")
     environment = named[0] if named else DEFAULT_ENVIRONMENT
     _check_name(environment, url)
-    if data and not data[0]:
-        raise UsageError(f"{redact(url)}: data= names no folder")
     conninfo = urlunsplit(parts._replace(query="&".join(others), fragment=""))
     if not parts.netloc:  # urlunsplit drops the empty host's slashes
         conninfo = f"{parts.scheme}://{parts.path}{'?' + '&'.join(others) if others else ''}"
-    return Address(conninfo, environment, data[0] if data else None, redact(url), tuple(partitions))
+    return Address(conninfo, environment, redact(url), tuple(partitions))
 
 
 def _split(url: str) -> SplitResult:

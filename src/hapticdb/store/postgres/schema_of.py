@@ -1,9 +1,6 @@
 """The schema of an environment: made, opened, checked, brought up to date, dropped."""
 
-import re
-from pathlib import Path
 from typing import NamedTuple
-from urllib.parse import unquote, urlsplit
 
 from psycopg import errors, sql
 
@@ -14,75 +11,32 @@ from hapticdb.errors import (
     NewerVersionError,
     NotAnEnvironmentError,
     ReadOnlyError,
-    UsageError,
 )
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import partitions
-from hapticdb.store.postgres.address import Address, parse
+from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.migrations import MIGRATIONS
-from hapticdb.store.postgres.private_server import shared_server
 from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
-DEFAULT_DATABASE = "hapticdb"
-SERVER_IS_OURS = re.compile(r"(?:^|&)(?:host|hostaddr|port|user|service)=")
 
-
-def connected(url: str, *, read_only: bool = False, making: bool = False) -> ServerConnection:
-    """Connect to an environment's database. The environment itself may be missing.
-
-    With `making`, a private server and its database are made if they are missing.
-    """
+def connected(url: str, *, read_only: bool = False) -> ServerConnection:
+    """Connect to an environment's database. The environment itself may be missing."""
     address = parse(url)
-    try:
-        found = ServerConnection(address, conninfo(address, making=making), read_only=read_only)
-    except EnvironmentNotFoundError as error:
-        raise error if address.data is None else _not_found(address) from None
+    found = ServerConnection(address, read_only=read_only)
     if found.is_standby and not read_only:
         found.close()
         raise failures.standby(address.shown)
     return found
 
 
-def conninfo(address: Address, *, making: bool) -> str:
-    """What libpq connects to; with ``data=`` a private server, started if it does not run."""
-    if address.data is None:
-        return address.conninfo
-    parts = urlsplit(address.conninfo)
-    if parts.netloc or SERVER_IS_OURS.search(parts.query):
-        raise UsageError(
-            f"{address.shown}: data= starts a server of its own: leave host, port and user out"
-        )
-    folder = Path(address.data).expanduser().resolve()
-    if not making and not folder.exists():
-        raise _not_found(address)
-    server = shared_server(folder)
-    server.start()
-    database = unquote(parts.path.strip("/")) or DEFAULT_DATABASE
-    if making:
-        server.create_database(database)
-    return "&".join(filter(None, (server.conninfo(database), parts.query)))
-
-
-def _not_found(address: Address) -> EnvironmentNotFoundError:
-    return EnvironmentNotFoundError(
-        f"no environment {address.environment!r} at {address.shown}; make one with "
-        "'hapticdb import URL FILE'"
-    )
-
-
 def exists(url: str) -> bool:
     """Whether a schema of that name is there, an environment or not."""
-    try:
-        with connected(url, read_only=True) as connection:
-            return _has_schema(connection)
-    except EnvironmentNotFoundError:
-        if parse(url).data is None:
-            raise
-        return False
+    with connected(url, read_only=True) as connection:
+        return _has_schema(connection)
 
 
 def _has_schema(connection: ServerConnection) -> bool:
@@ -110,7 +64,9 @@ def check(connection: ServerConnection) -> None:
     """Refuse a schema that is no environment or may not be read; migrate an older environment."""
     shown, name = connection.shown, connection.address.environment
     if not _has_schema(connection):
-        raise _not_found(connection.address)
+        raise EnvironmentNotFoundError(
+            f"no environment {name!r} at {shown}; make one with 'hapticdb import URL FILE'"
+        )
     readable = connection.rows(
         "SELECT has_schema_privilege(n.oid, 'USAGE') AND has_table_privilege(c.oid, 'SELECT')"
         "  FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace"
@@ -197,11 +153,11 @@ def read_environment(connection: ServerConnection) -> Made:
 
 def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
     """Make its partitions, then the schema with all tables and the grid, in one transaction."""
-    with connected(url, making=True) as connection:
+    with connected(url) as connection:
         name = connection.address.environment
         if connection.address.partitions and _has_schema(connection):
             raise _there_already(connection)
-        spread = partitions.spread(connection.address, _partition, grid, layout)
+        spread = partitions.spread(connection.address, connected, grid, layout)
 
         def work() -> None:
             try:
@@ -239,10 +195,6 @@ def _there_already(connection: ServerConnection) -> EnvironmentExistsError:
     )
 
 
-def _partition(url: str) -> ServerConnection:
-    return connected(url, making=True)
-
-
 def _migrate_once(connection: ServerConnection) -> None:
     """Migrate from the stored version, after any other process has finished migrating."""
     row = connection.execute("SELECT format FROM environment FOR UPDATE").fetchone()
@@ -262,7 +214,7 @@ def _migrate(connection: ServerConnection, version: int) -> None:
 
 def drop(connection: ServerConnection) -> None:
     """Delete an environment, whatever is in it."""
-    partitions.drop(connection, _partition)
+    partitions.drop(connection, connected)
     schema = sql.Identifier(connection.address.environment)
     connection.write(
         lambda: connection.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)),

@@ -209,11 +209,11 @@ class _PostgresEngine:
     title = "PostgreSQL"
 
     def open(self, url: str, *, read_only: bool) -> Store:
-        """Connect to an existing environment; ``?data=FOLDER`` starts its private server."""
+        """Connect to an existing environment."""
         return PostgresStore.open(url, read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        """Make a schema, which appears whole or not at all; ``?data=FOLDER`` makes the server."""
+        """Make a schema, which appears whole or not at all."""
         return PostgresStore.create(url, grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:

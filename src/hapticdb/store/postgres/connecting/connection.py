@@ -37,12 +37,12 @@ class ServerConnection(Link, Closes):
     connection, which comes back by itself, is not closed.
     """
 
-    def __init__(self, address: Address, conninfo: str, *, read_only: bool = False) -> None:
+    def __init__(self, address: Address, *, read_only: bool = False) -> None:
         self._thread = this_thread()
         self._depth = 0
         self.is_loading = False
         self.is_closed = False
-        super().__init__(address, conninfo, read_only=read_only)
+        super().__init__(address, read_only=read_only)
 
     # -- the connection ----------------------------------------------------------------------
 

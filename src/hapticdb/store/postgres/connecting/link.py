@@ -129,10 +129,9 @@ class Link:
     waited for a statement, else None.
     """
 
-    def __init__(self, address: Address, conninfo: str, *, read_only: bool) -> None:
+    def __init__(self, address: Address, *, read_only: bool) -> None:
         self.address = address
         self.shown = address.shown
-        self._conninfo = conninfo
         self._search_path = f"{_quoted(address.environment)}, pg_temp"
         self.is_read_only = read_only
         self._leisure = 0
@@ -146,10 +145,10 @@ class Link:
 
         seconds : that the server may take to accept the connection, unless the URL says otherwise.
         """
-        given = "connect_timeout=" in self._conninfo
+        given = "connect_timeout=" in self.address.conninfo
         try:
             made = _Connection.connect(
-                self._conninfo,
+                self.address.conninfo,
                 autocommit=True,
                 client_encoding="utf8",
                 fallback_application_name="hapticdb",

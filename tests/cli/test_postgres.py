@@ -69,7 +69,7 @@ def test_no_server_is_one_line(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> None:
-    url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", parse(database).conninfo)
+    url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", database)
     refused(run("info", url), '"nowhere" does not exist', "createdb")
     refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")
 

@@ -1,29 +1,29 @@
 """URLs of environments on PostgreSQL: which server, which database, which environment in it.
 
-``postgresql://user@host:port/database?environment=NAME`` and everything else that libpq takes in a
-URL, its TLS parameters among them. An environment is a schema of its own, `hapticdb` unless named;
-libpq's own way, ``?options=-csearch_path=NAME``, names it, too. ``?partitions=A,B`` names the
-servers of the rows of an environment that is to be made (`hapticdb.store.postgres.partitions`).
+``postgresql://user@host:port/database?environment=NAME``, with libpq's parameters, TLS among them.
+An environment is a schema, `hapticdb` unless named. ``?partitions=A,B`` names the servers of the
+rows of an environment that is to be made (`hapticdb.store.postgres.partitions`).
 """
 
-import re
 from typing import NamedTuple
-from urllib.parse import SplitResult, quote, unquote, urlsplit, urlunsplit
+from urllib.parse import quote, unquote
+
+from psycopg import ProgrammingError
+from psycopg.conninfo import conninfo_to_dict, make_conninfo
 
 from hapticdb.errors import UsageError
+from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.urls import PARTITIONS, redact
 
 DEFAULT_ENVIRONMENT = "hapticdb"
-SEARCH_PATH = re.compile(r"(?:-c\s*|--)search_path=(?:\"([^\"]+)\"|([^\s,]+))")
-LONE_PERCENT = re.compile(r"%(?![0-9a-fA-F]{2})|%00")
 LONGEST_NAME = 63
 
 
 class Address(NamedTuple):
     """A URL taken apart.
 
-    conninfo : for libpq, without hapticdb's own parameters; environment : the schema; shown : the
-    whole URL as messages may show it; partitions : servers of the rows, for `partition_urls`.
+    conninfo : for libpq; environment : the schema; shown : the URL as messages may show it;
+    partitions : servers of the rows, for `partition_addresses`.
     """
 
     conninfo: str
@@ -35,61 +35,41 @@ class Address(NamedTuple):
 def parse(url: str) -> Address:
     """Take a URL apart.
 
-    Raises `UsageError` when the environment's name cannot be a schema's, or is given twice; when
-    the text is no URL; when the URL names a user or a database that no server can have.
+    Raises `UsageError` when libpq does not read it, when a name in it is none that a server can
+    have, or when it names two environments.
     """
-    parts = _split(url)
-    _check_login(parts, url)
-    named: list[str] = []
-    partitions: list[str] = []
-    others: list[str] = []
-    found: str | None = None
-    for pair in parts.query.split("&") if parts.query else []:
-        key, _, value = pair.partition("=")
-        if key == "environment":
-            named.append(unquote(value))
-        elif key == PARTITIONS:
-            partitions += [unquote(one) for one in value.split(",")]
-        else:
-            # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
-            others.append(f"{key}={value.replace('=', '%3D')}")
-            if key == "options" and (match := SEARCH_PATH.search(unquote(value))):
-                found = match[1] or match[2]
-    if found is not None:
-        named.append(found)
-    if len(set(named)) > 1:
-        raise UsageError(f"{redact(url)}: name one environment")
-    environment = named[0] if named else DEFAULT_ENVIRONMENT
-    _check_name(environment, url)
-    conninfo = urlunsplit(parts._replace(query="&".join(others), fragment=""))
-    if not parts.netloc:  # urlunsplit drops the empty host's slashes
-        conninfo = f"{parts.scheme}://{parts.path}{'?' + '&'.join(others) if others else ''}"
-    return Address(conninfo, environment, redact(url), tuple(partitions))
-
-
-def _split(url: str) -> SplitResult:
-    """Split a URL; refuse one that libpq would misread and then quote in its message.
-
-    An @ that is not escaped in a password makes a part of the password a host, which libpq's
-    message would show.
-    """
+    shown = redact(url)
+    head, _, query = url.partition("?")
+    authority, _, path = head.partition("://")[2].partition("/")
+    # libpq would take a part of a password with an @ for a host, and name it in its message
+    if authority.count("@") > 1 or "@" in path or "#" in url or "\0" in url:
+        raise failures.unusable("", shown)
+    pairs = [pair.partition("=") for pair in query.split("&") if pair]
+    named = {unquote(value) for key, _, value in pairs if key == "environment"}
+    if len(named) > 1:
+        raise UsageError(f"{shown}: name one environment")
+    environment = named.pop() if named else DEFAULT_ENVIRONMENT
+    _check_environment(environment, shown)
+    spread = [value.split(",") for key, _, value in pairs if key == PARTITIONS]
+    others = [
+        # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
+        f"{key}{equals}{value.replace('=', '%3D')}"
+        for key, equals, value in pairs
+        if key not in {"environment", PARTITIONS}
+    ]
     try:
-        parts = urlsplit(url)
-    except ValueError:  # the error's text may hold the password
-        raise UsageError(f"{redact(url)} is no URL: check the host and its brackets") from None
-    pairs = [pair.partition("=") for pair in parts.query.split("&") if pair]
-    if (
-        parts.netloc.count("@") > 1
-        or "@" in parts.path
-        or "#" in url
-        or any(not equals or "@" in key for key, equals, _ in pairs)
-        or LONE_PERCENT.search(url)
-    ):
-        raise UsageError(
-            f"{redact(url)} is no URL: write @ : / ? # % in a password or name as "
-            "%40 %3A %2F %3F %23 %25"
-        )
-    return parts
+        login = conninfo_to_dict(f"{head}?{'&'.join(others)}")
+        for key, what in (("user", "user"), ("dbname", "database")):
+            name = str(login.get(key, ""))
+            if len(name.encode()) > LONGEST_NAME:
+                raise UsageError(
+                    f"{shown}: a {what}'s name {name!r} is longer than the {LONGEST_NAME} bytes "
+                    "that PostgreSQL allows: give it as the server lists it"
+                )
+    except (ProgrammingError, UnicodeError) as error:  # not shown: it may hold the password
+        raise failures.unusable(str(error), shown) from None
+    hosts = tuple(unquote(one) for part in spread for one in part)
+    return Address(make_conninfo("", **login), environment, shown, hosts)
 
 
 def with_environment(url: str, name: str) -> str:
@@ -97,33 +77,30 @@ def with_environment(url: str, name: str) -> str:
     check_name(name, "an environment's name")
     head, _, query = url.partition("?")
     kept = [pair for pair in query.split("&") if pair and not pair.startswith("environment=")]
-    for n, pair in enumerate(kept):
-        if pair.startswith("options="):
-            rest = SEARCH_PATH.sub("", unquote(pair.removeprefix("options="))).strip()
-            kept[n] = f"options={quote(rest, safe='')}"
     named = f"environment={quote(name, safe='')}"
     return f"{head}?{'&'.join([*kept, named])}"
 
 
-def partition_urls(address: Address) -> list[str]:
-    """URLs of the partitions: each a URL, or a host whose user and database are the address's.
+def partition_addresses(address: Address) -> list[Address]:
+    """Addresses of the partitions: each a URL, or a host with the address's user and database.
 
     Raises `UsageError` when one is neither.
     """
-    own = _split(address.conninfo)
-    login = own.netloc.rpartition("@")[0]
+    own = conninfo_to_dict(address.conninfo, host=None, hostaddr=None, port=None)
     found = []
     for given in address.partitions:
-        url = given
-        if "://" not in given:
-            host = f"{login}@{given}" if login else given
-            url = f"postgresql://{host}{own.path}{'?' + own.query if own.query else ''}"
+        url = given if "://" in given else f"postgresql://{given}"
         if not given or not url.startswith(("postgresql://", "postgres://")):
             raise UsageError(
                 f"{address.shown}: a partition {redact(given)!r}: give hosts, or URLs of "
                 "PostgreSQL, with commas between"
             )
-        found.append(with_environment(url, address.environment))
+        part = parse(with_environment(url, address.environment))
+        if url != given:
+            part = part._replace(
+                conninfo=make_conninfo("", **own | conninfo_to_dict(part.conninfo))
+            )
+        found.append(part)
     return found
 
 
@@ -147,32 +124,16 @@ def check_name(name: str, what: str) -> None:
         )
 
 
-def _check_login(parts: SplitResult, url: str) -> None:
-    """Refuse long names of users and databases: the server would cut them off to other names."""
-    pairs = [pair.partition("=") for pair in parts.query.split("&")]
-    user = parts.netloc.rpartition("@")[0].partition(":")[0]
-    names = [("a user's name", user), ("a database's name", parts.path.removeprefix("/"))]
-    names += [("a user's name", value) for key, _, value in pairs if unquote(key) == "user"]
-    names += [("a database's name", value) for key, _, value in pairs if unquote(key) == "dbname"]
-    for what, quoted in names:
-        name = unquote(quoted)
-        if len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME:
-            raise UsageError(
-                f"{redact(url)}: {what} {name!r} is longer than the {LONGEST_NAME} bytes that "
-                "PostgreSQL allows: give it as the server lists it"
-            )
-
-
-def _check_name(name: str, url: str) -> None:
+def _check_environment(name: str, shown: str) -> None:
     if (
         not name
         or not name.isprintable()  # nor half a surrogate pair, which no server accepts
         or "$$" in name  # would end the text of a function
-        or len(name.encode("utf-8", "surrogateescape")) > LONGEST_NAME
+        or len(name.encode()) > LONGEST_NAME
         or name.startswith("pg_")
         or name in {"public", "information_schema"}
     ):
         raise UsageError(
-            f"{redact(url)}: {name!r} cannot be an environment's name; give one of 1 to "
+            f"{shown}: {name!r} cannot be an environment's name; give one of 1 to "
             f"{LONGEST_NAME} bytes that is not the server's own"
         )

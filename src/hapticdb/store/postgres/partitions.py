@@ -17,7 +17,7 @@ from psycopg import errors, sql
 from hapticdb.errors import AccessError, EnvironmentExistsError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Table, row_shift
-from hapticdb.store.postgres.address import Address, partition_urls
+from hapticdb.store.postgres.address import Address, partition_addresses
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.migrations import AUTOVACUUM, BAND, BRICK, VOXEL
 
@@ -71,23 +71,23 @@ def ends(grid: Grid, layout: Layout, table: Table, n: int) -> list[int]:
 
 def spread(
     address: Address,
-    connect: Callable[[str], ServerConnection],
+    connect: Callable[[Address], ServerConnection],
     grid: Grid,
     layout: Layout,
 ) -> "Callable[[ServerConnection], None]":
     """Make the partitions of a new environment; returns what its own transaction does then.
 
-    address : of the environment, with its `partitions`; connect : connects to a partition's URL.
+    address : of the environment, with its `partitions`; connect : connects to a partition.
     """
-    urls = partition_urls(address)
-    if not urls:
+    partitions = partition_addresses(address)
+    if not partitions:
         return lambda _: None
     for table in TABLES[layout]:
-        ends(grid, layout, table, len(urls))
+        ends(grid, layout, table, len(partitions))
     made: list[ServerConnection] = []
     try:
-        for url in urls:
-            made.append(connect(url))
+        for partition in partitions:
+            made.append(connect(partition))
             made[-1].write(lambda: _make_partition(made[-1], layout))
     except BaseException:
         _undo(made)
@@ -105,13 +105,13 @@ def spread(
     return join
 
 
-def drop(connection: ServerConnection, connect: Callable[[str], ServerConnection]) -> None:
+def drop(connection: ServerConnection, connect: Callable[[Address], ServerConnection]) -> None:
     """Delete an environment's servers, and its partitions where the address names them."""
     name = connection.address.environment
     for (server,) in connection.rows(SERVERS, (name, _server_name(name, "%"))):
         drop_server = sql.SQL("DROP SERVER {} CASCADE").format(sql.Identifier(server))
         connection.write(lambda text=drop_server: connection.execute(text))  # type: ignore[misc]
-    _undo([connect(url) for url in partition_urls(connection.address)])
+    _undo([connect(one) for one in partition_addresses(connection.address)])
 
 
 def _server_name(environment: str, number: object) -> str:

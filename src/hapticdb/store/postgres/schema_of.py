@@ -16,7 +16,7 @@ from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import Layout
 from hapticdb.store.postgres import partitions
-from hapticdb.store.postgres.address import parse
+from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.migrations import MIGRATIONS
@@ -25,7 +25,11 @@ from hapticdb.store.schema import FORMAT_VERSION, migrations_after
 
 def connected(url: str, *, read_only: bool = False) -> ServerConnection:
     """Connect to an environment's database. The environment itself may be missing."""
-    address = parse(url)
+    return connect(parse(url), read_only=read_only)
+
+
+def connect(address: Address, *, read_only: bool = False) -> ServerConnection:
+    """Connect to a database; refuses a standby that is to be written."""
     found = ServerConnection(address, read_only=read_only)
     if found.is_standby and not read_only:
         found.close()
@@ -157,7 +161,7 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
         name = connection.address.environment
         if connection.address.partitions and _has_schema(connection):
             raise _there_already(connection)
-        spread = partitions.spread(connection.address, connected, grid, layout)
+        spread = partitions.spread(connection.address, connect, grid, layout)
 
         def work() -> None:
             try:
@@ -214,7 +218,7 @@ def _migrate(connection: ServerConnection, version: int) -> None:
 
 def drop(connection: ServerConnection) -> None:
     """Delete an environment, whatever is in it."""
-    partitions.drop(connection, connected)
+    partitions.drop(connection, connect)
     schema = sql.Identifier(connection.address.environment)
     connection.write(
         lambda: connection.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema)),

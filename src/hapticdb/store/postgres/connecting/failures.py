@@ -25,14 +25,14 @@ IS_STANDBY = "server is in hot standby mode"
 """What libpq says of a standby where it was asked for a primary."""
 EACH_HOST = "All failures were:"
 """What psycopg says before it lists the failure of each host."""
-OF_HOST = re.compile(r"- host: (None|'.*?'), port: (None|'.*?'), hostaddr: (?:None|'.*?'): ")
 ATTEMPT = re.compile(
+    r"(?:- host: '?(?P<host>.*?)'?, port: '?(?P<port>.*?)'?, hostaddr: (?:None|'.*?'): )?"
     r"(?:connection (?:failed|is bad): )?"
     r'(?:connection to server (?:on socket "(?P<socket>[^"]*)"'
-    r'|at "(?P<address>[^"]*)"(?: \([^)]*\))?, port (?P<port>\d+)) failed: )?'
-    r"(?:FATAL: +)?"
+    r'|at "(?P<address>[^"]*)"(?: \([^)]*\))?, port (?P<at>\d+)) failed: )?'
+    r"(?:FATAL: +)?(?P<why>.*)"
 )
-"""What libpq and psycopg say before the reason why one attempt has failed."""
+"""What psycopg and libpq say of one attempt to connect."""
 FULL = "too many clients|too many connections|slots are reserved|no more connections allowed"
 
 
@@ -45,42 +45,46 @@ def named_errors(shown: str) -> Iterator[None]:
         raise named(error, shown) from error
 
 
+MEANINGS: dict[type[HapticDBError], str] = {
+    StuckError: "{} did not answer in time ({}); raise the limit with "
+    "?options=-cstatement_timeout=MS, or look for what holds the server up",
+    BusyError: "{} was changed or is being written by another: try again later ({})",
+    ReadOnlyError: "{}: this user may not do that ({}); its owner can allow it with "
+    "'hapticdb grant URL ROLE --as editor'",
+    # to a user without rights, a schema looks as if it did not exist
+    DamagedError: "{} is damaged ({}), or this user may no longer use it: ask its owner, "
+    "restore a copy, or import the files again",
+    DatabaseError: "{}: the server has no room left ({}); nothing is half done",
+    ConnectionLostError: "{}: one of its partitions cannot be reached ({}); what was committed is "
+    "safe, so run the same again when it is back",
+}
+"""Words of our errors for errors of a server that answers: the URL, and the cause."""
+NAMED: dict[type[psycopg.Error], type[HapticDBError]] = {
+    errors.QueryCanceled: StuckError,
+    errors.LockNotAvailable: BusyError,
+    errors.DeadlockDetected: BusyError,
+    errors.SerializationFailure: BusyError,
+    errors.InsufficientPrivilege: ReadOnlyError,
+    errors.ReadOnlySqlTransaction: ReadOnlyError,
+    errors.UndefinedTable: DamagedError,
+    errors.UndefinedColumn: DamagedError,
+    errors.UndefinedFunction: DamagedError,
+    errors.DiskFull: DatabaseError,
+    errors.OutOfMemory: DatabaseError,
+    errors.SqlclientUnableToEstablishSqlconnection: ConnectionLostError,
+    errors.ConnectionFailure: ConnectionLostError,
+}
+
+
 def named(error: psycopg.Error, shown: str) -> HapticDBError:
     """Error of `hapticdb.errors` for an error of psycopg."""
     cause = _line(error)
-    if isinstance(error, errors.QueryCanceled):
-        return StuckError(
-            f"{shown} did not answer in time ({cause}); raise the limit with "
-            "?options=-cstatement_timeout=MS, or look for what holds the server up"
-        )
-    if isinstance(error, (errors.LockNotAvailable, errors.DeadlockDetected)):
-        return BusyError(f"{shown} is being written by another: try again later ({cause})")
-    if isinstance(error, errors.SerializationFailure):
-        return BusyError(f"{shown} was changed by another meanwhile: try again ({cause})")
-    if isinstance(error, (errors.InsufficientPrivilege, errors.ReadOnlySqlTransaction)):
-        return ReadOnlyError(
-            f"{shown}: this user may not do that ({cause}); its owner can allow it with "
-            "'hapticdb grant URL ROLE --as editor'"
-        )
-    if isinstance(error, (errors.UndefinedTable, errors.UndefinedColumn, errors.UndefinedFunction)):
-        return DamagedError(  # to a user without rights, a schema looks as if it did not exist
-            f"{shown} is damaged ({cause}), or this user may no longer use it: ask its owner, "
-            "restore a copy, or import the files again"
-        )
     if isinstance(error, (errors.DataCorrupted, errors.IndexCorrupted)):
         return damaged(shown, cause)
-    if isinstance(error, (errors.DiskFull, errors.OutOfMemory)):
-        return DatabaseError(
-            f"{shown}: the server has no room left ({cause}); nothing is half done"
-        )
-    if isinstance(
-        error, (errors.SqlclientUnableToEstablishSqlconnection, errors.ConnectionFailure)
-    ):
-        why = " ".join((error.diag.message_detail or cause).split())
-        return ConnectionLostError(
-            f"{shown}: one of its partitions cannot be reached ({why}); what was committed is "
-            "safe, so run the same again when it is back"
-        )
+    if (ours := NAMED.get(type(error))) is not None:
+        if ours is ConnectionLostError:  # of a partition
+            cause = " ".join((error.diag.message_detail or cause).split())
+        return ours(MEANINGS[ours].format(shown, cause))
     if is_lost(error):
         return ConnectionLostError(
             f"{shown}: the server went away ({cause}); what was committed is safe, "
@@ -110,7 +114,7 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     libpq gives no code here, only text. The text tells the usual causes apart.
     """
     if _line(error).startswith("connection is bad: invalid"):  # what libpq does not know
-        return unusable(error, shown)
+        return unusable(_line(error), shown)
     hosts = _reasons(str(error))
     cause = "; ".join(hosts)
     if re.search(r'database ".*" does not exist', cause):
@@ -138,43 +142,29 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
 
 
 def _reasons(text: str) -> list[str]:
-    """Why a connection could not be made, in short: a text for each host of the URL.
-
-    A host may have several reasons, one for each of its addresses.
-    """
-    found: dict[str, dict[str, None]] = {}  # in order, each once
-    where = ""
-    is_listed = EACH_HOST in text
+    """Why a connection could not be made, in short: each reason of each host of the URL once."""
+    found: dict[str, None] = {}
     for line in text.rpartition(EACH_HOST)[2].splitlines():
-        if is_listed and (named := OF_HOST.match(line)):
-            host, port = (word.strip("'") for word in named.groups())
-            where = host if port == "None" else f"{host}:{port}"
-            line = line[named.end() :]  # noqa: PLW2901 - the rest of it
-        if not line.strip() or line.startswith("\t"):  # libpq's advice
-            continue
-        attempt = ATTEMPT.match(line)
-        assert attempt is not None  # noqa: S101 - it matches any text
-        if not is_listed:
-            address = f"{attempt['address']}:{attempt['port']}" if attempt["port"] else ""
-            where = attempt["socket"] or address or where
-        found.setdefault(where, {})[" ".join(line[attempt.end() :].split())] = None
-    return [
-        f"{where}: {' and '.join(reasons)}" if where else " and ".join(reasons)
-        for where, reasons in found.items()
-    ]
+        one = ATTEMPT.fullmatch(line)
+        if one and one["why"] and not line.startswith("\t"):  # where libpq's advice is
+            host, port = (one["host"], one["port"]) if one["host"] else (one["address"], one["at"])
+            where = one["socket"] if not host else host if port == "None" else f"{host}:{port}"
+            found[f"{where}: {one['why']}" if where else one["why"]] = None
+    return list(found)
 
 
-def unusable(error: psycopg.Error, shown: str) -> UsageError:
+def unusable(cause: str, shown: str) -> UsageError:
     """Error for a URL that libpq refuses.
 
     libpq quotes what it does not understand, which may be a piece of a password. The quotation is
     shown only if the redacted URL contains it.
     """
-    cause = _line(error).removeprefix("connection is bad: ")
-    if any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):
-        cause = "libpq knows no such parameters"
+    cause = " ".join(cause.removeprefix("connection is bad: ").split())
+    if not cause or any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):
+        cause = "libpq cannot read it"
     return UsageError(
-        f"{shown}: {cause}; write NAME=VALUE for each parameter, and % & = in values as %25 %26 %3D"
+        f"{shown}: {cause}; write NAME=VALUE for each parameter, and @ : / ? # % & = in names, "
+        "passwords and values as %40 %3A %2F %3F %23 %25 %26 %3D"
     )
 
 

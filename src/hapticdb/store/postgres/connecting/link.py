@@ -158,7 +158,7 @@ class Link:
         except psycopg.OperationalError as error:
             raise failures.refused(error, self.shown) from None
         except psycopg.Error as error:
-            raise failures.unusable(error, self.shown) from None
+            raise failures.unusable(str(error), self.shown) from None
         made.link = self
         self.given_up = None
         self.driver: psycopg.Connection[tuple[Any, ...]] = made

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from hapticdb.store.base import BRICK_BYTES, Band, LocatedShell, Rows
 
-BYTEA, INT8, INT4, TEXT, FLOAT8 = 17, 20, 23, 25, 701
+BYTEA, INT8, TEXT, FLOAT8 = 17, 20, 25, 701
 INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
 HEADER_BYTES = 20
 _INT8S = np.dtype([("length", ">i4"), ("value", ">i8")])

@@ -151,15 +151,7 @@ def allowed(url: str) -> set[str]:
     return found
 
 
-@pytest.mark.parametrize("right", ALLOWED)
-def test_the_server_holds_a_role_to_its_right(
-    url: str, roles: dict[Right, str], right: Right
-) -> None:
-    grant(url, roles[right], right)
-    assert allowed(url_as(url, roles[right])) == ALLOWED[right]
-
-
-def test_a_new_right_replaces_the_former(url: str, roles: dict[Right, str]) -> None:
+def test_the_server_holds_a_role_to_its_last_right(url: str, roles: dict[Right, str]) -> None:
     role = roles["editor"]
     for right in ("editor", "viewer", "toucher", "nobody"):
         grant(url, role, right)

@@ -194,17 +194,9 @@ def test_long_names_have_channels_of_their_own_that_the_server_takes() -> None:
 # --- notifications from roles without rights -----------------------------------------------------
 
 FORGED = [
-    "",
-    "nonsense",
-    "-1",
-    "0",
-    "²",
-    "9" * 5000,
-    "9223372036854775807",
-    "1e300",
-    "\x1b[2J",
-    "x" * 7999,
-]
+    "", "nonsense", "-1", "0", "²", "9" * 5000, "9223372036854775807", "1e300",
+    "\x1b[2J", "x" * 7999,
+]  # fmt: skip
 
 
 @pytest.fixture

@@ -4,8 +4,8 @@
     make realtime ARGS=--quick                 # short sessions, into results-quick/
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
-same poses, and so do the smooth law and a budget of points. Sessions: `hapticdb feel` as a user
-runs it, on SQLite and on PostgreSQL. Edits: how soon a session feels another one's commit.
+same poses, and so does the smooth law. Sessions: `hapticdb feel` as a user runs it, on SQLite and
+on PostgreSQL. Edits: how soon a session feels another one's commit.
 """
 
 import argparse
@@ -31,12 +31,11 @@ from awake import awake
 from dense_frame import dense_bitmap, dense_feel
 from editing import edits
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import BUFFERS, RESULTS
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.poses import read_poses, write_poses
 from hapticdb.query.law import DistanceField
 from hapticdb.resident.frames import ResidentFrames
-from hapticdb.resident.held import counts_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.sample import write_sample
@@ -49,15 +48,8 @@ EXTENT = 1.6
 """Edge of the grid as a multiple of the model's longest side."""
 ROUNDS = 7
 """Number of timed passes over all poses; the result is their median."""
-BUDGET = 10_000
-"""Points near something that a frame with a budget looks at, at most."""
-WAYS: dict[str, dict[str, Any]] = {
-    "flat": {"run": 0},
-    "session": {},
-    "budget": {"budget_points": BUDGET},
-}
-"""Options of `ResidentFrames`: no clusters; as a session has it; with a budget."""
-EXACT = ("dense", "flat", "session")
+WAYS: dict[str, dict[str, Any]] = {"flat": {"run": 0}, "session": {}}
+"""Options of `ResidentFrames`: no clusters; as a session has it."""
 RATES = (1000, 5000)
 """Frames a second of the sessions."""
 FRAMES = 1000
@@ -93,7 +85,6 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         residency = Residency(env.store, table)
         frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
         frames["smooth"] = ResidentFrames(residency, shell, DistanceField())
-        left_out = frames["budget"].feel(poses).left_out
         frames["smooth"].feel(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]
@@ -111,17 +102,16 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
                         one = frames[name]
                         feel_kernel(
                             table.cells, row, one.clusters, poses, residency.place, one.law,
-                            one.hits, one.missed, out, one.budget, counts_of(1),
+                            one.hits, one.missed, out,
                         )  # fmt: skip
                     spent.append((time.perf_counter() - started) / len(poses) * 1e6)
                     found[name] = out
-        assert all(np.array_equal(found[name], found["dense"]) for name in EXACT), "bit for bit"
+        assert all(np.array_equal(found[name], found["dense"]) for name in WAYS), "bit for bit"
         medians = {name: float(np.median(spent[1:])) for name, spent in times.items()}
         return {
             "points": len(shell),
             "poses": len(poses),
             "hits": float(found["dense"][:, 6].mean()),
-            "frames_beyond_budget": int((left_out > 0).sum()),
             "cells": residency.writer.n_resident,
             "bitmap_mb": bitmap.nbytes / 1e6,
             "us_per_frame": medians,

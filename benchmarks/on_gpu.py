@@ -33,7 +33,6 @@ from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.poses import read_poses
-from hapticdb.resident.held import counts_of
 from hapticdb.sample import write_sample
 from slide_paths import write_along
 
@@ -108,7 +107,7 @@ def results_of(gpu: GpuFrames, poses: Floats) -> Floats:
 def on_processor(feeler: Feeler, poses: Floats) -> Floats:
     """The same of frames on the processor, in one thread."""
     frames, out = feeler._frames, np.zeros((len(poses), RESULTS))  # noqa: SLF001 - measured
-    frames._feel(poses, out, counts_of(len(poses)))  # noqa: SLF001
+    frames._run(poses, out, 0, len(poses))  # noqa: SLF001
     return out
 
 

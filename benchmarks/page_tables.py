@@ -81,8 +81,7 @@ def sessions(results: Results) -> str:
 
 def frames(results: Results) -> str:
     """Microseconds of the dense bitmap, and the others' times as multiples of it."""
-    heads = {"flat": "cells, flat loop", "session": "as a session", "budget": "with a budget"}
-    heads |= {"smooth": "smooth law"}
+    heads = {"flat": "cells, flat loop", "session": "as a session", "smooth": "smooth law"}
     return listed(
         results["realtime"]["frames"],
         {

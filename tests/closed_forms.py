@@ -29,7 +29,7 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.stations import Station, Stations
-from hapticdb.resident.held import PreparedTool, budget_of, spheres_of
+from hapticdb.resident.held import spheres_of
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -196,15 +196,14 @@ SPRING = DeviceSpring(
 )  # fmt: skip
 
 
-def tool_of(points: ArrayLike, size: float, run: int = 64) -> PreparedTool:
+def tool_of(points: ArrayLike, size: float, run: int = 64) -> Clusters:
     """A tool of points (N, 3) about their centre, without normals; size: of a voxel, m."""
     at = np.asarray(points, float).reshape(-1, 3)
     both = np.hstack([at, np.tile([0.0, 0.0, 1.0], (len(at), 1))])
-    clusters = Clusters(
+    return Clusters(
         both, at.mean(axis=0), *spheres_of(both, size, run), run, np.ascontiguousarray(at.T),
         np.zeros((SCRATCH_ROWS, run)),
     )  # fmt: skip
-    return PreparedTool(clusters, budget_of(clusters.spheres, None, len(at)))
 
 
 class Hand:
@@ -219,8 +218,7 @@ class Hand:
         **spring: float,
     ) -> None:
         self.field = field
-        tool = tool_of(points, field.place.size)
-        self.shell = tool.clusters
+        self.shell = tool = tool_of(points, field.place.size)
         reach = np.linalg.norm(self.shell.points[:, :3] - self.shell.center, axis=1).max()
         radius = max(float(reach), field.place.size)
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
@@ -229,7 +227,7 @@ class Hand:
             self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
         )
         row = self._station.row
-        row["place"], row["is_running"], self._station.follower["merges_from"] = field.place, 1, 0
+        row["place"], row["is_running"] = field.place, 1
         self._station.set_spring(self.spring)
         self._station.rest_at(np.concatenate([position, quaternion]))
         self.servo, self.follower = self._station.servo, self._station.follower

@@ -17,7 +17,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.stations import Station, Stations
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import clusters_of
 
 Floats = NDArray[np.float64]
 
@@ -57,7 +57,7 @@ class SmoothHand:
         self._periods = Stations(SMOOTH)
         self._station = Station(
             self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
-            ground.residency.grid, held_tool(shell, ground.size),
+            ground.residency.grid, clusters_of(shell, ground.size),
         )  # fmt: skip
         self._hand, self._sent = self._station.servo["hand"], self._station.servo["sent"]
         self._handle = Handle()
@@ -66,7 +66,7 @@ class SmoothHand:
         self._station.rest_at(pose_numbers(self._hand).copy())
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
         lever = max(reach, ground.size)
-        self._spring = DeviceSpring(
+        spring = DeviceSpring(
             stiffness=terms.stiffness,
             turn_stiffness=terms.stiffness * lever**2,
             cap=CAP,
@@ -77,18 +77,11 @@ class SmoothHand:
             hold=0.02,
             fade=0.02,
         )
-        self._station.set_spring(self._spring)
-        self._station.row["is_running"], self._station.follower["merges_from"] = True, 0
+        self._station.set_spring(spring)
+        self._station.row["is_running"] = True
         self._station.row["staleness"] = np.iinfo(np.int64).max
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))
-
-    def grant(self, cap: float) -> None:
-        """Take the cap of a server, N, and no damper, which is the client's."""
-        self._spring = self._spring._replace(
-            damping=0.0, cap=cap, turn_cap=cap * self._spring.radius
-        )
-        self._station.set_spring(self._spring)
 
     def step(self, pose: Floats, velocity: Floats) -> Floats:
         """Force (3,) on the device after one period, N.

@@ -24,7 +24,9 @@ from command_line import (  # noqa: F401 - fixtures
     scene,
     succeeded,
 )
+from hapticdb.cli.session_page import tell_cost
 from hapticdb.cli.values import size_bytes
+from hapticdb.query.law import LawName
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
 
@@ -99,17 +101,22 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert again["reason"].startswith("since the environment was edited: revision ")
 
 
-def test_a_budget_of_points_is_told_recorded_and_replayed(run: Run, scene: Path) -> None:
-    wish = feel(*PLAY, "--speed", 0.5, "--no-baseline", "--budget-points", 40)
-    out = succeeded(run(*wish, "--record", "felt.hdbrec"))
-    assert re.search(
-        r"^ *budget +40 points a frame; [\d,]+ frames? left out [\d,]+ points at most$", out,
-        re.MULTILINE,
-    )  # fmt: skip
-    assert Recording(scene.with_name("felt.hdbrec")).header.budget_points == 40
-    code, out, err = run("replay", "felt.hdbrec")
-    assert (code, err) == (0, OPENED)
-    assert out.startswith("equal: ")
+@pytest.mark.parametrize(
+    ("n_points", "rate", "law", "told"),
+    [
+        (300, 1000.0, "smooth", ""),
+        (20_000, 1000.0, "smooth", "20,000 points near a surface takes about 12 ms"),
+        (300, 20_000.0, "plane", ""),
+        (20_000, 5000.0, "plane", "takes about 1 ms, and 5,000 Hz leave 0.2 ms"),
+    ],
+)
+def test_what_a_large_tool_costs_is_said_in_a_line(
+    n_points: int, rate: float, law: LawName, told: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    tell_cost(n_points, rate, law)
+    said = capsys.readouterr().err
+    assert told in said
+    assert len(said.splitlines()) == bool(told)
 
 
 @pytest.mark.usefixtures("scene")
@@ -158,7 +165,6 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "random", "--at", ABOVE, "--seed", -1], ["--seed -1: give 0 or more"]),
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
-        ([*PLAY, "--budget-points", 0], ["a budget of 0 points leaves nothing to feel: give 1"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
         ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),

@@ -20,10 +20,10 @@ from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_
 from hapticdb.kernels.query import refining
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cells as resident
-from hapticdb.kernels.resident.budget import feel_kernel
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.frame import locate
-from hapticdb.resident.held import counts_of, held_tool
+from hapticdb.resident.held import clusters_of
 from naive_frame import NaiveTouch, distance_at, touch_distances
 from realtime import worlds
 
@@ -191,9 +191,9 @@ def on_cells(cells: resident.Cells, shell: PointShell, pose: Array, run: int | N
     """Result (RESULTS,) of a frame on resident cells."""
     out, met = np.zeros((1, resident.RESULTS)), np.empty(len(shell), dtype=np.int64)
     place = resident.Place(*ORIGIN, SIZE, float(1 << BITS))
-    clusters, budget = held_tool(shell, SIZE, run=run)
+    clusters = clusters_of(shell, SIZE, run)
     missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
-    feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out, budget, counts_of(1))
+    feel_kernel(cells, 0, clusters, pose[None], place, LAW, met, missed, out)
     return out[0]  # type: ignore[no-any-return]
 
 

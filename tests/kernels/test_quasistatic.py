@@ -15,6 +15,7 @@ from closed_forms import (
     Field,
     Hand,
     corner,
+    cylinder,
     field_of,
     hole,
     moved,
@@ -414,3 +415,24 @@ def test_a_hand_that_rests_on_a_surface_never_gains_energy(ground: str) -> None:
     assert (np.diff(windows) <= 1e-9).all()
     assert windows[0] - windows[-1] > 1e-3
     assert np.linalg.norm(velocity) < 1e-3
+
+
+@NEEDS_JIT
+def test_runs_that_are_tested_by_their_spheres_change_no_force() -> None:
+    """A broad tool comes from afar, slides, and leaves, over a plane and a cylinder."""
+    points = punch(40, 0.002)
+    cells = ((points - points.min(axis=0)) / np.ptp(points) * 255.0).astype(np.int64)
+    codes = sum(((cells[:, a] >> b) & 1) << (3 * b + a) for a in range(3) for b in range(8))
+    points = points[np.argsort(codes, kind="stable")]  # as in shells made from files
+    ways = [(0.0, 0.0, 0.03 * (1.0 - s)) for s in np.linspace(0.0, 1.0, 40)]
+    ways += [(0.03 * s, 0.0, 0.0) for s in np.linspace(0.0, 1.0, 40)]
+    for distance, height in ((plane([0.0, 0.0, 1.0]), 0.0), (cylinder(0.1), 0.1)):
+        field, at = field_of(distance, SIZE), np.array([0.0, 0.0, height + 1.5 * SIZE - 0.004])
+        forces = []
+        for is_large in (False, True):
+            hand = Hand(field, points, at + ways[0])
+            hand.follower["is_large"] = is_large
+            hand.advance()
+            forces.append(np.array([hand.move(at + way) for way in ways]))
+        assert forces[0].any()
+        np.testing.assert_allclose(forces[1], forces[0], atol=1e-9)

@@ -43,7 +43,6 @@ def test_the_simulator_moves_the_tool_as_the_processor(simulated: str, check: st
     [
         ({"frames_on": "tpu"}, "'tpu': choose 'cpu' or 'cuda'"),
         ({"frames_on": "cuda", "law": "plane"}, "smooth law"),
-        ({"frames_on": "cuda", "budget_points": 9}, "budget of points is for frames on 'cpu'"),
     ],
 )
 def test_what_a_gpu_cannot_do_is_refused_before_anything_is_opened(

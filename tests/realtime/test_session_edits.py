@@ -15,7 +15,7 @@ from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.session import Session
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.recording.frame import State
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 from realtime.hands import stroking
 from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
@@ -51,7 +51,7 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
         periods = Stations(SMOOTH if is_smooth else PLANE, seats, rings)
         cells = table.cells if is_smooth else table.cells.without_distances()
         station = Station(
-            periods.rows, cells, row, table.desk.sessions[row, ...], grid, held_tool(sphere, 0.01)
+            periods.rows, cells, row, table.desk.sessions[row, ...], grid, clusters_of(sphere, 0.01)
         )
         station.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
         station.servo["hand"]["quaternion"][0] = station.servo["tool"]["quaternion"][0] = 1.0

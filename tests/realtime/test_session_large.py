@@ -1,4 +1,4 @@
-"""Sessions of large tools: clusters sleep by themselves, and a budget bounds the points."""
+"""Sessions of large tools, whose clusters sleep by themselves."""
 
 from collections.abc import Iterator
 from pathlib import Path
@@ -11,20 +11,18 @@ from banded import write_points
 from children import PATIENCE
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
-from hapticdb.errors import UsageError
 from hapticdb.query.law import PLANE, LawName
 from hapticdb.realtime.replay import replay
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
-from realtime.hands import at, still
+from realtime.hands import at
 from realtime.sessions import NEVER_STALE, felt_at, floor_points, floored, recorded, standing_plate
 from realtime.worlds import SIZE, make
 
 RATE = 100.0
 """Frames a second: periods so long that a busy machine keeps them."""
-BUDGET = 150
 
 
 class Ground(NamedTuple):
@@ -62,11 +60,11 @@ def pressing(low: float) -> Player:
     return Player(np.linspace(0.0, 1.5, 5), [at(x, 0.0, z) for x, z in places])
 
 
-def felt(ground: Ground, shell: PointShell, path: Path, budget: int | None = None) -> Report:
+def felt(ground: Ground, shell: PointShell, path: Path) -> Report:
     hand = pressing(ground.height - 0.003)
     with Session(
         ground.cells, shell, hand, law=ground.law, rate=RATE, record=path, staleness=NEVER_STALE,
-        budget_points=budget, has_baseline=False,
+        has_baseline=False,
     ) as session:  # fmt: skip
         report = session.wait(PATIENCE)
     assert report is not None
@@ -78,8 +76,6 @@ def test_clusters_of_a_large_tool_sleep_and_change_no_bit(
 ) -> None:
     report = felt(ground, plate, tmp_path / "s.hdbrec")
     assert report.contact_frames > 0
-    assert report.budget_points is None
-    assert (report.left_out_frames, report.most_left_out) == (0, 0)
     frames = recorded(tmp_path / "s.hdbrec")
     assert frames["applied"].any()
     if ground.law == "plane":  # of which the device gets the force of a touch, once it has risen
@@ -88,25 +84,3 @@ def test_clusters_of_a_large_tool_sleep_and_change_no_bit(
         np.testing.assert_array_equal(flat[:, :3], known["applied"][:, :3])
     found = replay(Recording(tmp_path / "s.hdbrec"), ground.env)
     assert found.is_equal, found.describe()
-
-
-def test_a_budget_is_kept_reported_recorded_and_replayed_bit_for_bit(
-    ground: Ground, plate: PointShell, tmp_path: Path
-) -> None:
-    report = felt(ground, plate, tmp_path / "s.hdbrec", BUDGET)
-    assert report.budget_points == BUDGET
-    assert 0 < report.left_out_frames <= report.loop.frames
-    assert 0 < report.most_left_out < len(plate)
-    recording, frames = Recording(tmp_path / "s.hdbrec"), recorded(tmp_path / "s.hdbrec")
-    assert recording.header.budget_points == BUDGET
-    assert (frames["hits"] <= BUDGET).all()
-    assert frames["applied"].any()
-    replayed = replay(recording, ground.env)
-    assert replayed.is_equal, replayed.describe()
-
-
-@pytest.mark.parametrize("budget", [0, 1.5, True])
-def test_a_budget_that_is_no_number_of_points_is_refused(budget: object) -> None:
-    """Before the environment is looked for."""
-    with pytest.raises(UsageError, match=f"a budget of {budget} points"):
-        Session("none.db", PointShell.sphere(0.01, 10), still(0.03), budget_points=budget)  # type: ignore[arg-type]

@@ -12,10 +12,10 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.law import TangentPlaneLaw
-from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import HITS, RESULTS, UNKNOWNS, WRENCH, Cells, Place
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.paper.cost_model import CostModel, machine_name
-from hapticdb.resident.held import counts_of, held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Layout, Store
 from naive import Voxel
@@ -133,7 +133,7 @@ class Reader:
         self.table = table
         self.cells: Cells = table.cells
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        self.clusters, self.budget = held_tool(shell, grid.voxel_size)
+        self.clusters = clusters_of(shell, grid.voxel_size)
         self.row = table.join()
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.missed = np.zeros(64, dtype=np.int64)
@@ -143,8 +143,7 @@ class Reader:
         """Hits, wrench and number of unknown points."""
         feel_kernel(
             self.cells, self.row, self.clusters, pose[None], self.place,
-            TangentPlaneLaw(1000.0), self.hits, self.missed, self.out, self.budget,
-            counts_of(1),
+            TangentPlaneLaw(1000.0), self.hits, self.missed, self.out,
         )  # fmt: skip
         row = self.out[0]
         wrench = row[WRENCH : WRENCH + 6] + 0.0  # turns -0.0 into 0.0

@@ -38,7 +38,7 @@ def test_a_browser_uses_the_page_over_tls(environment: Path, tmp_path: Path) -> 
             additional_headers=SHOWN | {"Origin": f"https://{place}"}, open_timeout=PATIENCE,
         ) as browser:  # fmt: skip
             await browser.send(msgspec.msgpack.encode(CAMERA))
-            return await asyncio.wait_for(browser.recv(), PATIENCE)
+            return await asyncio.wait_for(anext(aiter(browser)), PATIENCE)
 
     serving = Serving(
         urls(environment), tokens=TOKENS, certificate=certificate, key=key, page="viser_page:work"

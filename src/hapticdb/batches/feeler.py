@@ -16,14 +16,13 @@ from hapticdb.closing import Closes
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.kernels.law import reads_distances
-from hapticdb.kernels.resident.budget import feel_kernel
 from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UNKNOWNS, WRENCH
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import HapticQuery, as_poses
 from hapticdb.query.law import ForceLaw, frames_by
 from hapticdb.ready import make_ready
 from hapticdb.resident.frames import ResidentFrames
-from hapticdb.resident.held import counts_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
 from hapticdb.store.base import Store
@@ -312,12 +311,11 @@ class Feeler(Closes):
     def _run(self, poses: Floats, out: Floats) -> None:
         """Frames at poses into out (B, RESULTS), in all threads."""
         cells, place, law = self._frames.cells, self._residency.place, self._frames.law
-        budget, counts = self._frames.budget, counts_of(1)
 
         def work(memory: ThreadMemory, one: slice) -> None:
             feel_kernel(
                 cells, memory.row, memory.clusters, poses[one], place, law, memory.met,
-                memory.missed, out[one], budget, counts,
+                memory.missed, out[one],
             )  # fmt: skip
 
         self._threads.run(work, len(poses))

@@ -10,6 +10,7 @@ from hapticdb.cli.tools import shell_record, shell_text
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
+    from hapticdb.cli.options import LawName
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.resident_cells import ResidentCells
@@ -20,7 +21,23 @@ MOST_NAMED = 8
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "worst": "worst"}
 """Heading of each, and the field of a `Spread`."""
 
+POINT_NS = {"plane": (50.0, 50.0), "smooth": (100.0, 600.0)}
+"""Nanoseconds that a frame takes for each point near a surface under a law, in tools of up to
+`IN_CACHE` points and larger ones (57,600 points pressed on a plane, and results/realtime.json)."""
+IN_CACHE = 10_000
+
 Facts = list[tuple[str, str]]
+
+
+def tell_cost(n_points: int, rate: float, law: "LawName") -> None:
+    """Say in a line what a tool costs whose frames may take longer than a period."""
+    seconds = 1e-9 * n_points * POINT_NS[law][n_points > IN_CACHE]
+    if seconds > 1.0 / rate:
+        render.note(
+            f"a frame with all of the tool's {n_points:,} points near a surface takes about "
+            f"{1e3 * seconds:.2g} ms, and {rate:,.0f} Hz leave {1e3 / rate:.2g} ms: give fewer "
+            "--points, a lower --rate, or --frames-on cuda"
+        )
 
 
 def show(
@@ -81,23 +98,11 @@ def _frame_facts(report: "Report") -> Facts:
     """Frames that touched, that knew too little, and whose force was held."""
     frames = report.unknown_frames, report.held_frames, report.hit_frames
     unknown, held, hit = (render.counted(n, "frame") for n in frames)
-    facts = [
+    return [
         ("touching", f"{hit} hit, {report.contact_frames:,} in contact"),
         ("not known", f"{unknown} with cells that were not in memory yet"),
         ("force held", f"{held}, {report.stale_frames:,} while the database was silent"),
     ]
-    if report.budget_points is not None:
-        facts.append(("budget", budget_text(report)))
-    return facts
-
-
-def budget_text(report: "Report") -> str:
-    """How often the budget of points left some out, and how many."""
-    budget = f"{report.budget_points:,} points a frame"
-    if not report.left_out_frames:
-        return f"{budget}; none was left out"
-    frames = render.counted(report.left_out_frames, "frame")
-    return f"{budget}; {frames} left out {report.most_left_out:,} points at most"
 
 
 def _force_facts(report: "Report") -> Facts:

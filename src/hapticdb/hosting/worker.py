@@ -24,7 +24,7 @@ from hapticdb.realtime.processes import MessageSender, parent_is_gone, reply_to_
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.timing import undisturbed
 from hapticdb.recording.header import Start
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 
 ENTRIES = tuple(f"period.loop.{name}" for name in ("run", "move_by_coupling"))
@@ -110,7 +110,7 @@ class Worker:
         row = rows[n : n + 1]
         station = Station(
             row, table.cells, request.reader, table.desk.sessions[request.reader, ...],
-            request.grid, held_tool(request.shell, request.grid.voxel_size),
+            request.grid, clusters_of(request.shell, request.grid.voxel_size),
         )  # fmt: skip
         pose = np.array(request.pose)
         station.rest_at(pose)

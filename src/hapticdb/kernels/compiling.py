@@ -30,7 +30,7 @@ from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER, sources_digest
 
 LONGEST = (
     *("period.loop", "surfaces.distances", "surfaces.voxelize"),
-    *("resident.nearest", "resident.first_hits", "resident.budget"),
+    *("resident.nearest", "resident.first_hits", "resident.feeling"),
     *("query.refining", "query.contact"),
 )
 """Modules of entries that take longest to compile, which come first."""
@@ -53,7 +53,7 @@ def _names() -> tuple[str, ...]:
 NAMES = _names()
 """Entries of each module, also by their names for the distance law (`_jit.SIGNATURES`)."""
 TOGETHER = {
-    "resident.budget": "period.loop.feel",
+    "resident.feeling": "period.loop.feel",
     "period.loop.move_directly": "period.loop.run",
     "triangles.sweeping": "triangles.nearest",
 }
@@ -91,7 +91,7 @@ _RESIDENT = (
     "field.packing.unpack_kernel",
     *_COST,
 )
-_FRAMES = "resident.budget.feel_kernel"
+_FRAMES = "resident.feeling.feel_kernel"
 _COUPLING = ("period.loop.run", "period.loop.move_by_coupling")
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,

@@ -143,7 +143,6 @@ SENT: Layout = _record(
         ("n_steps", "<i8"),  # made
         ("marks", "<i8"),  # bits named in `kernels.hand.holding`; `flags` is NumPy's own name
         ("revision", "<i8"),  # of the database
-        ("left_out", "<i8"),  # points near something that the budget left out, most of a frame
     ]
 )
 """The result of a period of the loop."""
@@ -188,20 +187,11 @@ FOLLOWER: Layout = _record(
         ("reversals", "<f8"),  # of the force, forgotten as time passes
         ("extreme", "<f8"),  # N, greatest or least force since the last reversal
         ("is_rising", "?"),  # the force, since then
-        # of large tools, set by the caller
-        ("is_large", "?"),  # a run is tested by its sphere before its points are
-        ("most_looked", "<i8"),  # points that a look takes at most; 0: all
-        ("merges_from", "<i8"),  # near points from which one contact stands for several; 0: never
-        # of large tools, kept by the coupling
-        ("stride", "<i8"),  # every how manieth point is looked at; 0 counts as 1
-        ("merged", "<i8"),  # points for which one contact stands; 0 counts as 1
-        ("n_looked", "<i8"),  # points of the last look
-        ("n_left_out", "<i8"),  # points of its runs that were left out
-        ("most_left_out", "<i8"),  # of a look of this period
+        ("is_large", "?"),  # a run is tested by its sphere before its points are; by the caller
         # where a GPU looks
         ("looker", "<i8"),  # address of what is called for a look; 0: the period's kernel looks
         ("way", "<f8"),  # voxels that the farthest point has moved since the last look
-        ("anew", "<i8"),  # what the next look forgets first, named in `near_points`
+        ("is_anew", "<i8"),  # the next look forgets first when points and runs are due
     ]
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
@@ -315,8 +305,6 @@ SEAT: Layout = _record(
         ("first_loose_frame", "<i8"),
         ("ended_loose", "<i8"),
         ("guard_actions", "<i8"),
-        ("left_out_frames", "<i8"),  # frames in which the budget left out points
-        ("most_left_out", "<i8"),  # points that one frame left out
         ("peak_force", "<f8"),  # N
         ("peak_torque", "<f8"),  # N m
         ("deepest", "<f8"),  # m
@@ -345,16 +333,6 @@ WAY: Layout = _record(
 )
 """The way of a hand to the pose that arrived last."""
 
-BUDGET: Layout = _record(
-    [
-        ("most", "<i8"),  # points near something that a frame looks at
-        # addresses of the arrays of `kernels.resident.budget.Budget`, by their names, and sizes
-        *((name, "<i8") for name in ("listed", "skips", "chosen", "columns", "indices")),
-        *((name, "<i8") for name in ("n_runs", "n_chosen")),
-    ]
-)
-"""The budget of a session's tool: where its memory is."""
-
 STATION: Layout = _record(
     [
         ("is_running", "<i8"),  # all other fields are complete
@@ -374,8 +352,6 @@ STATION: Layout = _record(
         # of the tool's pose, the law's frame there, and the unknown cells that were met
         *((name, "<i8") for name in ("pose", "felt", "missed")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
-        ("budget", BUDGET),
-        ("counts", "<i8", 2),  # of the last frame: `kernels.resident.budget.LOOKED_AT`
         ("place", "<f8", 5),  # origin and voxel size m, voxels on an axis
         ("bits", "<i8"),  # of the grid's curve, on an axis
         ("curve", "<i8"),  # its code

@@ -9,10 +9,9 @@ row if the brick has many points.
 import math
 import zipfile
 from dataclasses import dataclass, field, replace
-from operator import index
 from os import SEEK_END, PathLike
 from pathlib import Path
-from typing import IO, BinaryIO, SupportsIndex
+from typing import IO, BinaryIO
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -395,16 +394,3 @@ def fibonacci_sphere(n_points: int) -> Floats:
     angles = np.pi * (1 + 5**0.5) * np.arange(n_points)
     radii = np.sqrt(1 - heights**2)
     return np.stack([radii * np.cos(angles), radii * np.sin(angles), heights], axis=1)
-
-
-def checked_budget(points: int | None) -> int | None:
-    """Budget of points: None, or a whole number of 1 or more; else `UsageError`."""
-    if points is None:
-        return None
-    if isinstance(points, bool) or not isinstance(points, SupportsIndex):
-        raise UsageError(f"a budget of {points!r} points: give a whole number, 1 or more")
-    if index(points) < 1:
-        raise UsageError(
-            f"a budget of {index(points)} points leaves nothing to feel: give 1 or more"
-        )
-    return index(points)

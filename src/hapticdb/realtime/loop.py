@@ -40,7 +40,7 @@ from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import LoopAnswer, LoopFigures
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.timing import Timing, undisturbed
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import LOST, STOP, CellTable
 
 if TYPE_CHECKING:
@@ -72,7 +72,6 @@ class LoopRequest:
     seconds: float
     staleness: float
     has_baseline: bool = True
-    budget_points: int | None = None
     is_on_gpu: bool = False
 
 
@@ -94,7 +93,7 @@ class Loop:
         self.stations = Stations(request.law, self.board.seats, self.board.rings)
         has_distances = isinstance(request.coupling, SettledCoupling)
         cells = self.table.cells if has_distances else self.table.cells.without_distances()
-        tool = held_tool(request.shell, request.grid.voxel_size, request.budget_points)
+        tool = clusters_of(request.shell, request.grid.voxel_size)
         self.station = Station(
             self.stations.rows, cells, request.row, self.session, request.grid, tool
         )

@@ -18,14 +18,12 @@ from hapticdb.kernels.hand.near_points import (
     LAST_BOUND,
     LAST_U,
     LEAST_BOUND,
-    MOST_MERGED,
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
     NEVER,
     NOT_KNOWN,
     OPEN,
-    POINTS_ANEW,
     SHUT,
     U,
 )
@@ -50,14 +48,12 @@ USED_EVERY = 16
 evicted sooner after it was read."""
 
 
-def check_frames(frames_on: str, law: ForceLaw | None, budget_points: int | None) -> None:
+def check_frames(frames_on: str, law: ForceLaw | None) -> None:
     """Refuse a session whose frames cannot be computed there."""
     if frames_on != "cuda":
         raise UsageError(f"frames on {frames_on!r}: choose 'cpu' or 'cuda'")
     if law is not None and not is_smooth(law):
         raise UsageError("frames on 'cuda' are of the smooth law, and the law here is the plane")
-    if budget_points is not None:
-        raise UsageError("a budget of points is for frames on 'cpu': a GPU looks at all points")
     check_gpu()
 
 
@@ -189,24 +185,16 @@ class GpuLooks:
         self._mirror.seen()  # in the arrays that the launches read
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
-        self._epoch += int(follower.anew) == POINTS_ANEW
-        most, half, field = int(follower.merges_from), 1 - int(follower.side), station.field
-        while True:
-            n_due, n_near, n_unknown, least = self._look_once().tolist()
-            n, numbers = int(n_near), self._sight.numbers
-            if n > numbers.size:
-                self._put_back(-1, n_due)
-                self._make_room(n)
-                continue
-            numbers = np.array(numbers[:n])
-            shut = self._first_shut(numbers)
-            if not (0 < most < n and follower.merged < MOST_MERGED):
-                break
-            last = int(np.partition(numbers, most)[most])
-            if shut < last:
-                break
-            self._put_back(last, n_due)
-            follower.merged[()] *= 2
+        self._epoch += int(follower.is_anew)
+        half, field = 1 - int(follower.side), station.field
+        n_due, n_near, n_unknown, least = self._look_once().tolist()
+        n = int(n_near)
+        if n > self._sight.numbers.size:
+            self._put_back(-1, n_due)
+            self._make_room(n)
+            n_due, _, n_unknown, least = self._look_once().tolist()
+        numbers = np.array(self._sight.numbers[:n])
+        shut = self._first_shut(numbers)
         if shut < NOBODY:
             self._put_back(shut, n_due)
             return SHUT
@@ -235,11 +223,11 @@ class GpuLooks:
         self._n_looks += 1
         asked = kernels.Look(
             self._n_looks, self._epoch, self._station.clusters.run, follower.is_large,
-            follower.anew > 0, follower.is_bent, follower.merged, -1, 0, follower.travelled,
-            follower.way, tuple(self._tried[:3].ravel().tolist()),
+            follower.is_anew, follower.is_bent, -1, 0, follower.travelled, follower.way,
+            tuple(self._tried[:3].ravel().tolist()),
         )  # fmt: skip
         self._asked[: -len(asked.pose)], self._asked[-len(asked.pose) :] = asked[:-1], asked.pose
-        follower.anew[()] = 0
+        follower.is_anew[()] = 0
         self._begin_look()
         self._stream.synchronize()
         return self._found

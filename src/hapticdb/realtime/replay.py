@@ -19,7 +19,7 @@ from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.tracking import Wish
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import Frames, State
-from hapticdb.resident.held import held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 
@@ -137,7 +137,7 @@ class _Again:
         row = table.join()
         self._station = station = Station(
             self._stations.rows, table.cells, row, table.desk.sessions[row, ...], header.grid,
-            held_tool(header.shell, header.grid.voxel_size, header.budget_points),
+            clusters_of(header.shell, header.grid.voxel_size),
         )  # fmt: skip
         try:
             station.restore(header.start)

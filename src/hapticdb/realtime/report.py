@@ -97,8 +97,6 @@ class Report:
     coupling : SettledCoupling or DirectRendering
         The coupling between hand and tool, with what lowered its stiffness; under the plane law
         what bounded the wrench, which went to the device directly.
-    budget_points : int or None
-        Most points near something that a frame looks at; None: all.
     is_warm : bool
         Whether all wanted cells were resident before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
@@ -135,8 +133,6 @@ class Report:
         How often the guard lowered the stiffness because the force went back and forth.
     least_share : float
         Share of the stiffness that the guard left.
-    left_out_frames, most_left_out : int
-        Frames in which the budget left out points, and the most points that one frame left out.
     conditions : dict
         Conditions of the measurement: points of the tool, processor.
     """
@@ -146,7 +142,6 @@ class Report:
     empty: LoopFigures | None
     law: str
     coupling: DirectRendering
-    budget_points: int | None
     is_warm: bool
     cache: CacheFigures
     objects: tuple[int, ...]
@@ -170,8 +165,6 @@ class Report:
     ended_loose: bool
     guard_actions: int
     least_share: float
-    left_out_frames: int
-    most_left_out: int
     conditions: dict[str, str]
 
     def __repr__(self) -> str:

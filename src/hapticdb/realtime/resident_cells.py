@@ -261,13 +261,12 @@ class ResidentCells(Closes):
         law: ForceLaw,
         coupling: DirectRendering,
         start: Start,
-        budget_points: int | None = None,
         frames_on: str = "cpu",
     ) -> Header:
         """Header of a recording of a session in these cells, at their revision now."""
         return Header(
             self.url, self.grid, self.table.revision, shell, rate, law, self.filter.exclude,
-            asdict(coupling), where=self.filter.where, budget_points=budget_points, start=start,
+            asdict(coupling), where=self.filter.where, start=start,
             rendering="coupled" if isinstance(coupling, SettledCoupling) else "direct",
             frames_on=frames_on,
         )  # fmt: skip

@@ -11,7 +11,7 @@ from hapticdb.closing import Closes
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.pointshell.shell import PointShell, checked_budget
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
 from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.board import Board
@@ -75,11 +75,6 @@ class Session(Closes):
     staleness : float
         Seconds without an answer of the database after which all frames act as if all cells were
         unknown.
-    budget_points : int or None
-        Most points near something that a frame looks at; None: all. A frame with more looks at
-        one in 2, 4, 8 ... of them. A tool of 4096 points or more, or with a budget, has
-        clusters that sleep far from everything, which changes no result (docs/realtime.md, Large
-        tools).
     frames_on : {"cpu", "cuda"}
         What finds the tool's points near surfaces in each period: a processor, or a GPU of NVIDIA
         for tools of millions of points (docs/realtime.md, Large tools).
@@ -122,7 +117,6 @@ class Session(Closes):
         coupling: Coupling | None = None,
         handle: Handle | None = None,
         staleness: float = DEFAULT_STALENESS,
-        budget_points: int | None = None,
         frames_on: "BatchDevice" = "cpu",
         record: str | os.PathLike[str] | None = None,
         replace_recording: bool = False,
@@ -132,9 +126,9 @@ class Session(Closes):
     ) -> None:
         check_device(device)
         _check_choices(seconds, staleness)
-        self.budget_points, self._has_baseline = checked_budget(budget_points), has_baseline
+        self._has_baseline = has_baseline
         self.shell, self.handle = shell, handle or Handle()
-        self.frames_on = _checked_frames(frames_on, law, budget_points)
+        self.frames_on = _checked_frames(frames_on, law)
         self.timing = Timing(rate, processor)
         self._owns_cells = isinstance(cells, str)
         if isinstance(cells, str):
@@ -213,7 +207,6 @@ class Session(Closes):
             seconds=FOREVER if seconds is None else seconds,
             staleness=staleness,
             has_baseline=self._has_baseline,
-            budget_points=self.budget_points,
             is_on_gpu=self.frames_on == "cuda",
         )
         self._process = Process(
@@ -228,7 +221,7 @@ class Session(Closes):
             self._recording.begin(
                 self.cells.header(
                     self.shell, self.timing.rate, self.law, self.coupling, start,
-                    self.budget_points, self.frames_on,
+                    self.frames_on,
                 )
             )  # fmt: skip
 
@@ -363,7 +356,6 @@ class Session(Closes):
             lost_records=0 if recording is None else recording.n_lost,
             law="smooth" if is_smooth(self.law) else "plane",
             coupling=self.coupling,
-            budget_points=self.budget_points,
             **counts_of(self._open_board.seats[0]),
         )
 
@@ -411,12 +403,10 @@ def _check_choices(seconds: float | None, staleness: float) -> None:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
 
 
-def _checked_frames(
-    frames_on: "BatchDevice", law: ForceLaw | LawName | None, budget_points: int | None
-) -> "BatchDevice":
+def _checked_frames(frames_on: "BatchDevice", law: ForceLaw | LawName | None) -> "BatchDevice":
     """Refuse a session whose frames cannot be computed there."""
     if frames_on != "cpu":
         from hapticdb.realtime.on_gpu import check_frames  # noqa: PLC0415 - loads numba.cuda
 
-        check_frames(frames_on, as_law(law), budget_points)
+        check_frames(frames_on, as_law(law))
     return frames_on

@@ -14,17 +14,13 @@ from hapticdb.kernels.period import loop
 from hapticdb.kernels.period.following import USUAL_GAP_NS
 from hapticdb.kernels.period.memory import PERIOD_ROWS
 from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
-from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Place
+from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, is_smooth
 from hapticdb.recording.frame import Frames
 from hapticdb.recording.header import Start
-from hapticdb.resident.held import PreparedTool
 from hapticdb.resident.table import HEARTBEAT
 
-MERGES_FROM = 4096
-"""Near points of the quasi-static coupling from which one contact stands for several. Larger:
-broader contacts are felt point by point, and a period with them takes longer."""
 LARGE_FROM = 4096
 """Points from which the quasi-static coupling tests spheres of runs before their points. The
 results are the same: a larger value only costs time."""
@@ -55,7 +51,7 @@ class Station:
         (1,) of SESSION: its row on the desk.
     grid : Grid
         Grid of the cells.
-    tool : PreparedTool
+    clusters : Clusters
         The tool.
     """
 
@@ -66,14 +62,13 @@ class Station:
         reader: int,
         session: Record,
         grid: Grid,
-        tool: PreparedTool,
+        clusters: Clusters,
     ) -> None:
         row[:] = np.zeros((), STATION)
         self.row, self.cells, self.reader, self.session = row, cells, reader, session
         self.record = row[0, ...]
         self.servo, self.follower = self.record["servo"], self.record["follower"]
-        self.clusters, self.budget = tool
-        n_points = len(self.clusters.points)
+        self.clusters, n_points = clusters, len(clusters.points)
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
         self.field = np.zeros((FIELD_ROWS, n_points))
         self.met = np.zeros((PERIOD_ROWS, n_points), dtype=np.int64)
@@ -95,7 +90,7 @@ class Station:
         row["n_slots"], row["capacity"] = len(cells.used), cells.keys.shape[1]
 
     def _write_tool(self) -> None:
-        """Write the addresses of the tool's arrays; let it merge contacts and keep its budget."""
+        """Write the addresses of the tool's arrays."""
         row, clusters = self.row, self.clusters
         self._arrays = {
             name: np.ascontiguousarray(getattr(clusters, name))
@@ -106,14 +101,7 @@ class Station:
         n_points = len(clusters.points)
         row["n_points"], row["run"] = n_points, clusters.run
         row["n_spheres"], row["n_groups"] = len(clusters.spheres), len(clusters.groups)
-        budget, (most, *arrays) = row["budget"], self.budget
-        for name, array in zip(self.budget._fields[1:], arrays, strict=True):
-            budget[name] = array.ctypes.data
-        budget["most"] = most
-        budget["n_runs"], budget["n_chosen"] = len(self.budget.listed), len(self.budget.indices)
-        self.follower["merges_from"] = MERGES_FROM
-        self.follower["is_large"] = n_points >= LARGE_FROM or len(self.budget.listed) > 0
-        self.follower["most_looked"] = most if most < n_points else 0
+        self.follower["is_large"] = n_points >= LARGE_FROM
 
     def set_spring(self, spring: DeviceSpring) -> None:
         """Replace the coupling; periods take the new one whole."""

@@ -19,7 +19,7 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import build
 from hapticdb.kernels.records import FRAME
-from hapticdb.pointshell.shell import MAX_POINTS, PointShell, checked_budget
+from hapticdb.pointshell.shell import MAX_POINTS, PointShell
 from hapticdb.query.law import DistanceField, ForceLaw, TangentPlane, law_named
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
@@ -84,8 +84,6 @@ class Header:
     where: Words = ()
     """With `exclude`, which objects were felt: words as of `hapticdb.store.filtering.Filter`, since
     others may have added objects during the session that the words do not choose."""
-    budget_points: int | None = None
-    """Most points near something that a frame looked at; None: all."""
     rendering: Literal["coupled", "direct"] = "direct"
     frames_on: str = "cpu"
     """What computed the frames: "cpu" or "cuda"."""
@@ -94,7 +92,6 @@ class Header:
     start: Start = field(default_factory=Start)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "budget_points", checked_budget(self.budget_points))
         if not (math.isfinite(self.rate) and self.rate > 0):
             raise UsageError(f"rate {self.rate}: give frames a second, above 0")
         if not isinstance(self.law, (TangentPlane, DistanceField)):
@@ -133,7 +130,6 @@ class Header:
                 "rate": self.rate,
                 "where": self.where,
                 "exclude": self.exclude,
-                "budget_points": self.budget_points,
                 "coupling": self.coupling,
                 "frames_on": self.frames_on,
                 "version": self.version,
@@ -215,7 +211,6 @@ class Header:
                 coupling=given["coupling"],
                 version=str(given["version"]),
                 started=str(given["started"]),
-                budget_points=given["budget_points"],
                 rendering="coupled" if given["rendering"] == "coupled" else "direct",
                 frames_on=str(given["frames_on"]),
                 build=str(given["build"]),

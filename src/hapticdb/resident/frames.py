@@ -10,23 +10,22 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels.law import felt_within, reads_distances
 from hapticdb.kernels.records import MOST_MISSED
 from hapticdb.kernels.resident import cell_table as kernels
-from hapticdb.kernels.resident.budget import LEFT_OUT, LOOKED_AT, feel_kernel
 from hapticdb.kernels.resident.cells import (
     CONTACTS,
     DEEPEST,
     HITS,
-    LISTED,
     RESULTS,
     UNKNOWN,
     UNKNOWNS,
     WRENCH,
     Clusters,
 )
+from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.kernels.resident.first_hits import UNDECIDED, find_first_hits
-from hapticdb.pointshell.shell import PointShell, checked_budget
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import as_floats
 from hapticdb.query.law import ForceLaw, TangentPlane
-from hapticdb.resident.held import counts_of, held_tool
+from hapticdb.resident.held import clusters_of
 from hapticdb.resident.residency import Residency
 
 LEAST_FOUND = 1 << 16
@@ -35,9 +34,6 @@ collisions and takes longer to clear."""
 SMALL = 16.0
 """Greatest radius of a run, voxels, for which the search for cells uses the run's middle instead of
 its points. A larger value looks up fewer places and fetches more cells that no point meets."""
-
-MOST_ROUNDS = 4096
-"""Most times that a frame beyond its budget is repeated because cells beside it were unknown."""
 
 Floats = NDArray[np.float64]
 
@@ -48,8 +44,7 @@ class FeltFrames(NamedTuple):
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
     int64: numbers of points that hit (in a voxel or, with distances, near a surface), that touch
     (below their tangent plane or the onset), in a cell that is not resident; deepest (M,): depth of
-    the deepest contact, metres; looked_at, left_out (M,) int64: with a budget, numbers of points
-    near something that the frame looked at, and that it left out; otherwise all and none.
+    the deepest contact, metres.
     """
 
     wrenches: Floats
@@ -57,8 +52,6 @@ class FeltFrames(NamedTuple):
     contacts: NDArray[np.int64]
     unknown: NDArray[np.int64]
     deepest: Floats
-    looked_at: NDArray[np.int64]
-    left_out: NDArray[np.int64]
 
 
 class Surroundings(NamedTuple):
@@ -117,15 +110,12 @@ class ResidentFrames:
     law : ForceLaw or None
         Force law; the tangent plane with 1000 N/m unless given.
     run : int or None
-        As for `held_tool`.
-    budget_points : int or None
-        Most points near something that a frame looks at. A frame with more looks at one in 2, 4,
-        8 ... of them. `FeltFrames.left_out` counts the others.
+        As for `clusters_of`.
 
     Raises
     ------
     UsageError
-        If the law reads distances, and the cells have none; if the budget is below one point.
+        If the law reads distances, and the cells have none.
     """
 
     def __init__(
@@ -135,7 +125,6 @@ class ResidentFrames:
         law: ForceLaw | None = None,
         *,
         run: int | None = None,
-        budget_points: int | None = None,
     ) -> None:
         self.residency = residency
         self.shell = shell
@@ -150,8 +139,7 @@ class ResidentFrames:
         if not reads_distances(self.law):  # kernels are compiled for the plane without a payload
             self.cells = table.cells.without_distances()
         size = residency.grid.voxel_size
-        most = checked_budget(budget_points)
-        self.clusters, self.budget = held_tool(shell, size, most, run=run)
+        self.clusters = clusters_of(shell, size, run)
         self.hits = np.empty(len(shell), dtype=np.int64)
         self.surroundings = _surroundings_of(self.clusters, size, felt_within(self.law))
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
@@ -171,13 +159,10 @@ class ResidentFrames:
         """
         matrices = as_floats(poses, "poses").reshape(-1, 4, 4)
         out = np.zeros((len(matrices), RESULTS))
-        counts = counts_of(len(matrices))
-        if not len(self.budget.listed):
-            counts[:, LOOKED_AT] = len(self.shell)
         done = 0
         while done < len(matrices):
             n_poses = self.fetch(matrices[done:])
-            self._run(matrices, out, counts, done, n_poses)
+            self._run(matrices, out, done, n_poses)
             done += n_poses
         return FeltFrames(
             out[:, WRENCH : WRENCH + 6],
@@ -185,8 +170,6 @@ class ResidentFrames:
             out[:, CONTACTS].astype(np.int64),
             out[:, UNKNOWNS].astype(np.int64),
             out[:, DEEPEST],
-            counts[:, LOOKED_AT],
-            counts[:, LEFT_OUT],
         )
 
     def collides(
@@ -238,43 +221,12 @@ class ResidentFrames:
         residency.make_resident(cells)
         return int(n_poses)
 
-    def _run(
-        self, poses: Floats, out: Floats, counts: NDArray[np.int64], start: int, n_poses: int
-    ) -> None:
+    def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
         """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
         part = slice(start, start + n_poses)
-        feel = self._feel_within_budget if len(self.budget.listed) else self._feel
-        done = feel(poses[part], out[part], counts[part])
+        done = feel_kernel(
+            self.cells, self._row, self.clusters, poses[part], self.residency.place, self.law,
+            self.hits, self.missed, out[part],
+        )  # fmt: skip
         if done < n_poses:
             raise UsageError(f"pose {start + done} is no rigid transform: give a rotation")
-
-    def _feel(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
-        return int(
-            feel_kernel(
-                self.cells, self._row, self.clusters, poses, self.residency.place, self.law,
-                self.hits, self.missed, out, self.budget, counts,
-            )
-        )  # fmt: skip
-
-    def _feel_within_budget(self, poses: Floats, out: Floats, counts: NDArray[np.int64]) -> int:
-        """Compute frames with a budget; returns the number done.
-
-        Which points a frame beyond its budget looks at depends on all cells beside its near runs,
-        so the frame is repeated until they are resident.
-        """
-        missed = self.missed
-        for n in range(len(poses)):
-            one = slice(n, n + 1)
-            for _ in range(MOST_ROUNDS):
-                if not self._feel(poses[one], out[one], counts[one]):
-                    return n
-                if not out[n, UNKNOWNS]:
-                    break
-                n_missed = missed[LISTED]
-                self.residency.make_resident(np.sort(missed[LISTED + 1 :][:n_missed]))
-            else:
-                raise UsageError(
-                    "the cells around the tool do not fit into the table: give it more memory, or "
-                    "leave out the budget of points"
-                )
-        return len(poses)

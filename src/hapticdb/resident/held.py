@@ -1,11 +1,8 @@
-"""A tool as frames hold it: its points in runs, and its budget of points."""
-
-from typing import NamedTuple
+"""A tool as frames hold it: its points in runs."""
 
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels.resident.budget import COUNTS, Budget
 from hapticdb.kernels.resident.cells import BLOCK, GROUP, SCRATCH_ROWS, Clusters
 from hapticdb.pointshell.shell import PointShell
 
@@ -16,29 +13,6 @@ FLAT_RUN = 512
 NO_RUNS = np.empty(0, dtype=np.int64)
 
 Floats = NDArray[np.float64]
-
-
-class PreparedTool(NamedTuple):
-    """clusters : the points and bounding spheres; budget : most points that a frame looks at."""
-
-    clusters: Clusters
-    budget: Budget
-
-
-def held_tool(
-    shell: PointShell, voxel_size: float, most: int | None = None, *, run: int | None = None
-) -> PreparedTool:
-    """Prepare a shell for frames.
-
-    Parameters
-    ----------
-    shell, voxel_size, run
-        As for `clusters_of`; a budget needs clusters.
-    most : int or None
-        Most points near something that a frame looks at, `checked_budget`; None for all.
-    """
-    clusters = clusters_of(shell, voxel_size, run if most is None else run or RUN)
-    return PreparedTool(clusters, budget_of(clusters.spheres, most, len(shell)))
 
 
 def clusters_of(shell: PointShell, voxel_size: float, run: int | None = None) -> Clusters:
@@ -100,22 +74,3 @@ def _blocks_of(spheres: Floats) -> Floats:
     ways = np.linalg.norm(spheres[:, :3] - centers, axis=1)
     radii = np.maximum.reduceat(ways * (1.0 + 1e-5) + spheres[:, 3], starts)
     return np.hstack([centers[starts], radii[:, None]])
-
-
-def budget_of(spheres: Floats, most: int | None, n_points: int) -> Budget:
-    """Budget of a tool with those spheres (C, 4) of runs; None: no bound, and nothing is listed."""
-    n_runs = 0 if most is None else len(spheres)
-    n_chosen = min(most or 0, n_points)
-    return Budget(
-        n_chosen,
-        np.zeros(n_runs, dtype=np.int64),
-        np.zeros((n_runs, 1)),
-        np.zeros((n_chosen, 6)),
-        np.zeros((3, n_chosen)),
-        np.zeros(n_chosen, dtype=np.int64),
-    )
-
-
-def counts_of(n_poses: int) -> NDArray[np.int64]:
-    """Room for the counts of frames: see `budget.LOOKED_AT`."""
-    return np.zeros((n_poses, COUNTS), dtype=np.int64)

@@ -95,15 +95,6 @@ RecordLimitOption = Annotated[
         show_default="4GiB",
     ),
 ]
-BudgetPointsOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Most points near something that a frame looks at; a frame with more looks at one "
-        "in 2, 4, 8 ... of them, and the report says how many it left out.",
-        show_default="all",
-    ),
-]
 FramesOnOption = Annotated[
     FramesOn,
     typer.Option(
@@ -177,7 +168,6 @@ def feel(
     replace: ReplaceOption = False,
     record_limit: RecordLimitOption = None,
     budget: BudgetOption = 256.0,
-    budget_points: BudgetPointsOption = None,
     frames_on: FramesOnOption = "cpu",
     law: LawOption = None,
     conservative: ConservativeOption = False,
@@ -199,7 +189,7 @@ def feel(
     from hapticdb.query.law import inset_of
 
     began = perf_counter()
-    kernels = _begin_loop(law, processor, budget_points, frames_on)
+    kernels = _begin_loop(law, processor, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
@@ -211,9 +201,11 @@ def feel(
         inset = 0.0 if conservative else inset_of(env.grid.voxel_size, law or "smooth")
         shell = _shell(tool, tool_unit, points, seed, device, inset)
         fitting.warn_of_size(env, shell, felt.left_out)
+    if frames_on == "cpu":
+        session_page.tell_cost(len(shell), rate, law or "smooth")
     begin = partial(
         hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
-        law=chosen, coupling=coupling, budget_points=budget_points, frames_on=frames_on,
+        law=chosen, coupling=coupling, frames_on=frames_on,
         processor=processor, record=record, replace_recording=replace,
         record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
     )  # fmt: skip
@@ -264,7 +256,6 @@ def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool
 def _begin_loop(
     law: LawName | None,
     processor: int | None,
-    budget_points: int | None,
     frames_on: FramesOn,
 ) -> list[str]:
     """Have what forks the processes load kernels while the tool is sampled here.
@@ -275,17 +266,15 @@ def _begin_loop(
         from hapticdb.query.law import as_law
         from hapticdb.realtime.on_gpu import check_frames
 
-        check_frames(frames_on, as_law(law), budget_points)
+        check_frames(frames_on, as_law(law))
     from hapticdb.ready import session_purposes
 
     purposes = session_purposes(is_smooth=law != "plane")
     prepare("hapticdb.realtime.loop:work", ["resident", *purposes])
 
     with render.bar("loading", ""):
-        from hapticdb.pointshell.shell import checked_budget
         from hapticdb.realtime.timing import Timing
 
-    checked_budget(budget_points)
     Timing(processor=processor)
     return purposes
 

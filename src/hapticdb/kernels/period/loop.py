@@ -30,7 +30,6 @@ from hapticdb.kernels.period.following import follow_arrivals
 from hapticdb.kernels.period.memory import (
     FELT,
     array_at,
-    budget_of,
     cells_of,
     grid_of,
     memory_of,
@@ -49,13 +48,13 @@ from hapticdb.kernels.period.telling import (
     tell,
 )
 from hapticdb.kernels.records import FRAME, PACE, SEAT, SESSION, STATION
-from hapticdb.kernels.resident.budget import LEFT_OUT, LOOKED_AT, felt_within
 from hapticdb.kernels.resident.cells import (
     FELT_REVISION,
     READER_STRIDE,
     begin_frame,
     end_frame,
 )
+from hapticdb.kernels.resident.feeling import felt
 from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
@@ -114,16 +113,14 @@ _cells = chosen_by_type(
 def feel(station, which, laws):
     """Compute the law's frame at `station.pose`, into `station.felt` and row FELT of its `met`.
 
-    which: the directory that the frame reads; laws: a pointer to the law. Returns the number of
-    points that the budget left out.
+    which: the directory that the frame reads; laws: a pointer to the law.
     """
-    law, memory, counts = laws[0], memory_of(station), station.counts
-    counts[LOOKED_AT] = counts[LEFT_OUT] = 0
-    felt_within(
+    law, memory = laws[0], memory_of(station)
+    felt(
         law, _cells(law, station), which, tool_of(station), memory.pose, grid_of(station),
-        memory.met[FELT], memory.missed, budget_of(station), counts, memory.felt,
+        memory.met[FELT], memory.missed, memory.felt,
     )  # fmt: skip
-    return counts[LEFT_OUT]
+    return 0
 
 
 def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's NamedTuple
@@ -167,7 +164,7 @@ def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
     pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
     if is_rigid(memory.pose):
         which = begin_frame(cells, station.reader)
-        sent.left_out = call_kernel(pace.feeler, station, which, pace.law)
+        call_kernel(pace.feeler, station, which, pace.law)
         sent.revision = cells.readers[station.reader * READER_STRIDE + FELT_REVISION]
         end_frame(cells, station.reader)
     render(spring_of(station), tool_of(station).center, servo, memory.felt, pace.dt)

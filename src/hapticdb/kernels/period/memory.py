@@ -19,7 +19,6 @@ from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
 from hapticdb.kernels.records import MOST_MISSED, RESULTS
-from hapticdb.kernels.resident.budget import Budget
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     CELL_WORDS,
@@ -108,20 +107,6 @@ def tool_of(station):
         station.run,
         array_at(station.columns, (3, n_points), np.float64),
         array_at(station.scratch, (SCRATCH_ROWS, station.run), np.float64),
-    )
-
-
-@leaf
-def budget_of(station):
-    """Budget of a session's tool."""
-    at = station.budget
-    return Budget(
-        at.most,
-        array_at(at.listed, (at.n_runs,), np.int64),
-        array_at(at.skips, (at.n_runs, 1), np.float64),
-        array_at(at.chosen, (at.n_chosen, 6), np.float64),
-        array_at(at.columns, (3, at.n_chosen), np.float64),
-        array_at(at.indices, (at.n_chosen,), np.int64),
     )
 
 

@@ -148,8 +148,6 @@ def count(seat, servo, follower):
         seat.first_loose_frame = seat.n_frames
     seat.loose_frames += seat.ended_loose
     seat.guard_actions += (marks & IS_SOFTER) != 0
-    seat.left_out_frames += sent.left_out > 0
-    seat.most_left_out = max(seat.most_left_out, sent.left_out)
     seat.least_share = follower.wanted_share if follower.wanted_share > 0.0 else 1.0
 
 

@@ -139,9 +139,8 @@ class Clusters(NamedTuple):
     points (N, 6): metres and inward normals, tool frame, in the order of the shell; center (3,);
     spheres (C, 4): centre and radius, metres, of each run of `run` points, or (0, 4) for none;
     groups (G + B, 4): the same of each group of `GROUP` runs, and behind them of each block if
-    there are `BLOCK` runs or more; in a frame of a budget, which has no spheres, (C, 1) runs to
-    skip (`budget`); columns (3, N): the points again, one row for each axis; scratch (SCRATCH_ROWS,
-    run): memory for one placed run. Each thread needs its own scratch.
+    there are `BLOCK` runs or more; columns (3, N): the points again, one row for each axis; scratch
+    (SCRATCH_ROWS, run): memory for one placed run. Each thread needs its own scratch.
     """
 
     points: Floats

@@ -12,12 +12,28 @@ from typing import Any
 
 import numpy as np
 
-from hapticdb.kernels._jit import chosen_by_type, inlined, leaf
+from hapticdb.kernels._jit import (
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    chosen_by_type,
+    entry,
+    inlined,
+    leaf,
+)
 from hapticdb.kernels.field.corners import fetch_corners, interpolated
 from hapticdb.kernels.field.lattice import CELL_VALUES, VOXELS_A_STEP, cell_place, place_before
-from hapticdb.kernels.field.law import AHEAD, DistanceFieldLaw, agreement, depth_and_weight
+from hapticdb.kernels.field.law import (
+    AHEAD,
+    DISTANCE_FIELD,
+    DistanceFieldLaw,
+    agreement,
+    depth_and_weight,
+)
 from hapticdb.kernels.law import (
     NO_WRENCH,
+    TANGENT_PLANE,
     TangentPlaneLaw,
     accumulate,
     average_into,
@@ -30,16 +46,22 @@ from hapticdb.kernels.law import (
 )
 from hapticdb.kernels.resident.cells import (
     CELL_WORDS,
+    CELLS,
+    CELLS_WITH_DISTANCES,
+    CLUSTERS,
     CONTACTS,
     DEEPEST,
     HITS,
     LISTED,
+    PLACE,
     UNKNOWN,
     UNKNOWNS,
+    begin_frame,
     bit_in,
     brick_bit,
     cell_key,
     column_of,
+    end_frame,
     enter_cell,
     seen_in,
 )
@@ -56,7 +78,7 @@ from hapticdb.kernels.resident.runs import (
     place_run,
     words_of_run,
 )
-from hapticdb.kernels.rigid import moved, transform_of, turned
+from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 NORMAL, LOOK_UP, PART, HERE, THERE, DEPTH, WEIGHT = 6, 11, 12, 15, 16, 17, 18
 """Rows of the scratch, after the six of `place_run` and beside `runs.INDEX` and `runs.BASE`.
@@ -313,3 +335,21 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     out[HITS], out[CONTACTS] = n_hits, n_contacts
     out[UNKNOWNS], out[DEEPEST] = n_unknown, deepest
     missed[LISTED] = n_missed
+
+
+@entry(
+    CELLS, INT, CLUSTERS, FLOATS3, PLACE, TANGENT_PLANE, INTS, INTS, FLOATS2,
+    also={CELLS: CELLS_WITH_DISTANCES, TANGENT_PLANE: DISTANCE_FIELD},
+)  # fmt: skip
+def feel_kernel(cells, reader, shell, poses, place, law, met, missed, out):
+    """`felt` at poses (M, 4, 4) into out (M, RESULTS); met, missed: of the last frame.
+
+    Returns the number of poses done: fewer than M when one is not rigid.
+    """
+    for n in range(poses.shape[0]):
+        if not is_rigid(poses[n]):
+            return n
+        which = begin_frame(cells, reader)
+        felt(law, cells, which, shell, poses[n], place, met, missed, out[n])
+        end_frame(cells, reader)
+    return poses.shape[0]

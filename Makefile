@@ -53,9 +53,11 @@ figures: $(READY)
 scale: $(READY)
 	$(BIN)/python benchmarks/scale.py $(ARGS)
 
-# docs/realtime.md: frames in memory beside a dense bitmap, sessions beside an empty loop: four minutes
+# docs/realtime.md: frames in memory beside a dense bitmap, sessions beside an empty loop, and on a server far away:
+# six minutes
 realtime: $(READY)
 	$(BIN)/python benchmarks/in_real_time.py $(ARGS)
+	$(BIN)/python benchmarks/far_away.py $(ARGS)
 
 # docs/feel.md: how good the forces feel: ten minutes
 feel: $(READY)

@@ -119,12 +119,13 @@ def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]
         }
 
 
-def session(url: str, tool: Path, path: Path, rate: int, seconds: float) -> dict[str, Any]:
-    """Report of `hapticdb feel`; if it fails, exit with its error text."""
+def session(
+    url: str, tool: Path, path: Path, rate: int, seconds: float, *words: str
+) -> dict[str, Any]:
+    """Report of `hapticdb feel`, with more words; if it fails, exit with its error text."""
     command = [
         str(Path(sys.executable).with_name("hapticdb")), "feel", url, "--tool", str(tool),
-        "--device", str(path), "--loop", "--speed", "0.2", "--rate", str(rate),
-        "--seconds", str(seconds), "--json",
+        "--device", str(path), "--rate", str(rate), "--seconds", str(seconds), "--json", *words,
     ]  # fmt: skip
     limit = seconds + PATIENCE
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=limit)
@@ -167,7 +168,8 @@ def measure(folder: Path, model: Path | None, effort: Effort) -> dict[str, Any]:
             results["frames"].append(measure_frames(database, shell, poses[:count]))
         for engine, url in urls.items():
             for rate in RATES:
-                found = session(url, tool, round_trip, rate, effort.seconds)
+                more = "--loop", "--speed", "0.2"
+                found = session(url, tool, round_trip, rate, effort.seconds, *more)
                 results["sessions"].append({"engine": engine} | found)
             results["edits"].append({"engine": engine} | edits(url, tool, round_trip, effort.edits))
     return results

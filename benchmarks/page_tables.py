@@ -111,6 +111,24 @@ def edits(results: Results) -> str:
     return table(head, rows)
 
 
+def far_away(results: Results) -> str:
+    """Sessions whose database answers after a delay."""
+    return listed(
+        results["far_away"]["cells"],
+        {
+            "hand, m/s": lambda one: f"{one['speed']:g}",
+            "round trip, ms": lambda one: f"{1e3 * one['round_trip']:g}",
+            "reached, Hz": lambda one: f"{one['loop']['rate']:,.0f}",
+            "late p99, us": lambda one: f"{1e6 * one['loop']['lateness']['p99']:,.0f}",
+            "frames with unknown cells, %": lambda one: (
+                f"{100 * one['unknown_frames'] / one['loop']['frames']:.2g}"
+            ),
+            "cells fetched": lambda one: f"{one['cache']['loaded']:,}",
+            "a fetch, ms": lambda one: us_text(1e3 * one["cache"]["latency"]),
+        },
+    )
+
+
 def gpu_frames(results: Results) -> str:
     """Times of a frame on a GPU, pose in and wrench out, and on one processor."""
     rows = [
@@ -209,6 +227,7 @@ def tables() -> dict[str, Callable[[Results], str]]:
         "sessions": sessions,
         "frames": frames,
         "edits": edits,
+        "far-away": far_away,
         "gpu-frames": gpu_frames,
         "gpu-hands": gpu_hands,
         "gpu-batches": gpu_batches,

@@ -160,7 +160,6 @@ FOLLOWER: Layout = _record(
         ("astray", "<f8"),  # voxels from the tool's pose to the one looked at last
         ("clearance", "<f8"),  # voxels: no point is nearer to a surface, at the tool's pose
         ("tried_clearance", "<f8"),  # the same at the pose looked at last
-        ("least_clearance", "<f8"),  # least of a period
         # the equations of a step (`kernels.hand.step`)
         ("side", "<i8"),  # 0 or 1: which half of the rows has the near points at the tool's pose
         ("n_near", "<i8"),  # near points at the tool's pose

@@ -347,7 +347,6 @@ def settle(follower, field, met):
             field[ONSETS, n] = ONSET
     follower.side, follower.n_near = after, follower.n_tried
     follower.clearance, follower.astray = follower.tried_clearance, 0.0
-    follower.least_clearance = min(follower.least_clearance, follower.clearance)
 
 
 @leaf

@@ -39,7 +39,6 @@ from hapticdb.kernels.hand.near_points import (
     NEAR,
     NEAR_POINTS,
     NEAR_ROWS,
-    NEVER,
     NOT_KNOWN,
     ONSETS,
     OPEN,
@@ -313,7 +312,7 @@ def advance(grasp, version, spring, servo, dt):
     is_hand = is_somewhere(hand)
     is_held = hand.is_stale or not is_hand
     place_lost(tool, hand, is_hand)
-    follower.n_looks, follower.least_clearance = 0, NEVER
+    follower.n_looks = 0
     found = OPEN
     if not is_held:
         found = _move_tool(grasp, version, spring, tool, hand)

@@ -93,8 +93,6 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
     assert (code, err) == (1, OPENED)
     parted = re.match(r"parts at frame (\d+) \(\d+\.\d{3} s\)", out)
     assert parted
-    frames = recorded(scene.with_name("felt.hdbrec"))
-    assert not frames["hits"][: int(parted[1])].all()
     code, out, _ = run("replay", "felt.hdbrec", "--json")
     again = json.loads(out)
     assert (code, again["parts_at"]) == (1, int(parted[1]))

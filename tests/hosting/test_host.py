@@ -156,11 +156,10 @@ def test_objects_that_a_session_leaves_out_are_not_felt(
 
 
 def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
-    host: SessionHost, env: Environment, tmp_path: Path
+    host: SessionHost, env: Environment
 ) -> None:
     """The tool rests above the floor, and something is put where it is."""
     session = host.begin(standing_plate(), ABOVE)
-    session.record(tmp_path / "s.hdbrec")
     until(lambda: session.figures().frames > 20)
     last = session.latest()
     assert last is not None
@@ -168,7 +167,7 @@ def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
     points = np.array([(x, 32.0, 47.0) for x in np.arange(30.0, 34.0, 0.25)])
     added = write_points(env.store, points, "put")
     try:
-        until(lambda: (frame := session.latest()) is not None and frame["hits"][0] > 0)
+        until(lambda: (f := session.latest()) is not None and f["state"][0] & State.IN_OBJECT)
     finally:
         session.end()
         env.remove(added)

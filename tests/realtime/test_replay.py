@@ -19,7 +19,7 @@ from hapticdb.realtime.replay import Parting, replay
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Frames, Recorder, Recording, State
 from hapticdb.recording.header import Header
-from realtime.hands import NotedClutched, at
+from realtime.hands import NotedClutched, Steady, at
 from realtime.sessions import NEVER_STALE, RATE, floor_points, recorded, standing_plate
 from realtime.worlds import SIZE, block, make
 from servers import FOUND, named, url_on
@@ -34,7 +34,7 @@ def sliding(low: float) -> Player:
     tilted = at(-0.02, 0.0, low)
     tilted[1:3, 1:3] = [[np.cos(0.4), -np.sin(0.4)], [np.sin(0.4), np.cos(0.4)]]
     poses = [at(0.0, 0.0, 0.03), at(0.0, 0.0, low), at(0.02, 0.0, low), tilted, at(0.0, 0.0, 0.03)]
-    return Player(np.linspace(0.0, 1.0, len(poses)), poses)
+    return Player(np.linspace(0.0, 1.0, len(poses)), poses, clock=Steady())
 
 
 def record(

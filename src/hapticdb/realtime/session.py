@@ -155,10 +155,10 @@ class Session(Closes):
             self._begin(device, staleness, seconds)
         except BaseException:
             try:
-                self.close()
-            finally:  # runs even if a second signal interrupts the closing
                 if self._recording is not None:
                     self._recording.discard()
+            finally:  # even if a second signal interrupts that
+                self.close()
             raise
 
     def _check_distances(self, asked: ForceLaw | LawName | None) -> None:

@@ -231,6 +231,7 @@ class Recorder(Closes):
 
     def discard(self) -> None:
         """Remove the file if `open` made it; for a session that did not begin."""
+        self._end = 0  # no frame is taken any more
         if self._file is not None:
             self._file.close()
         if self._made is not None:

@@ -5,7 +5,7 @@
 
 A relay on the loopback interface holds back whatever passes between `feel` and the server for half
 of a round trip each way. A wrench slides over the model, and the cells are new wherever it comes.
-HAPTICDB_SERVER is the URL of a server to use instead of a private one, in whose database an
+HAPTICDB_SERVER is the URL of a server to use instead of one of its own, in whose database an
 environment may be made.
 """
 
@@ -28,9 +28,8 @@ import records
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.sample import write_sample
 from hapticdb.store.postgres.address import with_environment
-from hapticdb.store.postgres.private_server import find_binaries
 from in_real_time import CAR, EXTENT, FRAMES, SETTINGS, session
-from places import serving
+from postgres_servers import find_binaries, serving
 from slide_paths import write_along
 
 ROUND_TRIPS = (0.0, 5e-3, 50e-3)
@@ -103,8 +102,7 @@ def server_url(folder: Path) -> Iterator[str]:
     if given := os.environ.get("HAPTICDB_SERVER"):
         yield given
         return
-    binaries = max(find_binaries(), key=lambda found: found.major)
-    with serving(folder / "server", binaries, SETTINGS) as server:
+    with serving(folder / "server", find_binaries()[0], SETTINGS) as server:
         yield server.conninfo()
 
 

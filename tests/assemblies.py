@@ -131,20 +131,17 @@ TABLES = ("environment", "object", "voxel", "brick", "band", "surface", "change"
 
 
 def rows_of(database: Path, *tables: str) -> Rows:
-    """Rows of an environment's tables without random marks, by the standard library."""
+    """Rows of an environment's tables, by the standard library."""
     with closing(sqlite3.connect(f"file:{database}?mode=ro", uri=True)) as plain:
         assert plain.execute("PRAGMA integrity_check").fetchall() == [("ok",)]
-        found: Rows = {
+        return {
             table: plain.execute(f"SELECT * FROM {table} ORDER BY 1, 2").fetchall()
             for table in tables or TABLES
         }
-        if "environment" in found:  # without the column `lineage`, which is random
-            found["environment"] = [row[:8] for row in found["environment"]]
-        return found
 
 
 def drop_surfaces(url: str | Path, *digests: str) -> None:
-    """Take surfaces, all unless digests are given, out of an environment, as if it were older."""
+    """Take surfaces, all unless digests are given, out of an environment."""
     with closing(open_store(url)) as store:
         driver = cast("Any", store)._connection.driver
         for digest in digests or sorted(store.surface_digests()):

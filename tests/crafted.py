@@ -65,9 +65,10 @@ CRAFTED = {
     "a removal that was none": "UPDATE change SET action = 'remove' WHERE id = 2",
     "a surface of no object": "INSERT INTO surface VALUES ('x', x'00')",
     "a surface without a name": "INSERT INTO surface VALUES (x'00', x'00')",
-    "a surface of text": "INSERT INTO surface SELECT digest, 'x' FROM object WHERE id = 2",
-    "a surface cut short": "INSERT INTO surface SELECT digest, x'00' FROM object WHERE id = 2",
-    "another surface": f"INSERT INTO surface SELECT digest, x'{BALL}' FROM object WHERE id = 2",
+    "a surface of text": "UPDATE surface SET geometry = 'x'",
+    "a surface cut short": "UPDATE surface SET geometry = x'00'",
+    "another surface": f"UPDATE surface SET geometry = x'{BALL}'",
+    "an object without a surface": "DELETE FROM surface",
     "a view for the surfaces": VIEW.format("surface"),
     "a pair of one": (
         "INSERT INTO pair VALUES (2, 2, 'apart', 0, 0, 0, 0, 0, 0, 0, 0, 'new', 1, '', NULL, NULL)"

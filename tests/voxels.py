@@ -6,7 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import CurveName, Grid
+from hapticdb.ingest.geometry import packed_surface
 from hapticdb.ingest.layout import rows_of_voxels
+from hapticdb.mesh import Part
 from hapticdb.store.base import BRICK_BYTES, Band, Layout, Object, Rows, Store
 
 NOTICED_S = 10.0
@@ -25,7 +27,15 @@ EVERYWHERE = [np.array([bound], dtype=np.int64) for bound in (0, 2**62)]
 
 def write_voxels(store: Store, ijk: NDArray[np.int64], name: str = "voxels") -> int:
     """Write voxels (n, 3) as an object of no file; returns its id."""
-    return store.add(voxel_object(store.grid, ijk, name), rows_of_voxels(ijk, *kind(store)))
+    surface = packed_surface(_cloud_of(store.grid, ijk))
+    rows = rows_of_voxels(ijk, *kind(store))
+    return store.add(voxel_object(store.grid, ijk, name), rows, surface)
+
+
+def _cloud_of(grid: Grid, ijk: NDArray[np.int64]) -> Part:
+    """Geometry of an object made of voxels (n, 3): their centres."""
+    centres = np.array(grid.origin) + grid.voxel_size * (ijk + 0.5)
+    return Part("", centres, None, np.eye(4))
 
 
 def voxel_object(grid: Grid, ijk: NDArray[np.int64], name: str = "voxels") -> Object:
@@ -34,7 +44,7 @@ def voxel_object(grid: Grid, ijk: NDArray[np.int64], name: str = "voxels") -> Ob
     return Object(
         name=name,
         link="made",
-        digest=f"{len(ijk)} voxels",
+        digest=_cloud_of(grid, ijk).digest,
         transform=np.eye(4),
         voxels=len(ijk),
         bounds=bounds,

@@ -46,8 +46,6 @@ if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport as FileReport
     from hapticdb.ingest.files import ImportOptions as ImportOptions
     from hapticdb.ingest.files import import_files as import_files
-    from hapticdb.ingest.upgrading import UpgradeReport as UpgradeReport
-    from hapticdb.ingest.upgrading import upgrade_environment as upgrade_environment
     from hapticdb.paper.cost_model import CostModel as CostModel
     from hapticdb.paper.quantiles import QuantileVector as QuantileVector
     from hapticdb.pointshell.shell import PointShell as PointShell
@@ -68,7 +66,6 @@ if TYPE_CHECKING:
     from hapticdb.recording.file import Recording as Recording
     from hapticdb.store.base import Object as Object
     from hapticdb.store.connect import backup_environment as backup_environment
-    from hapticdb.store.connect import restore_environment as restore_environment
     from hapticdb.sweeps.result import Swept as Swept
     from hapticdb.sweeps.run import sweep as sweep
     from hapticdb.transfer import CopyReport as CopyReport

@@ -53,10 +53,6 @@ class CheckReport:
         Number of all faults.
     objects, voxels, rows, surfaces : int
         Numbers of objects, voxels, rows and surfaces that were read.
-    without_row_checksums : int
-        Objects that were written before there were checksums of their rows.
-    without_surfaces : int
-        Objects that were written before there were surfaces; 'hapticdb upgrade' reads them.
     wrong : list of int
         Objects whose rows or distances are not those that were written.
     strays : list of int
@@ -70,8 +66,6 @@ class CheckReport:
     voxels: int = 0
     rows: int = 0
     surfaces: int = 0
-    without_row_checksums: int = 0
-    without_surfaces: int = 0
     wrong: list[int] = field(default_factory=list)
     strays: list[int] = field(default_factory=list)
 
@@ -135,11 +129,6 @@ def repair_environment(
 
     Rows that are not those that were written are made anew from the object's surface. Rows of no
     object, as a crash between the servers of partitions leaves them, are removed.
-
-    Raises
-    ------
-    NoSurfaceError
-        When an object has no surface; those before it are mended.
     """
     with closing(open_store(url)) as store:
         total = len(report.wrong) + len(report.strays)
@@ -164,7 +153,6 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
             report.add(_cause(error))
             return
         report.objects = len(objects)
-        report.without_row_checksums = sum(obj.rows_crc is None for obj in objects.values())
         for finding in chain(
             _log_findings(store, objects),
             _row_findings(store, objects, report, progress),
@@ -274,7 +262,7 @@ def _row_findings(
         yield f"rows of object {missing}, which is not there"
     for obj in objects.values():
         found = sums.voxels.get(obj.id, 0)
-        is_other = obj.rows_crc is not None and sums.value(obj) != obj.rows_crc
+        is_other = sums.value(obj) != obj.rows_crc
         if found != obj.voxels:
             yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
         if is_other:
@@ -327,12 +315,14 @@ def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport
 def _surface_findings(
     store: Store, objects: dict[int, Object], report: CheckReport
 ) -> Iterator[str]:
-    """Surfaces that are damaged, or of no object; counts objects without one."""
+    """Surfaces that are damaged, missing, or of no object."""
     of_digest = {obj.digest: obj for obj in objects.values()}
     there = store.surface_digests()
     for digest in sorted(there - of_digest.keys()):
         yield f"surface {digest:.40} of no object"
-    report.without_surfaces = sum(obj.digest not in there for obj in objects.values())
+    for obj in objects.values():
+        if obj.digest not in there:
+            yield f"object {obj.id} ({obj.name}) has no surface"
     digests = sorted(there & of_digest.keys())
     for at in range(0, len(digests), AT_ONCE):
         for digest, surface in store.surfaces(digests[at : at + AT_ONCE]).items():

@@ -18,7 +18,6 @@
         ├── NotAnEnvironmentError             a file of another kind
         ├── NewerVersionError                 written by a newer hapticdb
         ├── DamagedError                      an environment whose contents are broken
-        ├── NoSurfaceError                    an object that an earlier version has imported
         ├── ReadOnlyError (PermissionError)   a write where only reading is possible
         ├── AccessError (PermissionError)     the server does not let this user in
         ├── ConflictError                     another has written the object meanwhile
@@ -111,10 +110,6 @@ class NewerVersionError(DatabaseError):
 
 class DamagedError(DatabaseError):
     """An environment whose contents are broken."""
-
-
-class NoSurfaceError(DatabaseError):
-    """An object whose surface is not in the database; an upgrade puts it there."""
 
 
 class ReadOnlyError(DatabaseError, PermissionError):

@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 import hapticdb
-from assemblies import drop_surfaces
 from command_line import (  # noqa: F401 - fixtures among them
     Run,
     boxes,
@@ -146,33 +145,3 @@ def test_a_copy_that_is_interrupted_says_that_it_goes_on(
 @pytest.mark.usefixtures("run")
 def test_a_terminal_sees_a_bar(scene: Path) -> None:
     assert "copying" in on_terminal("copy", scene, "b.db")
-
-
-# -- upgrade --------------------------------------------------------------------------------------
-
-
-def test_an_upgrade_says_what_it_did_and_what_it_left_out(run: Run, tmp_path: Path) -> None:
-    """Exit code 1 where an object stays without distances; running again goes on."""
-    without = hapticdb.ImportOptions(distances=False)
-    hapticdb.import_files(tmp_path / "e.db", [boxes(tmp_path / "boxes.glb")], without)
-    (tmp_path / "boxes.glb").rename(tmp_path / "hidden.glb")
-    drop_surfaces(tmp_path / "e.db")
-    assert "; 3 objects without surfaces: 'hapticdb upgrade'" in run("check", "e.db")[1]
-    code, out, err = run("upgrade", "e.db")
-    assert code == 1
-    assert len(err.splitlines()) == 1
-    assert "and 2 of the same file cannot be upgraded, its file cannot be read" in err
-    assert out.startswith("e.db: distances for 0 objects; 3 objects left out; the same command")
-    code, out, err = run("upgrade", "e.db", "--json")
-    record = json.loads(out)
-    assert (code, record["upgraded"], len(record["left_out"])) == (1, 0, 3)
-    assert "\ndistances     none\nsurfaces      none\n" in run("info", "e.db")[1]
-    (tmp_path / "hidden.glb").rename(tmp_path / "boxes.glb")
-    code, out, err = run("upgrade", "e.db")
-    assert (code, out, err) == (0, "e.db: distances for 3 objects, surfaces for 3\n", "")
-    told = json.loads(run("info", "e.db", "--json")[1])
-    found, surfaces = told["distances"], told["surfaces"]
-    assert found["objects"] == 3
-    assert 0 < found["rows"] < found["bytes"]
-    assert 0 < surfaces["shapes"] <= 3 < surfaces["bytes"]
-    assert run("upgrade", "e.db")[1] == "e.db: complete already (3 objects), nothing to do\n"

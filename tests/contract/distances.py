@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from contract.case import StoreCase
-from hapticdb.errors import EnvironmentExistsError, UsageError
+from hapticdb.errors import EnvironmentExistsError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import parsing
@@ -168,17 +168,3 @@ class DistancesContract(StoreCase):
             key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
             found.update(_content_of(rows))
         assert found == self.expected(band, 1, 3)
-
-    def test_a_wish_for_distances_stays(self, store: Store) -> None:
-        assert not store.wants_distances
-        assert _content_of(store.scan(*EVERYWHERE, distances=True)) == {}
-        if store.layout == "voxel":
-            with pytest.raises(UsageError, match="the layout voxel has no distances"):
-                store.want_distances()
-            return
-        store.want_distances()
-        assert store.wants_distances
-        assert store.revision() == 2
-        again = self.reopen(store)
-        assert again.wants_distances
-        again.close()

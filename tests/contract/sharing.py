@@ -49,7 +49,6 @@ class SharingContract(StoreCase):
         writes: list[Callable[[], object]] = [
             lambda: write_voxels(reader, blob(3, (20, 20, 20)), "three"),
             lambda: reader.save_costs("here", {"row": 0.25}),
-            lambda: reader.add_surface(store.object(1).digest, b"later"),
             lambda: reader.put_pairs([]),
         ]
         for write in writes:

@@ -220,7 +220,7 @@ def test_what_has_no_distances_is_not_felt_and_the_line_names_what_may_be_done(
     with (
         floored(make(tmp_path, bits=6)) as flat,
         SessionHost(flat.url, rate=RATE, budget_bytes=8 << 20) as host,
-        pytest.raises(UsageError, match=r"run 'hapticdb upgrade .*', or .* --law plane$"),
+        pytest.raises(UsageError, match=r"import with distances .* --law plane$"),
     ):
         host.begin(sphere, ABOVE)
 

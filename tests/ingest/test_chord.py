@@ -2,14 +2,12 @@
 
 from contextlib import closing
 from pathlib import Path
-from typing import Any, cast
 
 import numpy as np
 import pytest
 
 import hapticdb
 import step_files
-from assemblies import drop_surfaces
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.check import check_environment
 from hapticdb.difference import diff_environments
@@ -74,19 +72,3 @@ def test_a_finer_tessellation_replaces_the_surface(tmp_path: Path, file: Path) -
     with hapticdb.open(other) as env:
         report = env.add(file, replace=True, chord=1e-4)
         assert (report.status, report.chord) == ("complete", coarse.chord)
-
-
-def test_objects_of_earlier_versions_get_their_surfaces_and_have_none(
-    tmp_path: Path, file: Path
-) -> None:
-    """Their digests are those of the triangles alone, of the tolerance that there was."""
-    url = tmp_path / "a.db"
-    imported(url, file, chord=1.25e-5)
-    before = part_in(url).before[0].digest
-    drop_surfaces(url)
-    with closing(open_store(url)) as store:
-        driver = cast("Any", store)._connection.driver
-        driver.execute(f"UPDATE object SET digest = '{before}'")
-    report = hapticdb.upgrade_environment(url)
-    assert (report.surfaces, report.is_complete) == (1, True)
-    assert part_in(url).chord == 0.0

@@ -7,9 +7,9 @@ import numpy as np
 import pytest
 
 import hapticdb
-from assemblies import assembly, drop_surfaces, write_obj
+from assemblies import assembly, write_obj
 from hapticdb.ingest import geometry
-from hapticdb.ingest.geometry import found_parts, parts_of
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import parse_in_process
 from recorded_scene import write_parts
 from servers import Place
@@ -49,18 +49,6 @@ def test_parts_are_those_of_the_file_in_the_order_asked(
                 np.testing.assert_array_equal(part.triangles(), wanted.triangles())
                 arrays.setdefault(obj.digest, set()).add(id(part.vertices))
             assert all(len(one) == 1 for one in arrays.values())
-
-
-def test_an_object_without_a_surface_is_none_or_an_error(tmp_path: Path) -> None:
-    path = write_parts(tmp_path, 12)
-    with hapticdb.open(path, read_only=True) as env:
-        first, *_, last = env.objects()
-        assert first.digest != last.digest
-        drop_surfaces(path, last.digest)
-        kept = {obj.id for obj, part in found_parts(env.store, env.objects()) if part is not None}
-        assert kept == {obj.id for obj in env.objects() if obj.digest != last.digest}
-        with pytest.raises(hapticdb.errors.NoSurfaceError, match="'hapticdb upgrade"):
-            list(parts_of(env.store, [last, first]))
 
 
 def test_a_surface_too_large_for_a_row_is_told_and_nothing_is_made(

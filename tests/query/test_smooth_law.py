@@ -117,9 +117,9 @@ def test_the_default_law_follows_the_objects(env: Environment) -> None:
     with hapticdb.open(env.store.url) as other:
         write_voxels(other.store, blob(1, (20, 20, 20)), "without")
     assert env.touch(shell, pose).law.name == "plane"  # type: ignore[attr-defined]
-    with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
+    with pytest.raises(UsageError, match=r"1 of 6 objects .*: give the law 'plane'"):
         env.touch(shell, pose, law="smooth")
-    with pytest.raises(UsageError, match=r"1 of 6 objects .* 'hapticdb upgrade"):
+    with pytest.raises(UsageError, match=r"1 of 6 objects .*: give the law 'plane'"):
         env.touch(shell, poses=[pose], law="smooth")
     with pytest.raises(UsageError, match="choose one of plane, smooth"):
         env.touch(shell, pose, law="soft")  # type: ignore[call-overload]

@@ -194,7 +194,7 @@ def test_a_law_and_a_coupling_that_do_not_fit_are_refused(
     with floored(make(tmp_path, bits=5)) as without:
         with pytest.raises(UsageError, match="has no distances to its surface"):
             Session(without.url, ball, still(0.03), law="smooth")
-        with pytest.raises(UsageError, match=r"run 'hapticdb upgrade .*', or .* --law plane$"):
+        with pytest.raises(UsageError, match=r"import with distances .* --law plane$"):
             Session(without.url, ball, still(0.03))
         with (
             ResidentCells(without.url, budget_bytes=1 << 20) as plain,

@@ -5,13 +5,11 @@
 import shutil
 import socket
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import pytest
 
 import hapticdb
-from assemblies import drop_surfaces
 from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
 from hapticdb.mesh import read_file
 from hapticdb.recording.file import Recording
@@ -95,20 +93,6 @@ def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
     code, out, err = run("replay", recording)
     assert (code, out) == (1, "nothing to compare: the recording has no frames\n")
     assert err == f"hapticdb: {recording} names {scene}, which is opened\n"
-
-
-@pytest.mark.parametrize("address", ["http://{}/a.glb", "ws://{}/a.stl", "file:///a.ply"])
-def test_objects_whose_links_are_addresses_have_no_file(
-    scene: Path, listening: socket.socket, address: str
-) -> None:
-    link = address.format(f"127.0.0.1:{listening.getsockname()[1]}")
-    with hapticdb.open(scene) as env:
-        for obj in env.objects():  # the file of any of them would give its shape to all
-            env.restore(replace(env.remove(obj.id), link=link))
-        drop_surfaces(scene)
-        left_out = hapticdb.upgrade_environment(scene).left_out
-    assert left_out
-    assert all("there is no such file" in str(left.error) for left in left_out)
 
 
 @pytest.mark.parametrize(

@@ -1,10 +1,9 @@
-"""Backups of SQLite environments: made while others write, restored, never incomplete."""
+"""Backups of SQLite environments: made while others write, put back, never incomplete."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 import json
 import os
-import shutil
 import sys
 from collections.abc import Callable
 from contextlib import closing
@@ -18,7 +17,8 @@ import hapticdb
 from children import child, finished
 from command_line import Run, refused, run, succeeded  # noqa: F401 - a fixture
 from files_in_use import killed, make, write
-from hapticdb import backup_environment, restore_environment
+from hapticdb import backup_environment
+from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.store import SQLiteStore
 
 
@@ -110,27 +110,14 @@ def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
     assert sorted(files(tmp_path)) == ["q.db"]
 
 
-def test_a_copy_under_the_log_of_what_it_was_copied_from_is_refused(
-    path: Path, tmp_path: Path
-) -> None:
-    """Refused even without a commit before the copy: its pages may differ from the original's."""
-    store = SQLiteStore.open(path)
-    backup_environment(path, tmp_path / "copy.db")
-    write(store, 2)
-    shutil.copy(f"{path}-wal", tmp_path / "copy.db-wal")
-    with pytest.raises(hapticdb.errors.DamagedError, match=r"copy\.db-wal"):
-        hapticdb.open(tmp_path / "copy.db")
-    store.close()
-
-
-# --- restoring ------------------------------------------------------------------------------------
+# --- putting back --------------------------------------------------------------------------------
 
 
 def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) -> None:
     killed(path, 3, 4)
     assert Path(f"{path}-wal").stat().st_size
     kept = copy.read_bytes()
-    report = restore_environment(copy, path)
+    report = backup_environment(copy, path, replace=True)
     assert sorted(files(path.parent)) == ["copy.db", "q.db"]
     assert (report.revision, report.objects) == (2, 2)
     assert names(path) == ["floor", "blob 1"]
@@ -145,7 +132,7 @@ def test_a_copy_goes_where_the_file_is_gone_or_damaged(path: Path, copy: Path, w
         if what == "a log":
             killed(path, 3)
         path.unlink()
-    restore_environment(copy, path)
+    backup_environment(copy, path, replace=True)
     assert sorted(files(path.parent)) == ["copy.db", "q.db"]
     assert names(path) == ["floor", "blob 1"]
 
@@ -161,7 +148,7 @@ def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: 
     before = path.read_bytes()
     with closing(SQLiteStore.open(path, read_only=read_only)) as store:  # in this process
         with pytest.raises(hapticdb.errors.BusyError, match="is open"):
-            restore_environment(copy, path)
+            backup_environment(copy, path, replace=True)
         assert len(store.objects()) == 3
     command = [sys.executable, "-c", script, str(path), str(read_only)]
     with child(command, stdin=-1) as holder:
@@ -169,29 +156,11 @@ def test_a_file_that_is_open_is_not_replaced(path: Path, copy: Path, read_only: 
         assert holder.stdin is not None
         holder.stdout.readline()
         with pytest.raises(hapticdb.errors.BusyError, match="is open"):
-            restore_environment(copy, path)
+            backup_environment(copy, path, replace=True)
         holder.stdin.close()
         holder.stdin = None
     assert path.read_bytes() == before
-    restore_environment(copy, path)
-    assert names(path) == ["floor", "blob 1"]
-
-
-def test_a_restore_killed_between_file_and_log_is_finished_by_the_same_command(
-    path: Path, copy: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    killed(path, 3)
-
-    def die(*_: object, **__: object) -> NoReturn:
-        raise SystemExit
-
-    monkeypatch.setattr(Path, "unlink", die)
-    with pytest.raises(SystemExit):
-        restore_environment(copy, path)
-    monkeypatch.undo()
-    with pytest.raises(hapticdb.errors.DamagedError, match="-wal"):
-        hapticdb.open(path)
-    restore_environment(copy, path)
+    backup_environment(copy, path, replace=True)
     assert names(path) == ["floor", "blob 1"]
 
 
@@ -218,11 +187,9 @@ def test_what_is_no_environment_is_neither_replaced_nor_copied(
     make(other)
     before = files(tmp_path)
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
-        restore_environment(copy, other)
-    with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
         backup_environment(copy, other, replace=True)
     with pytest.raises(hapticdb.errors.NotAnEnvironmentError):
-        restore_environment(other, tmp_path / "q.db")
+        backup_environment(other, tmp_path / "q.db", replace=True)
     assert files(tmp_path) == before
 
 
@@ -239,13 +206,35 @@ def test_a_copy_without_room_names_the_file_that_was_asked_for(tmp_path: Path) -
     assert not list(tmp_path.glob("*copy*"))
 
 
+@pytest.mark.parametrize("step", ["sync_folder", "replace"])
+def test_a_replacement_that_is_killed_leaves_the_former_file_or_the_copy(
+    path: Path, copy: Path, monkeypatch: pytest.MonkeyPatch, step: str
+) -> None:
+    """The log of the former file never lies beside the copy, to which SQLite would apply it."""
+    killed(path, 3)
+    former = path.read_bytes()
+
+    def die(*_: object, **__: object) -> NoReturn:
+        raise SystemExit
+
+    owner = sqlite_bytes if step == "sync_folder" else Path
+    monkeypatch.setattr(owner, step, die)
+    with pytest.raises(SystemExit):
+        backup_environment(copy, path, replace=True)
+    monkeypatch.undo()
+    assert path.read_bytes() == former
+    assert not Path(f"{path}-wal").exists()
+    backup_environment(copy, path, replace=True)
+    assert names(path) == ["floor", "blob 1"]
+
+
 # --- the command line -----------------------------------------------------------------------------
 
 
 def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
     out = succeeded(run("backup", path, "copy.db"))
     assert out.startswith(f"copy.db: {path} at revision 2, 2 objects, 0.")
-    out = succeeded(run("restore", "copy.db", path, "--json"))
+    out = succeeded(run("backup", "copy.db", path, "--replace", "--json"))
     size = path.stat().st_size
     assert json.loads(out) == {
         "source": "copy.db",
@@ -259,13 +248,9 @@ def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:
 def test_bad_places_are_one_line(run: Run, path: Path, tmp_path: Path) -> None:
     before = files(tmp_path)
     refused(run("backup", path, path), "itself")
-    refused(run("restore", path, path), "itself")
     refused(run("backup", path, tmp_path / "no" / "copy.db"), "does not exist")
     refused(run("backup", tmp_path / "no.db", "copy.db"), "no environment at")
-    refused(run("restore", tmp_path / "no.db", path), "no environment at")
     server = "postgresql://me:secret@host/plant"
     assert "secret" not in refused(run("backup", server, "copy.db"), "hapticdb copy")
     refused(run("backup", path, server), "not a file")
-    refused(run("restore", path, server), "hapticdb copy")
-    refused(run("restore", server, path), "not a file")
     assert files(tmp_path) == before

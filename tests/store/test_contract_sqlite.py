@@ -5,10 +5,8 @@ import os
 import shutil
 import sqlite3
 import sys
-import zlib
 from collections.abc import Callable
 from contextlib import closing
-from dataclasses import replace
 from pathlib import Path
 
 import apsw
@@ -20,13 +18,11 @@ from children import child, exit_code, finished
 from contract.store import StoreContract
 from files_in_use import GRID, make
 from hapticdb.store.connect import backup_environment
-from hapticdb.store.schema import FORMAT_VERSION
+from hapticdb.store.refusals import FORMAT
 from hapticdb.store.sqlite import place
-from hapticdb.store.sqlite.file import named_errors
-from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS
-from hapticdb.store.sqlite.raw import PAGE_BYTES
+from hapticdb.store.sqlite.file import BEFORE_FORMAT_1, named_errors
 from hapticdb.store.sqlite.store import SQLiteStore
-from voxels import blob, with_distances, write_voxels
+from voxels import blob, write_voxels
 
 ALL_KEYS = np.array([0]), np.array([1 << 9])
 
@@ -48,93 +44,19 @@ def path(tmp_path: Path) -> Path:
     return make(tmp_path / "e.db")
 
 
-def make_old(path: Path) -> None:
-    """Turn a file into one of format 1: no marks of commits."""
-    with closing(SQLiteStore.open(path, read_only=True)) as new:
-        tables = {
-            name: new._connection.fetch(f"SELECT * FROM {name}")
-            for name in ("environment", "object", "voxel", "brick", "change")
-        }
-    path.unlink()
-    with closing(apsw.Connection(str(path))) as old:
-        old.execute("PRAGMA page_size = 8192")
-        for statement in MIGRATIONS["tables"]:
-            old.execute(statement)
-        tables["environment"] = [row[:8] for row in tables["environment"]]
-        for name, rows in tables.items():
-            for row in rows:
-                old.execute(f"INSERT INTO {name} VALUES ({', '.join('?' * len(row))})", row)
-        old.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-        old.execute("PRAGMA user_version = 1")
-        old.execute("PRAGMA journal_mode = WAL").fetchall()
-
-
-def give_checksums(path: Path) -> None:
-    """Turn a file into one whose pages have checksums in 16 reserved bytes, as they once had."""
-    with closing(apsw.Connection(str(path))) as made:
-        made.execute("PRAGMA journal_mode = DELETE").fetchall()
-        made.reserve_bytes(reserve=16)
-        made.execute("VACUUM")
-        made.execute(f"PRAGMA user_version = {1000 + FORMAT_VERSION}")
-        made.execute("PRAGMA journal_mode = WAL").fetchall()
-    content = path.read_bytes()
-    with path.open("wb") as file:
-        for n in range(len(content) // PAGE_BYTES):
-            page, start = content[n * PAGE_BYTES : (n + 1) * PAGE_BYTES - 16], b"HapC" + bytes(8)
-            crc = zlib.crc32(page, zlib.crc32(start + (n + 1).to_bytes(4, "big")))
-            file.write(page + start + crc.to_bytes(4, "big"))
-
-
-def test_a_file_of_format_1_is_read_as_it_is_and_brought_up_to_date_by_a_writer(path: Path) -> None:
-    make_old(path)
-    before = path.read_bytes()
-    everywhere = np.array([0]), np.array([2**62])
-    with closing(SQLiteStore.open(path, read_only=True)) as reader:
-        (obj,) = reader.objects()
-        assert not reader.wants_distances
-        assert not obj.has_distances
-        assert not len(reader.scan(*everywhere, distances=True))
-        assert reader.surface_digests() == set(reader.surfaces([obj.digest])) == set()
-        assert path.read_bytes() == before
-        rows = with_distances(blob(1, (20, 20, 20)), GRID, "brick")
-        with closing(SQLiteStore.open(path)) as writer:
-            assert not writer.wants_distances
-            writer.add(replace(obj, name="blob"), rows, b"surface")
-        assert len(reader.scan(*everywhere, distances=True)) == len(rows)
-        assert reader.surfaces([obj.digest]) == {obj.digest: b"surface"}
-    assert version_of(path) == FORMAT_VERSION
-
-
-def test_a_file_whose_pages_had_checksums_is_read_copied_and_written(
-    path: Path, tmp_path: Path
-) -> None:
-    give_checksums(path)
-    everywhere = np.array([0]), np.array([2**62])
-    copy = tmp_path / "copy.db"
-    backup_environment(path, copy)
-    with closing(SQLiteStore.open(path, read_only=True)) as reader:
-        rows = reader.scan(*everywhere)
-    assert version_of(path) == 1000 + FORMAT_VERSION
-    for file in (path, copy):
-        with closing(SQLiteStore.open(file)) as writer:
-            np.testing.assert_array_equal(writer.scan(*everywhere).keys, rows.keys)
-            write_voxels(writer, blob(1, (20, 20, 20)), "blob")
-        assert version_of(file) == 2000 + FORMAT_VERSION  # what wrote checksums refuses it
-        assert hapticdb.check_environment(file).findings == []
-
-
-def version_of(path: Path) -> int:
-    with closing(sqlite3.connect(path)) as plain:
-        return int(plain.execute("PRAGMA user_version").fetchone()[0])
-
-
 def write_text(path: Path) -> None:
     path.write_text("x,y,z\n" * 100)
 
 
 def write_newer_version(path: Path) -> None:
     with closing(sqlite3.connect(path)) as plain, plain:
-        plain.execute(f"PRAGMA user_version = {FORMAT_VERSION + 1}")
+        plain.execute(f"PRAGMA user_version = {FORMAT + 1}")
+
+
+def write_former_mark(path: Path) -> None:
+    with closing(sqlite3.connect(path)) as plain, plain:
+        plain.execute(f"PRAGMA application_id = {BEFORE_FORMAT_1}")
+        plain.execute("PRAGMA user_version = 7")
 
 
 def cut_off(path: Path) -> None:
@@ -150,6 +72,7 @@ def empty(path: Path) -> None:
     [
         (write_text, hapticdb.errors.NotAnEnvironmentError, "no hapticdb environment"),
         (empty, hapticdb.errors.NotAnEnvironmentError, "is empty"),
+        (write_former_mark, hapticdb.errors.NotAnEnvironmentError, r"was made before 0\.1; import"),
         (write_newer_version, hapticdb.errors.NewerVersionError, "install a newer"),
         (cut_off, hapticdb.errors.DamagedError, "is damaged"),
         (Path.unlink, hapticdb.errors.EnvironmentNotFoundError, "no environment at"),

@@ -12,7 +12,7 @@ import pytest
 
 import hapticdb
 from children import finished
-from files_in_use import make, names, write
+from files_in_use import make, write
 from hapticdb.store.sqlite.store import SQLiteStore
 
 EVERYWHERE = [(0, 2**62)]
@@ -38,20 +38,6 @@ def moved(path: Path) -> None:
     path.rename(path.with_name("elsewhere.db"))
 
 
-def log_deleted(path: Path) -> None:
-    Path(f"{path}-wal").unlink()
-
-
-def memory_deleted(path: Path) -> None:
-    Path(f"{path}-shm").unlink()
-
-
-def all_deleted(path: Path) -> None:
-    for suffix in ("", "-wal", "-shm"):
-        Path(f"{path}{suffix}").unlink()
-
-
-EVENTS = [replaced, deleted, moved, log_deleted, memory_deleted, all_deleted]
 WRITES: list[Callable[[SQLiteStore], object]] = [
     lambda store: write(store, 2),
     lambda store: store.remove(1, lambda _: EVERYWHERE),
@@ -60,8 +46,10 @@ WRITES: list[Callable[[SQLiteStore], object]] = [
 ]
 
 
-@pytest.mark.parametrize("event", EVENTS)
-@pytest.mark.parametrize("change", WRITES, ids=["add", "remove", "save_costs", "analyze"])
+@pytest.mark.parametrize(
+    ("event", "change"),
+    [*((replaced, one) for one in WRITES), *((e, WRITES[0]) for e in (deleted, moved))],
+)
 def test_a_write_into_a_file_that_is_gone_is_refused(
     path: Path, event: Callable[[Path], None], change: Callable[[SQLiteStore], object]
 ) -> None:
@@ -76,7 +64,7 @@ def test_a_write_into_a_file_that_is_gone_is_refused(
     store.close()
 
 
-@pytest.mark.parametrize("event", [replaced, deleted, log_deleted])
+@pytest.mark.parametrize("event", [replaced, deleted])
 def test_a_file_that_goes_while_it_is_written_is_not_reported_as_written(
     path: Path, event: Callable[[Path], None]
 ) -> None:
@@ -100,60 +88,6 @@ def test_a_replaced_file_keeps_what_is_its_own(path: Path) -> None:
         write(store, 2)
     store.close()
     assert path.read_bytes() == before
-    for suffix in ("-wal", "-shm"):
-        Path(f"{path}{suffix}").unlink(missing_ok=True)
-    assert names(path) == ["floor"]
-
-
-@pytest.mark.parametrize("event", [log_deleted, memory_deleted])
-def test_what_was_committed_goes_into_the_file_though_the_logs_name_is_gone(
-    path: Path, event: Callable[[Path], None]
-) -> None:
-    store = SQLiteStore.open(path)
-    write(store, 1)
-    event(path)
-    with pytest.raises(hapticdb.errors.ConnectionLostError, match=r"q\.db-(wal|shm) was removed"):
-        write(store, 2)
-    store.close()
-    assert names(path) == ["floor", "blob 1"]
-
-
-@pytest.mark.parametrize("read_only", [False, True])
-def test_nobody_opens_a_file_whose_log_was_taken_from_who_has_it_open(
-    path: Path, read_only: bool
-) -> None:
-    script = (
-        "import sys, hapticdb\n"
-        "try: hapticdb.open(sys.argv[1], read_only=sys.argv[2] == 'True')\n"
-        "except hapticdb.errors.BusyError as error: print(error)\n"
-    )
-    store = SQLiteStore.open(path)
-    write(store, 1)
-    log_deleted(path)
-    told = finished([sys.executable, "-c", script, str(path), str(read_only)])
-    assert "q.db-wal was removed while another has" in told.stdout
-    store.close()
-    assert names(path) == ["floor", "blob 1"]
-
-
-@pytest.mark.parametrize("is_dropped", [False, True])
-def test_a_copy_put_in_place_by_hand_is_not_written_into_by_the_log_that_was_removed(
-    path: Path, tmp_path: Path, is_dropped: bool
-) -> None:
-    """An old copy overwrites the file (same inode), the log is deleted; the old store ends last."""
-    with closing(SQLiteStore.open(path)) as store:
-        write(store, 1)
-    store = SQLiteStore.open(path)
-    write(store, 2)
-    shutil.copy(tmp_path / "copy", path)
-    log_deleted(path)
-    memory_deleted(path)
-    if is_dropped:
-        del store
-    else:
-        store.close()
-    assert path.read_bytes() == (tmp_path / "copy").read_bytes()
-    assert names(path) == ["floor"]
 
 
 def test_a_reader_never_feels_commits_into_another_file(

@@ -9,8 +9,7 @@ import pytest
 
 from hapticdb import Grid
 from hapticdb.errors import UsageError
-from hapticdb.store.connect import create_store, grant, open_store
-from hapticdb.store.engines import Right
+from hapticdb.store.connect import create_store, grant
 from hapticdb.store.postgres.address import LONGEST_NAME, parse, with_environment
 from servers import Place, roles
 
@@ -53,36 +52,6 @@ def test_a_role_name_that_is_too_long_is_not_granted_to_its_beginning(
     assert not may_read(admin, role, url)
     grant(url, role, "viewer")
     assert may_read(admin, role, url)
-
-
-@pytest.mark.parametrize("right", ["viewer", "editor"])
-def test_rights_from_before_a_table_hold_for_it(
-    place: Place, role: str, admin: psycopg.Connection, right: Right
-) -> None:
-    """The step that makes a table gives a role on it what it may do with the bricks."""
-    url = place()
-    create_store(url, GRID).close()
-    grant(url, role, right)
-    name = parse(url).environment
-    admin.execute(f"DROP TABLE {name}.band, {name}.surface, {name}.pair")
-    admin.execute(f"DROP INDEX {name}.object_digest")
-    admin.execute(f"ALTER TABLE {name}.environment DROP wants_distances")
-    admin.execute(f"UPDATE {name}.environment SET format = 3")
-    open_store(url).close()
-    held = admin.execute(
-        "SELECT has_table_privilege(%(role)s, %(band)s, 'SELECT'),"
-        "       has_table_privilege(%(role)s, %(band)s, 'INSERT'),"
-        "       has_table_privilege(%(role)s, %(band)s, 'DELETE'),"
-        "       has_table_privilege(%(role)s, %(surface)s, 'INSERT'),"
-        "       has_column_privilege(%(role)s, %(one)s, 'wants_distances', 'UPDATE')",
-        {
-            "role": role,
-            "band": f"{name}.band",
-            "surface": f"{name}.surface",
-            "one": f"{name}.environment",
-        },
-    ).fetchone()
-    assert held == (True, *[right == "editor"] * 4)
 
 
 @pytest.mark.parametrize(

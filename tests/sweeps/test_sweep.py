@@ -13,12 +13,11 @@ from numpy.typing import NDArray
 
 import hapticdb
 from hapticdb import Environment, PointShell
-from hapticdb.errors import NoSurfaceError, ObjectNotFoundError, UsageError
+from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.poses import rotation_of
 from hapticdb.sweeps.result import Swept
 from hapticdb.sweeps.run import CONTACT, sweep
-from voxels import write_voxels
 
 Floats = NDArray[np.float64]
 
@@ -318,14 +317,6 @@ def test_a_sweep_sees_one_revision_while_others_write(tmp_path: Path) -> None:
         after = sweep(env, TOOL, path)
     assert (names(meanwhile), meanwhile.revision) == (["shelf"], before)
     assert (names(after), after.revision) == ([], before + 1)
-
-
-def test_an_object_without_a_surface_is_refused_in_one_line(tmp_path: Path) -> None:
-    grid = hapticdb.Grid(0.01, (0.0, 0.0, 0.0), 5)
-    with hapticdb.create(tmp_path / "x.db", grid) as env:
-        write_voxels(env.store, np.array([[3, 3, 3]]), "voxels")
-        with pytest.raises(NoSurfaceError, match="hapticdb upgrade"):
-            sweep(env, TOOL, line((0.03, 0.03, 0.03)))
 
 
 @pytest.mark.parametrize(

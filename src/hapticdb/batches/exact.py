@@ -25,7 +25,7 @@ def exact_clearance(
 ) -> ClearanceBatch:
     """Distances at poses (B, 4, 4), rigid; boxes say which objects may be near, surfaces how near.
 
-    Raises `UsageError` if the shell has no surface, NoSurfaceError if an object has none.
+    Raises `UsageError` if the shell has no surface.
     """
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 

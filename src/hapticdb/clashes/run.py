@@ -87,7 +87,7 @@ def find_clashes(
         If a number is out of range.
     ClusterError, MissingExtraError
         If there are no workers, or they do not reach the environment.
-    ObjectNotFoundError, NoSurfaceError
+    ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
     if not 0.0 < contact <= within < np.inf:

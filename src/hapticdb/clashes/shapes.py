@@ -5,7 +5,7 @@ from collections import OrderedDict
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.ingest.geometry import no_surface, unpacked_part
+from hapticdb.ingest.geometry import unpacked_part
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import Object, Store
 
@@ -28,10 +28,7 @@ class Shapes:
         self._placements: dict[int, tuple[tuple[str, bytes], Floats]] = {}
 
     def shape(self, obj: Object) -> CollisionShape | None:
-        """Shape of an object; None if it was written meanwhile.
-
-        Raises `NoSurfaceError` if the object's surface is not in the database.
-        """
+        """Shape of an object; None if it was written meanwhile."""
         key, _ = self.placement(obj)
         shape = self._kept.get(key)
         if shape is None:
@@ -54,10 +51,10 @@ class Shapes:
 
     def _read(self, obj: Object, linear: Floats) -> CollisionShape | None:
         packed = self._store.surfaces([obj.digest]).get(obj.digest)
-        if packed is None:
-            if all(now.digest != obj.digest for now in self._store.objects([obj.id])):
-                return None
-            raise no_surface(self._store.url, obj)
+        if packed is None and all(
+            now.digest != obj.digest for now in self._store.objects([obj.id])
+        ):
+            return None
         part = unpacked_part(self._store.url, obj, packed)
         corners = part.vertices @ linear.T
         if part.faces is None:

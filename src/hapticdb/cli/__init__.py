@@ -21,7 +21,7 @@ from hapticdb.cli.verbs.extracting import HELP as EXTRACT_HELP
 from hapticdb.cli.verbs.extracting import extract
 from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.importing import import_
-from hapticdb.cli.verbs.keeping import backup, check, grant, restore, upgrade
+from hapticdb.cli.verbs.keeping import backup, check, grant
 from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
@@ -57,8 +57,6 @@ VERBS: dict[Callable[..., None], str] = {
     diff: "Say whether two environments hold the same.",
     check: "Say whether an environment is sound.",
     backup: "Copy an SQLite environment into a file, whole.",
-    restore: "Put such a copy in an environment's place.",
-    upgrade: "Give objects surfaces and distances that they lack.",
     grant: "Say what a role may do, on PostgreSQL.",
     demo: "Make, import, touch and draw the sample.",
     sample: "Write a sample: a car, a wrench and its path.",

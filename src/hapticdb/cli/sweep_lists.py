@@ -8,7 +8,7 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
-from hapticdb.errors import FileError, NoSurfaceError, ObjectNotFoundError, UsageError
+from hapticdb.errors import FileError, ObjectNotFoundError, UsageError
 
 COLUMNS = ("part", "tool", "path", "where", "exclude", "contact")
 BETWEEN = ";"
@@ -41,7 +41,7 @@ def naming(line: str) -> Iterator[None]:
     """Put a line's place before what is wrong with it."""
     try:
         yield
-    except (FileError, NoSurfaceError, ObjectNotFoundError, UsageError) as error:
+    except (FileError, ObjectNotFoundError, UsageError) as error:
         if not line:
             raise
         raise UsageError(f"{line}: {error}") from error

@@ -154,8 +154,6 @@ class Environment(Queries, Closes):
         ------
         ObjectNotFoundError
             If a word chooses nothing.
-        NoSurfaceError
-            If an object was imported by a version that kept no surfaces.
         UsageError
             If no word is given, or an object is a point cloud, which has no surface.
         """
@@ -281,7 +279,7 @@ class Environment(Queries, Closes):
         ------
         EnvironmentExistsError
             If the part is in the environment.
-        NoSurfaceError
+        UsageError
             If neither `removed` nor the environment has its surface.
         """
         self._check_writable()
@@ -305,8 +303,6 @@ class Environment(Queries, Closes):
         ------
         ConflictError
             If `revision` is given and the object has been written since.
-        NoSurfaceError
-            If the object was imported by a version that kept no surfaces.
         OutsideGridError
             If the object would leave the grid.
         """
@@ -330,7 +326,7 @@ class Environment(Queries, Closes):
 
         Raises
         ------
-        NoSurfaceError, OutsideGridError
+        OutsideGridError
             As for `move`; then no object is shifted.
         """
         self._check_writable()

@@ -14,7 +14,7 @@ from typing import Any, Literal, NamedTuple
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
-from hapticdb.errors import MissingExtraError, NoSurfaceError, UsageError
+from hapticdb.errors import MissingExtraError, UsageError
 from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict, ids_of
 from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
@@ -163,7 +163,7 @@ def disassemble(
 
     Raises
     ------
-    ObjectNotFoundError, NoSurfaceError, UsageError
+    ObjectNotFoundError, UsageError
         As for `extract`, about the parts. Other objects whose files are gone are not taken off.
     MissingExtraError
         If straight pulls lead to no order, and the planner is not installed.
@@ -328,7 +328,7 @@ class _OrderSearch:
             if not is_wanted:
                 self._check_something_stands({*excluded, *ids})
             found = self._searched(ids, motions)
-        except (NoSurfaceError, UsageError) as error:
+        except UsageError as error:
             if is_wanted:
                 raise
             failed = FailedSearch(parts, n_gone, None, (), str(error))

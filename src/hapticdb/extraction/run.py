@@ -96,8 +96,6 @@ def extract(
     ------
     ObjectNotFoundError
         If a word chooses no object.
-    NoSurfaceError
-        If a part was imported by a version that kept no surfaces.
     MissingExtraError
         If no straight pull leads out, and the planner is not installed.
     UsageError

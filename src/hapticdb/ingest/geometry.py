@@ -6,7 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 
-from hapticdb.errors import FileError, NoSurfaceError, UsageError
+from hapticdb.errors import FileError, UsageError
 from hapticdb.ingest.layout import Bricks, bricks_of_rows, merged
 from hapticdb.mesh import Part, packing
 from hapticdb.paper.quantiles import QuantileVector
@@ -25,26 +25,7 @@ than a second. A larger value needs fewer statements and more memory."""
 
 
 def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
-    """Yield objects with their geometry, as `found_parts`.
-
-    Raises `NoSurfaceError` if the surface of an object is not in the database.
-    """
-    for obj, part in found_parts(store, objects):
-        if part is None:
-            raise no_surface(store.url, obj)
-        yield obj, part
-
-
-def no_surface(url: str, obj: Object) -> NoSurfaceError:
-    """Error of an object whose surface is not in the database."""
-    return NoSurfaceError(
-        f"object {obj.id} ({obj.name}) has no surface in {url}: run 'hapticdb upgrade {url}', "
-        f"which reads it from {obj.link}"
-    )
-
-
-def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part | None]]:
-    """Yield objects, in their order, with their geometry; None without a surface in the database.
+    """Yield objects, in their order, with their geometry; DamagedError for an object without.
 
     Reads each surface once, and keeps it as long as a later object has it.
     """
@@ -58,20 +39,22 @@ def found_parts(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Objec
             ahead = {later.digest for later in objects[at : at + AT_ONCE]} - asked
             packed |= store.surfaces(sorted(ahead))
             asked |= ahead
-        if digest in packed:
-            shapes[digest] = unpacked_part(store.url, obj, packed.pop(digest))
-        shape = shapes.get(digest)
+        if digest not in shapes:
+            shapes[digest] = unpacked_part(store.url, obj, packed.pop(digest, None))
+        shape = shapes[digest]
         uses[digest] -= 1
         if not uses[digest]:
-            shapes.pop(digest, None)
-        yield obj, None if shape is None else _placed(shape, obj)
+            del shapes[digest]
+        yield obj, replace(shape, name=obj.name, world_from_part=obj.transform)
 
 
-def unpacked_part(url: str, obj: Object, surface: bytes) -> Part:
+def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
     """Geometry of an object from its packed surface; DamagedError if it is not that of its digest.
 
     The digest is a checksum of all that the part has, so nothing else is ever returned.
     """
+    if surface is None:
+        raise damaged(url, f"object {obj.id} ({obj.name}) has no surface")
     try:
         vertices, faces, colours, chord = packing.unpack(surface)
     except ValueError as error:
@@ -116,11 +99,6 @@ def shell_of_objects(
     faces = np.arange(len(corners)).reshape(-1, 3)
     shell = PointShell.from_mesh(corners, faces, points, spacing=spacing, seed=seed, inset=inset)
     return replace(shell, chord=chord)
-
-
-def _placed(shape: Part, obj: Object) -> Part:
-    """A shape as the part of an object; objects of one shape share its arrays."""
-    return replace(shape, name=obj.name, world_from_part=obj.transform)
 
 
 def rows_of_object(

@@ -6,7 +6,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.errors import NoSurfaceError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of, unpacked_part
 from hapticdb.ingest.planning import bounds_inside
 from hapticdb.ingest.voxelizing import rows_of_part
@@ -33,9 +33,9 @@ def restore_object(store: Store, record: Object) -> int:
     """Write an object that was removed, at its place and with its id; see `Environment.restore`."""
     surface = record.surface or store.surfaces([record.digest]).get(record.digest)
     if surface is None:
-        raise NoSurfaceError(
-            f"object {record.id} ({record.name}) cannot be put back, its surface is not in "
-            f"{store.url}: import {record.link} again"
+        raise UsageError(
+            f"object {record.id} ({record.name}) cannot be put back: give what 'remove' returned, "
+            "which has its surface"
         )
     part = unpacked_part(store.url, record, surface)
     bounds = bounds_inside(part, record.link, store.grid, record.transform)

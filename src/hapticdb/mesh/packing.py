@@ -7,8 +7,7 @@ lzma 0.3 to 0.5 less and ten times as long; the distinct values of each axis, so
 less and twice the code. Unpacking takes a quarter of a second for a million triangles.
 
 Colours follow as a zlib stream of their own, where there are some: a palette, and the number in it
-of each triangle. The chord error comes last, where there is one. Without them nothing follows, as
-in versions that knew neither.
+of each triangle. The chord error comes last, where there is one.
 """
 
 import struct

@@ -1,8 +1,7 @@
 """What a mesh file holds once read: parts, their placements, and what was wrong with them."""
 
 import hashlib
-from dataclasses import dataclass, field, replace
-from typing import Any
+from dataclasses import dataclass, field
 
 import numpy as np
 from numpy.typing import NDArray
@@ -88,30 +87,16 @@ class Part:
     @property
     def digest(self) -> str:
         """SHA-256 of geometry, colours and chord error, 64 hex digits, without placement."""
-        chord = np.array([self.chord]) if self.chord else None
-        return self._hashed("digest", (self.vertices, self.faces, self.colours, chord))
-
-    @property
-    def before(self) -> tuple["Part", "Part"]:
-        """The part without chord error, and without colours, too, as earlier versions had it."""
-        exact = self._hashed("exact", (self.vertices, self.faces, self.colours))
-        bare = self._hashed("bare", (self.vertices, self.faces))
-        return (
-            replace(self, chord=0.0, shared={"digest": exact}),
-            replace(self, chord=0.0, colours=None, shared={"digest": bare}),
-        )
-
-    def _hashed(self, key: str, arrays: tuple[NDArray[Any] | None, ...]) -> str:
-        if key not in self.shared:
-            content = hashlib.sha256()
-            content.update(b"cloud" if self.faces is None else b"mesh")
-            for array in arrays:
+        if "digest" not in self.shared:
+            chord = np.array([self.chord]) if self.chord else None
+            content = hashlib.sha256(b"cloud" if self.faces is None else b"mesh")
+            for array in (self.vertices, self.faces, self.colours, chord):
                 if array is not None:
                     little = np.ascontiguousarray(array, dtype=array.dtype.newbyteorder("<"))
                     content.update(len(little).to_bytes(8, "little"))
                     content.update(little.data)
-            self.shared[key] = content.hexdigest()
-        return self.shared[key]
+            self.shared["digest"] = content.hexdigest()
+        return self.shared["digest"]
 
     def world_points(
         self, world_from_part: NDArray[np.float64] | None = None

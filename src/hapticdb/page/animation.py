@@ -13,7 +13,7 @@ from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError, pip_line
 from hapticdb.extraction.result import Extraction
 from hapticdb.grid import corners_of
-from hapticdb.ingest.geometry import found_parts
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.page import colours
 from hapticdb.page.drawing import put_at
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened, sharpened
@@ -201,8 +201,8 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
         and (obj.bounds[0] < box[1] + reach).all()
     ]
     shapes: dict[int, Facets] = {}
-    for obj, part in found_parts(env.store, near):
-        if part is None or part.is_cloud:
+    for obj, part in parts_of(env.store, near):
+        if part.is_cloud:
             shapes[obj.id] = _of_voxels(env, obj)
         else:
             shapes[obj.id] = _of_triangles(part.triangles(obj.transform))

@@ -12,7 +12,7 @@ from PIL import Image, ImageDraw
 
 from hapticdb.clashes.result import GRAVITY, Clash, Clashes
 from hapticdb.environment import Environment
-from hapticdb.ingest.geometry import found_parts
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
@@ -157,8 +157,7 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
         a, b = pair
         if one.kind not in GRAVITY[:4] or one.place is None or a is None or b is None:
             continue
-        parts = [part for _, part in found_parts(env.store, [a, b])]
-        surfaces = [part.surface() for part in parts if part is not None]
+        surfaces = [part.surface() for _, part in parts_of(env.store, [a, b])]
         picture = io.BytesIO()
         _drawn(one, (a, b), surfaces, up).save(picture, "PNG")
         data = base64.b64encode(picture.getvalue()).decode()

@@ -11,7 +11,7 @@ from PIL import Image, ImageColor, ImageDraw, ImageFont
 from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import FileError
-from hapticdb.ingest.geometry import found_parts
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import read_file
 from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
@@ -50,7 +50,7 @@ def _compose(env: Environment, scene: "DemoScene", comparison: "Comparison") -> 
     colors = dict(zip(most, COLORS, strict=False))
     boxes = np.array([obj.bounds for obj in objects])
     canvas = Canvas(boxes, SCENE, np.array(WINDOW, float), _rgb(PAPER), up_axis(objects))
-    parts = [(obj, part.surface()) for obj, part in found_parts(env.store, objects) if part]
+    parts = [(obj, part.surface()) for obj, part in parts_of(env.store, objects)]
     tints = [np.tile(_rgb(colors.get(obj.id, BODY)), (len(faces), 1)) for obj, faces in parts]
     canvas.fill(np.concatenate([faces for _, faces in parts]), np.concatenate(tints))
     tool = np.concatenate([part.triangles() for part in read_file(scene.files.wrench).parts])

@@ -145,7 +145,8 @@ class KnownObjects:
         if lacking:
             raise UsageError(
                 f"{len(lacking)} of {len(self.by_id)} objects of {url} have no distances to their "
-                f"surfaces ({lacking[0]}): run 'hapticdb upgrade {url}', or give the law 'plane'"
+                f"surfaces ({lacking[0]}): give the law 'plane', or import with distances into "
+                "another environment"
             )
 
 

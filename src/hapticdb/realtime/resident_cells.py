@@ -69,7 +69,8 @@ def without_distances(url: str) -> str:
     """Words for a coupling in an environment without distances: what may be done."""
     return (
         f"{redact(url)} has no distances to surfaces, which the coupling of hand and tool needs: "
-        f"run 'hapticdb upgrade {redact(url)}', or feel tangent planes directly with --law plane"
+        "import with distances into another environment, or feel tangent planes directly with "
+        "--law plane"
     )
 
 

@@ -346,12 +346,6 @@ class _WritesObjects(Protocol):
     def remove(self, object_id: int, covering: Covering) -> None:
         """Remove an object and its rows in one transaction; `covering` says where they are."""
 
-    def add_surface(self, digest: str, surface: bytes) -> None:
-        """Write the surface of objects that lack it; nothing if no object has the digest."""
-
-    def want_distances(self) -> None:
-        """Make `Store.wants_distances` true from now on, for all who open the environment."""
-
 
 class _KeepsStatistics(Protocol):
     """Knows how large the environment is and how its keys are distributed; keeps cost figures."""

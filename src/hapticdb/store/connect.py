@@ -85,7 +85,8 @@ def backup_environment(
     file : path
         Where the copy goes. The copy is an environment, too. It appears whole or not at all.
     replace : bool
-        Replace an environment that is there, unless somebody has it open.
+        Replace an environment that is there, and its log, unless somebody has it open. It stays as
+        it is until the copy is whole beside it. So a copy is put back, too.
     progress : callable or None
         Called after each 4 MiB with the bytes done and in all.
 
@@ -94,53 +95,15 @@ def backup_environment(
     EnvironmentExistsError
         When `file` is there and `replace` is false.
     BusyError
-        When the file that is to be replaced is open.
-    DamagedError
-        When the checksum of a page is wrong. No copy is left then.
-    UsageError
-        When either is on PostgreSQL, or both are one file.
-    """
-    engine = _engine_of_both(url, file)
-    return engine.back_up(os.fspath(url), os.fspath(file), replace=replace, progress=progress)
-
-
-def restore_environment(
-    file: Url,
-    url: Url,
-    *,
-    progress: Progress | None = None,
-) -> BackupReport:
-    """Put a copy of an SQLite environment in its place, and remove the log of the former file.
-
-    The former file stays until the copy is complete beside it. `file` itself is not changed.
-
-    Parameters
-    ----------
-    file : path
-        A copy that `backup_environment` made, or any other environment's file.
-    url : str or path
-        Where it goes: a path or ``sqlite:///path``. An environment may be there already.
-    progress : callable or None
-        Called after each 4 MiB with the bytes done and in all.
-
-    Raises
-    ------
-    BusyError
-        When the environment that is to be replaced is open. A reader that cannot write the folder
-        is not noticed.
+        When the file that is to be replaced is open. A reader that cannot write the folder is not
+        noticed.
     NotAnEnvironmentError
-        When there is a file that is no environment.
+        When the file that is to be replaced is no environment.
     DamagedError
-        When the checksum of a page of `file` is wrong. Nothing has changed then.
+        When the structure of the copy is damaged. Nothing is replaced then.
     UsageError
         When either is on PostgreSQL, or both are one file.
     """
-    engine = _engine_of_both(url, file)
-    return engine.restore(os.fspath(file), os.fspath(url), progress=progress)
-
-
-def _engine_of_both(url: Url, file: Url) -> SupportsBackup:
-    """The engine of an environment and of its copy; refuses one that cannot copy, and two."""
     engine, other = engine_of(url), engine_of(file)
     if not isinstance(engine, SupportsBackup):
         raise UsageError(
@@ -149,7 +112,7 @@ def _engine_of_both(url: Url, file: Url) -> SupportsBackup:
         )
     if other is not engine:
         raise UsageError(f"{redact(os.fspath(file))} is on {other.title}, not a file: give a path")
-    return engine
+    return engine.back_up(os.fspath(url), os.fspath(file), replace=replace, progress=progress)
 
 
 def check_curve(curve: str, layout: Layout) -> None:

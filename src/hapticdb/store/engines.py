@@ -19,7 +19,7 @@ Right = Literal["viewer", "toucher", "editor", "nobody"]
 
 
 class BackupReport(NamedTuple):
-    """Result of a backup or restore.
+    """Result of a backup.
 
     revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
     """
@@ -98,15 +98,12 @@ class DropsRows(Protocol):
 
 @runtime_checkable
 class SupportsBackup(Protocol):
-    """An engine that copies a whole environment as of one moment, and puts a copy in its place."""
+    """An engine that copies a whole environment as of one moment."""
 
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: Progress | None
     ) -> BackupReport:
         """Copy an environment while others read and write it; `copy` is an environment, too."""
-
-    def restore(self, copy: str, url: str, *, progress: Progress | None) -> BackupReport:
-        """Put a copy in an environment's place, whole or not at all."""
 
 
 FOLDERS = {"": "sqlite", "sqlite": "sqlite", "postgresql": "postgres", "postgres": "postgres"}

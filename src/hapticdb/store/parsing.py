@@ -39,10 +39,11 @@ DISTANCES_CRC = "distances_crc"
 CHECKSUMS = (ROWS_CRC, DISTANCES_CRC)
 ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
-TABLES = ("brick", "change", "cost", "environment", "object", "quantile", "voxel")
-"""Tables that every environment has, in every format."""
-BAND, SURFACE, PAIR = "band", "surface", "pair"
-"""Tables of distances, surfaces and pairs, which an environment has since formats 4, 6 and 7."""
+TABLES = (
+    "band", "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed",
+    "surface", "voxel",
+)  # fmt: skip
+"""Tables that every environment has."""
 Floats = NDArray[np.float64]
 
 
@@ -151,9 +152,6 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
             raise damaged(url, f"no such table: {name}")
         if kind != "table":
             raise damaged(url, f"{name} is a {kind} and no table")
-    for name in (BAND, SURFACE, PAIR):
-        if kinds.get(name, "table") != "table":
-            raise damaged(url, f"{name} is a {kinds[name]} and no table")
 
 
 def object_of(url: str, row: Sequence[Any]) -> Object:

@@ -3,11 +3,15 @@
 from hapticdb.errors import (
     ConflictError,
     EnvironmentExistsError,
+    NewerVersionError,
+    NotAnEnvironmentError,
     ObjectNotFoundError,
-    ReadOnlyError,
     UsageError,
 )
 from hapticdb.store.base import Layout, Object
+
+FORMAT = 1
+"""Format of the tables that this version reads and writes: `schema.sql` of each engine."""
 
 
 def no_object(object_id: int, url: str) -> ObjectNotFoundError:
@@ -24,12 +28,18 @@ def present_already(record: Object, url: str) -> EnvironmentExistsError:
     )
 
 
-def older_format(url: str) -> ReadOnlyError:
-    """Build the error for a write into a table that only the environment's owner can make."""
-    return ReadOnlyError(
-        f"{url} has an older format: its owner has to open it once to write, and it is brought up "
-        "to date"
-    )
+def made_before(url: str) -> NotAnEnvironmentError:
+    """Build the error for an environment of a format before 1."""
+    return NotAnEnvironmentError(f"{url} was made before 0.1; import it again, into a new one")
+
+
+def check_format(url: str, found: int) -> None:
+    """Refuse an environment of a newer format."""
+    if found > FORMAT:
+        raise NewerVersionError(
+            f"{url} has format {found}, newer than the {FORMAT} known here: install a newer "
+            "hapticdb"
+        )
 
 
 def check_outside(depth: int, url: str) -> None:

@@ -42,10 +42,8 @@ from hapticdb.store.pairs import (
     PairRow,
 )
 from hapticdb.store.refusals import (
-    check_distances,
     check_unwritten,
     no_object,
-    older_format,
     present_already,
 )
 
@@ -61,9 +59,7 @@ UPDATE object SET digest = %s, transform = %s, voxels = %s, bounds = %s, attribu
        revision = %s
  WHERE id = %s"""
 # asked before the bytes are sent
-LACKS_SURFACE = """
-SELECT EXISTS (SELECT 1 FROM object WHERE digest = %s)
-       AND NOT EXISTS (SELECT 1 FROM surface WHERE digest = %s)"""
+LACKS_SURFACE = "SELECT NOT EXISTS (SELECT 1 FROM surface WHERE digest = %s)"
 DROP_SURFACE = """
 DELETE FROM surface
  WHERE digest = %s AND NOT EXISTS (SELECT 1 FROM object WHERE digest = %s)"""
@@ -105,8 +101,6 @@ class Tables(ABC):
     attributes are those of `hapticdb.store.base.Store`.
     """
 
-    HAS_TABLE: ClassVar[str]
-    """Statement that finds a row if there is a table of that name."""
     AMONG: ClassVar[str]
     """Condition that an id is in a JSON list."""
     LISTED: ClassVar[str]
@@ -124,7 +118,6 @@ class Tables(ABC):
     def __init__(self, connection: _Connection) -> None:
         self._connection = connection
         self.is_read_only = connection.is_read_only
-        self._found: set[str] = set()
 
     # -- what an engine adds ---------------------------------------------------------------------
 
@@ -227,12 +220,6 @@ class Tables(ABC):
 
     # -- reads -----------------------------------------------------------------------------------
 
-    def has_table(self, name: str) -> bool:
-        """Whether a table of a later format is there; another may make it at any time."""
-        if name not in self._found and self._rows(self.HAS_TABLE, (name,)):
-            self._found.add(name)
-        return name in self._found
-
     def objects(self, ids: Collection[int] | None = None) -> list[Object]:
         """All objects, or those of some ids that are there, ordered by id."""
         if ids is not None:
@@ -267,22 +254,21 @@ class Tables(ABC):
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
         """Packed surfaces of the digests that have one, in one statement."""
-        if not self.has_table(parsing.SURFACE):
-            return {}
         text = f"SELECT digest, geometry FROM surface WHERE digest IN ({self.LISTED})"
         found = self._rows(text, (json.dumps(list(digests)),), binary=True)
         return parsing.surfaces_of(self.url, found)
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""
-        if not self.has_table(parsing.SURFACE):
-            return set()
         return parsing.digests_of(self.url, self._rows("SELECT digest FROM surface"))
 
     def pairs(self) -> KeptPairs:
         """All rows of the table `pair`, and the mark, in one statement."""
-        found = self._rows(ALL, binary=True) if self.has_table(parsing.PAIR) else []
-        return KeptPairs(found, partial(parsing.pair_of, self.url))
+        return KeptPairs(self._rows(ALL, binary=True), partial(parsing.pair_of, self.url))
+
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+        return {row[0] for row in self._rows("SELECT name FROM removed WHERE link = %s", (link,))}
 
     # -- writes ----------------------------------------------------------------------------------
 
@@ -362,18 +348,6 @@ class Tables(ABC):
 
         self._commit(work)
 
-    def add_surface(self, digest: str, surface: bytes) -> None:
-        """Write the surface of objects that lack it; nothing if no object has the digest."""
-        if not self.has_table(parsing.SURFACE):
-            raise older_format(self.url)
-        self._alone(lambda: self._put_surface(digest, surface))
-
-    def want_distances(self) -> None:
-        """Note that parts get distances when they are imported."""
-        check_distances(self.layout, distances=True)
-        self._save("UPDATE environment SET wants_distances = true")
-        self.wants_distances = True
-
     def put_pairs(
         self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
     ) -> MaybeMark:
@@ -385,14 +359,10 @@ class Tables(ABC):
             self._do(COUNT, MARK)
             return mark
 
-        if not self.has_table(parsing.PAIR):
-            raise older_format(self.url)
         return self._alone(work)
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
         """Note why a pair is accepted, and the shapes of both."""
-        if not self.has_table(parsing.PAIR):
-            raise older_format(self.url)
         text = "UPDATE pair SET because = %s, shapes = %s WHERE (a, b) = (%s, %s)"
         self._save(text, (because, shapes, a, b))
 
@@ -407,16 +377,13 @@ class Tables(ABC):
         )
 
     def _put_surface(self, digest: str, surface: bytes | None) -> None:
-        """Write a surface; an editor of an older environment, whose owner makes the table, none."""
-        if surface is None or not self.has_table(parsing.SURFACE):
-            return
-        if self._do(LACKS_SURFACE, (digest, digest))[0][0]:
+        """Write a surface, unless there is one of that digest."""
+        if surface is not None and self._do(LACKS_SURFACE, (digest,)) == [(True,)]:
             self._do("INSERT INTO surface VALUES (%s, %s)", (digest, surface))
 
     def _drop_surface(self, digest: str) -> None:
         """Delete a surface that no object has any more."""
-        if self.has_table(parsing.SURFACE):
-            self._do(DROP_SURFACE, (digest, digest))
+        self._do(DROP_SURFACE, (digest, digest))
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
         """Record which keys a write touched."""

@@ -84,7 +84,7 @@ def sweep(
     ------
     UsageError
         If a pose is not rigid, a number is out of range, or the tool has no surface.
-    ObjectNotFoundError, NoSurfaceError
+    ObjectNotFoundError
         If a word chooses no object; if an object's surface is not in the database.
     """
     asked = _Asked(contact, overlap, seated, until_hit, progress).begun(limit, seconds)

@@ -1,4 +1,4 @@
-"""The verbs that keep an environment: check, backup, restore, upgrade, grant."""
+"""The verbs that keep an environment: check, backup, grant."""
 
 from typing import TYPE_CHECKING, Annotated, Literal
 
@@ -7,16 +7,12 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.cli.root import left_at
-from hapticdb.cli.verbs.importing import JobsOption
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
     from hapticdb.check import CheckReport
-    from hapticdb.ingest.upgrading import UpgradeReport
-    from hapticdb.store.engines import BackupReport
 
-CopyArgument = Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")]
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
 MEANINGS: dict[RightName, str] = {
     "viewer": "may read and touch",
@@ -80,35 +76,28 @@ def _checked(report: "CheckReport") -> str:
         count = render.counted(report.n_findings, "finding")
         mend = "'--repair' mends rows, " if report.wrong or report.strays else ""
         return f"{report.url} is damaged: {count}; {mend}restore a copy or import the files again"
-    line = (
+    return (
         f"{report.url} is sound: {render.counted(report.objects, 'object')}, "
         f"{render.counted(report.voxels, 'voxel')}, {render.counted(report.rows, 'row')}"
     )
-    if report.without_row_checksums:
-        line += (
-            f"; {render.counted(report.without_row_checksums, 'object')} without checksums: "
-            "'hapticdb copy' makes an environment that has them"
-        )
-    if report.without_surfaces:
-        line += (
-            f"; {render.counted(report.without_surfaces, 'object')} without surfaces: "
-            "'hapticdb upgrade' reads them"
-        )
-    return line
 
 
 def backup(
     url: UrlArgument,
-    file: CopyArgument,
+    file: Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")],
     *,
-    replace: Annotated[bool, typer.Option("--replace", help="Replace a copy that exists.")] = False,
+    replace: Annotated[
+        bool, typer.Option("--replace", help="Replace an environment that exists, with its log.")
+    ] = False,
     json: JsonOption = False,
 ) -> None:
     """Copy an environment whole into a file, while others go on working with it.
 
     The copy holds the environment as of one moment, can be opened as any
     other, and appears when it is whole. Copying the file by other means
-    leaves out what is still in its log. On PostgreSQL pg_dump does this.
+    leaves out what is still in its log. --replace puts a copy back in an
+    environment's place, which nobody may have open. On PostgreSQL pg_dump
+    and pg_restore do this.
 
     Example: hapticdb backup car.db backups/monday.db
     """
@@ -116,26 +105,6 @@ def backup(
 
     with left_at(f"there is no new {file}"), render.bar("copying", "MB", of=10**6) as progress:
         report = backup_environment(url, file, replace=replace, progress=progress)
-    _say_copied(report, json=json)
-
-
-def restore(file: CopyArgument, url: UrlArgument, *, json: JsonOption = False) -> None:
-    """Put a copy in an environment's place, and remove the log of what was there.
-
-    The environment stays as it is until the copy is whole beside it, and is
-    replaced then; nobody may have it open. FILE stays as it is. On PostgreSQL
-    pg_restore does this.
-
-    Example: hapticdb restore backups/monday.db car.db
-    """
-    from hapticdb.store.connect import restore_environment
-
-    with left_at(f"{url} is as it was"), render.bar("copying", "MB", of=10**6) as progress:
-        report = restore_environment(file, url, progress=progress)
-    _say_copied(report, json=json)
-
-
-def _say_copied(report: "BackupReport", *, json: bool) -> None:
     if json:
         render.say_json(report._asdict())
         return
@@ -143,64 +112,6 @@ def _say_copied(report: "BackupReport", *, json: bool) -> None:
         f"{report.target}: {report.source} at revision {report.revision}, "
         f"{render.counted(report.objects, 'object')}, {report.bytes / 1e6:,.1f} MB"
     )
-
-
-def upgrade(url: UrlArgument, *, jobs: JobsOption = None, json: JsonOption = False) -> None:
-    """Give objects what an earlier version has not stored: surfaces, and distances to them.
-
-    A surface that is missing is read from the object's file; moves, tools and
-    views need it. Smooth forces need distances; the layout voxel has none.
-    Voxels stay as they are. Every object is written in a transaction of its
-    own: run the same command again to go on with what was interrupted. An
-    object whose file is gone or has changed is named and stays as it is, and
-    the exit code is 1. Parts that are imported later get distances, too.
-
-    Example: hapticdb upgrade car.db
-    """
-    from hapticdb.ingest.upgrading import upgrade_environment
-
-    with left_at("what is upgraded is whole, and the same command goes on from there"):
-        render.compile_kernels("move")
-        with render.import_bar() as progress:
-            report = upgrade_environment(url, jobs=jobs, progress=progress)
-    for left in report.left_out:
-        render.note(str(left.error))
-    if json:
-        render.say_json(_upgrade_record(report))
-    else:
-        render.say(_upgraded(report))
-    if not report.is_complete:
-        raise typer.Exit(1)
-
-
-def _upgrade_record(report: "UpgradeReport") -> dict[str, object]:
-    return {
-        "url": report.url,
-        "surfaces": report.surfaces,
-        "upgraded": report.upgraded,
-        "present": report.present,
-        "voxels": report.voxels,
-        "left_out": [
-            {"id": obj.id, "name": obj.name, "link": obj.link, "error": str(left.error)}
-            for left in report.left_out
-            for obj in left.objects
-        ],
-    }
-
-
-def _upgraded(report: "UpgradeReport") -> str:
-    there = render.counted(report.present, "object")
-    if not (report.surfaces or report.upgraded) and report.is_complete:
-        return f"{report.url}: complete already ({there}), nothing to do"
-    line = f"{report.url}: distances for {render.counted(report.upgraded, 'object')}"
-    if report.surfaces:
-        line += f", surfaces for {report.surfaces:,}"
-    if report.present:
-        line += f"; {there} had all already"
-    if not report.is_complete:
-        n_left = sum(len(left.objects) for left in report.left_out)
-        line += f"; {render.counted(n_left, 'object')} left out; the same command tries again"
-    return line
 
 
 def grant(

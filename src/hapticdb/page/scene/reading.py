@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError
-from hapticdb.ingest.geometry import found_parts
+from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh import Part
 from hapticdb.page.colours import by_height
 from hapticdb.page.scene.facets import Facets, block_facets, coarsened
@@ -85,7 +85,7 @@ class ShapeReader:
         try:
             with closing(open_store(self._url, read_only=True)) as store:
                 shown, n_triangles, digest = monotonic(), 0, ""
-                for obj, part in found_parts(store, ordered):
+                for obj, part in parts_of(store, ordered):
                     if self._ended.is_set():
                         return
                     if obj.digest != digest and (
@@ -94,10 +94,9 @@ class ShapeReader:
                         self._show_drawn(ready)
                         ready, shown, n_triangles = [], monotonic(), 0
                     digest = obj.digest
-                    if part is not None:
-                        ready.append(self._shaped(obj, part))
-                        n_triangles += ready[-1][1].n_triangles
-                        del left[obj.id]
+                    ready.append(self._shaped(obj, part))
+                    n_triangles += ready[-1][1].n_triangles
+                    del left[obj.id]
         except HapticDBError:  # the database is away or damaged: the others are shown by voxels
             pass
         self._show_drawn(ready)

@@ -10,7 +10,9 @@ between they hold rows that no object has, which no frame reads (`tables/stateme
 `check --repair` removes.
 """
 
+import re
 from collections.abc import Callable, Sequence
+from pathlib import Path
 
 from psycopg import errors, sql
 
@@ -19,15 +21,13 @@ from hapticdb.grid import Grid
 from hapticdb.store.base import Layout, Table, row_shift
 from hapticdb.store.postgres.address import Address, partition_addresses
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.migrations import AUTOVACUUM, BAND, BRICK, VOXEL
 
 CELL_BITS = 15
 """Bits of a key that name a voxel within its cell."""
-TABLES: dict[Layout, dict[Table, tuple[str, ...]]] = {
-    "voxel": {"voxel": VOXEL},
-    "brick": {"brick": BRICK, "band": BAND},
-}
-"""Tables whose rows lie on the partitions, and the statements that make one."""
+SCHEMA = Path(__file__).with_name("schema.sql").read_text(encoding="utf-8")
+"""Makes all tables and functions of an environment, in its schema."""
+TABLES: dict[Layout, tuple[Table, ...]] = {"voxel": ("voxel",), "brick": ("brick", "band")}
+"""Tables of a layout whose rows lie on the partitions, or in a layout's own tables."""
 SIZE = """
 CREATE VIEW size AS
 SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0)::bigint AS bytes,
@@ -67,6 +67,13 @@ def ends(grid: Grid, layout: Layout, table: Table, n: int) -> list[int]:
             "partitions: give fewer partitions, or more bits"
         )
     return [(cells * i // n) << (within - shift) for i in range(1, n)]
+
+
+def _statements(table: Table) -> list[str]:
+    """Statements of a table's section of `SCHEMA`."""
+    found = re.search(rf"^-- ## {table}$(.*?)(?=^-- ## )", SCHEMA, re.MULTILINE | re.DOTALL)
+    assert found is not None  # noqa: S101 - the file has a section for each table
+    return found[1].split(";")[:-1]
 
 
 def spread(
@@ -136,8 +143,8 @@ def _make_partition(connection: ServerConnection, layout: Layout) -> None:
             f"{connection.shown}: schema {name!r} exists already on this partition; name another "
             "environment with ?environment=NAME, or drop it there"
         ) from error
-    for statements in TABLES[layout].values():
-        for statement in statements:
+    for table in TABLES[layout]:
+        for statement in _statements(table):
             connection.execute(statement)
     index = sql.Literal(f"{layout}_key")
     connection.execute(sql.SQL(SIZE).format(name=sql.Literal(name), index=index))
@@ -168,11 +175,11 @@ def _join(
         )
         place = sql.Identifier(f"size_{n}"), server, sql.Literal(schema)
         connection.execute(inherits.format(*place))
-    for table, statements in TABLES[layout].items():
+    for table in TABLES[layout]:
         connection.execute(f"DROP TABLE {table}")
-        for statement in statements:
-            if "INDEX" not in statement:
-                by_range = statement.replace(f"WITH ({AUTOVACUUM})", "PARTITION BY RANGE (z_val)")
+        for statement in _statements(table):
+            if "CREATE UNIQUE INDEX" not in statement:
+                by_range = re.sub(r"WITH \(.*\)", "PARTITION BY RANGE (z_val)", statement)
                 connection.execute(by_range)
         inner = map(str, ends(grid, layout, table, len(made)))
         limits = ["MINVALUE", *inner, "MAXVALUE"]

@@ -36,8 +36,9 @@ EDITOR = (
         " {schema}.band, {schema}.surface, {schema}.pair TO {role}"
     ),
     "GRANT INSERT ON {schema}.change TO {role}",  # no UPDATE: rows of the log stay
+    "GRANT INSERT, DELETE ON {schema}.removed TO {role}",
     "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",
-    "GRANT UPDATE (revision, wants_distances) ON {schema}.environment TO {role}",
+    "GRANT UPDATE (revision) ON {schema}.environment TO {role}",
     # UPDATE: a copy keeps its ids, so the sequence must be set after them
     "GRANT USAGE, SELECT, UPDATE ON SEQUENCE {schema}.object_id_seq TO {role}",
     "GRANT EXECUTE ON FUNCTION {schema}.refresh_statistics() TO {role}",

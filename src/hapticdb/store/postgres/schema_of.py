@@ -1,4 +1,4 @@
-"""The schema of an environment: made, opened, checked, brought up to date, dropped."""
+"""The schema of an environment: made, opened, checked, dropped."""
 
 from typing import NamedTuple
 
@@ -8,7 +8,6 @@ from hapticdb.errors import (
     AccessError,
     EnvironmentExistsError,
     EnvironmentNotFoundError,
-    NewerVersionError,
     NotAnEnvironmentError,
     ReadOnlyError,
 )
@@ -19,8 +18,7 @@ from hapticdb.store.postgres import partitions
 from hapticdb.store.postgres.address import Address, parse
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.migrations import MIGRATIONS
-from hapticdb.store.schema import FORMAT_VERSION, migrations_after
+from hapticdb.store.refusals import FORMAT, check_format, made_before
 
 
 def connected(url: str, *, read_only: bool = False) -> ServerConnection:
@@ -52,7 +50,7 @@ def _has_schema(connection: ServerConnection) -> bool:
 
 
 def opened(url: str, *, read_only: bool) -> ServerConnection:
-    """Connect to an existing environment; migrate it when it is older and may be written."""
+    """Connect to an existing environment."""
     connection = connected(url, read_only=read_only)
     try:
         check(connection)
@@ -65,36 +63,31 @@ def opened(url: str, *, read_only: bool) -> ServerConnection:
 
 
 def check(connection: ServerConnection) -> None:
-    """Refuse a schema that is no environment or may not be read; migrate an older environment."""
+    """Refuse a schema that is no environment, is of another format, or may not be read."""
     shown, name = connection.shown, connection.address.environment
     if not _has_schema(connection):
         raise EnvironmentNotFoundError(
             f"no environment {name!r} at {shown}; make one with 'hapticdb import URL FILE'"
         )
-    readable = connection.rows(
-        "SELECT has_schema_privilege(n.oid, 'USAGE') AND has_table_privilege(c.oid, 'SELECT')"
+    found = connection.rows(
+        "SELECT has_schema_privilege(n.oid, 'USAGE') AND has_table_privilege(c.oid, 'SELECT'),"
+        "       ARRAY(SELECT attname::text FROM pg_attribute WHERE attrelid = c.oid)"
         "  FROM pg_class c JOIN pg_namespace n ON n.oid = c.relnamespace"
         " WHERE n.nspname = %s AND c.relname = 'environment'",
         (name,),
     )
-    if not readable:
+    is_readable, columns = found[0] if found else (False, [])
+    if "format" in columns:
+        raise made_before(shown)
+    if "version" not in columns:
         raise NotAnEnvironmentError(
             f"schema {name!r} at {shown} is no hapticdb environment; name another one with "
             "?environment=NAME"
         )
-    if readable != [(True,)]:  # without the right, the server hides the schema
+    if not is_readable:  # without the right, the server hides the schema
         raise failures.denied(shown, name)
-    found = connection.rows("SELECT format FROM environment")
-    version = int(found[0][0]) if found else 0
-    if not version >= 1:
-        raise parsing.damaged(shown, f"format {version}")
-    if version > FORMAT_VERSION:
-        raise NewerVersionError(
-            f"{shown} has format {version}, newer than the {FORMAT_VERSION} known here: "
-            "install a newer hapticdb"
-        )
-    if version < FORMAT_VERSION and not connection.is_read_only and connection.is_owner():
-        connection.write(lambda: _migrate_once(connection))
+    for (version,) in connection.rows("SELECT version FROM environment"):
+        check_format(shown, version)
 
 
 def _check_writable(connection: ServerConnection) -> None:
@@ -116,15 +109,11 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'p' THEN 'table' W
  WHERE nspname = %s AND relkind <> 'i'"""
 
 
-ROWS_ELSEWHERE = "distribution"
-"""Table of an environment whose rows lie on several servers; its own tables of rows are empty."""
-
-
 class Made(NamedTuple):
     """What is fixed when an environment is made.
 
-    identity : an oid that differs if the environment is remade; wants_distances : may become true
-    later; is_spread : whether the rows are on partitions.
+    identity : an oid that differs if the environment is remade; is_spread : whether the rows are on
+    partitions.
     """
 
     grid: Grid
@@ -137,16 +126,9 @@ class Made(NamedTuple):
 def read_environment(connection: ServerConnection) -> Made:
     """Read the one row of the table `environment`."""
     kinds = dict(connection.rows(TABLE_KINDS, (connection.address.environment,)))
-    if ROWS_ELSEWHERE in kinds:
-        raise NotAnEnvironmentError(
-            f"{connection.shown} has its rows on several servers, which this version cannot read: "
-            "copy it to one server with the version that made it"
-        )
-    # a reader may have opened an environment of an older format
-    wish = "wants_distances" if parsing.BAND in kinds else "false"
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
-        f" tableoid::bigint, {wish}, (SELECT relkind = 'p' FROM pg_class"
+        " tableoid::bigint, wants_distances, (SELECT relkind = 'p' FROM pg_class"
         "  WHERE oid = to_regclass(layout)) FROM environment"
     )
     grid, layout = parsing.grid_of(connection.shown, rows)
@@ -174,18 +156,11 @@ def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
                     "make one; the database's owner can allow it with "
                     "'GRANT CREATE ON DATABASE ... TO ...'"
                 ) from error
-            _migrate(connection, 0)
+            connection.execute(partitions.SCHEMA)
+            kept = grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, distances
             connection.execute(
-                "INSERT INTO environment VALUES (1, %s, %s, %s, %s, %s, %s, %s, %s, 0, %s)",
-                (
-                    FORMAT_VERSION,
-                    grid.voxel_size,
-                    *grid.origin,
-                    grid.bits,
-                    grid.curve,
-                    layout,
-                    distances,
-                ),
+                "INSERT INTO environment VALUES (1, %s, %s, %s, %s, %s, %s, %s, %s, %s, 0)",
+                (FORMAT, *kept),
             )
             spread(connection)
 
@@ -197,23 +172,6 @@ def _there_already(connection: ServerConnection) -> EnvironmentExistsError:
         f"{connection.shown}: schema {connection.address.environment!r} exists already; open it, "
         "or name another environment with ?environment=NAME"
     )
-
-
-def _migrate_once(connection: ServerConnection) -> None:
-    """Migrate from the stored version, after any other process has finished migrating."""
-    row = connection.execute("SELECT format FROM environment FOR UPDATE").fetchone()
-    assert row is not None  # noqa: S101 - it was there before
-    _migrate(connection, int(row[0]))
-
-
-def _migrate(connection: ServerConnection, version: int) -> None:
-    """Run the migrations after `version`, inside a transaction."""
-    schema = sql.Identifier(connection.address.environment)
-    for _, statements in migrations_after(version, MIGRATIONS):
-        for statement in statements:
-            connection.execute(sql.SQL(statement).format(schema=schema))
-    if version:
-        connection.execute("UPDATE environment SET format = %s", (FORMAT_VERSION,))
 
 
 def drop(connection: ServerConnection) -> None:

@@ -128,7 +128,7 @@ class PostgresStore(ServerTables):
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
         table: Table = "band" if distances else self.layout
-        if (form != "after" and not asked[0].size) or (distances and not self.has_table(table)):
+        if form != "after" and not asked[0].size:
             return no_rows(distances=distances)
         text = getattr(self._sql, form)[table]
         if form == "lookup_one":
@@ -176,12 +176,6 @@ class PostgresStore(ServerTables):
             leave_out = statements.without_few
         text = leave_out(text, self.layout, len(parameters) + 1)
         return text, [*parameters, *self._excluded_parameters]
-
-    def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
-        if self._rows("SELECT to_regprocedure('removed_parts(text)')") == [(None,)]:
-            return set()  # the format is 2 or older, and only the owner can bring it up to date
-        return {row[0] for row in self._rows("SELECT removed_parts(%s)", (link,))}
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:

@@ -17,7 +17,6 @@ import apsw
 from hapticdb.errors import (
     BusyError,
     DamagedError,
-    DatabaseError,
     EnvironmentExistsError,
     NotAnEnvironmentError,
     ReadOnlyError,
@@ -26,10 +25,8 @@ from hapticdb.errors import (
 from hapticdb.store.base import Progress
 from hapticdb.store.engines import BackupReport
 from hapticdb.store.sqlite import file as sqlite_file
-from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.file import named_errors
-from hapticdb.store.sqlite.migrations import APPLICATION_ID, VERSION_UNIT
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 STEP_PAGES = 512
@@ -74,7 +71,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
                 first = sqlite_bytes.read_bytes(target, sqlite_file.HEADER_BYTES)
             except OSError as error:
                 raise ReadOnlyError(f"{target} cannot be read: {error.strerror}") from error
-        if int.from_bytes(first[68:72], "big") != APPLICATION_ID:
+        if sqlite_file.application_id(first) != sqlite_file.APPLICATION_ID:
             raise NotAnEnvironmentError(
                 f"{target} is no hapticdb environment, so it is not replaced; give another path"
             )
@@ -93,7 +90,7 @@ def _copied(
     target : what errors name: the file that was asked for.
     """
     connection, file = sqlite_file.open_file(source, read_only=True)
-    with contextlib.closing(file), named_errors(str(source)):
+    with contextlib.closing(connection), named_errors(str(source)):
         connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
         connection.execute("BEGIN")
         ((revision, objects),) = connection.execute(
@@ -104,9 +101,7 @@ def _copied(
             contextlib.closing(apsw.Connection(str(unfinished))) as made,
         ):
             _copy_pages(connection, made, progress)
-            _finish(made)
-        if Path(f"{unfinished}-wal").exists():
-            raise DatabaseError(f"the log of {target} could not be folded into it: try again")
+            _check_pages(made)
         file.look()  # the path must still lead to the file that was copied
         if file.stamp is not None:
             file.check_stamp()
@@ -125,19 +120,14 @@ def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progre
                 progress(done * PAGE_BYTES, copying.page_count * PAGE_BYTES)
 
 
-def _finish(made: apsw.Connection) -> None:
-    """Bring a copy up to date and draw a new mark, so that only its own log can be applied."""
-    ((version,),) = made.execute("PRAGMA user_version").fetchall()
-    sqlite_file.migrate(made, int(str(version)) % VERSION_UNIT)
-    sqlite_file.leave_checksums(made)
-    made.execute("UPDATE environment SET lineage = ?", (sqlite_log.first_lineage(),))
+def _check_pages(made: apsw.Connection) -> None:
+    """Refuse a copy whose structure is damaged."""
     found = made.execute("PRAGMA quick_check(1)").fetchall()
     if found != [("ok",)]:
         raise DamagedError(
-            f"what was to be copied is damaged ({found[0][0]}): restore an older copy, "
-            "or import the files again"
+            f"what was to be copied is damaged ({found[0][0]}): copy an older copy, or import the "
+            "files again"
         )
-    made.wal_checkpoint(mode=apsw.SQLITE_CHECKPOINT_TRUNCATE)
 
 
 def _sync(path: Path) -> None:
@@ -170,10 +160,10 @@ def _alone(path: Path) -> Iterator[None]:
 def _put_in_place(unfinished: Path, path: Path) -> None:
     """Replace a database, and remove the files beside the former one.
 
-    If the process is killed in between, the former log lies beside the new file, but does not have
-    its mark. Opening is then refused in one line, and the same command run again finishes the work.
+    The log goes first: SQLite would apply it to the new file if the process were killed in between.
     """
     with _alone(path):
-        unfinished.replace(path)
         for suffix in ("-wal", "-shm"):
             Path(f"{path}{suffix}").unlink(missing_ok=True)
+        sqlite_bytes.sync_folder(path)
+        unfinished.replace(path)

@@ -1,7 +1,9 @@
 """A connection to one file: statements, snapshots, transactions, and the thread that may use it."""
 
+import atexit
 import contextlib
 import time
+import weakref
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
@@ -10,7 +12,6 @@ import apsw
 
 from hapticdb.store.refusals import check_outside
 from hapticdb.store.sqlite import file as sqlite_file
-from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.threads import check_thread, this_thread
 
@@ -39,10 +40,11 @@ class FileConnection:
         self._depth = 0
         self._seen = self._noticed = -1
         self._thread = this_thread()
+        _OPEN.add(self)
 
     def close(self) -> None:
-        """Close the connection. Only the last one folds the write-ahead log into its file."""
-        self.file.close()
+        """Close the connection. The last one folds the write-ahead log into its file."""
+        self.driver.close()
 
     def check_thread(self) -> None:
         """Refuse a call from any thread but the connection's owner."""
@@ -80,7 +82,6 @@ class FileConnection:
             self.driver.execute("BEGIN IMMEDIATE")
             try:
                 self.file.look()
-                self.driver.execute(sqlite_log.RENEW_LINEAGE)
                 yield
             except BaseException:
                 sqlite_file.roll_back(self.driver)
@@ -90,9 +91,7 @@ class FileConnection:
 
     def compact(self) -> None:
         """Write the file anew with full pages, unless it is large, in use, or the disk is full."""
-        with self.writing():  # a log of the new pages must not follow a copy of the old ones
-            pages = self.driver.pragma("page_count")
-        if pages * PAGE_BYTES > MOST_COMPACTED:
+        if self.driver.pragma("page_count") * PAGE_BYTES > MOST_COMPACTED:
             return
         self.driver.pragma("temp_store", "file")
         with sqlite_file.named_errors(self.url), contextlib.suppress(*NO_ROOM):
@@ -127,3 +126,14 @@ class FileConnection:
         before = self._noticed
         self._noticed = self.fetch("PRAGMA data_version")[0][0]
         return self._noticed != before
+
+
+_OPEN: "weakref.WeakSet[FileConnection]" = weakref.WeakSet()
+
+
+@atexit.register
+def _close_all() -> None:
+    """Close what is still open when the program ends, so that no log stays beside a file."""
+    for connection in list(_OPEN):
+        with contextlib.suppress(Exception):
+            connection.close()

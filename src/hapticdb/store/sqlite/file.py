@@ -6,7 +6,6 @@ import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import cast
 
 import apsw
 
@@ -16,15 +15,18 @@ from hapticdb.errors import (
     DatabaseError,
     EnvironmentExistsError,
     EnvironmentNotFoundError,
-    NewerVersionError,
     NotAnEnvironmentError,
     ReadOnlyError,
 )
-from hapticdb.store.schema import FORMAT_VERSION, migrations_after
+from hapticdb.store.refusals import check_format, made_before
 from hapticdb.store.sqlite import raw as sqlite_bytes
-from hapticdb.store.sqlite.migrations import APPLICATION_ID, MIGRATIONS, VERSION_UNIT
 from hapticdb.store.sqlite.place import OpenedFile
 
+APPLICATION_ID = int.from_bytes(b"hapt")
+"""Mark in the header of each file, as `schema.sql` sets it."""
+BEFORE_FORMAT_1 = int.from_bytes(b"HAPT")
+"""Mark of files made before 0.1."""
+SCHEMA = Path(__file__).with_name("schema.sql")
 BUSY_TIMEOUT_MS = 10_000
 """Milliseconds that a write waits for another process's write before it gives up."""
 CACHE_KIB = 256 * 1024
@@ -79,8 +81,8 @@ def _is_full(path: str) -> bool:
 def damaged(path: str, cause: str) -> DamagedError:
     """Build the error for an environment whose contents are broken."""
     return DamagedError(
-        f"{path} is damaged ({cause}): restore a copy with 'hapticdb restore COPY {path}', or "
-        "import the files again"
+        f"{path} is damaged ({cause}): 'hapticdb backup COPY {path} --replace' puts a copy in its "
+        "place; or import the files again"
     )
 
 
@@ -110,9 +112,12 @@ def _check_kind(path: Path) -> None:
         raise _foreign(path)
     if len(header) < HEADER_BYTES:
         raise damaged(str(path), "its header is cut off")
-    if int.from_bytes(header[68:72], "big") != APPLICATION_ID:
+    mark = application_id(header)
+    if mark == BEFORE_FORMAT_1:
+        raise made_before(str(path))
+    if mark != APPLICATION_ID:
         raise _foreign(path)
-    _check_known(path, int.from_bytes(header[60:64], "big"))
+    check_format(str(path), int.from_bytes(header[60:64]))
     wal = Path(f"{path.resolve()}-wal")
     if wal.exists() and wal.stat().st_size:
         return  # the size in the header may be older than the log: SQLite decides
@@ -122,37 +127,29 @@ def _check_kind(path: Path) -> None:
         raise damaged(str(path), f"{path.stat().st_size} bytes of {expected}")
 
 
+def application_id(header: bytes) -> int:
+    """The mark of the program that made a file."""
+    return int.from_bytes(header[68:72])
+
+
 def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFile]:
-    """Open an existing environment; migrate it when it is older and may be written."""
+    """Open an existing environment."""
     _check_kind(path)
     file = OpenedFile(path)
     is_immutable = read_only and needs_immutable(path)
-    log, memory = (Path(f"{path.resolve()}{suffix}") for suffix in ("-wal", "-shm"))
-    # before the engine makes one; who was told so has left an empty one
-    is_log_taken = memory.exists() and not (log.exists() and log.stat().st_size)
     with named_errors(str(path)):
         connection = _connect_to_read(path) if read_only else _connect_to_write(path)
         try:
-            version = _version(connection, path)
-            connection.execute("SELECT id FROM environment").fetchall()  # a page of every log
-            file.settle(connection, is_immutable=is_immutable)
-            if not read_only:
-                migrate(connection, version)
-                leave_checksums(connection)
-        except BaseException as error:
-            connection.config(apsw.SQLITE_DBCONFIG_NO_CKPT_ON_CLOSE, 1)
+            connection.execute("SELECT id FROM environment").fetchall()  # the first read
+            file.settle(is_immutable=is_immutable)
+        except BaseException:
             connection.close()
-            if isinstance(error, apsw.IOError) and is_log_taken:
-                raise BusyError(
-                    f"{path}-wal was removed while another has {path} open: end all that has it "
-                    "open, which puts what was committed into the file, then open it again"
-                ) from error
             raise
     return connection, file
 
 
 def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
-    """Make an environment of the newest format; `fill` writes its first rows.
+    """Make an environment; `fill` writes its first rows.
 
     The file is made under another name beside its path: it appears whole or not at all.
     """
@@ -165,7 +162,7 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
         with named_errors(str(path)), contextlib.closing(made) as new:
             new.execute(f"PRAGMA page_size = {sqlite_bytes.PAGE_BYTES}")
             new.execute("PRAGMA journal_mode = OFF").fetchall()
-            migrate(new, 0)
+            new.execute(SCHEMA.read_text(encoding="utf-8"))
             fill(new)
             new.execute("PRAGMA journal_mode = WAL").fetchall()
         publish(unfinished, path)
@@ -225,23 +222,6 @@ def _sweep_unfinished(path: Path) -> None:
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not Path(f"/proc/{pid}").exists():
             left.unlink(missing_ok=True)
-
-
-def migrate(connection: apsw.Connection, version: int) -> None:
-    """Run the migrations after `version`, each in one transaction with the number it leads to."""
-    for number, statements in migrations_after(version, MIGRATIONS):
-        connection.execute("BEGIN IMMEDIATE")
-        try:
-            marked, done = divmod(_pragma(connection, "user_version"), VERSION_UNIT)
-            if done < number:  # else another process was faster
-                for statement in statements:
-                    connection.execute(statement)
-                connection.execute(f"PRAGMA application_id = {APPLICATION_ID}")
-                connection.execute(f"PRAGMA user_version = {marked * VERSION_UNIT + number}")
-            connection.execute("COMMIT")
-        except BaseException:
-            roll_back(connection)
-            raise
 
 
 def roll_back(connection: apsw.Connection) -> None:
@@ -316,10 +296,6 @@ def _connect_to_write(path: Path) -> apsw.Connection:
     return connection
 
 
-def _pragma(connection: apsw.Connection, name: str) -> int:
-    return int(cast("int", connection.execute(f"PRAGMA {name}").fetchall()[0][0]))
-
-
 def _settle(connection: apsw.Connection) -> None:
     connection.set_busy_timeout(BUSY_TIMEOUT_MS)
     connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
@@ -329,35 +305,6 @@ def _settle(connection: apsw.Connection) -> None:
     # never read a blob as text, nor a string in double quotes as a literal
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DML, 0)
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DDL, 0)
-
-
-def _version(connection: apsw.Connection, path: Path) -> int:
-    """Version of a file's tables; refuses a file that is no environment, or a newer one."""
-    found = _pragma(connection, "user_version")
-    if _pragma(connection, "application_id") != APPLICATION_ID:
-        raise _foreign(path)
-    version = _check_known(path, found)
-    if version < 1:
-        raise damaged(str(path), f"format {version}")
-    return version
-
-
-def leave_checksums(connection: apsw.Connection) -> None:
-    """Have earlier programs refuse a file whose pages had checksums, since none are written now."""
-    marked, version = divmod(_pragma(connection, "user_version"), VERSION_UNIT)
-    if marked == 1:
-        connection.execute(f"PRAGMA user_version = {2 * VERSION_UNIT + version}")
-
-
-def _check_known(path: Path, found: int) -> int:
-    """Version of a file's tables, from its user version; refuses one that is newer."""
-    version = found % VERSION_UNIT
-    if version > FORMAT_VERSION:
-        raise NewerVersionError(
-            f"{path} has format {version}, newer than the {FORMAT_VERSION} known here: "
-            "install a newer hapticdb"
-        )
-    return version
 
 
 def _foreign(path: Path) -> NotAnEnvironmentError:

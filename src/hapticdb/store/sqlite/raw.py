@@ -18,8 +18,6 @@ READ_MAIN = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READONLY
 DESCRIPTORS = Path("/proc/self/fd")
 PAGE_BYTES = 8192
 """Bytes of a page: the block size of the paper."""
-PAGE_COUNT_AT = 28
-"""Offset of the number of pages in a file's header, 4 bytes, big-endian."""
 
 
 @contextlib.contextmanager

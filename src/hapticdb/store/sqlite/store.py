@@ -36,7 +36,6 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.engines import BackupReport, unknown_scheme
 from hapticdb.store.sqlite import file as sqlite_file
-from hapticdb.store.sqlite import log as sqlite_log
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
@@ -102,12 +101,10 @@ class SQLiteStore(FileTables):
         cls, path: str | Path, grid: Grid, layout: Layout = "brick", *, distances: bool = False
     ) -> "SQLiteStore":
         """Make a new environment with its grid; its file appears whole or not at all."""
-        lineage = sqlite_log.first_lineage()
-        told = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, lineage)
-        row = (*told, int(distances))
+        row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, int(distances))
 
         def fill(connection: apsw.Connection) -> None:
-            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?, ?)", row)
+            connection.execute("INSERT INTO environment VALUES (1, ?, ?, ?, ?, ?, ?, ?, ?)", row)
 
         sqlite_file.create_file(Path(path), fill)
         return cls.open(path)
@@ -139,7 +136,7 @@ class SQLiteStore(FileTables):
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
         table: Table = "band" if distances else self.layout
-        if (form != "after" and not asked[0].size) or (distances and not self.has_table(table)):
+        if form != "after" and not asked[0].size:
             return no_rows(distances=distances)
         fetch = self._connection.fetch
         if form == "lookup_one":
@@ -172,11 +169,6 @@ class SQLiteStore(FileTables):
         found = self._connection.fetch(*sqlite_force.hits_statement(self.layout, frame))
         pairs = _pairs_of(self.url, found)
         return pairs[:, 0] - 1, pairs[:, 1].copy()
-
-    def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
-        found = self._connection.fetch("SELECT name FROM removed WHERE link = ?", (link,))
-        return {row[0] for row in found}
 
 
 def _rows_of(url: str, found: list[Any], table: Table) -> Rows:
@@ -244,12 +236,6 @@ class _SQLiteEngine:
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
         return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)
-
-    def restore(self, copy: str, url: str, *, progress: Progress | None) -> BackupReport:
-        """Put a copy in a file's place, and remove the log of the former file."""
-        from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
-
-        return back_up(_path_of(copy), _path_of(url), replace=True, progress=progress)
 
 
 ENGINE = _SQLiteEngine()

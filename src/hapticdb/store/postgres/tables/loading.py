@@ -17,9 +17,8 @@ from hapticdb.store.base import Layout, Table
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.partitions import TABLES
 
-TABLES: dict[Layout, tuple[Table, ...]] = {"voxel": ("voxel",), "brick": ("brick", "band")}
-"""Tables of a layout whose index is made after the rows."""
 # Advisory locks of an environment: one for its loaders, one for the maker of the index.
 # The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
 # with a sign.

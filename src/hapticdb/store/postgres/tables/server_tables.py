@@ -7,7 +7,6 @@ import numpy as np
 from numpy.typing import NDArray
 from psycopg import errors
 
-from hapticdb.store import parsing
 from hapticdb.store.base import (
     LAYOUTS,
     NO_KEYS,
@@ -24,8 +23,9 @@ from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
+from hapticdb.store.postgres.partitions import TABLES
 from hapticdb.store.postgres.tables import statements
-from hapticdb.store.postgres.tables.loading import TABLES, Loading
+from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.watching import channel_of
 from hapticdb.store.tables import Tables
 
@@ -85,7 +85,6 @@ SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
 class ServerTables(Tables):
     """The tables on a server. They remember the revision that the last read has seen."""
 
-    HAS_TABLE = "SELECT 1 WHERE to_regclass(%s) IS NOT NULL"
     AMONG = "id = ANY (ARRAY(SELECT json_array_elements_text(%s::json)::bigint))"
     LISTED = "SELECT json_array_elements_text(%s::json)"
     AS_TEXT = "::text"
@@ -229,7 +228,6 @@ class ServerTables(Tables):
         """Rows, bytes of all tables and indexes, leaf blocks; rows of distances; surfaces."""
         with self._connection.snapshot(), self._connection.without_limit():
             self.revision()
-            band = surfaces = (0, 0)
             counted = (
                 "SELECT count(*) FROM brick"
                 if self.layout == "brick"
@@ -237,13 +235,11 @@ class ServerTables(Tables):
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
-            if self.has_table(parsing.BAND):
-                (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
+            (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
             if self._is_spread:
                 ((more, index, of_band),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
                 total, index, band = total + int(more), int(index), (band[0], of_band)
-            if self.has_table(parsing.SURFACE):
-                (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
+            (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
             return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
 
     def quantiles(self, resolution: int) -> Histogram:

@@ -58,11 +58,9 @@ def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
     """Grid and layout of an environment, and whether it wants distances, all checked."""
     kinds = dict(connection.fetch(KINDS))
     parsing.check_tables(connection.url, kinds)
-    # a reader may have opened a file of an older format
-    wish = "wants_distances" if parsing.BAND in kinds else "0"
     rows = connection.fetch(
-        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, "
-        f"{wish} FROM environment"
+        "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout, wants_distances"
+        "  FROM environment"
     )
     grid, layout = parsing.grid_of(connection.url, rows)
     return grid, layout, parsing.wish_of(connection.url, rows[0][7])
@@ -71,7 +69,6 @@ def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
 class FileTables(Tables):
     """The tables in a file."""
 
-    HAS_TABLE = "SELECT 1 FROM sqlite_master WHERE name = %s AND type = 'table'"
     AMONG = "id IN (SELECT value FROM json_each(%s))"
     LISTED = "SELECT value FROM json_each(%s)"
     AS_TEXT = ""
@@ -163,16 +160,13 @@ class FileTables(Tables):
 
     def size(self) -> Size:
         """Rows, bytes of the file and its log, leaf blocks; rows of distances; surfaces."""
-        band = surfaces = (0, 0)
         with self._connection.snapshot():
             rows = self._connection.fetch(f"SELECT count(*) FROM {self.layout}")[0][0]
             blocks = self._connection.fetch(
                 "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self.layout,)
             )
-            if self.has_table(parsing.BAND):
-                (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
-            if self.has_table(parsing.SURFACE):
-                (surfaces,) = self._connection.fetch(SIZE_OF_SURFACES)
+            (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
+            (surfaces,) = self._connection.fetch(SIZE_OF_SURFACES)
         wal = Path(f"{self._connection.path}-wal")
         total = self._connection.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
         n_blocks = int(blocks[0][0]) if blocks else 1

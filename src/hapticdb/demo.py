@@ -26,8 +26,6 @@ from hapticdb.query.touches import Query, Touch
 from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
-from hapticdb.store.connect import beside
-from hapticdb.store.urls import redact
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
@@ -117,7 +115,6 @@ class Comparison:
 def prepare(
     folder: str | os.PathLike[str],
     *,
-    url: str | None = None,
     bits: int = 10,
     frames: int = 1000,
     points: int = 300,
@@ -125,20 +122,18 @@ def prepare(
 ) -> DemoScene:
     """Write the sample and import it in both layouts.
 
-    folder : where everything goes; url : environment beside which the demo's are made instead;
-    bits : of an axis of the grid; frames : poses of the path; points : of the tool's shell;
-    progress : as for `hapticdb.import_files`.
+    folder : where everything goes; bits : of an axis of the grid; frames : poses of the path;
+    points : of the tool's shell; progress : as for `hapticdb.import_files`.
     """
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
     make_ready("demo")
     shell = PointShell.from_file(files.wrench, points)
-    imported = []
-    first = str(home / "car.db") if url is None else beside(url, "_demo_car")
-    layouts: tuple[tuple[Layout, str], ...] = (("brick", first), ("voxel", beside(first, "_voxel")))
-    for layout, place in layouts:
-        imported.append(_import(place, files.car, layout, options, progress))
+    layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
+    imported = [
+        _import(str(home / name), files.car, layout, options, progress) for layout, name in layouts
+    ]
     with open_environment(imported[0].url, read_only=True) as env:
         grid_text = env.grid.describe()
     poses = read_poses(files.path)
@@ -153,9 +148,7 @@ def _import(
     try:
         report: FileReport = import_files(url, [car], options, progress)[0]
     except GridError as error:
-        raise UsageError(
-            f"{redact(url)} is of another demo: give another folder or --url ({error})"
-        ) from error
+        raise UsageError(f"{url} is of another demo: give another folder ({error})") from error
     seconds = time.perf_counter() - started
     if report.error is not None:
         raise report.error

@@ -6,9 +6,7 @@ import re
 import shutil
 from pathlib import Path
 
-import psycopg
 import pytest
-from psycopg import sql
 
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
     test_calibrate_prints_figures_with_their_spread,
@@ -17,8 +15,6 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
     test_statistics_are_renewed_after_many_edits,
 )
 from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
-from hapticdb.demo import prepare
-from hapticdb.store.postgres.address import parse
 from hapticdb.store.urls import redact
 from servers import Place
 
@@ -72,34 +68,3 @@ def test_a_missing_database_is_one_line(run: Run, database: str, made: Path) -> 
     url = re.sub(r"(://[^/]*)/[^?]*", r"\1/nowhere", database)
     refused(run("info", url), '"nowhere" does not exist', "createdb")
     refused(run("import", url, made / "boxes.glb"), '"nowhere" does not exist', "createdb")
-
-
-# -- the demo -------------------------------------------------------------------------------------
-
-
-@pytest.mark.long
-def test_the_demo_stands_beside_an_environment_and_joins_its_own(
-    run: Run, scene: str, admin: psycopg.Connection, tmp_path: Path
-) -> None:
-    before = rows_of(scene)
-    args = ("demo", "demo", "--url", scene, "--frames", 12, "--points", 40, "--bits", 7)
-    name = parse(scene).environment
-    try:
-        code, out, _ = run(*args)
-        assert code == 0
-        assert "there already" not in out
-        assert "all agreed: hits, ids and wrench bit for bit" in out
-        for layout in ("brick", "voxel"):
-            assert re.search(rf"^PostgreSQL [\d.]+, {layout} layout, ", out, re.MULTILINE)
-        assert f"environment={name}_demo_car:" in out
-        again = prepare("demo", url=scene, bits=7, frames=12, points=40)
-        assert [one.is_new for one in again.imported] == [False, False]
-        assert (tmp_path / "demo" / "demo.png").is_file()
-        assert rows_of(scene) == before
-        code, out, err = run(*args[:-1], 6)
-        assert (code, out) == (2, "")
-        assert "is of another demo" in err
-    finally:
-        for layout in ("", "_voxel"):
-            schema = sql.Identifier(f"{name}_demo_car{layout}")
-            admin.execute(sql.SQL("DROP SCHEMA IF EXISTS {} CASCADE").format(schema))

@@ -44,11 +44,6 @@ def exists(url: Url) -> bool:
     return engine_of(url).exists(os.fspath(url))
 
 
-def beside(url: Url, ending: str) -> str:
-    """URL of another environment in the same folder or database, whose name has an ending more."""
-    return engine_of(url).beside(os.fspath(url), ending)
-
-
 def grant(url: Url, role: str, right: Right) -> None:
     """Give a role of the server one right on an environment; see `hapticdb.store.postgres.rights`.
 

@@ -56,9 +56,6 @@ class Engine(Protocol):
     def exists(self, url: str) -> bool:
         """Whether something is there already, an environment or not. May connect."""
 
-    def beside(self, url: str, ending: str) -> str:
-        """URL of another environment at the same place, whose name has an ending more."""
-
 
 @runtime_checkable
 class SupportsGrant(Protocol):

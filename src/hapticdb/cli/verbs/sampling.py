@@ -53,13 +53,6 @@ def warm() -> None:
 def demo(
     folder: FolderArgument = Path("demo"),
     *,
-    url: Annotated[
-        str | None,
-        typer.Option(
-            metavar="URL",
-            help="Make the environments beside the one that this URL names, instead of in DIR.",
-        ),
-    ] = None,
     bits: Annotated[int, typer.Option(metavar="1..21", help="Bits of each axis of the grid.")] = 10,
     frames: FramesOption = 1000,
     points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
@@ -67,8 +60,6 @@ def demo(
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 
     Example: hapticdb demo demo --bits 11
-
-    Example: hapticdb demo --url postgresql:///plant
     """
     from shlex import quote
 
@@ -76,12 +67,11 @@ def demo(
 
     from hapticdb.demo import compare, prepare
     from hapticdb.pictures.demo import draw
-    from hapticdb.store.urls import redact
 
     render.compile_kernels("demo")
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
-        scene = prepare(folder, url=url, bits=bits, frames=frames, points=points, progress=progress)
+        scene = prepare(folder, bits=bits, frames=frames, points=points, progress=progress)
     _show_scene(scene)
     comparison = compare(scene)
     for measured in comparison.layouts:
@@ -91,7 +81,7 @@ def demo(
     picture = folder / "demo.png"
     draw(picture, scene, comparison)
     render.say(f"picture: {picture}")
-    url = quote(redact(scene.imported[0].url))
+    url = quote(scene.imported[0].url)
     render.say(f"see it and feel it in a browser: {render.program()} view {url}")
     if comparison.disagreed:
         raise typer.Exit(1)
@@ -108,17 +98,14 @@ def _show_scene(scene: "DemoScene") -> None:
 
 
 def _import_text(one: "Imported") -> str:
-    from hapticdb.store.urls import redact
-
-    where = redact(one.url)
     size = (
         f"{render.counted(one.objects, 'object')}, {render.counted(one.voxels, 'voxel')}, "
         f"{render.counted(one.rows, 'row')}, {render.bytes_text(one.bytes)}"
     )
     if not one.is_new:
-        return f"{where}: {size}; there already"
+        return f"{one.url}: {size}; there already"
     rate = render.counted(one.voxels / one.seconds, "voxel")
-    return f"{where}: {size}; {one.seconds:.1f} s, {rate} a second"
+    return f"{one.url}: {size}; {one.seconds:.1f} s, {rate} a second"
 
 
 def _show_layout(measured: "LayoutFigures", scene: "DemoScene", hits: float) -> None:

@@ -24,7 +24,6 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.engines import Lag, Right
 from hapticdb.store.postgres import rights, schema_of
-from hapticdb.store.postgres.address import parse, with_environment
 from hapticdb.store.postgres.connecting import wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 from hapticdb.store.postgres.tables import statements
@@ -213,10 +212,6 @@ class _PostgresEngine:
     def exists(self, url: str) -> bool:
         """Whether a schema of that name is there. Connects."""
         return schema_of.exists(url)
-
-    def beside(self, url: str, ending: str) -> str:
-        """URL of another schema in the same database."""
-        return with_environment(url, parse(url).environment + ending)
 
     def grant(self, url: str, role: str, right: Right) -> None:
         """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""

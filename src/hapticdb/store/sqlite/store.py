@@ -225,10 +225,6 @@ class _SQLiteEngine:
         """Whether a file of that name is there."""
         return _path_of(url).exists()
 
-    def beside(self, url: str, ending: str) -> str:
-        """Path of another file in the same folder."""
-        return str(_path_of(url).with_name(f"{_path_of(url).stem}{ending}.db"))
-
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: Progress | None
     ) -> BackupReport:

@@ -1,18 +1,20 @@
-"""Checks whether an environment is sound: structure, rows, objects, the log of changes."""
+"""Checks whether an environment is sound: what is stored against what it derives from."""
 
 import os
 from collections.abc import Iterator
 from contextlib import closing
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from itertools import chain
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.clashes.kept import pair_faults
 from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
-from hapticdb.ingest.geometry import AT_ONCE, unpacked_part
+from hapticdb.ingest.geometry import unpacked_part
 from hapticdb.ingest.moving import rewrite_object
+from hapticdb.ingest.placement import OTHER_BOUNDS, placement_faults
 from hapticdb.kernels import curves
 from hapticdb.kernels.field import packing
 from hapticdb.store.base import (
@@ -27,6 +29,7 @@ from hapticdb.store.base import (
 )
 from hapticdb.store.connect import open_store
 from hapticdb.store.engines import DropsRows
+from hapticdb.store.pairs import PairRow
 from hapticdb.store.parsing import Checksum
 
 ROWS_AT_ONCE = 1 << 17
@@ -57,6 +60,10 @@ class CheckReport:
         Objects whose rows or distances are not those that were written.
     strays : list of int
         Ids of rows or distances that no object has.
+    pairs : list of PairRow
+        Rows of pairs that are not what their surfaces are.
+    lacks_pairs : bool
+        Whether rows of pairs are missing.
     """
 
     url: str
@@ -68,6 +75,8 @@ class CheckReport:
     surfaces: int = 0
     wrong: list[int] = field(default_factory=list)
     strays: list[int] = field(default_factory=list)
+    pairs: list[PairRow] = field(default_factory=list)
+    lacks_pairs: bool = False
 
     def __repr__(self) -> str:
         found = f"{self.n_findings} faults" if self.n_findings else "sound"
@@ -77,6 +86,11 @@ class CheckReport:
     def is_sound(self) -> bool:
         """Whether the check found no fault."""
         return self.n_findings == 0
+
+    @property
+    def is_mendable(self) -> bool:
+        """Whether `repair_environment` can mend some of it."""
+        return bool(self.wrong or self.strays or self.pairs or self.lacks_pairs)
 
     def add(self, finding: str) -> None:
         """Add a finding, unless the report has it already."""
@@ -97,8 +111,10 @@ def check_environment(
     outside the grid. Every object must have its number of voxels, and its rows the checksum that
     was written with them; so must its distances, if it has any, and every brick that holds a voxel
     of it must have distances. Every surface must be the one of its digest, and an object must have
-    that digest. The log of changes must have no gaps and agree with the objects. Rows are read in
-    batches, so memory does not grow with their number.
+    that digest; at the object's transform it must have the object's bounds, lie in the grid, and be
+    where the object's voxels are. Every pair is judged again. The log of changes must have no gaps
+    and agree with the objects. Rows are read in batches, and surfaces one by one, so memory does
+    not grow with their number.
 
     Parameters
     ----------
@@ -125,10 +141,11 @@ def check_environment(
 def repair_environment(
     url: str | os.PathLike[str], report: CheckReport, *, progress: Progress | None = None
 ) -> None:
-    """Mend what a check has found about rows: a transaction an object.
+    """Mend what a check has found about rows and pairs: a transaction an object.
 
-    Rows that are not those that were written are made anew from the object's surface. Rows of no
-    object, as a crash between the servers of partitions leaves them, are removed.
+    Rows that are not those that were written, and bounds, are made anew from the object's surface.
+    Rows of no object, as a crash between the servers of partitions leaves them, are removed. Pairs
+    are marked, so that the next search for clashes measures them again; they stay accepted.
     """
     with closing(open_store(url)) as store:
         total = len(report.wrong) + len(report.strays)
@@ -141,6 +158,19 @@ def repair_environment(
             rewrite_object(store, store.object(object_id))
             if progress is not None:
                 progress(n + 1, total)
+        if report.pairs or report.lacks_pairs:
+            _mark_pairs(store, report.pairs)
+
+
+def _mark_pairs(store: Store, wrong: list[PairRow]) -> None:
+    """Note that pairs are of no search: the next one measures them, and all that are missing."""
+    there, revision = {obj.id for obj in store.objects()}, store.revision()
+    gone = [row for row in wrong if row.revision > revision or not {row.a, row.b} <= there]
+    anew = [row._replace(setting="", revision=revision) for row in wrong if row not in gone]
+    store.put_pairs(anew, [(row.a, row.b) for row in gone])
+    for row in anew:
+        if row.because is None or row.shapes is None:
+            store.accept_pair(row.a, row.b, None, None)
 
 
 def _check(store: Store, report: CheckReport, progress: Progress | None) -> None:
@@ -153,6 +183,8 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
             report.add(_cause(error))
             return
         report.objects = len(objects)
+        if not store.wants_distances and any(obj.has_distances for obj in objects.values()):
+            report.add("objects have distances, and the environment wants none")
         for finding in chain(
             _log_findings(store, objects),
             _row_findings(store, objects, report, progress),
@@ -161,7 +193,10 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
         ):
             report.add(finding)
         try:
-            list(store.pairs())
+            for fault in pair_faults(store, objects):
+                report.add(fault.text)
+                report.lacks_pairs |= fault.row is None
+                report.pairs += [fault.row] if fault.row else []
         except DamagedError as error:
             report.add(_cause(error))
 
@@ -315,22 +350,30 @@ def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport
 def _surface_findings(
     store: Store, objects: dict[int, Object], report: CheckReport
 ) -> Iterator[str]:
-    """Surfaces that are damaged, missing, or of no object."""
-    of_digest = {obj.digest: obj for obj in objects.values()}
+    """Surfaces that are damaged, missing, of no object, or elsewhere."""
+    of_digest: dict[str, list[Object]] = {}
+    for obj in objects.values():
+        of_digest.setdefault(obj.digest, []).append(obj)
     there = store.surface_digests()
     for digest in sorted(there - of_digest.keys()):
         yield f"surface {digest:.40} of no object"
     for obj in objects.values():
         if obj.digest not in there:
             yield f"object {obj.id} ({obj.name}) has no surface"
-    digests = sorted(there & of_digest.keys())
-    for at in range(0, len(digests), AT_ONCE):
-        for digest, surface in store.surfaces(digests[at : at + AT_ONCE]).items():
-            report.surfaces += 1
-            try:
-                unpacked_part(store.url, of_digest[digest], surface)
-            except DamagedError as error:
-                yield _cause(error)
+    for digest in sorted(there & of_digest.keys()):
+        report.surfaces += 1
+        same = of_digest[digest]
+        try:
+            shape = unpacked_part(store.url, same[0], store.surfaces([digest])[digest])
+        except DamagedError as error:
+            yield _cause(error)
+            continue
+        for obj in same:
+            part = replace(shape, name=obj.name, world_from_part=obj.transform)
+            found = list(placement_faults(store, obj, part))
+            if found == [OTHER_BOUNDS] and obj.id not in report.wrong:
+                report.wrong.append(obj.id)
+            yield from (f"object {obj.id} ({obj.name}): {fault}" for fault in found)
 
 
 def _is_ascending(rows: Rows, key: int, object_id: int) -> bool:

@@ -24,7 +24,7 @@ from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.ready import make_ready
-from hapticdb.store.base import Object, Progress
+from hapticdb.store.base import Object, Progress, Store
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
 
@@ -98,11 +98,11 @@ def find_clashes(
         raise UsageError(f"a search of {seconds} seconds: give more than 0")
     began = time.monotonic()
     until = np.inf if seconds is None else began + seconds
-    asked = _Asked(within, contact, tuple(of), tuple(against), until, budget, progress)
+    asked = Asked(within, contact, tuple(of), tuple(against), until, budget, progress)
     with connected(on) as workers:
         if workers is None:
             make_ready("clashes")
-        return _Search(env, asked, workers).found(began)
+        return Search(env.store, asked, env.address, workers).found(began)
 
 
 def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> list[PairRow]:
@@ -133,7 +133,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     return rows
 
 
-class _Asked(NamedTuple):
+class Asked(NamedTuple):
     """What is asked, as for `find_clashes`; until : time of `time.monotonic`."""
 
     within: float
@@ -150,13 +150,14 @@ class _Asked(NamedTuple):
         return f"within {self.within!r} contact {self.contact!r} by motions"
 
 
-class _Search:
+class Search:
     """State of one search."""
 
-    def __init__(self, env: Environment, asked: _Asked, workers: Cluster | None) -> None:
-        store = env.store
+    def __init__(
+        self, store: Store, asked: Asked, address: str = "", workers: Cluster | None = None
+    ) -> None:
         self._store, self._asked = store, asked
-        self._address, self._workers = env.address, workers
+        self._address, self._workers = address, workers
         self._is_kept = not store.is_read_only
         self._waiting: list[PairRow] = []
         self._wrote = time.monotonic()
@@ -179,7 +180,7 @@ class _Search:
             if is_whole and (of := self._changed(kept, revision)) is not None:
                 kept, rest = kept.parted(of)
             rows = {(row.a, row.b): row for row in kept}
-            near = self._near(outlines, of, against)
+            near = self.near(outlines, of, against)
             looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
             keys = [key for key in near if key not in looked]
             by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}
@@ -189,7 +190,7 @@ class _Search:
         stale = [(by_id[a], by_id[b]) for a, b in keys]
         shown = {key: row for key, row in rows.items() if _is_asked(*key, of, against)}
         try:
-            for row in self._measured(stale, rows, revision):
+            for row in self.measured(stale, rows, revision):
                 shown[row.a, row.b] = row
                 looked.add((row.a, row.b))
         finally:  # of an error or an interrupt, too
@@ -210,7 +211,7 @@ class _Search:
             return None
         return {change.id for change in self._store.changes(since)}
 
-    def _near(
+    def near(
         self, outlines: Outlines, of: set[int] | None, against: set[int] | None
     ) -> dict[tuple[int, int], int]:
         """Keys of pairs of near boxes that are asked for, and the later revision of both."""
@@ -226,7 +227,7 @@ class _Search:
     def _is_fresh(self, row: PairRow | None, newest: int) -> bool:
         return row is not None and row.revision >= newest and row.setting == self._setting
 
-    def _measured(
+    def measured(
         self,
         stale: Sequence[tuple[Object, Object]],
         rows: dict[tuple[int, int], PairRow],
@@ -391,12 +392,13 @@ def _compared(row: PairRow, old: PairRow | None) -> PairRow:
     elif not was_told:
         status = "new"
     else:
-        status = "same" if old.status == "same" and _is_same(row, old) else "changed"
+        status = "same" if old.status == "same" and is_same(row, old) else "changed"
     return row._replace(status=status, because=old.because, shapes=old.shapes)
 
 
-def _is_same(row: PairRow, old: PairRow) -> bool:
+def is_same(row: PairRow, old: PairRow, share: float = 0.0) -> bool:
+    """Whether kinds are the same, and lengths to `SAME` or a share of them."""
     if row.kind != old.kind or (row.at_most is None) != (old.at_most is None):
         return False
-    moved = row.at_least - old.at_least, (row.at_most or 0.0) - (old.at_most or 0.0)
-    return all(abs(length) <= SAME for length in moved)
+    lengths = (row.at_least, old.at_least), (row.at_most or 0.0, old.at_most or 0.0)
+    return all(abs(x - y) <= SAME + share * max(x, y) for x, y in lengths)

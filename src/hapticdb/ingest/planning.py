@@ -2,6 +2,7 @@
 
 import contextlib
 from collections.abc import Iterable, Mapping
+from dataclasses import replace
 from typing import NamedTuple
 
 import numpy as np
@@ -47,11 +48,12 @@ def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
 def bounds_inside(
     part: Part, link: str, grid: Grid, world_from_part: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """Bounds (2, 3) of a part in metres, world frame, at a given placement or at the file's.
+    """`Part.bounds` at a given placement or at the file's.
 
     Raises `OutsideGridError` if the part leaves the grid.
     """
-    points = part.world_points(world_from_part)
+    placed = part if world_from_part is None else replace(part, world_from_part=world_from_part)
+    points = placed.world_points()
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
     scaled = grid.to_voxel_units(bounds)
     # a point on the upper border has no voxel; a surface there still touches the last one
@@ -61,7 +63,7 @@ def bounds_inside(
             f"{link}: part {part.name!r} spans {_box(bounds)} m, outside the grid's "
             f"{_box(grid.bounds)} m; move it, or make an environment with a larger --extent"
         )
-    return bounds
+    return placed.bounds
 
 
 def _box(bounds: NDArray[np.float64]) -> str:

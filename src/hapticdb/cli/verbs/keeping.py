@@ -28,16 +28,18 @@ def check(
     repair: Annotated[
         bool,
         typer.Option(
-            "--repair", help="Then make wrong rows anew, from surfaces; remove stray ones."
+            "--repair",
+            help="Then make wrong rows and boxes anew, from surfaces; remove stray rows; have "
+            "'clashes' measure wrong pairs again.",
         ),
     ] = False,
     json: JsonOption = False,
 ) -> None:
     """Read all of an environment and say what is wrong with it, a line each.
 
-    The structure, rows, objects and the log of changes are compared. The exit code
-    is 0 when it is sound, 1 when it is damaged, 2 when it cannot be read. With
-    --repair it says what is still wrong when rows are mended.
+    The structure, rows, objects, surfaces, pairs and the log of changes are
+    compared. The exit code is 0 when it is sound, 1 when it is damaged, 2 when it
+    cannot be read. With --repair it says what is still wrong when rows are mended.
 
     Example: hapticdb check car.db
     """
@@ -45,10 +47,11 @@ def check(
 
     render.compile_kernels("copy", *(["move"] if repair else []))
     report = _read(url, check_environment)
-    if repair and (report.wrong or report.strays):
+    if repair and report.is_mendable:
         render.note(
             f"mending rows: of {render.counted(len(report.wrong), 'object')} made anew, of "
-            f"{len(report.strays)} that are not there removed"
+            f"{len(report.strays)} that are not there removed, of "
+            f"{render.counted(len(report.pairs), 'pair')} to be measured again"
         )
         with render.bar("mending", "objects") as progress:
             repair_environment(url, report, progress=progress)
@@ -74,7 +77,7 @@ def _read(url: str, check_environment: "Callable[..., CheckReport]") -> "CheckRe
 def _checked(report: "CheckReport") -> str:
     if not report.is_sound:
         count = render.counted(report.n_findings, "finding")
-        mend = "'--repair' mends rows, " if report.wrong or report.strays else ""
+        mend = "'--repair' mends rows, " if report.is_mendable else ""
         return f"{report.url} is damaged: {count}; {mend}restore a copy or import the files again"
     return (
         f"{report.url} is sound: {render.counted(report.objects, 'object')}, "

@@ -1,0 +1,121 @@
+"""`hapticdb check` finds what is not what it derives from: each column, altered by itself."""
+
+from collections.abc import Callable, Iterator
+from contextlib import closing
+from functools import partial
+from pathlib import Path
+
+import apsw
+import numpy as np
+import psycopg
+import pytest
+from psycopg import sql
+
+import hapticdb
+from assemblies import row_of_boxes
+from hapticdb.check import CheckReport, check_environment, repair_environment
+from hapticdb.clashes.run import accept_clash, find_clashes
+from hapticdb.store.postgres.address import parse
+from servers import FOUND, named, url_on
+
+TURNED = np.diag([-1.0, -1.0, 1.0, 1.0])
+SIDES = np.array([[-2.0, -2.0, -2.0], [2.0, 2.0, 2.0]])
+ALTERED: dict[str, tuple[str, np.ndarray | None]] = {
+    "transform": ("UPDATE object SET transform = ? WHERE id = 2", TURNED),
+    "no placement": ("UPDATE object SET transform = ? WHERE id = 2", np.ones((4, 4))),
+    "out of the grid": ("UPDATE object SET transform = ? WHERE id = 2", 99.0 * np.eye(4)),
+    "bounds": ("UPDATE object SET bounds = ? WHERE id = 2", SIDES),
+    "digest": ("UPDATE object SET digest = 'x' WHERE id = 2", None),
+    "voxels": ("UPDATE object SET voxels = voxels + 1 WHERE id = 2", None),
+    "revision": ("UPDATE object SET revision = revision + 1 WHERE id = 2", None),
+    "voxel_size": ("UPDATE environment SET voxel_size = 1.5 * voxel_size", None),
+    "origin": ("UPDATE environment SET origin_y = origin_y + 0.5", None),
+    "curve": ("UPDATE environment SET curve = 'hilbert'", None),
+    "layout": ("UPDATE environment SET layout = 'voxel'", None),
+    "a": ("UPDATE pair SET a = 1 WHERE a = 2 AND b = 3", None),
+    "b": ("UPDATE pair SET b = 9 WHERE a = 1 AND b = 2", None),
+    "kind": ("UPDATE pair SET kind = 'touching' WHERE a = 1", None),
+    "far": ("UPDATE pair SET kind = 'far' WHERE a = 1", None),
+    "at_least": ("UPDATE pair SET at_least = 2 * at_least WHERE a = 1", None),
+    "at_most": ("UPDATE pair SET at_most = at_most + 0.001 WHERE a = 1", None),
+    "no bound": ("UPDATE pair SET at_most = NULL WHERE a = 1", None),
+    "place": ("UPDATE pair SET a_x = a_x + 1, b_x = b_x + 1 WHERE a = 1", None),
+    "pair's revision": ("UPDATE pair SET revision = 99 WHERE a = 1", None),
+    "setting": ("UPDATE pair SET setting = 'x' WHERE a = 1", None),
+    "because": ("UPDATE pair SET because = 'x' WHERE a = 2", None),
+    "a pair that is gone": ("DELETE FROM pair WHERE a = 1", None),
+}  # fmt: skip
+OF_PAIRS = list(ALTERED)[list(ALTERED).index("a") :]
+
+
+def searched(url: str | Path) -> None:
+    """Cubes 1 and 2 overlap by 1 mm, and so do 2 and 3; the first pair is accepted."""
+    with hapticdb.open(url) as env:
+        find_clashes(env)
+        accept_clash(env, [1], [2], "meant so")
+
+
+@pytest.fixture(params=[None, *FOUND], ids=named)
+def altered(
+    request: pytest.FixtureRequest, tmp_path: Path
+) -> Iterator[tuple[str, Callable[[str], CheckReport]]]:
+    """An environment on SQLite or a server, and what alters a column of it and checks it."""
+    path = row_of_boxes(tmp_path / "row.db", 3, 0.099)
+    with url_on(request.param, tmp_path) as url:
+        hapticdb.copy_environment(path, url)
+        searched(url)
+        yield url, partial(alter, url)
+
+
+def alter(url: str, name: str) -> CheckReport:
+    statement, array = ALTERED[name]
+    if "://" not in url:
+        with closing(apsw.Connection(url)) as connection:
+            connection.execute("PRAGMA ignore_check_constraints = ON")
+            connection.execute(statement, () if array is None else (array.tobytes(),))
+        return check_environment(url)
+    address = parse(url)
+    with psycopg.connect(address.conninfo, autocommit=True) as server:
+        schema = sql.Identifier(address.environment)
+        server.execute(sql.SQL("SET search_path = {}").format(schema))
+        given = () if array is None else (array.ravel().tolist(),)
+        server.execute(statement.replace("?", "%s").encode(), given)
+    return check_environment(url)
+
+
+@pytest.mark.parametrize("name", ALTERED)
+def test_an_altered_column_is_found(
+    altered: tuple[str, Callable[[str], CheckReport]], name: str
+) -> None:
+    url, alter_it = altered
+    assert check_environment(url).findings == []
+    report = alter_it(name)
+    assert not report.is_sound
+    assert all("\n" not in finding for finding in report.findings)
+
+
+@pytest.mark.parametrize("name", ["bounds", *OF_PAIRS])
+def test_repair_mends_what_can_be_made_anew(
+    altered: tuple[str, Callable[[str], CheckReport]], name: str
+) -> None:
+    """Pairs, by the next search; the accepted pair stays accepted where its row is there."""
+    url, alter_it = altered
+    repair_environment(url, alter_it(name))
+    with hapticdb.open(url) as env:
+        found = find_clashes(env)
+    assert check_environment(url).findings == []
+    assert found.counts()["overlapping"] == 2
+    lost = {"a", "b", "pair's revision", "because", "a pair that is gone"}
+    if name not in lost:
+        assert [one.because for one in found.pairs if one.a == 1] == ["meant so"]
+
+
+def test_moved_and_removed_objects_leave_a_sound_environment(tmp_path: Path) -> None:
+    path = row_of_boxes(tmp_path / "row.db", 4, 0.099)
+    searched(path)
+    with hapticdb.open(path) as env:
+        env.shift([2], (0.0, 0.3, 0.01))
+        env.remove(4)
+        assert check_environment(path).findings == []
+        find_clashes(env)
+    assert check_environment(path).findings == []

@@ -34,7 +34,7 @@ def geometries(draw: st.DrawFn) -> Geometry:
     return vertices, faces, draw(arrays(np.uint8, shape, elements=draw(SHADES)))
 
 
-@settings(max_examples=100, deadline=None)
+@settings(max_examples=200, deadline=None)
 @given(geometries(), st.sampled_from([0.0, 1e-5, 5e-324]))
 def test_what_is_packed_returns_bit_for_bit(geometry: Geometry, chord: float) -> None:
     """The chord error is last, so that surfaces without one are as before."""
@@ -60,7 +60,7 @@ def ball(n: int) -> tuple[Floats, Ints]:
     return points.reshape(-1, 3), corners.reshape(-1, 3)
 
 
-@settings(max_examples=150, deadline=None)
+@settings(max_examples=300, deadline=None)
 @given(st.data())
 def test_damaged_bytes_are_an_error_or_another_sound_geometry(data: st.DataObject) -> None:
     """Never a position that is no number, nor a triangle of a vertex that is not there."""

@@ -21,15 +21,14 @@ def poses_at(poses: Floats, middle: Floats, times: Floats) -> Floats:
     middle (3,): the tool's middle in its own frame.
     """
     last = len(poses) - 1
+    times = np.clip(times, 0.0, last)
+    m = np.minimum(times.astype(int), max(last - 1, 0))
+    a, b, share = poses[m], poses[np.minimum(m + 1, last)], (times - m)[:, None]
+    turns = Rotation.from_matrix(b[:, :3, :3] @ a[:, :3, :3].swapaxes(1, 2)).as_rotvec()
+    begin, end = placed(a, middle[None])[:, 0], placed(b, middle[None])[:, 0]
     out = np.tile(np.eye(4), (len(times), 1, 1))
-    for n, time in enumerate(np.clip(times, 0.0, last).tolist()):
-        m = min(int(time), max(last - 1, 0))
-        share = time - m
-        a, b = poses[m], poses[min(m + 1, last)]
-        turn = Rotation.from_matrix(b[:3, :3] @ a[:3, :3].T).as_rotvec()
-        out[n, :3, :3] = Rotation.from_rotvec(share * turn).as_matrix() @ a[:3, :3]
-        begin, end = a[:3, :3] @ middle + a[:3, 3], b[:3, :3] @ middle + b[:3, 3]
-        out[n, :3, 3] = begin + share * (end - begin) - out[n, :3, :3] @ middle
+    out[:, :3, :3] = Rotation.from_rotvec(share * turns).as_matrix() @ a[:, :3, :3]
+    out[:, :3, 3] = begin + share * (end - begin) - out[:, :3, :3] @ middle
     return out
 
 

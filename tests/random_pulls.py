@@ -9,7 +9,6 @@ from typing import NamedTuple
 
 import numpy as np
 import trimesh
-from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from contact_scenes import (
@@ -46,6 +45,11 @@ class Body(NamedTuple):
 
     def shifted(self, by: Floats) -> "Body":
         return Body(self.triangles + by, self.solid + by, self.thin)
+
+    def within(self, size: float) -> "Body":
+        """The same, made smaller if it is wider."""
+        scale = min(1.0, size / np.ptp(self.triangles, axis=(0, 1)).max())
+        return Body(self.triangles * scale, self.solid * scale, self.thin * scale)
 
     @property
     def height(self) -> tuple[float, float]:
@@ -221,11 +225,8 @@ def _rests(rng: Random) -> RandomPull:
         aside = np.array([tool.triangles[..., 0].max() - other.triangles[..., 0].min() + 1.0, 0, 0])
         aside[2] = tool.height[0] - other.height[0]
         other = other.shifted(aside)
-        tool = Body(
-            joined(tool.triangles, other.triangles),
-            joined(tool.solid, other.solid),
-            min(tool.thin, other.thin),
-        )
+        both = joined(tool.triangles, other.triangles), joined(tool.solid, other.solid)
+        tool = Body(*both, min(tool.thin, other.thin))
     radius, middle = 0.0, np.zeros(3)
     if rng.random() < 0.12:
         radius = _log(rng, 0.5, 6)
@@ -268,10 +269,9 @@ def _fits(rng: Random) -> RandomPull:
     length = _log(rng, 3, 20)
     sunk = float(rng.choice([0.0, -0.002, 0.01, -_log(rng, 0.002, 0.045)]))
     peg = rod(radius + sunk, length * rng.uniform(0.8, 1.5), n)
-    if rng.random() < 0.5:
-        bore = ring(radius, radius + _log(rng, 0.3, 6), length, n)
-    else:  # finer by a whole factor: the peg's corners are where corners of the bore are
-        bore = ring(radius, radius + _log(rng, 0.3, 6), length, 3 * n)
+    # finer by a whole factor: the peg's corners are where corners of the bore are
+    times = 1 if rng.random() < 0.5 else 3
+    bore = ring(radius, radius + _log(rng, 0.3, 6), length, times * n)
     poses, is_along = _path(rng), rng.random() < 0.5
     if is_along:
         ends = rng.choice([-2.0, 2.0]) * length * np.cumsum(rng.random(int(rng.integers(1, 3))))
@@ -284,10 +284,7 @@ def _fits(rng: Random) -> RandomPull:
 
 def _in_tin(rng: Random) -> RandomPull:
     """A thing on the floor of a closed tin of 18 inside; it never gets out."""
-    tool = _shape(rng, SHAPES, tilted=0.3)
-    size = np.ptp(tool.triangles, axis=(0, 1)).max()
-    scale = min(1.0, 6.0 / size)
-    tool = Body(tool.triangles * scale, tool.solid * scale, tool.thin * scale)
+    tool = _shape(rng, SHAPES, tilted=0.3).within(6.0)
     sunk = -float(rng.choice([0.002, 0.01, 0.03]))
     tool = tool.shifted(np.array([0.0, 0.0, -9.0 - tool.height[0] - sunk]))
     thick = _log(rng, 0.05, 3)
@@ -300,9 +297,7 @@ def _in_tin(rng: Random) -> RandomPull:
 
 def _buried(rng: Random) -> RandomPull:
     """A thing within a block, near its face or far from it: a hit wherever it goes."""
-    tool = _shape(rng, SHAPES, tilted=0.5)
-    scale = min(1.0, 8.0 / np.ptp(tool.triangles, axis=(0, 1)).max())
-    tool = Body(tool.triangles * scale, tool.solid * scale, tool.thin * scale)
+    tool = _shape(rng, SHAPES, tilted=0.5).within(8.0)
     deep = float(rng.choice([0.002, 0.02, 0.045, 0.5, 3.0]))
     tool = tool.shifted(np.array([0.0, 0.0, -deep - tool.height[1]]))
     block = _closed(box((30, 30, 30), (0, 0, -15)))
@@ -315,7 +310,3 @@ KINDS = (_rests, _rests, _rests, _rests, _rests, _rests, _fits, _fits, _in_tin, 
 def random_pull(seed: int) -> RandomPull:
     """The pull of a seed."""
     return KINDS[seed % len(KINDS)](np.random.default_rng([46, seed]))
-
-
-def at_poses(triangles: Floats, pose: NDArray[np.float64]) -> Floats:
-    return np.asarray(triangles @ pose[:3, :3].T + pose[:3, 3])

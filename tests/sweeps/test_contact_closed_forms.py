@@ -76,10 +76,16 @@ def outcome(found: Swept) -> str:
 @pytest.mark.parametrize("seed", FRAMES)
 @pytest.mark.parametrize("name", SEATED)
 def test_a_seated_part_is_free_overlaps_or_hits(env: Environment, name: str, seed: int) -> None:
+    """The proved depth is never more than the motion that frees, and both fit the scene."""
     pull = SCENES[name]
     found = found_in(env, pull, seed)
     assert outcome(found) == pull.expected
     assert found.is_free == (pull.expected != "hits")
+    touching: tuple[Any, ...] = found.touching
+    for one in touching:
+        if np.isfinite(one.start):  # infinite where nothing frees
+            assert one.start_at_least <= one.start * (1.0 + 1e-6)
+            assert one.start / MM <= max(pull.start, REACH + pull.contact - CONTACT)
     if pull.expected == "hits":
         assert pull.after <= first_hit(found) <= pull.by + LOOK
 
@@ -93,6 +99,7 @@ def test_a_foreign_tool_has_no_seat(env: Environment, name: str, seed: int) -> N
     assert outcome(found) == ("hits" if pull.start else pull.expected)
     if pull.start:
         assert first_hit(found) == 0.0
+    assert found.gap.at_least == 0.0 or outcome(found) != "hits"
 
 
 @pytest.mark.parametrize("seed", FRAMES)
@@ -104,18 +111,6 @@ def test_an_overlap_that_is_accepted_is_clear(env: Environment, name: str, seed:
     assert CONTACT < start / MM <= pull.start
     assert found_in(env, pull, seed, overlap=1.01 * start).verdict in FREE
     assert found_in(env, pull, seed, overlap=0.9 * start).verdict not in FREE
-
-
-@pytest.mark.parametrize("seed", FRAMES)
-@pytest.mark.parametrize("name", SEATED)
-def test_bounds_of_the_start_overlap(env: Environment, name: str, seed: int) -> None:
-    """The proved depth is never more than the motion that frees, and both fit the scene."""
-    pull = SCENES[name]
-    touching: tuple[Any, ...] = found_in(env, pull, seed).touching
-    for one in touching:
-        if np.isfinite(one.start):  # infinite where nothing frees
-            assert one.start_at_least <= one.start * (1.0 + 1e-6)
-            assert one.start / MM <= max(pull.start, REACH + pull.contact - CONTACT)
 
 
 def test_a_hood_in_its_seam_overlaps_by_two_millimetres(env: Environment) -> None:
@@ -132,16 +127,6 @@ def test_a_peg_touches_until_it_has_left_its_bore(env: Environment) -> None:
         (one,) = found.touching
         assert found.verdict == "slides"
         assert one.until * 25.0 == pytest.approx(20.1, abs=0.15)
-
-
-def test_poses_of_a_path_of_one_pose_are_judged(env: Environment) -> None:
-    """A foreign tool that stands in material is hit at its only pose; one that rests is free."""
-    buried, rests = SCENES["buried tool"], SCENES["sunk plate, rests"]
-    for pull, expected in ((buried, "hits"), (rests, "free")):
-        for seed in FRAMES:
-            found = found_in(env, pull, seed, seated=False)
-            assert outcome(found) == expected
-            assert found.gap.at_least == 0.0 or expected == "free"
 
 
 def test_a_tool_within_a_body_is_hit_wherever_it_stands(env: Environment) -> None:
@@ -221,7 +206,7 @@ def test_a_part_of_two_bodies_is_one_tool(env: Environment) -> None:
 def test_extract_finds_no_way_out_of_a_closed_tin(tmp_path_factory: pytest.TempPathFactory) -> None:
     folder = tmp_path_factory.mktemp("tin")
     with imported(folder / "tin.db", {"tin": TIN, "label": LABEL}) as env:
-        found = hapticdb.extract(env, "label", seconds=5.0, motions=300)
+        found = hapticdb.extract(env, "label", seconds=5.0, motions=100)
     assert found.way is None or not found.is_free
     assert found.verdict != "comes out"
 

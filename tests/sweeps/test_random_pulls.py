@@ -26,7 +26,7 @@ from contact_scenes import (
 from draws import drawn
 from hapticdb import Environment, PointShell
 from hapticdb.sweeps.result import Swept
-from random_pulls import Body, RandomPull, at_poses, random_pull
+from random_pulls import Body, RandomPull, random_pull
 from winding import Surface, crossed, distances
 
 SOME, ALL, AT_ONCE = 100, 1000, 50
@@ -119,9 +119,9 @@ def is_met_again(case: Case) -> bool:
 def gap(case: Case, body: Floats, step: Floats) -> float:
     """Distance of the tool from an object after a displacement, up to 1; 0 where they meet."""
     if case.pull.radius:
-        middle = at_poses(case.pull.middle[None], step)
+        middle = placed(case.pull.middle[None], step)
         return float(distances(middle, body)[0]) - case.pull.radius
-    found = judged(at_poses(case.pull.tool.triangles, step), body)
+    found = judged(placed(case.pull.tool.triangles, step), body)
     return found.at_least if found.kind in {"far", "apart", "touching"} else 0.0
 
 
@@ -139,14 +139,14 @@ def against_winding(case: Case, body: Body, reach: float) -> str:
     for n, step in enumerate(case.steps(*LOOKS)):
         back = np.linalg.inv(step)
         deep = max(
-            thing.depth_of(at_poses(tool.samples, step)),
-            tool.depth_of(at_poses(thing.samples, back)),
+            thing.depth_of(placed(tool.samples, step)),
+            tool.depth_of(placed(thing.samples, back)),
         )
         if deep > reach:
             return f"{deep:.3f} deep at look {n}, {reach:.3f} is allowed"
         if (
-            crossed(at_poses(tool.edges, step), thing, reach, reach, reach).any()
-            or crossed(at_poses(thing.edges, back), tool, reach, reach, reach).any()
+            crossed(placed(tool.edges, step), thing, reach, reach, reach).any()
+            or crossed(placed(thing.edges, back), tool, reach, reach, reach).any()
         ):
             return f"an edge is through a surface at look {n}"
     return ""
@@ -173,7 +173,7 @@ def against_tracks(case: Case, body: Body, reach: float) -> str:
 def against_clashes(case: Case, body: Body, reach: float) -> str:
     """The end is no worse a clash than the start, but for `reach`."""
     start, end = (
-        judged(at_poses(case.pull.tool.triangles, step), body.triangles)
+        judged(placed(case.pull.tool.triangles, step), body.triangles)
         for step in case.steps(0.0, 1.0)
     )
     if end.kind == "overlapping" and end.at_least <= max(reach, start.at_least) + SLACK:

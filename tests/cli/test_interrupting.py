@@ -41,7 +41,7 @@ else:
 """A program: the command line, interrupted in the n-th import after its own module's."""
 
 
-@pytest.mark.parametrize("at", drawn(range(1, 521), 5))
+@pytest.mark.parametrize("at", drawn(range(1, 521), 3))
 def test_ctrl_c_within_any_import_is_one_line(scene: Path, at: int) -> None:
     how = "module" if at % 2 else "script"
     done = finished([sys.executable, "-c", AT_IMPORT, str(at), how, "objects", str(scene)])

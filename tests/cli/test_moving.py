@@ -47,17 +47,9 @@ def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path)
 
 
 def test_copy_json_has_the_documented_keys(run: Run, scene: Path) -> None:
-    out = succeeded(run("copy", scene, "b.db", "--json"))
-    with hapticdb.open(scene, read_only=True) as env:
-        voxels = sum(obj.voxels for obj in env.objects())
-    assert json.loads(out) == {
-        "source": str(scene),
-        "target": "b.db",
-        "copied": 3,
-        "voxels": voxels,
-        "present": 0,
-        "renumbered": 0,
-    }
+    found = json.loads(succeeded(run("copy", scene, "b.db", "--json")))
+    assert list(found) == ["source", "target", "copied", "voxels", "present", "renumbered"]
+    assert (found["copied"], found["present"], found["renumbered"]) == (3, 0, 0)
 
 
 # -- diff -----------------------------------------------------------------------------------------

@@ -58,9 +58,10 @@ def test_what_is_hit_is_said_with_where(run: Run, scene: Path) -> None:
     first, *rest = out.splitlines()
     assert first.startswith("hits box0 at ")
     assert "(segment 0)" in first
-    assert [name for name in ("box0", "box1", "box2") if any(name in line for line in rest)] == [
-        "box0", "box1", "box2",
-    ]  # fmt: skip
+    for name in ("box0", "box1", "box2"):
+        assert any(name in line for line in rest)
+    words = ("sweep", scene, *TOOL, "--path", "through.csv", "--json", "--until-hit")
+    assert [one["name"] for one in json.loads(run(*words)[1])["hits"]] == ["box0"]
 
 
 @pytest.mark.usefixtures("along")
@@ -182,10 +183,8 @@ def test_wrong_use_of_sweep_is_one_line(run: Run, scene: Path) -> None:
     refused(run("sweep", scene, *path, *TOOL, "--part", 1), "--tool and --part")
     refused(run("sweep", scene, *path, "--part", 1, "--tool-unit", "mm"), "--tool-unit")
     refused(run("sweep", scene, *path, "--part", 9), "no object 9")
-    refused(run("sweep", scene, *path, *TOOL, "--exclude", "9"), "no object 9")
     refused(run("sweep", scene, *path, *TOOL, "--exclude", "x"), "--exclude")
     refused(run("sweep", scene, *path, *TOOL, "--seconds", -1), "second")
-    refused(run("sweep", scene, "--path", "none.csv", *TOOL), "no file of poses")
     refused(run("sweep", "none.db", *path, *TOOL), "none.db")
 
 
@@ -239,14 +238,4 @@ def test_a_foreign_tool_has_no_seat(run: Run, seam: Path, monkeypatch: pytest.Mo
     write_obj(Path("hood.obj"), {"hood": (corners, np.arange(len(corners)).reshape(-1, 3))})
     words = ("--path", "up.csv", "--exclude", "hood")
     code, out, _ = run("sweep", seam, "--tool", "hood.obj", "--tool-unit", "m", *words)
-    assert code == 1
-    assert re.match(r"starts inside seam: at least (1\.9\d*|2) mm", out)
-
-
-@pytest.mark.usefixtures("through")
-def test_a_sweep_may_end_at_the_first_hit(run: Run, scene: Path) -> None:
-    words = ("sweep", scene, *TOOL, "--path", "through.csv", "--json")
-    every, first = (json.loads(run(*words, *more)[1]) for more in ((), ("--until-hit",)))
-    assert len(every["hits"]) == 3
-    assert [one["name"] for one in first["hits"]] == ["box0"]
-    assert first["hits"][0]["fraction"] == pytest.approx(every["hits"][0]["fraction"], abs=1e-4)
+    assert (code, out.partition(":")[0]) == (1, "starts inside seam")

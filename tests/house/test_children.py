@@ -38,7 +38,9 @@ print(server.pid, flush=True)
 """
 
 
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGTERM], ids=str)
+@pytest.mark.parametrize(
+    "how", [signal.SIGKILL, pytest.param(signal.SIGTERM, marks=pytest.mark.long)], ids=str
+)
 def test_a_run_that_is_killed_leaves_no_server_no_process_and_no_file(how: signal.Signals) -> None:
     with child([sys.executable, "-c", HOLDING], env=PATHS, stderr=None) as run:
         assert run.stdout is not None

@@ -22,28 +22,6 @@ from children import finished
 from hapticdb.kernels._cache import cache_folder, sources_digest
 from sources import PACKAGE, ROOT, modules, named, python_files
 
-# from the top down; a module may import from its own floor and the floors below it
-FLOORS: list[set[str]] = [
-    {"__main__"},
-    {"cli"},
-    {"server"},
-    {"page"},
-    {"demo", "pictures"},
-    {"hosting"},
-    {"check", "clashes", "extraction", "realtime", "sweeps"},
-    {"recording", "devices"},
-    {"batches", "environment", "resident", "sample"},
-    {"difference", "ingest", "transfer"},
-    {"paper"},
-    {"cluster", "query"},
-    {"pointshell", "mesh", "poses"},
-    {"store"},
-    {"grid", "ready"},
-    {"kernels"},
-    {"units"},
-    {"closing", "errors", "interrupting"},
-]
-LEVELS = {name: level for level, floor in enumerate(FLOORS) for name in floor}
 # domains that may import less than their floor allows -> what they may import
 NARROW: dict[str, set[str]] = {
     "kernels": set(),
@@ -61,6 +39,21 @@ PUBLIC = hapticdb.__all__
 def domain(path: Path) -> str:
     """Domain of a source: the module or folder directly below the package."""
     return path.relative_to(PACKAGE).parts[0].removesuffix(".py")
+
+
+def drawn_floors() -> list[set[str]]:
+    """Domains on each line of the drawing, from the top.
+
+    A module may import from its own floor and the floors below it.
+    """
+    page = (ROOT / "ARCHITECTURE.md").read_text()
+    block = page.partition("## Rooms and floors")[2].split("```")[1]
+    lines = [{word.rstrip("/") for word in line.split()} for line in block.splitlines()]
+    known = {domain(path) for path in modules()} - {"__init__"}
+    return [found for words in lines if (found := words & known)]
+
+
+LEVELS = {name: level for level, floor in enumerate(drawn_floors()) for name in floor}
 
 
 def imported(path: Path) -> Iterator[str]:
@@ -83,23 +76,12 @@ def own(path: Path) -> set[str]:
 # --- imports ------------------------------------------------------------------------------------
 
 
-def test_every_module_stands_on_a_floor() -> None:
-    assert {domain(path) for path in modules()} - {"__init__"} <= set(LEVELS)
+def test_every_module_stands_on_one_floor() -> None:
+    drawn = sorted(name for floor in drawn_floors() for name in floor)
+    assert drawn == sorted({domain(path) for path in modules()} - {"__init__"})
 
 
-def drawn_floors() -> list[set[str]]:
-    """Names of rooms on each line of the drawing, from the top."""
-    page = (ROOT / "ARCHITECTURE.md").read_text()
-    block = page.partition("## Rooms and floors")[2].split("```")[1]
-    lines = [{word.rstrip("/") for word in line.split()} for line in block.splitlines()]
-    return [found for words in lines if (found := words & set(LEVELS))]
-
-
-def test_the_floors_are_drawn_as_they_are_tested() -> None:
-    assert drawn_floors() == FLOORS
-
-
-def test_imports_point_one_way() -> None:
+def test_imports_point_one_way_and_no_farther_than_they_may() -> None:
     for path in modules():
         if domain(path) == "__init__":
             continue
@@ -107,12 +89,7 @@ def test_imports_point_one_way() -> None:
         public = {*PUBLIC, "__version__"} if LEVELS[domain(path)] < LEVELS["environment"] else set()
         above = {n for n in own(path) - public if LEVELS.get(n, -1) < LEVELS[domain(path)]}
         assert above == set(), f"{named(path)} imports from above"
-
-
-def test_modules_import_no_more_than_they_need() -> None:
-    for path in modules():
-        if domain(path) in NARROW:
-            assert own(path) <= NARROW[domain(path)], f"{named(path)}: {own(path)}"
+        assert own(path) <= NARROW.get(domain(path), own(path)), f"{named(path)}: {own(path)}"
 
 
 def round_about(below: dict[str, set[str]]) -> set[str]:
@@ -124,16 +101,12 @@ def round_about(below: dict[str, set[str]]) -> set[str]:
     return set(left)
 
 
-def test_no_two_domains_import_each_other() -> None:
+def test_no_two_domains_and_no_two_modules_import_each_other() -> None:
     """Also within one floor, and also in imports for the type checker only."""
-    below: dict[str, set[str]] = {}
+    domains: dict[str, set[str]] = {}
     for path in modules():
-        below.setdefault(domain(path), set()).update(own(path) & set(LEVELS))
-    assert round_about(below) == set()
-
-
-def test_no_two_modules_import_each_other() -> None:
-    """Nor several in a circle, also in imports for the type checker only."""
+        domains.setdefault(domain(path), set()).update(own(path) & set(LEVELS))
+    assert round_about(domains) == set()
     paths = {dotted(path): path for path in modules()}
     below = {
         name: {one if one in paths else one.rpartition(".")[0] for one in imported(path)} - {name}
@@ -149,30 +122,19 @@ def dotted(path: Path) -> str:
     return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
 
 
-def test_kernels_import_numpy_numba_and_their_own_folder() -> None:
-    # llvmlite is numba's own lower half
-    for path in (PACKAGE / "kernels").rglob("*.py"):
-        found = {
-            name for name in imported(path) if name.split(".")[0] not in sys.stdlib_module_names
-        }
-        foreign = [
-            n for n in found if not re.match(r"(numpy|numba|llvmlite|hapticdb\.kernels)(\.|$)", n)
-        ]
-        assert foreign == [], named(path)
-
-
-def test_only_the_command_line_draws_on_terminals() -> None:
-    for path in modules():
-        if domain(path) not in {"cli", "__main__"}:
-            words = {name.split(".")[0] for name in imported(path)}
-            assert not words & {"rich", "typer", "click"}, named(path)
-
-
-def test_the_package_imports_no_benchmark() -> None:
+def test_kernels_and_terminals_and_benchmarks_are_kept_apart() -> None:
+    """Kernels import numpy, numba with llvmlite, and their own folder; only cli/ draws."""
     benchmarks = {path.stem for path in (ROOT / "benchmarks").iterdir()} - {"__pycache__"}
     for path in modules():
-        words = {name.split(".")[0] for name in imported(path)}
+        names = set(imported(path))
+        words = {name.split(".")[0] for name in names}
         assert not words & benchmarks, named(path)
+        if domain(path) not in {"cli", "__main__"}:
+            assert not words & {"rich", "typer", "click"}, named(path)
+        if domain(path) == "kernels":
+            theirs = words - sys.stdlib_module_names - {"numpy", "numba", "llvmlite"}
+            assert theirs <= {"hapticdb"}, named(path)  # of which `NARROW` allows nothing else
+            assert "hapticdb" not in names, named(path)
 
 
 def run_python(script: str, *arguments: str, **variables: str) -> str:

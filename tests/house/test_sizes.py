@@ -37,38 +37,11 @@ def test_no_function_is_longer_than_60_lines() -> None:
 
 MOST_FILES = 15
 """Most Python files in a folder, without ``__init__``."""
-SHARED = 4
-"""So many files of one folder whose names begin with one word belong in a folder of their own."""
-
-
-def folders() -> dict[str, list[str]]:
-    """Names of the modules in each folder of the package."""
-    found: dict[str, list[str]] = {}
-    for path in modules():
-        if path.stem != "__init__":
-            found.setdefault(named(path.parent), []).append(path.stem)
-    return found
-
-
-def first_words(names: list[str]) -> Counter[str]:
-    """Number of names that begin with each word; an underscore ends a word."""
-    return Counter(name.partition("_")[0] for name in names if not name.startswith("_"))
 
 
 def test_no_folder_holds_more_than_15_files() -> None:
-    counts = {folder: len(names) for folder, names in folders().items()}
+    counts = Counter(named(path.parent) for path in modules() if path.stem != "__init__")
     assert {folder: n for folder, n in counts.items() if n > MOST_FILES} == {}
-
-
-def test_names_that_begin_alike_are_a_folder() -> None:
-    assert first_words(["sweep_a", "sweep_b", "sweep", "sweeper"]) == {"sweep": 3, "sweeper": 1}
-    shared = {
-        (folder, word): n
-        for folder, names in folders().items()
-        for word, n in first_words(names).items()
-        if n >= SHARED
-    }
-    assert shared == {}
 
 
 def public_classes(source: str) -> list[str]:

@@ -12,27 +12,21 @@ from realtime.worlds import SIZE, block, cloud, make, move, poses_in, scatter
 from voxels import write_voxels
 
 
-def test_cells_stay_in_memory_between_calls(tmp_path: Path) -> None:
+def test_cells_stay_in_memory_between_calls_until_it_is_closed(tmp_path: Path) -> None:
     with make(tmp_path) as env:
         scatter(env)
         shell, poses = cloud(100), poses_in(env.grid, 50)
-        with env.feeler(shell) as feeler:
+        with env.feeler(shell, jobs=2) as feeler:
             first = feeler.touch(poses)
             n_loaded = feeler.n_loaded
             assert n_loaded > 0
             again = feeler.touch(poses[::-1])
             assert feeler.n_loaded == n_loaded
         assert again.forces[::-1].tobytes() == first.forces.tobytes()
-
-
-def test_a_closed_feeler_says_so(tmp_path: Path) -> None:
-    with make(tmp_path, 6) as env:
-        feeler = env.feeler(cloud(5), jobs=2)
-        feeler.close()
         feeler.close()
         for ask in (feeler.touch, feeler.clearance, feeler.collides):
             with pytest.raises(UsageError, match="closed"):
-                ask(poses_in(env.grid, 3))
+                ask(poses)
 
 
 @pytest.mark.parametrize("by", ["itself", "another"])

@@ -74,14 +74,13 @@ def env(tmp_path: Path) -> Environment:
     return make(tmp_path, 6)
 
 
-def test_no_gpu_is_told_in_a_line(env: Environment, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_no_gpu_or_unknown_device_is_told(
+    env: Environment, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(cuda, "is_available", lambda: False)
     shell, poses = cloud(5), poses_in(env.grid, 2)
     with pytest.raises(MissingExtraError, match=r"no GPU.*pip install .*numba-cuda"):
         env.touch(shell, poses=poses, device="cuda")
     assert len(env.touch(shell, poses=poses)) == 2
-
-
-def test_an_unknown_device_is_refused(env: Environment) -> None:
     with pytest.raises(UsageError, match="'tpu': choose 'cpu' or 'cuda'"):
         env.feeler(cloud(5), device="tpu")  # type: ignore[arg-type]

@@ -1,6 +1,5 @@
 """Ways out of scenes made of boxes, whose ways are known by construction."""
 
-import time
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -174,8 +173,9 @@ def test_the_same_seed_gives_the_same_path(tmp_path: Path) -> None:
     assert again.motions == found.motions
 
 
-def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path) -> None:
-    found = found_in(enclosed(tmp_path), "block", motions=60)
+@pytest.mark.parametrize("to", [None, shifted(np.array([0.2, 0.0, 0.0]))])
+def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path, to: Any) -> None:  # noqa: ANN401
+    found = found_in(enclosed(tmp_path), "block", motions=60, to=to)
     assert (found.verdict, found.way, found.is_planned) == ("no way found", None, True)
     assert [one.object.name for one in found.blockers] == ["cage"]
     assert found.blockers[0].pulls == found.pulls
@@ -185,10 +185,8 @@ def test_what_is_enclosed_has_no_way_and_its_cage_is_named(tmp_path: Path) -> No
 
 def test_the_time_ends_the_planner(tmp_path: Path) -> None:
     """Without its end, ten million motions would take hours."""
-    began = time.monotonic()
-    found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=3.0)
+    found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=1.0)
     assert found.way is None
-    assert time.monotonic() - began < 200.0
 
 
 def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -258,12 +256,6 @@ def test_a_bolt_goes_into_its_bore(tmp_path: Path) -> None:
     assert found.way is not None
     assert (found.verdict, found.way.how) == ("comes out", "plan")
     assert np.allclose(found.way.poses[-1], np.linalg.inv(aside), atol=1e-12)
-
-
-def test_a_pose_behind_walls_is_not_reached_and_they_are_named(tmp_path: Path) -> None:
-    found = found_in(enclosed(tmp_path), "block", to=shifted(np.array([0.2, 0, 0])), motions=60)
-    assert (found.verdict, found.way) == ("no way found", None)
-    assert found.blockers[0].object.name == "cage"
 
 
 # --- wrong arguments -----------------------------------------------------------------------------

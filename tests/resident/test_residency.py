@@ -57,10 +57,8 @@ def check(residency: Residency, wanted: dict[int, set[Voxel]]) -> int:
     assert not set(filled) & set(residency.writer.slots._free)
     retired = {slot for _, held in residency.writer.slots._retired for slot in held}
     assert len(filled) + len(residency.writer.slots._free) + len(retired) == table.n_slots - 1
-    assert (residency.writer.n_resident, residency.writer.n_empty) == (
-        len(filled),
-        len(slots) - len(filled),
-    )
+    assert residency.writer.n_resident == len(filled)
+    assert residency.writer.n_empty == len(slots) - len(filled)
     assert len(entries) <= table.capacity // 2
     for key, slot in zip(cells.tolist(), slots.tolist(), strict=True):
         low = (key >> 32 << 5, (key >> 16 & 0xFFFF) << 5, (key & 0xFFFF) << 5)
@@ -187,8 +185,10 @@ def test_what_is_wanted_stays_and_the_rest_makes_way(tmp_path: Path, table: Cell
     check(residency, voxels_by_cell(env))
 
 
-def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: CellTable) -> None:
-    """A tool too large for the table keeps the cells that it has."""
+def test_a_tool_too_large_for_the_table_keeps_the_cells_that_it_has(
+    tmp_path: Path, table: CellTable
+) -> None:
+    """Also with a new writer, which reads as many again as there is room for."""
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
     cells = cells_of(env.grid)
@@ -202,6 +202,11 @@ def test_nothing_is_thrown_out_that_is_wanted_just_now(tmp_path: Path, table: Ce
         residency.begin_round()
         assert residency.load(residency.missing(cells)).cells == 0
     assert (residency.slots_of(cells) > 0).tolist() == resident.tolist()
+    urgent = cells[resident]
+    residency = Residency(env.store, table, urgent=urgent)
+    n_read = check(residency, voxels_by_cell(env))
+    assert n_read == table.n_slots // 3
+    assert (residency.slots_of(urgent[:n_read]) > 0).all()
 
 
 def test_empty_cells_beyond_number_do_not_push_out_those_at_the_tool(
@@ -303,13 +308,6 @@ def test_slots_of_a_load_that_failed_are_used_again(
     check(residency, voxels_by_cell(env))
 
 
-def two_of_one_grid(tmp_path: Path) -> list[Environment]:
-    folders = [tmp_path / "first", tmp_path / "second"]
-    for folder in folders:
-        folder.mkdir()
-    return list(map(make, folders))
-
-
 def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
     tmp_path: Path, table: CellTable
 ) -> None:
@@ -317,7 +315,9 @@ def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
 
     Urgent cells are read again within one version, so no version lacks them.
     """
-    env, other = two_of_one_grid(tmp_path)
+    for name in ("first", "second"):
+        (tmp_path / name).mkdir()
+    env, other = make(tmp_path / "first"), make(tmp_path / "second")
     write_voxels(env.store, block((0, 0, 0), (5, 5, 5)))
     write_voxels(other.store, block((8, 8, 8), (70, 70, 70)))
     cells = cells_of(env.grid)
@@ -330,23 +330,6 @@ def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
     assert table.version == before + 1
     assert check(residency, voxels_by_cell(other)) == len(urgent)
     assert (residency.slots_of(urgent) != UNKNOWN).all()
-
-
-def test_there_is_room_to_read_the_urgent_again_in_a_full_table_that_a_writer_has_left(
-    tmp_path: Path, table: CellTable
-) -> None:
-    env = full_of_voxels(tmp_path)
-    residency = Residency(env.store, table)
-    cells = cells_of(env.grid)
-    for _ in range(20):
-        residency.begin_round()
-        residency.load(residency.missing(cells))
-    assert residency.writer.n_resident == table.n_slots - 1
-    urgent = cells[residency.slots_of(cells) > 0]
-    residency = Residency(env.store, table, urgent=urgent)
-    n_read = check(residency, voxels_by_cell(env))
-    assert n_read == table.n_slots // 3
-    assert (residency.slots_of(urgent[:n_read]) > 0).all()
 
 
 def test_an_order_without_cells_is_refused(tmp_path: Path, table: CellTable) -> None:

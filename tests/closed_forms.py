@@ -6,6 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from bands import steps_of
 from hapticdb.grid import Grid
 from hapticdb.kernels.field.lattice import (
     BEYOND,
@@ -97,12 +98,6 @@ def moved(distance: Distance, by: ArrayLike) -> Distance:
     return lambda p: distance(p - shift)
 
 
-def stored(distances: Floats) -> NDArray[np.uint8]:
-    """Stored values of distances in voxels."""
-    steps = np.minimum(np.floor(distances / HALF_WIDTH * STEPS + 0.5), STEPS)
-    return np.where(distances > HALF_WIDTH, BEYOND, steps).astype(np.uint8)
-
-
 # --- resident cells -----------------------------------------------------------------------------
 
 
@@ -121,18 +116,15 @@ def field_of(distance: Distance, size: float, n_cells: ArrayLike = (2, 2, 2)) ->
     origin = -0.5 * side * size
     keys = np.full((3, EVERYWHERE), -1, dtype=np.int64)
     slots = np.zeros((3, EVERYWHERE), dtype=np.int32)
-    payload, words, masks = (
-        [np.full(CELL_VALUES, BEYOND, np.uint8)],
-        [np.zeros(1024, np.uint32)],
-        [0],
-    )
+    payload, words = [np.full(CELL_VALUES, BEYOND, np.uint8)], [np.zeros(1024, np.uint32)]
+    masks = [0]
     steps = np.arange(-1, CELL_SIDE - 1)
     first = (side // 32 - counts) // 2
     for cell in np.ndindex(*counts):
         at = np.asarray(cell) + first
         axes = [origin + size * (32 * at[axis] + steps + 0.5) for axis in range(3)]
         centers = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1).reshape(-1, 3)
-        values = stored(distance(centers) / size)
+        values = steps_of(distance(centers) / size)
         slot = 0
         if (values != BEYOND).any():
             slot = len(payload)
@@ -143,21 +135,14 @@ def field_of(distance: Distance, size: float, n_cells: ArrayLike = (2, 2, 2)) ->
     keys[1:], slots[1:] = keys[0], slots[0]
     control = np.zeros(16, dtype=np.int64)
     control[0] = 3
+    near = np.zeros((len(payload), 1024), dtype=np.uint32)
     cells = Cells(
-        control,
-        np.zeros(16 * READER_STRIDE, dtype=np.int64),
-        keys,
-        slots,
-        np.array(words),
-        np.array(masks, dtype=np.uint64),
-        np.zeros(len(payload), dtype=np.uint8),
-        np.array(payload),
-        np.zeros((len(payload), 1024), dtype=np.uint32),
-    )
-    slots_filled = np.arange(1, len(payload))
-    assert cells.payload is not None
-    assert cells.near is not None
-    mark_near_voxels(slots_filled, cells.payload, cells.masks, cells.words, cells.near)
+        control, np.zeros(16 * READER_STRIDE, dtype=np.int64), keys, slots, np.array(words),
+        np.array(masks, dtype=np.uint64), np.zeros(len(payload), dtype=np.uint8),
+        np.array(payload), near,
+    )  # fmt: skip
+    filled = np.arange(1, len(payload))
+    mark_near_voxels(filled, np.array(payload), cells.masks, cells.words, near)
     return Field(cells, Place(origin, origin, origin, size, float(side)), distance)
 
 

@@ -20,7 +20,7 @@ from hapticdb.kernels.surfaces.distances import (
 from naive import z_order
 
 JIT = not numba.config.DISABLE_JIT
-few = settings(max_examples=60 if JIT else 2, deadline=None)
+few = settings(max_examples=40 if JIT else 2, deadline=None)
 Floats = NDArray[np.float64]
 seeds = st.integers(0, 2**32 - 1)
 KINDS = ("small", "medium", "sliver", "line", "point", "flat", "huge")
@@ -78,18 +78,13 @@ def check_against_brute_force(triangles: Floats, bits: int) -> None:
 @given(seeds, st.sampled_from(KINDS))
 def test_every_centre_has_its_distance(seed: int, kind: str) -> None:
     check_against_brute_force(random_triangles(seed, kind, 4 if JIT else 1, 16.0), 4)
+    points = np.random.default_rng(seed).uniform(-4.0, 20.0, (1 + seed % 9, 1, 3))
+    check_against_brute_force(points, 4)
 
 
 @pytest.mark.parametrize("bits", [1, 2, 3])
 def test_small_grids_have_one_brick(bits: int) -> None:
     check_against_brute_force(random_triangles(1, "medium", 3, 2.0**bits), bits)
-
-
-@few
-@given(seeds, st.integers(1, 30))
-def test_points_have_their_distance(seed: int, n: int) -> None:
-    points = np.random.default_rng(seed).uniform(-4.0, 20.0, (n, 1, 3))
-    check_against_brute_force(points, 4)
 
 
 def test_triangles_far_beyond_the_grid_have_their_distance() -> None:

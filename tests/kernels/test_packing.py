@@ -7,6 +7,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from bands import steps_of
 from hapticdb.kernels.field import lattice
 from hapticdb.kernels.field.packing import MOST_ROW_BYTES, pack, unpack
 
@@ -22,12 +23,6 @@ def centres() -> NDArray[np.float64]:
     return np.stack(np.meshgrid(axis, axis, axis, indexing="ij"), axis=-1).reshape(-1, 3)
 
 
-def stored(distances: NDArray[np.float64]) -> Values:
-    """Stored values of distances, as `lattice.step_of` gives them."""
-    steps = np.floor(np.abs(distances) / lattice.VOXELS_A_STEP + 0.5)
-    return np.where(np.abs(distances) > lattice.HALF_WIDTH, lattice.BEYOND, steps).astype(np.uint8)
-
-
 def of_planes(seed: int, n: int) -> Values:
     """Rows of the distances to one, two or three planes through the brick."""
     rng = np.random.default_rng(seed)
@@ -36,7 +31,7 @@ def of_planes(seed: int, n: int) -> Values:
         normals = rng.normal(size=(rng.integers(1, 4), 3))
         normals /= np.linalg.norm(normals, axis=1)[:, None]
         away = np.abs(centres() @ normals.T - rng.uniform(-2.0, 9.0, len(normals)))
-        rows.append(stored(away.min(axis=1)))
+        rows.append(steps_of(away.min(axis=1)))
     return np.array(rows)
 
 
@@ -87,24 +82,18 @@ def test_no_rows_are_no_bytes() -> None:
 
 def test_flat_surfaces_and_nothing_cost_little() -> None:
     beyond = np.full((1, 1000), lattice.BEYOND, np.uint8)
-    flat = stored(centres()[:, 1] - 3.3)[None]
     assert len(pack(beyond)[0]) <= 4
-    assert len(pack(flat)[0]) <= 30
+    assert len(pack(steps_of(np.abs(centres()[:, 1] - 3.3))[None])[0]) <= 30
     assert len(pack(of_planes(1, 20))[0]) < 20 * 600
 
 
-def test_a_row_does_not_depend_on_the_rows_beside_it() -> None:
+@pytest.mark.parametrize("at_once", [1, 3])
+def test_a_row_does_not_depend_on_the_rows_beside_it(
+    monkeypatch: pytest.MonkeyPatch, at_once: int
+) -> None:
     rows = np.concatenate([random_rows(1), of_planes(2, 3)])
-    data, ends = pack(rows)
-    one_by_one = [pack(row[None])[0] for row in rows]
-    np.testing.assert_array_equal(data, np.concatenate(one_by_one))
-    np.testing.assert_array_equal(ends, np.cumsum(list(map(len, one_by_one))))
-
-
-def test_rows_are_packed_in_pieces(monkeypatch: pytest.MonkeyPatch) -> None:
-    rows = of_planes(3, 8)
     whole = pack(rows)
-    monkeypatch.setattr("hapticdb.kernels.field.packing.ROWS_AT_ONCE", 3)
+    monkeypatch.setattr("hapticdb.kernels.field.packing.ROWS_AT_ONCE", at_once)
     for a, b in zip(pack(rows), whole, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -119,6 +108,13 @@ def test_only_wanted_rows_are_unpacked() -> None:
         unpack(data, ends)
 
 
+def is_read_or_told(data: Values, ends: NDArray[np.int64]) -> None:
+    try:
+        assert unpack(data, ends).shape == (len(ends), 1000)
+    except ValueError as error:
+        assert "is damaged" in str(error)  # noqa: PT017 - either outcome is right
+
+
 @few
 @given(seeds)
 def test_changed_bytes_are_rows_or_told(seed: int) -> None:
@@ -127,12 +123,7 @@ def test_changed_bytes_are_rows_or_told(seed: int) -> None:
     data, ends = pack(rows)
     places = rng.integers(0, len(data), rng.integers(1, 9))
     data[places] = rng.integers(0, 256, len(places))
-    try:
-        found = unpack(data, ends)
-    except ValueError as error:
-        assert "is damaged" in str(error)  # noqa: PT017 - either outcome is right
-    else:
-        assert found.shape == rows.shape
+    is_read_or_told(data, ends)
 
 
 @few
@@ -141,12 +132,7 @@ def test_any_bytes_and_ends_are_rows_or_told(data: bytes, ends: list[int]) -> No
     blob = np.frombuffer(data, np.uint8)
     near = np.array([end % (len(data) + 3) for end in ends], np.int64)
     for some in (np.array(ends, np.int64), near, np.sort(near)):
-        try:
-            found = unpack(blob, some)
-        except ValueError as error:
-            assert "is damaged" in str(error)  # noqa: PT017 - either outcome is right
-        else:
-            assert found.shape == (len(ends), 1000)
+        is_read_or_told(blob, some)
 
 
 @pytest.mark.parametrize("change", ["shorter", "longer", "bits left over"])

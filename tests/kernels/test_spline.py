@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 import naive_field
-from closed_forms import stored
+from bands import steps_of
 from hapticdb.kernels.field import spline as kernels
 from hapticdb.kernels.field.lattice import CELL_SIDE, CELL_VALUES
 
@@ -22,7 +22,7 @@ def ball() -> NDArray[np.uint8]:
     """Payload (1, 34^3) of a cell with that ball."""
     steps = np.arange(-1, CELL_SIDE - 1) + 0.5 - 16.0
     centers = np.stack(np.meshgrid(steps, steps, steps, indexing="ij"), axis=-1).reshape(-1, 3)
-    return stored(np.abs(np.linalg.norm(centers, axis=1) - RADIUS)).reshape(1, CELL_VALUES)
+    return steps_of(np.abs(np.linalg.norm(centers, axis=1) - RADIUS)).reshape(1, CELL_VALUES)
 
 
 BALL = ball()

@@ -1,5 +1,6 @@
 """An opened environment: its objects, moving and removing them, and what other readers see."""
 
+import shutil
 import sys
 from pathlib import Path
 
@@ -37,15 +38,19 @@ from voxels import KINDS
 ELSEWHERE = placement(0.03, -0.05, 0.04, 0.7)
 
 
-@pytest.fixture
-def file(tmp_path: Path) -> Path:
-    return write_obj(tmp_path / "assembly.obj", assembly(4))
+@pytest.fixture(scope="module")
+def made(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """An environment of four objects in a grid of 32^3 voxels, whose file is gone."""
+    folder = tmp_path_factory.mktemp("made")
+    file = write_obj(folder / "assembly.obj", assembly(4))
+    hapticdb.import_files(folder / "e.db", [file], small_options())
+    file.unlink()
+    return folder / "e.db"
 
 
 @pytest.fixture
-def env(tmp_path: Path, file: Path) -> Environment:
-    """An environment of four objects in a grid of 32^3 voxels."""
-    hapticdb.import_files(tmp_path / "e.db", [file], small_options())
+def env(tmp_path: Path, made: Path) -> Environment:
+    shutil.copy(made, tmp_path)
     return hapticdb.open(tmp_path / "e.db")
 
 
@@ -65,9 +70,6 @@ def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
     """Parse files in this process: the tests' own files are sound, and a child takes longer."""
     for module in (opened, files):
         monkeypatch.setattr(module, "read_file", parse_in_process)
-
-
-# --- objects ------------------------------------------------------------------------------------
 
 
 # --- moving -------------------------------------------------------------------------------------
@@ -175,11 +177,10 @@ def test_a_move_reads_the_file_in_the_unit_that_it_was_imported_in(tmp_path: Pat
         assert voxel_set(env.voxels(1)) == oracle_voxels(part, env.grid)
 
 
-def test_an_imported_environment_needs_its_files_no_more(env: Environment, file: Path) -> None:
-    """Tools of parts, moves and removals, of the last object of a shape, too; damage is told."""
-    shell, before = env.shell(1, 3, points=200), index_rows(env)
-    file.unlink()
-    np.testing.assert_array_equal(env.shell(1, 3, points=200).points, shell.points)
+def test_an_imported_environment_needs_its_files_no_more(env: Environment) -> None:
+    """Tools of parts, moves and removals, of the last object of a shape, too."""
+    assert len(env.shell(1, 3, points=200)) == 200
+    before = index_rows(env)
     home = env.object(2).transform
     env.move(2, ELSEWHERE)
     assert index_rows(env) != before
@@ -208,29 +209,18 @@ def test_an_object_without_a_surface_is_told_in_one_line(env: Environment) -> No
     assert all(finding.endswith("has no surface") for finding in report.findings)
 
 
-def test_no_object_is_moved_out_of_the_grid(env: Environment) -> None:
+def test_a_placement_out_of_the_grid_or_that_is_none_is_refused(env: Environment) -> None:
     before = rows_of(Path(env.url))
     for far in (placement(0.3, 0, 0), placement(0, 0, -0.3), placement(1e300, 0, 0)):
         with pytest.raises(hapticdb.errors.OutsideGridError, match="part 'ball 0' spans"):
             env.move(1, far)
+    for wrong in (
+        np.eye(3), np.full((4, 4), np.nan), np.diag([1.0, 1.0, 0.0, 1.0]),
+        np.diag([1, 1, 1, 2.0]), np.eye(4)[:, ::-1],
+    ):  # fmt: skip
+        with pytest.raises(hapticdb.errors.UsageError):
+            env.move(1, wrong)
     assert rows_of(Path(env.url)) == before
-
-
-@pytest.mark.parametrize(
-    "transform",
-    [
-        np.eye(3),
-        np.full((4, 4), np.nan),
-        np.diag([1.0, 1.0, 0.0, 1.0]),
-        np.diag([1, 1, 1, 2.0]),
-        np.eye(4)[:, ::-1],
-    ],
-)
-def test_what_is_no_placement_is_refused(env: Environment, transform: NDArray[np.float64]) -> None:
-    before = index_rows(env)
-    with pytest.raises(hapticdb.errors.UsageError):
-        env.move(1, transform)
-    assert index_rows(env) == before
 
 
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
@@ -261,8 +251,9 @@ def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
 # --- opening and closing ------------------------------------------------------------------------
 
 
-def test_an_environment_opened_to_read_refuses_every_write(env: Environment, file: Path) -> None:
-    before = rows_of(Path(env.url))
+def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> None:
+    before, file = rows_of(Path(env.url)), Path(env.url).with_name("more.obj")
+    write_obj(file, assembly(1))
     reader = hapticdb.open(env.url, read_only=True)
     for write in (
         lambda: reader.add(file),

@@ -89,9 +89,11 @@ class Relay:
     @staticmethod
     def _give(target: socket.socket, held: "queue.SimpleQueue[tuple[float, bytes]]") -> None:
         with contextlib.suppress(OSError):
-            while (block := held.get())[1]:
-                time.sleep(max(block[0] - time.monotonic(), 0.0))
-                target.sendall(block[1])
+            for due, block in iter(held.get, None):  # `_take` ends with an empty block
+                time.sleep(max(due - time.monotonic(), 0.0))
+                if not block:
+                    break
+                target.sendall(block)
         with contextlib.suppress(OSError):
             target.shutdown(socket.SHUT_RDWR)
 

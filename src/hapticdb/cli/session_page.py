@@ -29,10 +29,10 @@ IN_CACHE = 10_000
 Facts = list[tuple[str, str]]
 
 
-def tell_cost(n_points: int, rate: float, law: "LawName") -> None:
-    """Say in a line what a tool costs whose frames may take longer than a period."""
+def tell_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu") -> None:
+    """Say in a line what a tool costs whose frames may take a processor longer than a period."""
     seconds = 1e-9 * n_points * POINT_NS[law][n_points > IN_CACHE]
-    if seconds > 1.0 / rate:
+    if seconds > 1.0 / rate and frames_on == "cpu":
         render.note(
             f"a frame with all of the tool's {n_points:,} points near a surface takes about "
             f"{1e3 * seconds:.2g} ms, and {rate:,.0f} Hz leave {1e3 / rate:.2g} ms: give fewer "

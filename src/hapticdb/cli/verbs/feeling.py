@@ -1,7 +1,7 @@
 """The verb feel."""
 
 import signal
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from functools import partial
 from time import perf_counter
@@ -186,8 +186,6 @@ def feel(
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
-    from hapticdb.query.law import inset_of
-
     began = perf_counter()
     kernels = _begin_loop(law, processor, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
@@ -196,13 +194,9 @@ def feel(
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, *kernels)
-    with hapticdb.open(url, read_only=True) as env:
-        felt = felt_objects(env, where, exclude)
-        inset = 0.0 if conservative else inset_of(env.grid.voxel_size, law or "smooth")
-        shell = _shell(tool, tool_unit, points, seed, device, inset)
-        fitting.warn_of_size(env, shell, felt.left_out)
-    if frames_on == "cpu":
-        session_page.tell_cost(len(shell), rate, law or "smooth")
+    drawn_in = partial(_shell, tool, tool_unit, points, seed, device)
+    felt, shell = _looked_at(url, where, exclude, drawn_in, law or "smooth", not conservative)
+    session_page.tell_cost(len(shell), rate, law or "smooth", frames_on)
     begin = partial(
         hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
         law=chosen, coupling=coupling, frames_on=frames_on,
@@ -241,6 +235,27 @@ def _shell(
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     seed = None if is_for_hand_alone else seed
     return shell_of(tool, unit, points, seed, inset=inset)
+
+
+def _looked_at(
+    url: str,
+    where: Sequence[str] | None,
+    exclude: Sequence[str] | None,
+    drawn_in: "Callable[[float], PointShell]",
+    law: LawName,
+    is_inset: bool,  # noqa: FBT001 - of one call
+) -> "tuple[Felt, PointShell]":
+    """Read what is felt, and make the shell, drawn in to where contact begins if it `is_inset`.
+
+    All of it is checked before a process is started.
+    """
+    from hapticdb.query.law import inset_of
+
+    with hapticdb.open(url, read_only=True) as env:
+        felt = felt_objects(env, where, exclude)
+        shell = drawn_in(inset_of(env.grid.voxel_size, law) if is_inset else 0.0)
+        fitting.warn_of_size(env, shell, felt.left_out)
+    return felt, shell
 
 
 def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool) -> int:

@@ -9,7 +9,7 @@ from contract.sharing import SharingContract
 from contract.writing import WritingContract
 from hapticdb.errors import EnvironmentExistsError, EnvironmentNotFoundError
 from hapticdb.grid import Grid
-from hapticdb.store.connect import beside, create_store, exists, open_store
+from hapticdb.store.connect import create_store, exists, open_store
 from voxels import floor_voxels, write_voxels
 
 GRID = Grid(0.01, (0, 0, 0), 6)
@@ -43,7 +43,7 @@ class UrlContract(Case):
 
     def test_another_environment_stands_beside(self) -> None:
         url = self.new_url()
-        other = beside(url, "_beside")
+        other = self.new_url()
         first = create_store(url, GRID)
         assert not exists(other)
         store = create_store(other, GRID)

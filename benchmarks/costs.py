@@ -67,7 +67,7 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
     cell: dict[str, Any] = {"environment": model.name, "bits": bits, "extent": model.extent}
     parts = read_file(model.file).parts
     cell["triangles"] = sum(len(part.triangles()) for part in parts)
-    for name, distances in (("plain", 0), ("smooth", 1)):
+    for name, distances in (("plain", 0), ("distance", 1)):
         url = folder / f"cost-{name}.db"
         words = [str(url), str(model.file), str(bits), str(model.extent), str(distances)]
         done = subprocess.run(

@@ -59,13 +59,13 @@ class Effort:
 QUICK = Effort(2, 5, (1000.0,), (0.0, 0.002), 2000, 200, 9)
 PANELS = (
     ("depth", "plane", "touch against depth, plane", "depth, voxels"),
-    ("depth", "smooth", "touch against depth, smooth", "depth, voxels"),
+    ("depth", "distance", "touch against depth, distance", "depth, voxels"),
     ("slide", "plane", "touch on a slide, plane", "way, mm"),
-    ("slide", "smooth", "touch on a slide, smooth", "way, mm"),
-    ("press", "smooth", "session against the hand's depth", "depth, m"),
-    ("edge", "smooth", "session round a convex edge", "way, m"),
-    ("tap", "smooth", "a tap at 0.3 m/s, firm grip", "time, s"),
-    ("walk", "smooth", "a walk over a model", "time, s"),
+    ("slide", "distance", "touch on a slide, distance", "way, mm"),
+    ("press", "distance", "session against the hand's depth", "depth, m"),
+    ("edge", "distance", "session round a convex edge", "way, m"),
+    ("tap", "distance", "a tap at 0.3 m/s, firm grip", "time, s"),
+    ("walk", "distance", "a walk over a model", "time, s"),
 )
 """Panels of the plot: curve, law, title, name of the x axis."""
 
@@ -85,29 +85,29 @@ def measure(effort: Effort, place: Path, model: Path) -> tuple[list[Record], lis
     def draw(curve: str, law: str, drawn: Sequence[Record]) -> None:
         curves.extend({"curve": curve, "law": law} | each for each in drawn)
 
-    for law in (touching.PLANE, touching.SMOOTH):
+    for law in (touching.PLANE, touching.DISTANCE):
         say(f"touch, {law.name} law")
         slides = touching.slides_of_touch(law, place, effort.n_random)
         draw("slide", law.name, [slides.pop("curve")])
         draw("depth", law.name, touching.depth_curves(law, place))
         keep(law.name, **slides)
     say("sessions on planes")
-    keep("smooth", session_ripple=sliding.ripple_of_sessions(place, effort.n_random))
+    keep("distance", session_ripple=sliding.ripple_of_sessions(place, effort.n_random))
     force, pressed = sliding.force_of_sessions(place)
-    draw("press", "smooth", pressed)
-    keep("smooth", session_force=force)
-    keep("smooth", session_enter=sliding.step_on_entering(place, effort.n_random))
+    draw("press", "distance", pressed)
+    keep("distance", session_force=force)
+    keep("distance", session_enter=sliding.step_on_entering(place, effort.n_random))
     say("sessions round an edge")
     edges, rounded = sliding.edge_of_sessions(place)
-    draw("edge", "smooth", rounded)
-    keep("smooth", **edges)
+    draw("edge", "distance", rounded)
+    keep("distance", **edges)
     say("taps and stiff walls")
     tap, tapped = stability.tap(place)
-    draw("tap", "smooth", [tapped])
+    draw("tap", "distance", [tapped])
     walls = stability.z_width(place, effort.rates, effort.delays, effort.tries)
-    keep("smooth", tap=tap, z_width=walls)
+    keep("distance", tap=tap, z_width=walls)
     say("computing time")
-    keep("smooth", period=sliding.time_of_periods(place, effort.periods))
+    keep("distance", period=sliding.time_of_periods(place, effort.periods))
     say("a walk over a model")
     url = place / "model.db"
     grid = GridOptions(bits=effort.bits, extent=EXTENT)
@@ -115,8 +115,8 @@ def measure(effort: Effort, place: Path, model: Path) -> tuple[list[Record], lis
     if report.error is not None:
         raise report.error
     walk, walked = walking.walk_over(url, effort.places)
-    draw("walk", "smooth", [walked])
-    keep("smooth", walk=walk)
+    draw("walk", "distance", [walked])
+    keep("distance", walk=walk)
     return cells, curves
 
 

@@ -4,7 +4,7 @@
     make realtime ARGS=--quick                 # short sessions, into results-quick/
 
 Frames: the resident cells' kernels and the same flat loop over one dense bitmap take turns on the
-same poses, and so does the smooth law. Sessions: `hapticdb feel` as a user runs it, on SQLite and
+same poses, and so does the law distance. Sessions: `hapticdb feel` as a user runs it, on SQLite and
 on PostgreSQL. Edits: how soon a session feels another one's commit.
 """
 
@@ -77,15 +77,15 @@ SETTINGS = {"shared_buffers": "256MB"}
 
 
 def measure_frames(database: Path, shell: PointShell, poses: NDArray[np.float64]) -> dict[str, Any]:
-    """Medians, in us a frame, of all ways and the dense bitmap, in turns; the smooth law's, too."""
+    """Medians, in us a frame, of all ways and the dense bitmap, in turns; by distance, too."""
     with (
         hapticdb.open(database, read_only=True) as env,
         CellTable.create(CELL_BYTES, distances=True) as table,
     ):
         residency = Residency(env.store, table)
         frames = {name: ResidentFrames(residency, shell, **way) for name, way in WAYS.items()}
-        frames["smooth"] = ResidentFrames(residency, shell, DistanceField())
-        frames["smooth"].feel(poses)  # fetches the cells that its band reaches
+        frames["distance"] = ResidentFrames(residency, shell, DistanceField())
+        frames["distance"].feel(poses)  # fetches the cells that its band reaches
         bitmap = dense_bitmap(table.cells, table.version % BUFFERS, env.grid.side)
         first = frames["flat"]
         times: dict[str, list[float]] = {"dense": [], **{name: [] for name in frames}}

@@ -81,7 +81,7 @@ def sessions(results: Results) -> str:
 
 def frames(results: Results) -> str:
     """Microseconds of the dense bitmap, and the others' times as multiples of it."""
-    heads = {"flat": "cells, flat loop", "session": "as a session", "smooth": "smooth law"}
+    heads = {"flat": "cells, flat loop", "session": "as a session", "distance": "law distance"}
     return listed(
         results["realtime"]["frames"],
         {

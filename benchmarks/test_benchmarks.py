@@ -67,7 +67,7 @@ def test_cells_and_the_dense_bitmap_feel_the_same(database: Path, sample: Sample
     shell, poses = PointShell.from_file(sample.wrench, 3000), read_poses(sample.path)
     found = in_real_time.measure_frames(database, shell, poses)
     assert found["hits"] > 0
-    assert set(found["ratio"]) == {"flat", "session", "smooth"}
+    assert set(found["ratio"]) == {"flat", "session", "distance"}
 
 
 def test_edits_are_felt_and_taken_back(database: Path, sample: SampleFiles) -> None:

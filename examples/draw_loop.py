@@ -111,12 +111,12 @@ def _curve(picture: Image.Image, forces: Floats, now: int, top: float) -> Image.
 
 
 def wrench(stage: _Stage, tool: Path, path: Path) -> Iterator[Image.Image]:
-    """Pictures of the wrench that slides under the smooth law, with its force."""
+    """Pictures of the wrench that slides under the distance law, with its force."""
     shell = stage.env.tool(tool)
     poses = hapticdb.read_poses(path)[FIRST:LAST]
     felt = stage.env.touch(shell, poses=poses).forces
     forces = np.linalg.norm(felt, axis=1)
-    held = tools.from_files([str(tool)], stage.env.grid.voxel_size, smooth=True)[0]
+    held = tools.from_files([str(tool)], stage.env.grid.voxel_size, has_distances=True)[0]
     scene = stage.client.scene
     node = scene.add_mesh_simple(
         "/wrench", held.vertices, held.faces, color=(70, 76, 86), flat_shading=True, side="double"

@@ -28,7 +28,7 @@ from hapticdb.kernels.resident.cells import (
 )
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
-from hapticdb.query.law import SMOOTH
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import spheres_of
 
@@ -207,7 +207,7 @@ class Hand:
         reach = np.linalg.norm(self.shell.points[:, :3] - self.shell.center, axis=1).max()
         radius = max(float(reach), field.place.size)
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
-        self._periods = Stations(SMOOTH)
+        self._periods = Stations(DISTANCE)
         self._station = Station(
             self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
         )

@@ -24,7 +24,7 @@ def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Pa
         assert env.has_distances
         tool = env.tool("tool.stl")
         library = env.touch(tool, path[0])
-        (held,) = from_files(["tool.stl"], env.grid.voxel_size, smooth=env.has_distances)
+        (held,) = from_files(["tool.stl"], env.grid.voxel_size, has_distances=env.has_distances)
         centred = path[0].copy()
         centred[:3, 3] += middle_of(tool)
         page = env.touch(held.shell, centred)

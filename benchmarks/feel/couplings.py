@@ -1,4 +1,4 @@
-"""The coupling of the smooth law, period by period in this process.
+"""The coupling of the distance law, period by period in this process.
 
 No loop, no clock and no device: a measure gives the hand's place and reads the force.
 """
@@ -14,7 +14,7 @@ from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.records import pose_numbers
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import SMOOTH
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import clusters_of
@@ -26,7 +26,7 @@ STIFFNESS = 1000.0
 RATE = 1000.0
 """Periods a second, where a measure names no other."""
 CAP = 20.0
-"""Most force of the smooth law's device, N: above all that is wanted of it here. Larger: stiffer
+"""Most force of the distance law's device, N: above all that is wanted of it here. Larger: stiffer
 contacts in its coupling."""
 REST = 40
 """Periods that a tool rests at its first place: a session's force rises within 20 ms. Larger: a
@@ -46,7 +46,7 @@ class Terms:
     delay: float = 0.0
 
 
-class SmoothHand:
+class CoupledHand:
     """A hand with a tool that rests where forces balance, from one period to the next.
 
     The tool is at rest at the pose (4, 4) of the device, and has been there for `REST` periods. The
@@ -54,7 +54,7 @@ class SmoothHand:
     """
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._periods = Stations(SMOOTH)
+        self._periods = Stations(DISTANCE)
         self._station = Station(
             self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
             ground.residency.grid, clusters_of(shell, ground.size),
@@ -108,7 +108,7 @@ def posed(position: Floats) -> Floats:
     return pose
 
 
-def drive(hand: SmoothHand, positions: Floats, rate: float = RATE) -> Drive:
+def drive(hand: CoupledHand, positions: Floats, rate: float = RATE) -> Drive:
     """Lead a hand along positions (M, 3), one a period, upright."""
     velocities = np.zeros((len(positions), 6))
     velocities[1:, :3] = np.diff(positions, axis=0) * rate

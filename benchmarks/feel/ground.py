@@ -64,7 +64,7 @@ class Ground:
         voxel_size : float
             Metres.
         distances : bool
-            Whether the environment holds distances to surfaces, for the smooth law.
+            Whether the environment holds distances to surfaces, for the distance law.
         """
         pitch = 2.0 * max(scene.reach for scene in scenes) + APART
         n_a_side = math.ceil(round(len(scenes) ** (1 / 3), 9))

@@ -1,4 +1,4 @@
-"""The measures: what each one is called, what is wanted of the smooth law, and the page's tables.
+"""The measures: what each one is called, what is wanted of the distance law, and the page's tables.
 
 docs/feel.md says how each is taken.
 """
@@ -11,7 +11,7 @@ from typing import Any
 from page_tables import NONE, table
 
 Cell = Mapping[str, Any]
-LAWS = ("plane", "smooth")
+LAWS = ("plane", "distance")
 """Columns of the table: the laws, as `touch` names them."""
 
 
@@ -105,18 +105,18 @@ MEASURES: Mapping[str, Measure] = {
 
 
 def table_of(cells: Sequence[Cell]) -> str:
-    """The table: measure, the plane law's direct frame, the smooth law, what is wanted."""
+    """The table: measure, the plane law's direct frame, the distance law, what is wanted."""
     found = {(cell["measure"], cell["law"]): cell for cell in cells}
     rows = [
         [one.title, *(one.text(found.get((key, law))) for law in LAWS), one.wanted]
         for key, one in MEASURES.items()
         if any(measure == key for measure, _ in found)
     ]
-    return table(["measure", "plane, direct", "smooth", "wanted"], rows)
+    return table(["measure", "plane, direct", "distance", "wanted"], rows)
 
 
 def walls_of(cells: Sequence[Cell]) -> str:
-    """The stiffest walls of the smooth law, N/m: a line for each grip and rate, by the delay."""
+    """The stiffest walls of the distance law, N/m: a line for each grip and rate, by the delay."""
     (found,) = [cell for cell in cells if cell["measure"] == "z_width"]
     rows: dict[tuple[str, float], list[str]] = {}
     for case in found["cases"]:

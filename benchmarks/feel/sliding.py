@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from feel.couplings import RATE, STIFFNESS, Drive, SmoothHand, Terms, drive, posed, straight
+from feel.couplings import RATE, STIFFNESS, CoupledHand, Drive, Terms, drive, posed, straight
 from feel.figures import largest_step, ripple
 from feel.ground import Ground
 from feel.scenes import Scene, convex_edge, plane, planes, slope_axes
@@ -77,7 +77,7 @@ class Slides(NamedTuple):
 def slide_at_depths(ground: Ground, scene: Scene, shell: PointShell) -> Slides:
     """Press a flat tool in, deeper and deeper, and slide at each of `DEPTHS`."""
     stand = stand_on(ground, scene)
-    hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
+    hand = CoupledHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
     entering = drive(hand, straight(stand.at(-ABOVE), stand.at(DEPTHS[0]), 0.01))
     forces, last = [], (DEPTHS[0], 0.0)
     for n, depth in enumerate(DEPTHS):
@@ -115,7 +115,7 @@ def step_on_entering(folder: Path, n_random: int) -> dict[str, Any]:
         for scene in scenes:
             stand = stand_on(ground, scene)
             shell = flat_tool(3, SIZE, scene.axes)
-            hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
+            hand = CoupledHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
             way = drive(hand, straight(stand.at(-ABOVE), stand.at(0.005), 0.01))
             steps.append(largest_step(way.forces))
     return {"values": [max(steps)], "cases": steps}
@@ -130,7 +130,7 @@ def press(folder: Path, size: float) -> tuple[dict[str, Any], dict[str, Any]]:
     with Ground.of_scenes(folder, [scene], size, distances=True) as ground:
         stand = stand_on(ground, scene)
         shell = flat_tool(3, size, scene.axes)
-        hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
+        hand = CoupledHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
         forces, depths, curve, last = [], [], [], -ABOVE
         for depth in PRESSED:
             way = drive(hand, straight(stand.at(last), stand.at(depth), SPEED))
@@ -207,7 +207,7 @@ def round_edge(
     path = ground.origins[scene.name] + path @ scene.axes.T
     outward = outward @ scene.axes.T
     start = path[0] + (depth * SIZE + ABOVE) * outward[0]
-    hand = SmoothHand(ground, shell, posed(start), Terms())
+    hand = CoupledHand(ground, shell, posed(start), Terms())
     drive(hand, straight(start, path[0], SPEED))
     drive(hand, np.repeat(path[:1], 100, axis=0))
     forces = drive(hand, path).forces
@@ -236,7 +236,7 @@ def time_of_periods(folder: Path, count: int) -> dict[str, Any]:
     with Ground.of_scenes(folder, [scene], SIZE, distances=True) as ground:
         stand = stand_on(ground, scene)
         shell = flat_tool(17, SIZE, scene.axes)
-        hand = SmoothHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
+        hand = CoupledHand(ground, shell, posed(stand.at(-ABOVE)), Terms())
         drive(hand, straight(stand.at(-ABOVE), stand.at(0.002), SPEED))
         velocity, pose = np.zeros(6), np.eye(4)
         for n in range(count):

@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from feel.couplings import SmoothHand, Terms, posed
+from feel.couplings import CoupledHand, Terms, posed
 from feel.figures import is_limit_cycle, overshoot
 from feel.ground import Ground
 from feel.person import FIRM, LIGHT, Grip, Person
@@ -44,7 +44,7 @@ RATES = (1000.0, 5000.0)
 GRIPS = (LIGHT, FIRM)
 
 
-def live(hand: SmoothHand, person: Person, targets: Floats) -> tuple[Floats, Floats]:
+def live(hand: CoupledHand, person: Person, targets: Floats) -> tuple[Floats, Floats]:
     """Let a person hold a hand while the arm goes along targets (M, 3), one a period.
 
     Returns the forces and the positions of the device, both (M, 3).
@@ -69,7 +69,7 @@ def tap(folder: Path) -> tuple[dict[str, Any], dict[str, Any]]:
     with Ground.of_scenes(folder, [scene], SIZE, distances=True) as ground:
         stand = stand_on(ground, scene)
         start = stand.at(-TAP_HEIGHT)
-        hand = SmoothHand(ground, flat_tool(3, SIZE, scene.axes), posed(start), terms)
+        hand = CoupledHand(ground, flat_tool(3, SIZE, scene.axes), posed(start), terms)
         person = Person(FIRM, 1.0 / terms.rate, terms.delay, start)
         times = np.arange(1, round(TAP_SECONDS * terms.rate) + 1) / terms.rate
         depths = np.minimum(-TAP_HEIGHT + TAP_SPEED * times, TAP_DEPTH)
@@ -102,7 +102,7 @@ def stiffest(is_stable: Callable[[float], bool], tries: int = TRIES) -> float:
 def rests(ground: Ground, stand: Stand, grip: Grip, terms: Terms) -> bool:
     """Whether a hand that presses on a plane comes to rest: no limit cycle is left."""
     start = stand.at(-ABOVE)
-    hand = SmoothHand(ground, flat_tool(3, ground.size, stand.axes), posed(start), terms)
+    hand = CoupledHand(ground, flat_tool(3, ground.size, stand.axes), posed(start), terms)
     person = Person(grip, 1.0 / terms.rate, terms.delay, start)
     count = round(REST_SECONDS * terms.rate)
     depths = np.minimum(-ABOVE + 0.05 * np.arange(1, count + 1) / terms.rate, REST_DEPTH)

@@ -61,7 +61,7 @@ class Law:
 
 
 PLANE = Law("plane", 0.0, FILLING, TangentPlane(STIFFNESS), distances=False)
-SMOOTH = Law("smooth", ONSET, (0.0,), DistanceField(STIFFNESS), distances=True)
+DISTANCE = Law("distance", ONSET, (0.0,), DistanceField(STIFFNESS), distances=True)
 
 
 def slide_poses(ground: Ground, scene: Scene, height: float) -> Floats:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter1d
 
-from feel.couplings import RATE, SmoothHand, Terms, drive, posed, straight
+from feel.couplings import RATE, CoupledHand, Terms, drive, posed, straight
 from feel.figures import largest_step
 from feel.ground import Ground
 from feel.tools import ball
@@ -91,7 +91,7 @@ def walk_over(url: str | Path, places: int = PLACES) -> tuple[dict[str, Any], di
             ground.fetch(place, NEAR)
         shell = ball(RADIUS, ground.size, POINTS)
         above = np.array([0.0, 0.0, ONSET * ground.size])
-        hand = SmoothHand(ground, shell, posed(lead[0] + above), Terms())
+        hand = CoupledHand(ground, shell, posed(lead[0] + above), Terms())
         drive(hand, lead + above)
         return _figures_of(drive(hand, walk.hand + above).forces)
 

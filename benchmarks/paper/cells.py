@@ -16,7 +16,7 @@ WHERE = ("engine", "layout", "law", "file", "poses", "points", "region")
 ORDERS: Mapping[str, Sequence[object]] = {
     "layout": ("brick", "voxel"),
     "poses": ("slide", "random"),
-    "law": ("plane", "smooth"),
+    "law": ("plane", "distance"),
     "file": ("cached", "cold"),
     "region": ("low", "middle", "high"),
     "strategy": ("points", "statement", "array", "maxgap", "cbgroup"),

@@ -19,7 +19,7 @@ from paper.workload import Task
 
 PAPER_CACHE = 4 << 20
 """Bytes of the paper's database cache: 500 blocks of 8 KB."""
-LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "smooth": DistanceField()}
+LAWS: dict[str, ForceLaw] = {"plane": TangentPlane(), "distance": DistanceField()}
 
 
 @dataclass

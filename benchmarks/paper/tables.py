@@ -46,7 +46,7 @@ def time_text(cell: Cell | None) -> str:
 def claim(results: Results) -> str:
     """Frames a second of every strategy at random poses; the best beside the bitmap in memory."""
     cells = [cell for cell in cells_of(results, "claim") if cell["poses"] == "random"]
-    cells = [cell for cell in cells if (cell["law"], cell["file"]) != ("smooth", "cold")]
+    cells = [cell for cell in cells if (cell["law"], cell["file"]) != ("distance", "cold")]
     (bitmap,) = [cell for cell in cells if cell["strategy"] == "bitmap"]
     rows = []
     for group in grouped(cells, ("engine", "layout", "law", "file")).values():
@@ -60,7 +60,7 @@ def claim(results: Results) -> str:
 
 
 def claim_laws(results: Results) -> str:
-    """The smooth law's fastest frames beside the plane's, on bricks."""
+    """The distance law's fastest frames beside the plane's, on bricks."""
     cells = [
         cell
         for cell in cells_of(results, "claim")
@@ -71,12 +71,12 @@ def claim_laws(results: Results) -> str:
         ratios = []
         for group in grouped(every, ("engine",)).values():
             best = [
-                min(typical(c) for c in group if c["law"] == law) for law in ("smooth", "plane")
+                min(typical(c) for c in group if c["law"] == law) for law in ("distance", "plane")
             ]
             ratios.append(best[0] / best[1])
         said = f"{min(ratios):.1f} to {max(ratios):.1f}"
         lines.append(
-            f"- {poses} poses: the fastest smooth frame takes {said} times the fastest plane one."
+            f"- {poses} poses: the fastest distance frame takes {said} times the fastest plane one."
         )
     return "\n".join(lines)
 
@@ -100,7 +100,7 @@ def costs(results: Results) -> str:
     rows = []
     for cell in cells_of(results, "costs"):
         millions = cell["object_voxels"] / 1e6
-        for name, words in (("plain", "without"), ("smooth", "with")):
+        for name, words in (("plain", "without"), ("distance", "with")):
             one = cell[name]
             rows.append([
                 f"{cell['environment']}, {words} distances",

@@ -113,7 +113,7 @@ def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.f
     unit : of the file's positions, one of `hapticdb.mesh.UNITS`.
     """
     metres = metres_of(unit)
-    poses = _poses_of(_read_rows(Path(path)))
+    poses = poses_of(_read_rows(Path(path)))
     poses[:, :3, 3] *= metres
     return poses
 
@@ -146,13 +146,13 @@ def read_timed_poses(
     """
     rows = _read_rows(Path(path), optional="t")
     if rows.shape[1] == len(COLUMNS):
-        return None, _poses_of(rows)
+        return None, poses_of(rows)
     times = rows[:, -1]
     late = np.flatnonzero(np.diff(times) <= 0.0)
     if len(late):
         first, second = times[late[0]], times[late[0] + 1]
         raise FileError(f"{path}: t must increase, but {second:.9g} follows {first:.9g}; {_HINT}")
-    return times.copy(), _poses_of(rows)
+    return times.copy(), poses_of(rows)
 
 
 def pose_of_row(position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float64]:
@@ -162,7 +162,7 @@ def pose_of_row(position: ArrayLike, quaternion: ArrayLike) -> NDArray[np.float6
     if not (length > 1e-9 and math.isfinite(length)):
         raise UsageError(f"the quaternion {given.tolist()} is no rotation")
     row = np.concatenate([as_floats(position, "a position"), given / length])
-    return np.asarray(_poses_of(row[None])[0])
+    return np.asarray(poses_of(row[None])[0])
 
 
 def row_of_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -170,8 +170,8 @@ def row_of_pose(pose: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.concatenate([pose[:3, 3], quaternion_of(pose[:3, :3])[0]])
 
 
-def _poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Poses (M, 4, 4) of rows whose first columns are `COLUMNS`."""
+def poses_of(rows: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Poses (M, 4, 4) of rows that begin with position and unit quaternion."""
     poses = np.tile(np.eye(4), (len(rows), 1, 1))
     poses[:, :3, :3] = rotation_of(rows[:, 3:7])
     poses[:, :3, 3] = rows[:, :3]

@@ -25,9 +25,10 @@ def seconds_of(names: Collection[str]) -> float:
     return max(sum(each) / min(os.cpu_count() or 1, len(each)), *each)
 
 
-def session_purposes(*, is_smooth: bool) -> list[str]:
-    """Purposes of a session under the smooth or the plane law."""
-    return ["feel", "coupling" if is_smooth else "direct"]
+def session_purposes(rendering: str, *, reads_distances: bool) -> list[str]:
+    """Purposes of a session with that rendering, under a law that reads distances or not."""
+    direct = "direct by distance" if reads_distances else "direct"
+    return ["feel", "coupling" if rendering == "coupled" else direct]
 
 
 _READY: set[str] = set()

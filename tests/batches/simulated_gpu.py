@@ -37,7 +37,7 @@ Floats = NDArray[np.float64]
 
 
 class CopiedLaw(NamedTuple):
-    """A user's law that reads distances: another type with the leaves of the smooth law."""
+    """A user's law that reads distances: another type with the leaves of the distance law."""
 
     stiffness: float
 

@@ -52,7 +52,7 @@ def test_a_batch_equals_single_touches(tmp_path_factory: pytest.TempPathFactory,
             assert collides.tolist() == (felt.hits > 0).tolist()
 
 
-def test_a_batch_equals_single_touches_under_the_smooth_law(tmp_path: Path) -> None:
+def test_a_batch_equals_single_touches_under_the_law_distance(tmp_path: Path) -> None:
     with create_environment(tmp_path / "s.db", Grid(0.002, (-0.06,) * 3, 6)) as env:
         sheet = np.argwhere(np.ones((40, 40))) / 3.0 - 7.0
         for axis in range(2):

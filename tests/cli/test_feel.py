@@ -102,8 +102,8 @@ def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) 
 @pytest.mark.parametrize(
     ("n_points", "rate", "law", "told"),
     [
-        (300, 1000.0, "smooth", ""),
-        (20_000, 1000.0, "smooth", "20,000 points near a surface takes about 12 ms"),
+        (300, 1000.0, "distance", ""),
+        (20_000, 1000.0, "distance", "20,000 points near a surface takes about 12 ms"),
         (300, 20_000.0, "plane", ""),
         (20_000, 5000.0, "plane", "takes about 1 ms, and 5,000 Hz leave 0.2 ms"),
     ],
@@ -164,6 +164,14 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
+        (
+            [*PLAY, "--law", "plane", "--rendering", "coupled"],
+            ["coupled needs distances"],
+        ),
+        (
+            [*PLAY, "--rendering", "direct", "--delay", 5],
+            ["--delay belongs to"],
+        ),
         ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
         ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already", "--replace"]),

@@ -1,4 +1,4 @@
-"""Fit under the smooth law: tools drawn inward, and the clearance that is told from contact."""
+"""Fit under the distance law: tools drawn inward, and the clearance that is told from contact."""
 
 # ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
@@ -54,7 +54,7 @@ def test_contact_begins_at_the_surface_unless_the_tool_is_conservative(
     run: Run, floor: Path
 ) -> None:
     frames = touched(run, floor)
-    assert {frame["law"] for frame in frames} == {"smooth"}
+    assert {frame["law"] for frame in frames} == {"distance"}
     above, below = lifts(frames)
     assert above == 0.0 < below
     inset, none = {"least": 1.5 * VOXEL, "greatest": 1.5 * VOXEL}, {"least": 0.0, "greatest": 0.0}

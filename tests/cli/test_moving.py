@@ -32,9 +32,7 @@ from voxels import write_voxels
 def test_a_copy_says_what_went_over_and_equals_its_source(run: Run, scene: Path) -> None:
     code, out, err = run("copy", scene, "b.db", "--layout", "voxel", "--curve", "hilbert")
     assert code == 0
-    assert err == (
-        "hapticdb: the layout voxel has no distances, so the smooth law cannot be felt there\n"
-    )
+    assert err == ("hapticdb: the layout voxel has no distances: it has the law plane alone\n")
     assert out.startswith("b.db: 3 objects copied, ")
     found = json.loads(run("info", "b.db", "--json")[1])
     assert (found["layout"], found["curve"], found["objects"]) == ("voxel", "hilbert", 3)

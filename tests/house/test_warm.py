@@ -81,9 +81,9 @@ for n, (layout, curve) in enumerate(KINDS):
                 env.clearance(each, [np.eye(4)])
                 env.collides(each, [np.eye(4)])
 hand = RandomHand(np.zeros(3))
-smooth = folder / "smooth.db"
-hapticdb.import_files(smooth, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))
-for url, law in ((folder / "0.db", "plane"), (smooth, "smooth")):
+distance = folder / "distance.db"
+hapticdb.import_files(distance, [stl], hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6)))
+for url, law in ((folder / "0.db", "plane"), (distance, "distance")):
     with hapticdb.Session(
         str(url), shell, hand, law=law, seconds=0.3, has_baseline=False
     ) as session:
@@ -180,12 +180,12 @@ def test_what_another_copy_of_the_package_has_compiled_is_missing_here(
             os.utime(copy / "kernels" / "rigid.py", (1e9, 1e9))
         code = (
             "from hapticdb.kernels.compiling import compile_missing, missing; "
-            f"names = ['rigid.poses_of']; {work}; print(missing(names))"
+            f"names = ['rigid.first_not_rigid']; {work}; print(missing(names))"
         )
         cache = {"NUMBA_CACHE_DIR": str(tmp_path / "cache"), "PYTHONPATH": str(copy.parent)}
         done = finished([sys.executable, "-c", code], env=os.environ | cache, check=True)
         told.append(done.stdout.strip())
-    assert told == ["[]", "[]", "['rigid.poses_of']"]
+    assert told == ["[]", "[]", "['rigid.first_not_rigid']"]
 
 
 @NEEDS_JIT

@@ -84,7 +84,9 @@ class Aim:
         self.facts = facts = SceneFacts.of(view)
         self.framing, self.up = framing(facts.bounds, view.up), view.up
         eye, view_middle = self.framing.position, facts.bounds.mean(axis=0)
-        ball = tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth)[0]
+        ball = tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances)[
+            0
+        ]
         self.radius = ball.radius
         found: list[tuple[float, int, Floats, Floats]] = []
         for obj in view.objects.values():

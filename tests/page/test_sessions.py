@@ -63,7 +63,7 @@ class Person(Browser):
         self.client.add_notification = lambda *words, **_: self.told.append(": ".join(words))
         self.site.objects, self.site.edits, self.site.error_text = {}, None, str
         self.site.connection.preparing = ""
-        self.site.facts = SimpleNamespace(is_smooth=False, diagonal=1.0)
+        self.site.facts = SimpleNamespace(has_distances=False, diagonal=1.0)
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
         self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]
         self.stiffness = 1000.0

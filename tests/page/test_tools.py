@@ -16,11 +16,11 @@ from hapticdb.store.base import Object
 VOXEL = 0.002
 
 
-@pytest.mark.parametrize("smooth", [True, False])
-def test_probes_are_closed_and_about_their_origin(smooth: bool) -> None:
-    small = tools.built_in(1e-3, VOXEL, smooth=smooth)[0]
+@pytest.mark.parametrize("has_distances", [True, False])
+def test_probes_are_closed_and_about_their_origin(has_distances: bool) -> None:
+    small = tools.built_in(1e-3, VOXEL, has_distances=has_distances)[0]
     assert small.radius == pytest.approx(tools.LEAST_VOXELS * VOXEL, rel=0.01)
-    probes = tools.built_in(1.0, VOXEL, smooth=smooth)
+    probes = tools.built_in(1.0, VOXEL, has_distances=has_distances)
     assert [probe.name for probe in probes] == ["ball", "peg"]
     for probe in probes:
         assert probe.shell.is_closed
@@ -29,7 +29,7 @@ def test_probes_are_closed_and_about_their_origin(smooth: bool) -> None:
         volume = np.einsum("fk,fk->", corners[:, 0], np.cross(corners[:, 1], corners[:, 2])) / 6
         assert volume > 0.0  # wound outward
         deepest = float(probe.shell.inset.max())
-        assert deepest == pytest.approx(ONSET * VOXEL if smooth else 0.0, rel=0.05)
+        assert deepest == pytest.approx(ONSET * VOXEL if has_distances else 0.0, rel=0.05)
 
 
 def test_a_shell_far_from_its_origin_is_centred_with_its_normals_kept() -> None:
@@ -77,7 +77,7 @@ def test_tools_start_free_and_apart(up: int) -> None:
 @pytest.mark.parametrize("radius", [1e-4, 0.1, 1.0, 100.0])
 def test_the_first_view_shows_scene_and_tool_however_large_it_is(radius: float) -> None:
     bounds = np.array([[-1.0, -0.5, -0.2], [1.0, 0.5, 0.4]])
-    facts = SceneFacts(bounds, np.eye(3)[2], np.eye(3)[1], VOXEL, is_smooth=True)
+    facts = SceneFacts(bounds, np.eye(3)[2], np.eye(3)[1], VOXEL, has_distances=True)
     server = SimpleNamespace(initial_camera=SimpleNamespace())
     set_first_view(server, bounds, 2, facts.reach(radius))  # type: ignore[arg-type]
     camera = server.initial_camera

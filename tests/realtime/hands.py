@@ -128,12 +128,16 @@ class Noted(Slow):
             file.write(wrench.tobytes())
 
 
-class NotedClutched(Noted, Clutched):
-    """One whose button changes between down and up every 100 reads; it ends after 500."""
+class NotedClutched(Noted):
+    """One whose first button is down between 5 and 12 mm along x."""
 
-    def __init__(self, hand: Player, path: Path) -> None:
-        Clutched.__init__(self, hand)
-        self.path = path
+    @property
+    def is_over(self) -> bool:
+        return self.hand.is_over
+
+    def read(self) -> Reading:
+        reading = super().read()
+        return reading._replace(buttons=int(0.005 < reading.pose[0, 3] < 0.012))
 
 
 class Beckoned(Slow):

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 import children
 from children import PATIENCE
 from hapticdb import Environment, PointShell
-from hapticdb.kernels.rigid import poses_of
+from hapticdb.poses import poses_of
 from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.session import Session
 from hapticdb.realtime.stations import LARGE_FROM
@@ -71,7 +71,5 @@ def felt_at(
     env: Environment, shell: PointShell, frames: Recorded, law: ForceLaw
 ) -> NDArray[np.float64]:
     """Wrenches (n, 6) of touches at the tool's recorded poses."""
-    poses = np.empty((len(frames), 4, 4))
-    poses_of(np.ascontiguousarray(frames["tool"]), poses)
-    touches = (env.touch(shell, pose, "array", law=law) for pose in poses)
+    touches = (env.touch(shell, pose, "array", law=law) for pose in poses_of(frames["tool"]))
     return np.array([(*touch.force, *touch.torque) for touch in touches])

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import HAND, pose_numbers
-from hapticdb.kernels.rigid import poses_of
+from hapticdb.poses import poses_of
 from hapticdb.realtime.handle import Hand, Handle
 from realtime.worlds import turned
 
@@ -27,9 +27,7 @@ def reading(rng: np.random.Generator, buttons: int = 0) -> Reading:
 
 
 def pose(hand: Hand) -> Floats:
-    out = np.empty((1, 4, 4))
-    poses_of(pose_numbers(hand)[None], out)
-    found: Floats = out[0]
+    found: Floats = poses_of(pose_numbers(hand)[None])[0]
     return found
 
 

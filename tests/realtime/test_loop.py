@@ -96,8 +96,8 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
             rate = float(str(options.pop("rate", 500.0)))
             request = LoopRequest(
                 table=cells.table, row=row, board=board, grid=cells.grid, shell=sphere,
-                device=device, law=TangentPlane(), coupling=DIRECT, handle=Handle(),
-                timing=Timing(rate), seconds=0.3, staleness=60.0,
+                device=device, law=TangentPlane(), rendering="direct", coupling=DIRECT,
+                handle=Handle(), timing=Timing(rate), seconds=0.3, staleness=60.0,
             )  # fmt: skip
             heard = Heard()
             work(dataclasses.replace(request, **options), heard)  # type: ignore[arg-type]

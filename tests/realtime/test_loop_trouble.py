@@ -22,7 +22,7 @@ from hapticdb.kernels.period.loop import WITHDRAWN_NS
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import Coupling, DirectRendering
+from hapticdb.realtime.coupling import Coupling, DirectRendering, rendering_of
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, work
 from hapticdb.realtime.timing import Timing
@@ -75,7 +75,7 @@ class Pressing:
         self.sent.append(wrench.copy())
 
 
-@pytest.fixture(params=["plane", "smooth"])
+@pytest.fixture(params=["plane", "distance"])
 def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
     """A floor that is felt directly, or through the coupling."""
     monkeypatch.setattr(
@@ -83,7 +83,7 @@ def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
     )  # standard input may be closed
     monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
     before = signal.getsignal(signal.SIGTERM)
-    made = World(has_distances=request.param == "smooth")
+    made = World(has_distances=request.param == "distance")
     yield made
     made.table.close()
     signal.signal(signal.SIGTERM, before)
@@ -104,6 +104,7 @@ def requested(world: World, hand: Pressing, seconds: float = 1.0) -> LoopRequest
         shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
         device=hand,
         law=law,
+        rendering=rendering_of(None, law),
         coupling=coupling,
         handle=Handle(),
         timing=Timing(200.0),

@@ -42,7 +42,7 @@ def test_the_simulator_moves_the_tool_as_the_processor(simulated: str, check: st
     ("choices", "told"),
     [
         ({"frames_on": "tpu"}, "'tpu': choose 'cpu' or 'cuda'"),
-        ({"frames_on": "cuda", "law": "plane"}, "smooth law"),
+        ({"frames_on": "cuda", "law": "plane"}, "rendering coupled"),
     ],
 )
 def test_what_a_gpu_cannot_do_is_refused_before_anything_is_opened(

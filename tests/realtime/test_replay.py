@@ -15,6 +15,7 @@ from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import GridError
 from hapticdb.query.law import LawName
+from hapticdb.realtime.coupling import Rendering
 from hapticdb.realtime.replay import Parting, replay
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Frames, Recorder, Recording, State
@@ -25,7 +26,9 @@ from realtime.worlds import SIZE, block, make
 from servers import FOUND, named, url_on
 from voxels import write_voxels
 
-LAWS: tuple[LawName, ...] = ("plane", "smooth")
+SESSIONS: tuple[tuple[LawName, Rendering], ...] = (
+    ("distance", "coupled"), ("distance", "direct"), ("plane", "direct"),
+)  # fmt: skip
 GRID = Grid(SIZE, (-32 * SIZE,) * 3, 6)
 
 
@@ -39,12 +42,12 @@ def sliding(low: float) -> Player:
 
 def record(
     env: Environment, shell: PointShell, path: Path, hand: Device | None = None,
-    law: LawName = "smooth", **options: object,
+    law: LawName = "distance", rendering: Rendering | None = None, **options: object,
 ) -> Frames:  # fmt: skip
     """Record a session and return its frames."""
     with Session(
-        env.url, shell, hand or sliding(0.010), law=law, rate=RATE, record=path,
-        staleness=NEVER_STALE, has_baseline=False, **options,  # type: ignore[arg-type]
+        env.url, shell, hand or sliding(0.010), law=law, rendering=rendering, rate=RATE,
+        record=path, staleness=NEVER_STALE, has_baseline=False, **options,  # type: ignore[arg-type]
     ) as session:  # fmt: skip
         assert session.wait(PATIENCE) is not None
     frames = recorded(path)
@@ -71,12 +74,13 @@ def env(
         yield made
 
 
-@pytest.mark.parametrize("law", LAWS)
+@pytest.mark.parametrize(("law", "rendering"), SESSIONS)
 def test_what_the_device_received_is_recorded_and_replays_bit_for_bit(
-    env: Environment, sphere: PointShell, tmp_path: Path, law: LawName
+    env: Environment, sphere: PointShell, tmp_path: Path, law: LawName, rendering: Rendering
 ) -> None:
     hand = NotedClutched(sliding(0.010), tmp_path / "received")
-    frames = record(env, sphere, tmp_path / "s.hdbrec", hand, law, handle=Handle(clutch=0))
+    handle = Handle(clutch=0)
+    frames = record(env, sphere, tmp_path / "s.hdbrec", hand, law, rendering, handle=handle)
     received = np.fromfile(hand.path).reshape(-1, 6)
     # before the first frame and after the last one the device is set to zero
     assert received[1 : 1 + len(frames)].tobytes() == frames["applied"].tobytes()

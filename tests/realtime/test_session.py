@@ -61,7 +61,7 @@ def played(
     return play(cells, sphere, tmp_path_factory.mktemp("played") / "session.hdbrec", "plane")
 
 
-@pytest.fixture(scope="module", params=["plane", "smooth"])
+@pytest.fixture(scope="module", params=["plane", "distance"])
 def by_law(
     request: pytest.FixtureRequest, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Played]:
@@ -69,11 +69,11 @@ def by_law(
     if request.param == "plane":
         yield request.getfixturevalue("played")
         return
-    folder = tmp_path_factory.mktemp("smooth")
+    folder = tmp_path_factory.mktemp("distance")
     with make(folder, bits=6) as made:
         write_points(made.store, floor_points(31.5), "floor")
         with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
-            yield play(cells, sphere, folder / "session.hdbrec", "smooth")
+            yield play(cells, sphere, folder / "session.hdbrec", "distance")
 
 
 def play(cells: ResidentCells, shell: PointShell, path: Path, law: LawName) -> Played:

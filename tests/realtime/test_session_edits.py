@@ -10,7 +10,7 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.kernels.records import FRAME, SEAT
 from hapticdb.kernels.resident.cell_table import publish
-from hapticdb.query.law import PLANE, SMOOTH
+from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.realtime.coupling import Coupling
 from hapticdb.realtime.session import Session
 from hapticdb.realtime.stations import Station, Stations
@@ -41,15 +41,15 @@ def test_edits_on_a_server_are_felt_and_no_frame_mixes_two_revisions(
         check_edits(env, sphere, tmp_path / "edited.hdbrec")
 
 
-@pytest.mark.parametrize("is_smooth", [False, True])
+@pytest.mark.parametrize("reads_distances", [False, True])
 def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
-    sphere: PointShell, *, is_smooth: bool
+    sphere: PointShell, *, reads_distances: bool
 ) -> None:
     """Others write just before its kernel begins, and again as soon as it has ended."""
     grid, seats, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
-    with CellTable.create(8 << 20, distances=is_smooth) as table, table.reading() as row:
-        periods = Stations(SMOOTH if is_smooth else PLANE, seats, rings)
-        cells = table.cells if is_smooth else table.cells.without_distances()
+    with CellTable.create(8 << 20, distances=reads_distances) as table, table.reading() as row:
+        periods = Stations(DISTANCE if reads_distances else PLANE, seats, rings)
+        cells = table.cells if reads_distances else table.cells.without_distances()
         station = Station(
             periods.rows, cells, row, table.desk.sessions[row, ...], grid, clusters_of(sphere, 0.01)
         )

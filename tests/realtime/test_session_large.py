@@ -34,7 +34,7 @@ class Ground(NamedTuple):
     law: LawName
 
 
-@pytest.fixture(scope="module", params=["plane", "smooth"])
+@pytest.fixture(scope="module", params=["plane", "distance"])
 def ground(
     request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
 ) -> Iterator[Ground]:

@@ -11,7 +11,7 @@ import pytest
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import TIME_BINS
-from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
+from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.realtime.loop import empty_loop
 from hapticdb.realtime.report import spread_of
 from hapticdb.realtime.timing import SWITCH_INTERVAL, Timing, undisturbed
@@ -30,9 +30,9 @@ def test_percentiles_are_of_all_that_was_counted() -> None:
     assert spread.worst == 1.0
 
 
-@pytest.mark.parametrize("law", [PLANE, SMOOTH])
+@pytest.mark.parametrize("law", [PLANE, DISTANCE])
 def test_an_empty_loop_lasts_as_many_deadlines_as_asked(law: ForceLaw) -> None:
-    figures = empty_loop(law, 500.0, 0.1)
+    figures = empty_loop(law, None, 500.0, 0.1)
     assert 50 <= figures.frames + figures.missed < 60 + figures.missed
     assert figures.seconds >= 0.1
     assert all(map(math.isfinite, (*figures.lateness, *figures.elapsed)))

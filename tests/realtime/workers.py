@@ -6,7 +6,7 @@ import time
 from pathlib import Path
 
 from hapticdb.errors import DatabaseError
-from hapticdb.query.law import SMOOTH
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.loop import empty_loop
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
@@ -35,7 +35,7 @@ def work(request: tuple[str, object], sender: MessageSender) -> None:
             sender.send("tidied")
     elif word == "measure":
         sender.send("measuring")
-        empty_loop(SMOOTH, 1000.0, 3600.0)
+        empty_loop(DISTANCE, None, 1000.0, 3600.0)
     elif word == "end of file":
         raise EOFError("of something else")
     elif word == "hang":

@@ -10,7 +10,7 @@ from banded import move_points, write_points
 from hapticdb import Environment, PointShell
 from hapticdb.errors import UsageError
 from hapticdb.grid import CurveName
-from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
+from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.held import RUN
 from hapticdb.resident.residency import Residency
@@ -85,7 +85,7 @@ def test_a_tool_whose_surroundings_do_not_fit_is_felt_all_the_same(tmp_path: Pat
 
 
 BUDGET = 8 << 20
-LAWS: list[ForceLaw] = [SMOOTH, PLANE]
+LAWS: list[ForceLaw] = [DISTANCE, PLANE]
 Wrenches = NDArray[np.float64]
 
 
@@ -136,4 +136,4 @@ def test_a_law_that_reads_distances_demands_cells_that_have_them(tmp_path: Path)
     with CellTable.create(LEAST_BUDGET) as table:
         residency = Residency(env.store, table)
         with pytest.raises(UsageError, match=r"reads distances.*CellTable.create\(distances=True"):
-            ResidentFrames(residency, cloud(5), SMOOTH)
+            ResidentFrames(residency, cloud(5), DISTANCE)

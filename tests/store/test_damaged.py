@@ -59,7 +59,7 @@ def answers(path: Path) -> str:
             for strategy in strategies:
                 touch = env.touch(shell, pose, strategy, law="plane")
                 told.append((touch.force.tolist(), touch.torque.tolist(), touch.pairs.tolist()))
-        with env.feeler(shell, jobs=1) as feeler:  # the smooth law where there are distances
+        with env.feeler(shell, jobs=1) as feeler:  # the distance law where there are distances
             told.append(feeler.touch(poses).forces.tolist())
     return json.dumps(told)
 

@@ -7,14 +7,15 @@ from hapticdb.errors import UsageError
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.query.law import ForceLaw, LawName
-    from hapticdb.realtime.coupling import Coupling
+    from hapticdb.realtime.coupling import Coupling, Rendering
 
-PLANE_STIFFNESS = 1000.0
-"""Stiffness of a contact under the law plane unless --stiffness is given, N/m."""
+CONTACT_STIFFNESS = 1000.0
+"""Stiffness of a contact, rendered directly, unless --stiffness is given, N/m."""
 
 
 def law_and_coupling(
     law_name: "LawName | None",
+    rendering: "Rendering",
     stiffness: float | None,
     cap: float | None,
     delay_ms: float | None,
@@ -22,16 +23,17 @@ def law_and_coupling(
 ) -> "tuple[ForceLaw | None, Coupling]":
     """Law and coupling of a session; a UsageError where options contradict.
 
-    stiffness : N/m, at the device under the smooth law, of a contact under the plane law; cap : N;
-    delay_ms : milliseconds.
+    stiffness : N/m, at the device if it is coupled, else of a contact; cap : N; delay_ms :
+    milliseconds.
     """
-    from hapticdb import TangentPlane
+    from hapticdb import DistanceField, TangentPlane
     from hapticdb.realtime.coupling import Coupling
 
-    if law_name != "plane":
+    if rendering == "coupled":
         delay = None if delay_ms is None else 1e-3 * delay_ms
         return None, Coupling(stiffness, cap, delay=delay, profile=profile)
     if delay_ms is not None:
-        raise UsageError("--delay belongs to the smooth law: under the plane law leave it out")
-    stiffness = PLANE_STIFFNESS if stiffness is None else stiffness
-    return TangentPlane(stiffness), Coupling(cap=cap, profile=profile)
+        raise UsageError("--delay belongs to --rendering coupled: leave it out")
+    stiffness = CONTACT_STIFFNESS if stiffness is None else stiffness
+    law = TangentPlane(stiffness) if law_name == "plane" else DistanceField(stiffness)
+    return law, Coupling(cap=cap, profile=profile)

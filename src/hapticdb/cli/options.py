@@ -7,7 +7,8 @@ import typer
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
 LayoutName = Literal["brick", "voxel"]
-LawName = Literal["plane", "smooth"]
+LawName = Literal["plane", "distance"]
+RenderingName = Literal["coupled", "direct"]
 FramesOn = Literal["cpu", "cuda"]
 UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 
@@ -85,16 +86,16 @@ LawOption = Annotated[
     LawName | None,
     typer.Option(
         "--law",
-        help="Force law: the tangent plane of a voxel, or smooth by distances to surfaces; smooth "
-        "unless given where every object has distances.",
+        help="Force law of a frame: the tangent plane of a voxel, or a penalty on the distance to "
+        "surfaces; distance unless given where every object has distances.",
     ),
 ]
 ConservativeOption = Annotated[
     bool,
     typer.Option(
         "--conservative",
-        help="Leave the tool's points on its surface, so that clearance is kept: under the smooth "
-        "law contact begins 1.5 voxels before the surface. Otherwise points are drawn inward by "
+        help="Leave the tool's points on its surface, so that clearance is kept: with distances "
+        "contact begins 1.5 voxels before the surface. Otherwise points are drawn inward by "
         "1.5 voxels, and it begins at the surface.",
     ),
 ]

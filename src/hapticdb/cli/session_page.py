@@ -21,7 +21,7 @@ MOST_NAMED = 8
 PERCENTILES = {"p50": "p50", "p99": "p99", "p99.9": "p999", "worst": "worst"}
 """Heading of each, and the field of a `Spread`."""
 
-POINT_NS = {"plane": (50.0, 50.0), "smooth": (100.0, 600.0)}
+POINT_NS = {"plane": (50.0, 50.0), "distance": (100.0, 600.0)}
 """Nanoseconds that a frame takes for each point near a surface under a law, in tools of up to
 `IN_CACHE` points and larger ones (57,600 points pressed on a plane, and results/realtime.json)."""
 IN_CACHE = 10_000
@@ -110,12 +110,12 @@ def _force_facts(report: "Report") -> Facts:
     from hapticdb.realtime.coupling import SettledCoupling, limit_text
 
     spring = report.coupling
-    facts = [("force law", "smooth: distances to surfaces")]
+    facts = [("force law", report.law), ("rendering", "coupled: the hand feels a spring")]
     if isinstance(spring, SettledCoupling):
         lowered = "" if spring.lowered is None else f"; {spring.lowered}"
         facts.append(("stiffness", f"{spring.stiffness:.4g} N/m at the device{lowered}"))
     else:
-        facts = [("force law", "plane: each frame's wrench goes to the device, without coupling")]
+        facts[1] = ("rendering", "direct: each frame's wrench goes to the device")
     caps = f"{spring.cap:.4g} N, {spring.torque_cap:.3g} N m (profile {spring.profile})"
     facts.append(("at most", caps))
     limit = limit_text(report.peak_force, spring.cap)

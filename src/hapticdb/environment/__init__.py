@@ -43,7 +43,7 @@ def create(
     layout : {"brick", "voxel"}
         Rows of its index table.
     distances : bool or None
-        Whether parts get distances for the smooth force law; bricks do unless told otherwise.
+        Whether parts get distances for the force law distance; bricks do unless told otherwise.
 
     Raises
     ------

@@ -178,7 +178,7 @@ class Environment(Queries, Closes):
             As for `PointShell.from_file`.
         inset : float or None
             How far points are drawn inward, metres. Unless given, so far that contact begins at
-            the tool's surface: 1.5 voxels where objects have distances, for the smooth law.
+            the tool's surface: 1.5 voxels where objects have distances, for the distance law.
         """
         drawn = self._inset if inset is None else inset
         return PointShell.from_file(
@@ -187,7 +187,7 @@ class Environment(Queries, Closes):
 
     @property
     def _inset(self) -> float:
-        return inset_of(self.grid.voxel_size, "smooth" if self.has_distances else "plane")
+        return inset_of(self.grid.voxel_size, "distance" if self.has_distances else "plane")
 
     def add(
         self,

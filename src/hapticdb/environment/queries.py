@@ -100,9 +100,9 @@ class Queries:
             ``attribute=value``, as for `find`; read again whenever others have written.
         maxgap : int
             For the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range.
-        law : TangentPlane, DistanceField, "plane", "smooth" or None
-            By default ``smooth`` (`DistanceField`) where `has_distances`, else ``plane``, with 1000
-            N/m. The strategy ``statement`` computes ``plane`` alone.
+        law : TangentPlane, DistanceField, "plane", "distance" or None
+            By default ``distance`` (`DistanceField`) where `has_distances`, else ``plane``, with
+            1000 N/m. The strategy ``statement`` computes ``plane`` alone.
 
         Raises
         ------

@@ -6,7 +6,7 @@ from hapticdb.errors import UsageError
 from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import WorkerProcess
-from hapticdb.query.law import SMOOTH
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.file import Recorder
@@ -41,7 +41,7 @@ class Running:
         try:
             recording.open()
             first, start = self.worker.ask("state", self.seat)
-            header = self.cells.header(asked.shell, rate, SMOOTH, asked.coupling, start)
+            header = self.cells.header(asked.shell, rate, DISTANCE, asked.coupling, start)
             recording.begin(header, first)
         except BaseException:
             recording.discard()

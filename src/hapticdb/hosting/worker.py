@@ -16,7 +16,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels.compiling import load
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import SMOOTH
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.channel import Message
 from hapticdb.realtime.coupling import SettledCoupling
@@ -72,7 +72,7 @@ class Worker:
         self._rate = request.rate
         self._tables: dict[int, CellTable] = {}
         self._board = board = request.board
-        self._stations = Stations(SMOOTH, board.seats, board.rings)
+        self._stations = Stations(DISTANCE, board.seats, board.rings)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     # -- commands ----------------------------------------------------------------------------

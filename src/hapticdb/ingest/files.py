@@ -118,7 +118,7 @@ class ImportOptions:
     """Make the environment agree with the file: replace objects, under their ids, whose parts have
     another geometry, placement or unit now, and remove objects whose parts the file lacks."""
     distances: bool | None = None
-    """Whether parts of a new environment get distances to their surfaces, which the smooth force
+    """Whether parts of a new environment get distances to their surfaces, which the force
     law needs. Unless given, they do in the layout brick. The layout voxel has none."""
 
     def __post_init__(self) -> None:

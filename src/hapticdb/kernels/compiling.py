@@ -93,6 +93,7 @@ _RESIDENT = (
 )
 _FRAMES = "resident.feeling.feel_kernel"
 _COUPLING = ("period.loop.run", "period.loop.move_by_coupling")
+_DIRECT = ("period.loop.run", "period.loop.move_directly")
 PURPOSES: dict[str, tuple[str, ...]] = {
     "import": _VOXELIZE,
     "points": ("curves.encode_kernel",),
@@ -120,10 +121,11 @@ PURPOSES: dict[str, tuple[str, ...]] = {
     "resident": _RESIDENT,
     "feel": (*_SHELL, *_RESIDENT, "hand.handle.*", "motion.*", "rigid.*"),
     "coupling": _COUPLING,
-    "direct": ("period.loop.run", "period.loop.move_directly", "period.loop.feel"),
+    "direct": (*_DIRECT, "period.loop.feel"),
+    "direct by distance": (*_DIRECT, "period.loop.feel@distances"),
     "host": (*_RESIDENT, *_COUPLING),
-    "frames": (*_RESIDENT, _FRAMES, "rigid.poses_of"),
-    "frames by distance": (*_RESIDENT, _FRAMES + "@distances", "rigid.poses_of"),
+    "frames": (*_RESIDENT, _FRAMES),
+    "frames by distance": (*_RESIDENT, _FRAMES + "@distances"),
     "clashes": ("surfaces.sides.*", "triangles.*", "curves.encode_kernel"),
     "sweep": (*_SHELL, "triangles.*", *_RANGES),
     "extract": (

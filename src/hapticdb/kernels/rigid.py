@@ -6,7 +6,7 @@ vector: its axis times its angle in radians.
 
 import math
 
-from hapticdb.kernels._jit import FLOATS2, FLOATS3, entry, inlined, leaf
+from hapticdb.kernels._jit import FLOATS3, entry, inlined, leaf
 
 
 @leaf
@@ -189,11 +189,3 @@ def set_numbers(body, numbers):
         body.position[n] = numbers[n]
     for n in range(4):
         body.quaternion[n] = numbers[3 + n]
-
-
-@entry(FLOATS2, FLOATS3)
-def poses_of(states, out):
-    """Matrices, out (M, 4, 4), of states (M, 7): m, unit quaternion."""
-    for m in range(states.shape[0]):
-        x, y, z = states[m, 0], states[m, 1], states[m, 2]
-        pose_of_quaternion(x, y, z, states[m, 3], states[m, 4], states[m, 5], states[m, 6], out[m])

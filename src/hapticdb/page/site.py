@@ -52,7 +52,7 @@ class _Updated(Protocol):
 class SceneFacts:
     """Where everything happens: the box of all objects (2, 3), metres, and which way is up.
 
-    up, toward : unit vectors, the second level and towards the first eye; is_smooth : whether
+    up, toward : unit vectors, the second level and towards the first eye; has_distances : whether
     forces come from distances to surfaces.
     """
 
@@ -60,7 +60,7 @@ class SceneFacts:
     up: Floats
     toward: Floats
     voxel_size: float
-    is_smooth: bool
+    has_distances: bool
 
     @classmethod
     def of(cls, view: SceneView) -> "SceneFacts":
@@ -68,8 +68,8 @@ class SceneFacts:
         box, objects = view.contents.box(), view.objects.values()
         bounds = view.grid.bounds if box is None else box
         toward = np.eye(3)[(view.up + 2) % 3]
-        is_smooth = bool(objects) and all(obj.has_distances for obj in objects)
-        return cls(bounds, np.eye(3)[view.up], toward, view.grid.voxel_size, is_smooth)
+        has_distances = bool(objects) and all(obj.has_distances for obj in objects)
+        return cls(bounds, np.eye(3)[view.up], toward, view.grid.voxel_size, has_distances)
 
     @property
     def diagonal(self) -> float:
@@ -115,8 +115,8 @@ class Site:
         self.facts = facts = SceneFacts.of(self.view)
         self.database = DatabaseThread(self.url)
         self.tools = [
-            *tools.from_files(request.tools, facts.voxel_size, smooth=facts.is_smooth),
-            *tools.built_in(facts.diagonal, facts.voxel_size, smooth=facts.is_smooth),
+            *tools.from_files(request.tools, facts.voxel_size, has_distances=facts.has_distances),
+            *tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances),
         ]
         set_first_view(self.server, facts.bounds, self.view.up, facts.reach(self.tools[0].radius))
         self._clock = threading.Thread(target=self._tick, name="page-clock", daemon=True)

@@ -63,14 +63,14 @@ BUILT_IN = ("ball", "peg")
 """Names of the probes that every environment has."""
 
 
-def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTool]:
+def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
     """Probes that fit a scene: a ball and a peg.
 
-    diagonal : of the scene's box, metres; smooth : whether forces come from distances, so that
-    points are drawn inward by the law's onset.
+    diagonal : of the scene's box, metres; has_distances : whether forces come from distances, so
+    that points are drawn inward by the law's onset.
     """
     radius = max(PROBE_SHARE * diagonal, LEAST_VOXELS * voxel_size)
-    inset = inset_of(voxel_size, "smooth" if smooth else "plane")
+    inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     ball = np.linspace(-0.5 * math.pi, 0.5 * math.pi, AROUND // 2 + 1)
     peg = np.linspace(-0.5 * math.pi, 0.0, AROUND // 4 + 1)
     slim, long = 0.45 * radius, 3.2 * radius
@@ -87,9 +87,9 @@ def built_in(diagonal: float, voxel_size: float, *, smooth: bool) -> list[HeldTo
     return found
 
 
-def from_files(paths: Sequence[str], voxel_size: float, *, smooth: bool) -> list[HeldTool]:
+def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
     """Tools of the operator's files, named by them; FileError if one holds no readable surface."""
-    inset = inset_of(voxel_size, "smooth" if smooth else "plane")
+    inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     found = []
     for path in map(Path, paths):
         if path.suffix.lower() == ".npz":

@@ -1,6 +1,6 @@
-"""Points drawn inward from a tool's surface, for the smooth law.
+"""Points drawn inward from a tool's surface, for the distance law.
 
-Under the smooth law contact begins a fixed distance before the surface. Points that lie as far
+Under the distance law contact begins a fixed distance before the surface. Points that lie as far
 inside the tool make it begin at the surface. The points are images of samples, moved along their
 inward normals, and an image is kept only if no part of the surface is nearer to it than its own
 sample. So points vanish along convex edges, which touch late, by d (1 / sin(a / 2) - 1) for an

@@ -159,7 +159,7 @@ class PointShell:
         seed : int
             Random seed of the points: equal seeds give equal points.
         inset : float
-            How far the points are drawn inward, metres. Give the smooth law's onset, 1.5 voxels,
+            How far the points are drawn inward, metres. Give the distance law's onset, 1.5 voxels,
             for contact that begins at the surface; 0 for points on it, so that clearance is kept.
             Thin walls, sharp edges and tips are drawn in as far as they can be.
 

@@ -6,7 +6,7 @@ import numpy as np
 
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
-from hapticdb.query.law import PLANE, SMOOTH, ForceLaw
+from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
 from hapticdb.store.base import Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
 
@@ -25,7 +25,7 @@ class KnownObjects:
     have_distances : bool
         Whether there is an object, and every object has distances.
     own_law : ForceLaw
-        The law of a frame that is given none: the smooth one where they have distances.
+        The law of a frame that is given none: the distance one where they have distances.
     version : int or None
         The store's version when the objects were listed; None before that, and after an edit
         through the same environment.
@@ -85,7 +85,7 @@ class KnownObjects:
         self._unfelt = {}
         objects = self.by_id.values()
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
-        self.own_law = SMOOTH if self.have_distances else PLANE
+        self.own_law = DISTANCE if self.have_distances else PLANE
 
     def _writes_since(self, revision: int) -> tuple[list[Change] | None, Change | None]:
         """Writes since the last listing, and the last of all; revision : the newest, or an older.

@@ -11,7 +11,7 @@ from hapticdb.errors import UsageError
 from hapticdb.kernels import law as kernels
 from hapticdb.kernels.field import law as field
 
-LawName = Literal["plane", "smooth"]
+LawName = Literal["plane", "distance"]
 LAW_NAMES: tuple[LawName, ...] = get_args(LawName)
 MOST_STIFFNESS = 1e9
 """Largest stiffness of a law, N/m: stiffer than any hand, device or part."""
@@ -19,7 +19,7 @@ MOST_STIFFNESS = 1e9
 
 def inset_of(voxel_size: float, law: LawName) -> float:
     """How far a tool's points are drawn inward, metres, for contact to begin at its surface."""
-    return float(field.ONSET * voxel_size) if law == "smooth" else 0.0
+    return float(field.ONSET * voxel_size) if law == "distance" else 0.0
 
 
 class ForceLaw(Protocol):
@@ -64,7 +64,9 @@ class TangentPlane:
 
 @dataclass(frozen=True)
 class DistanceField:
-    """Smooth law: a point is felt by its distance u to the nearest surface (Barbic and James 2008).
+    """Penalty on the distance field: a point is felt by its distance u to the nearest surface.
+
+    After Barbic and James 2008.
 
     u is in voxels, interpolated between the stored distances at the 8 voxel centres around the
     point; at each centre the least distance of all objects counts. With the voxel size s and the
@@ -86,7 +88,7 @@ class DistanceField:
 
     stiffness: float = 1000.0
 
-    name: ClassVar[str] = "smooth"
+    name: ClassVar[str] = "distance"
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "stiffness", _checked(self.stiffness))
@@ -103,7 +105,7 @@ def _checked(stiffness: float) -> float:
     return float(stiffness)
 
 
-PLANE, SMOOTH = TangentPlane(), DistanceField()
+PLANE, DISTANCE = TangentPlane(), DistanceField()
 """The laws with their default stiffness."""
 
 
@@ -113,7 +115,7 @@ def as_law(law: "ForceLaw | LawName | None") -> ForceLaw | None:
         return law
     if law not in LAW_NAMES:
         raise UsageError(f"law {law!r}: choose one of {', '.join(LAW_NAMES)}, or give a law")
-    return PLANE if law == PLANE.name else SMOOTH
+    return PLANE if law == PLANE.name else DISTANCE
 
 
 def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
@@ -129,11 +131,11 @@ def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
     return TangentPlane(stiffness) if name == PLANE.name else DistanceField(stiffness)
 
 
-def is_smooth(law: ForceLaw | LawName) -> bool:
+def reads_distances(law: ForceLaw | LawName) -> bool:
     """Whether a law, or the law of that name, reads distances to surfaces."""
-    return law == SMOOTH.name or isinstance(law, DistanceField)
+    return law == DISTANCE.name or isinstance(law, DistanceField)
 
 
 def frames_by(law: ForceLaw | LawName, what: str = "frames") -> str:
     """Purpose (`kernels.compiling.PURPOSES`) of what a law does: frames over resident cells."""
-    return f"{what} by distance" if is_smooth(law) else what
+    return f"{what} by distance" if reads_distances(law) else what

@@ -1,11 +1,13 @@
 """The coupling between hand and tool, and direct rendering without one.
 
-The coupling needs distances to surfaces: the tool rests where its spring and the contacts balance.
-Without distances the wrench of each frame goes to the device directly, up to the device's caps.
+The virtual coupling with contact constraints needs distances to surfaces: the tool rests where its
+spring and the contacts balance. Rendered directly, the wrench of each frame goes to the device, up
+to the device's caps, under either law.
 """
 
 import math
 from dataclasses import dataclass
+from typing import Literal, get_args
 
 import numpy as np
 
@@ -14,7 +16,12 @@ from hapticdb.devices.stability import allow
 from hapticdb.errors import UsageError
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import ForceLaw, reads_distances
 
+Rendering = Literal["coupled", "direct"]
+RENDERINGS: tuple[Rendering, ...] = get_args(Rendering)
+"""How a session renders forces: by the virtual coupling with contact constraints, or each frame's
+wrench, up to the device's caps."""
 HOLD = FADE = 0.02
 """Seconds. In unknown cells the last wrench is kept for `HOLD` and then falls to zero in `FADE`. It
 rises again within `FADE`, in at least four frames; so it does when a session starts and when the
@@ -28,6 +35,26 @@ def limit_text(newtons: float, cap: float) -> str:
     return ", at its limit" if newtons >= 0.999 * cap else ""
 
 
+def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
+    """Rendering of a session under a law; by default coupled where the law reads distances.
+
+    Raises
+    ------
+    UsageError
+        If there is no such rendering, or the coupling's contacts have no distances.
+    """
+    if rendering is None:
+        return "coupled" if reads_distances(law) else "direct"
+    if rendering not in RENDERINGS:
+        raise UsageError(f"rendering {rendering!r}: choose one of {', '.join(RENDERINGS)}")
+    if rendering == "coupled" and not reads_distances(law):
+        raise UsageError(
+            "the rendering coupled needs distances to surfaces, which the law plane does not read: "
+            "choose the law distance, or the rendering direct"
+        )
+    return rendering
+
+
 @dataclass(frozen=True)
 class Coupling:
     """The spring between hand and tool; all in device units.
@@ -38,8 +65,8 @@ class Coupling:
     (`hapticdb.devices.profiles`), and the stiffness is lowered to what stays stable
     (`hapticdb.devices.stability`).
 
-    Without distances there is no spring: `cap`, `torque_cap` and `profile` then bound what is
-    rendered directly, and the other numbers are refused.
+    The rendering direct has no spring: `cap`, `torque_cap` and `profile` then bound the wrench, and
+    the other numbers are refused.
 
     Attributes
     ----------
@@ -146,8 +173,8 @@ class Coupling:
         for name in ("stiffness", "turn_stiffness", "damping", "delay"):
             if getattr(self, name) is not None:
                 raise UsageError(
-                    f"a coupling's {name} does not go with the plane law, which is rendered "
-                    "without a coupling: leave it out, or use the smooth law"
+                    f"a coupling's {name} does not go with the rendering direct, which has no "
+                    "spring: leave it out, or choose the rendering coupled"
                 )
         profile = self.profile or profile
         cap = profile.cap if self.cap is None else self.cap
@@ -164,8 +191,8 @@ class Coupling:
 class DirectRendering:
     """Rendering without a coupling: the tool is at the hand, and feels what the device renders.
 
-    This is the loop of the paper (section 4, Figure 4). The wrench of the tangent-plane law goes to
-    the device, up to its caps; nothing keeps the tool out of surfaces.
+    This is the loop of the paper (section 4, Figure 4). The wrench of each frame goes to the
+    device, up to its caps; nothing keeps the tool out of surfaces.
 
     Attributes
     ----------

@@ -32,9 +32,9 @@ from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.period.loop import DEVICE, NOBODY
 from hapticdb.kernels.records import pose_numbers, views_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw
+from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
+from hapticdb.realtime.coupling import DirectRendering, Rendering
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import LoopAnswer, LoopFigures
@@ -66,6 +66,7 @@ class LoopRequest:
     shell: PointShell
     device: Device
     law: ForceLaw
+    rendering: Rendering
     coupling: DirectRendering
     handle: Handle
     timing: Timing
@@ -90,9 +91,10 @@ class Loop:
         self.reader = Reader(request.device)
         self.table, self.board = request.table, request.board
         self.session = self.table.desk.sessions[request.row, ...]
-        self.stations = Stations(request.law, self.board.seats, self.board.rings)
-        has_distances = isinstance(request.coupling, SettledCoupling)
-        cells = self.table.cells if has_distances else self.table.cells.without_distances()
+        self.stations = Stations(request.law, self.board.seats, self.board.rings, request.rendering)
+        cells = self.table.cells
+        if not reads_distances(request.law):
+            cells = cells.without_distances()
         tool = clusters_of(request.shell, request.grid.voxel_size)
         self.station = Station(
             self.stations.rows, cells, request.row, self.session, request.grid, tool
@@ -266,12 +268,14 @@ class Loop:
             self.device.close()
 
 
-def empty_loop(law: ForceLaw, rate: float, seconds: float) -> LoopFigures:
+def empty_loop(
+    law: ForceLaw, rendering: Rendering | None, rate: float, seconds: float
+) -> LoopFigures:
     """Run a loop that does nothing at that rate, to measure the machine's lateness.
 
     It ends at once if the process that started this one ends, or closes its channel.
     """
-    stations = Stations(law)
+    stations = Stations(law, rendering=rendering)
     stations.rows["source"], stations.rows["is_running"] = NOBODY, True
 
     # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
@@ -300,7 +304,8 @@ def work(request: LoopRequest, sender: MessageSender) -> None:
             empty = None
             if request.has_baseline:
                 seconds = min(EMPTY_SECONDS, request.seconds)
-                empty = empty_loop(request.law, request.timing.rate, seconds)
+                rate = request.timing.rate
+                empty = empty_loop(request.law, request.rendering, rate, seconds)
             loop.prepare()
             compiled = n_compiled()
             sender.send("running", loop.station.state())

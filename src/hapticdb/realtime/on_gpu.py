@@ -29,7 +29,7 @@ from hapticdb.kernels.hand.near_points import (
 )
 from hapticdb.kernels.records import MOST_MISSED, views_of
 from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
-from hapticdb.query.law import SMOOTH, ForceLaw, is_smooth
+from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.stations import Station
 from hapticdb.resident.mirror import CellMirror
 from hapticdb.resident.table import CellTable
@@ -48,12 +48,12 @@ USED_EVERY = 16
 evicted sooner after it was read."""
 
 
-def check_frames(frames_on: str, law: ForceLaw | None) -> None:
+def check_frames(frames_on: str, rendering: str) -> None:
     """Refuse a session whose frames cannot be computed there."""
     if frames_on != "cuda":
         raise UsageError(f"frames on {frames_on!r}: choose 'cpu' or 'cuda'")
-    if law is not None and not is_smooth(law):
-        raise UsageError("frames on 'cuda' are of the smooth law, and the law here is the plane")
+    if rendering != "coupled":
+        raise UsageError("frames on 'cuda' are of the rendering coupled, and this one is direct")
     check_gpu()
 
 
@@ -116,7 +116,7 @@ class GpuLooks:
         self._follower = views_of(station.follower)
         self._tried = station.servo["tool"]["tried_pose"]
         self._place = Place(*station.record["place"].tolist())
-        self._mirror = CellMirror(table, SMOOTH.for_kernels, side=None)
+        self._mirror = CellMirror(table, DISTANCE.for_kernels, side=None)
         self._n_looks, self._epoch = 0, 0
         self._error: BaseException | None = None
         self._stream = cuda.stream()

@@ -12,8 +12,9 @@ from hapticdb.kernels.compiling import build
 from hapticdb.kernels.hand.near_points import FAR, LONGEST_REST
 from hapticdb.kernels.records import FRAME, SEAT, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import LISTED, VERSION
-from hapticdb.kernels.rigid import poses_of
-from hapticdb.ready import make_ready
+from hapticdb.poses import poses_of
+from hapticdb.query.law import reads_distances
+from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.coupling import radius_of
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.tracking import Wish
@@ -85,7 +86,9 @@ class Replayed:
 
 def purposes_of(recording: Recording) -> list[str]:
     """What a replay calls kernels for."""
-    return ["resident", "coupling" if recording.header.rendering == "coupled" else "direct"]
+    header = recording.header
+    by_law = session_purposes(header.rendering, reads_distances=reads_distances(header.law))
+    return ["resident", by_law[-1]]
 
 
 def replay(recording: Recording, environment: Environment) -> Replayed:
@@ -116,7 +119,7 @@ def replay(recording: Recording, environment: Environment) -> Replayed:
             f"has {environment.grid.describe()}: give the environment of {header.environment}"
         )
     make_ready(*purposes_of(recording))
-    with CellTable.create(distances=header.rendering == "coupled") as table:
+    with CellTable.create(distances=reads_distances(header.law)) as table:
         residency = Residency(environment.store, table, header.exclude, where=header.where)
         again = _Again(recording, residency, table)
         frames, comparison = recording.frames(), _Comparison(recording, residency)
@@ -133,7 +136,7 @@ class _Again:
         header, self._residency, self._table = recording.header, residency, table
         self._seats = np.zeros(1, SEAT)
         self._ring = np.zeros((1, BLOCK), FRAME)
-        self._stations = Stations(header.law, self._seats, self._ring)
+        self._stations = Stations(header.law, self._seats, self._ring, header.rendering)
         row = table.join()
         self._station = station = Station(
             self._stations.rows, table.cells, row, table.desk.sessions[row, ...], header.grid,
@@ -168,9 +171,8 @@ class _Again:
 
     def _around(self, frames: Frames) -> NDArray[np.int64]:
         """Cells around the recorded tools, as many as half the table holds."""
-        poses, grid = np.empty((len(frames), 4, 4)), self._residency.grid
-        poses_of(np.ascontiguousarray(frames["tool"]), poses)
-        ways = (poses @ self._center)[:, :3]
+        grid = self._residency.grid
+        ways = (poses_of(frames["tool"]) @ self._center)[:, :3]
         ways = (ways - np.array(grid.origin)) / grid.voxel_size
         if not np.isfinite(ways).all():
             return np.empty(0, np.int64)

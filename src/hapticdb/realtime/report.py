@@ -93,10 +93,12 @@ class Report:
         Timing of the session's loop, and of an empty loop at the same rate on this machine just
         before. The empty loop shows the machine's own lateness; None if it was not run.
     law : str
-        The force law: "plane" or "smooth".
+        Force law of a frame: "plane" or "distance".
+    rendering : str
+        "coupled" or "direct".
     coupling : SettledCoupling or DirectRendering
-        The coupling between hand and tool, with what lowered its stiffness; under the plane law
-        what bounded the wrench, which went to the device directly.
+        The coupling between hand and tool, with what lowered its stiffness; rendered directly, what
+        bounded the wrench.
     is_warm : bool
         Whether all wanted cells were resident before the first frame; after
         `hapticdb.realtime.loop.WARM_PATIENCE` a session starts without them.
@@ -141,6 +143,7 @@ class Report:
     loop: LoopFigures
     empty: LoopFigures | None
     law: str
+    rendering: str
     coupling: DirectRendering
     is_warm: bool
     cache: CacheFigures
@@ -170,6 +173,7 @@ class Report:
     def __repr__(self) -> str:
         return (
             f"Report({self.loop.frames:,} frames in {self.loop.seconds:.3g} s, law {self.law}, "
+            f"{self.rendering}, "
             f"{self.contact_frames:,} in contact, peak {self.peak_force:.4g} N, "
             f"{self.loop.missed:,} deadlines missed)"
         )

@@ -90,8 +90,8 @@ class ResidentCells(Closes):
         words as for `Environment.find`. They are read again as others write: an object that is
         added or renamed later is felt if the words choose it then.
     distances : bool or None
-        Whether the cells have distances to surfaces, for the smooth law: a tenth as many cells fit
-        then. Every object that is felt must have distances. None: where they have them.
+        Whether the cells have distances to surfaces, for the law distance: a tenth as many cells
+        fit then. Every object that is felt must have distances. None: where they have them.
     wrap : callable or None
         Takes the fetching process's store and returns the store to use; importable. For tests.
 

@@ -12,10 +12,16 @@ from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import SMOOTH, ForceLaw, LawName, as_law, is_smooth
+from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
 from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import Coupling, DirectRendering, radius_of
+from hapticdb.realtime.coupling import (
+    Coupling,
+    DirectRendering,
+    Rendering,
+    radius_of,
+    rendering_of,
+)
 from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
@@ -63,13 +69,15 @@ class Session(Closes):
         Frames a second, 10 to 20,000.
     seconds : float or None
         Duration; None: until the device's script ends or `stop` is called.
-    law : {"plane", "smooth"}, ForceLaw or None
-        Force law of the contacts. None: the smooth law, which needs distances to surfaces. The
-        tangent plane needs none, and is rendered directly: the tool is at the hand, and the wrench
-        of each frame goes to the device, up to its caps.
+    law : {"plane", "distance"}, ForceLaw or None
+        Force law of a frame. None: ``distance``, which needs distances to surfaces.
+    rendering : {"coupled", "direct"} or None
+        ``coupled``: a virtual coupling with contact constraints, which needs distances. ``direct``:
+        the tool is at the hand, and the wrench of each frame goes to the device, up to its caps.
+        None: coupled under the law ``distance``, direct under every other one.
     coupling : Coupling or None
-        Coupling between hand and tool under the smooth law. Its stiffness is lowered to what the
-        device holds: see `coupling.lowered`. Under the tangent plane it gives caps alone.
+        Coupling between hand and tool. Its stiffness is lowered to what the device holds: see
+        `coupling.lowered`. Rendered directly, it gives caps alone.
     handle : Handle or None
         Mapping of the hand to the scene: scale and clutch.
     staleness : float
@@ -114,6 +122,7 @@ class Session(Closes):
         rate: float = 1000.0,
         seconds: float | None = None,
         law: ForceLaw | LawName | None = None,
+        rendering: Rendering | None = None,
         coupling: Coupling | None = None,
         handle: Handle | None = None,
         staleness: float = DEFAULT_STALENESS,
@@ -128,15 +137,16 @@ class Session(Closes):
         _check_choices(seconds, staleness)
         self._has_baseline = has_baseline
         self.shell, self.handle = shell, handle or Handle()
-        self.frames_on = _checked_frames(frames_on, law)
+        self.law = as_law(law) or DISTANCE
+        self.rendering = rendering_of(rendering, self.law)
+        self.frames_on = _checked_frames(frames_on, self.rendering)
         self.timing = Timing(rate, processor)
         self._owns_cells = isinstance(cells, str)
         if isinstance(cells, str):
-            cells = ResidentCells(cells, distances=None if law is None else is_smooth(law))
+            cells = ResidentCells(cells, distances=None if law is None else reads_distances(law))
         elif cells.is_closed:
             raise UsageError("these cells are closed: make others")
         self.cells = cells
-        self.law = as_law(law) or SMOOTH
         self._check_distances(law)
         self.coupling = self._settled(coupling or Coupling(), device)
         self._pid, self._row = os.getpid(), -1
@@ -162,12 +172,12 @@ class Session(Closes):
             raise
 
     def _check_distances(self, asked: ForceLaw | LawName | None) -> None:
-        if not is_smooth(self.law) or self.cells.has_distances:
+        if not reads_distances(self.law) or self.cells.has_distances:
             return
         if asked is None:
             raise UsageError(without_distances(self.cells.url))
         raise UsageError(
-            "the smooth law needs cells with distances to surfaces, and these have none: make "
+            "the law distance needs cells with distances to surfaces, and these have none: make "
             "ResidentCells(..., distances=True), or give law='plane'"
         )
 
@@ -175,7 +185,7 @@ class Session(Closes):
         """Coupling or caps of the session, with all numbers."""
         profile, scale = profile_of(device), self.handle.scale
         radius = radius_of(self.shell, self.cells.grid.voxel_size)
-        if is_smooth(self.law):
+        if self.rendering == "coupled":
             return coupling.settled(profile, self.timing.rate, scale, radius)
         return coupling.direct(profile, scale, radius)
 
@@ -185,7 +195,7 @@ class Session(Closes):
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = session_purposes(is_smooth=is_smooth(self.law))
+        purposes = session_purposes(self.rendering, reads_distances=reads_distances(self.law))
         make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
@@ -201,6 +211,7 @@ class Session(Closes):
             shell=without_surface(self.shell),
             device=device,
             law=self.law,
+            rendering=self.rendering,
             coupling=self.coupling,
             handle=self.handle,
             timing=self.timing,
@@ -354,7 +365,8 @@ class Session(Closes):
             recording_ended=self.recording_ended,
             database_lost=self.database_lost,
             lost_records=0 if recording is None else recording.n_lost,
-            law="smooth" if is_smooth(self.law) else "plane",
+            law="distance" if reads_distances(self.law) else "plane",
+            rendering=self.rendering,
             coupling=self.coupling,
             **counts_of(self._open_board.seats[0]),
         )
@@ -403,10 +415,10 @@ def _check_choices(seconds: float | None, staleness: float) -> None:
         raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
 
 
-def _checked_frames(frames_on: "BatchDevice", law: ForceLaw | LawName | None) -> "BatchDevice":
+def _checked_frames(frames_on: "BatchDevice", rendering: Rendering) -> "BatchDevice":
     """Refuse a session whose frames cannot be computed there."""
     if frames_on != "cpu":
         from hapticdb.realtime.on_gpu import check_frames  # noqa: PLC0415 - loads numba.cuda
 
-        check_frames(frames_on, as_law(law))
+        check_frames(frames_on, rendering)
     return frames_on

@@ -16,7 +16,8 @@ from hapticdb.kernels.period.memory import PERIOD_ROWS
 from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
 from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw, is_smooth
+from hapticdb.query.law import ForceLaw
+from hapticdb.realtime.coupling import Rendering, rendering_of
 from hapticdb.recording.frame import Frames
 from hapticdb.recording.header import Start
 from hapticdb.resident.table import HEARTBEAT
@@ -144,18 +145,23 @@ class Stations:
     """Stations of a process, and the call of their periods.
 
     law : that all sessions feel; seats, rings : of the board (`realtime.board.Board`), and for each
-    seat a station; unless given, of one session alone.
+    seat a station; unless given, of one session alone; rendering : as of `rendering_of`.
     """
 
     def __init__(
-        self, law: ForceLaw, seats: Record | None = None, rings: Frames | None = None
+        self,
+        law: ForceLaw,
+        seats: Record | None = None,
+        rings: Frames | None = None,
+        rendering: Rendering | None = None,
     ) -> None:
         self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
         self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
-        mover = loop.move_by_coupling if is_smooth(law) else loop.move_directly
+        is_coupled = rendering_of(rendering, law) == "coupled"
+        mover = loop.move_by_coupling if is_coupled else loop.move_directly
         self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
-        if not is_smooth(law):
+        if not is_coupled:
             self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
         self._arguments = (self.rows, seats, rings, self.pace)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]

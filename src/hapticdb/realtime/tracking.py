@@ -41,7 +41,7 @@ MET = -1.0
 """Urgency of unknown cells that a frame has already met; all other cells have 0 or more, and come
 later."""
 NEAR = ONSET + 0.87
-"""Voxels within which an object is felt, where cells have distances: the onset of the smooth law,
+"""Voxels within which an object is felt, where cells have distances: the onset of the distance law,
 and half a voxel's diagonal, since the distance counts at the centre of the voxel that holds the
 point. Larger: objects are named that are not felt."""
 

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from hapticdb.closing import Closes
 from hapticdb.errors import FileError, UsageError
-from hapticdb.kernels.rigid import poses_of
+from hapticdb.poses import poses_of
 from hapticdb.recording.frame import FRAME, Frames, State
 from hapticdb.recording.header import OLDER, Header
 
@@ -77,9 +77,7 @@ class Recording:
     def poses(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Times (M,), s, and poses (M, 4, 4) world_from_hand of the handle, for a `Player`."""
         frames = self.frames()
-        poses = np.empty((len(frames), 4, 4))
-        poses_of(np.ascontiguousarray(frames["hand"]), poses)
-        return np.array(frames["time"]), poses
+        return np.array(frames["time"]), poses_of(frames["hand"])
 
     def environment_beside(self) -> Path:
         """Path of the recorded environment: an SQLite file in the recording's own folder.

@@ -96,7 +96,7 @@ class Header:
             raise UsageError(f"rate {self.rate}: give frames a second, above 0")
         if not isinstance(self.law, (TangentPlane, DistanceField)):
             kind = type(self.law).__name__
-            raise UsageError(f"law {kind}: only frames of the laws plane and smooth are recorded")
+            raise UsageError(f"law {kind}: only frames of the laws plane and distance are recorded")
         try:
             coupling = json.loads(json.dumps(dict(self.coupling), allow_nan=False))
         except (TypeError, ValueError, RecursionError):

@@ -167,7 +167,7 @@ class CellTable(Closes):
     def create(cls, budget_bytes: int = DEFAULT_BUDGET, *, distances: bool = False) -> "CellTable":
         """Make a table of at most `budget_bytes`, in which every cell is unknown.
 
-        With `distances` its cells have the distances to surfaces, which the smooth law reads; then
+        With `distances` its cells have the distances to surfaces of the law distance; then
         a tenth as many cells fit.
         """
         memory = os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES")

@@ -23,6 +23,7 @@ from hapticdb.cli.options import (
     LawName,
     LawOption,
     PointsOption,
+    RenderingName,
     ToolOption,
     ToolUnitOption,
     UrlArgument,
@@ -37,6 +38,7 @@ from hapticdb.realtime.fork_server import prepare
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
+    from hapticdb.realtime.coupling import Rendering
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.session import Session
 
@@ -102,12 +104,21 @@ FramesOnOption = Annotated[
         "tools of millions of points.",
     ),
 ]
+RenderingOption = Annotated[
+    RenderingName | None,
+    typer.Option(
+        "--rendering",
+        help="coupled: a spring between hand and tool, which stays outside of surfaces; needs "
+        "distances. direct: each frame's wrench goes to the device, up to its caps.",
+        show_default="coupled; direct with --law plane",
+    ),
+]
 DeviceStiffnessOption = Annotated[
     float | None,
     typer.Option(
         metavar="N/M",
         help="Stiffness that the hand feels; lowered to what the device holds without trembling. "
-        "Under the law plane: of a contact.",
+        "With --rendering direct: of a contact.",
         show_default="the device's, or 1000",
     ),
 ]
@@ -170,6 +181,7 @@ def feel(
     budget: BudgetOption = 256.0,
     frames_on: FramesOnOption = "cpu",
     law: LawOption = None,
+    rendering: RenderingOption = None,
     conservative: ConservativeOption = False,
     stiffness: DeviceStiffnessOption = None,
     device_profile: ProfileOption = None,
@@ -187,19 +199,19 @@ def feel(
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
-    kernels = _begin_loop(law, processor, frames_on)
+    chosen_rendering, kernels = _begin_loop(law, rendering, processor, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
-    chosen, coupling = law_and_coupling(law, stiffness, cap, delay, profile)
+    chosen, coupling = law_and_coupling(law, chosen_rendering, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     compile_for(tool, *kernels)
     drawn_in = partial(_shell, tool, tool_unit, points, seed, device)
-    felt, shell = _looked_at(url, where, exclude, drawn_in, law or "smooth", not conservative)
-    session_page.tell_cost(len(shell), rate, law or "smooth", frames_on)
+    felt, shell = _looked_at(url, where, exclude, drawn_in, law or "distance", not conservative)
+    session_page.tell_cost(len(shell), rate, law or "distance", frames_on)
     begin = partial(
         hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
-        law=chosen, coupling=coupling, frames_on=frames_on,
+        law=chosen, rendering=chosen_rendering, coupling=coupling, frames_on=frames_on,
         processor=processor, record=record, replace_recording=replace,
         record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
     )  # fmt: skip
@@ -221,7 +233,7 @@ def _begun(
         with render.bar(doing, ""):
             cells = held.enter_context(hapticdb.ResidentCells(
                 url, budget_bytes=budget_bytes, where=felt.where, exclude=felt.exclude,
-                distances=None if law is None else law == "smooth",
+                distances=None if law is None else law == "distance",
             ))  # fmt: skip
             session = held.enter_context(begin(cells))
         yield session
@@ -270,28 +282,31 @@ def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool
 
 def _begin_loop(
     law: LawName | None,
+    rendering: RenderingName | None,
     processor: int | None,
     frames_on: FramesOn,
-) -> list[str]:
+) -> "tuple[Rendering, list[str]]":
     """Have what forks the processes load kernels while the tool is sampled here.
 
-    It also refuses what the loop cannot do. Returns the purposes of the session's kernels.
+    It also refuses what the loop cannot do. Returns rendering and purposes of the session.
     """
+    from hapticdb.query.law import DISTANCE, as_law
+    from hapticdb.ready import session_purposes
+    from hapticdb.realtime.coupling import rendering_of
+
+    chosen = rendering_of(rendering, as_law(law) or DISTANCE)
     if frames_on != "cpu":
-        from hapticdb.query.law import as_law
         from hapticdb.realtime.on_gpu import check_frames
 
-        check_frames(frames_on, as_law(law))
-    from hapticdb.ready import session_purposes
-
-    purposes = session_purposes(is_smooth=law != "plane")
+        check_frames(frames_on, chosen)
+    purposes = session_purposes(chosen, reads_distances=law != "plane")
     prepare("hapticdb.realtime.loop:work", ["resident", *purposes])
 
     with render.bar("loading", ""):
         from hapticdb.realtime.timing import Timing
 
     Timing(processor=processor)
-    return purposes
+    return chosen, purposes
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:

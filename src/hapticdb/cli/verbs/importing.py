@@ -84,7 +84,7 @@ DistancesOption = Annotated[
     bool | None,
     typer.Option(
         "--distances/--no-distances",
-        help="Store distances to surfaces, for smooth forces, in a new environment.",
+        help="Store distances to surfaces, which coupled sessions need, in a new environment.",
         show_default="yes for bricks",
     ),
 ]

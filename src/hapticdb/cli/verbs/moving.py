@@ -53,7 +53,7 @@ def copy(
     else:
         render.say(_copied(report))
         if layout == "voxel":
-            render.note("the layout voxel has no distances, so the smooth law cannot be felt there")
+            render.note("the layout voxel has no distances: it has the law plane alone")
 
 
 def _copied(report: "CopyReport") -> str:

@@ -128,11 +128,11 @@ def touch(
     import hapticdb
     from hapticdb.query.law import frames_by, inset_of
 
-    plane, smooth = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
+    plane, distance = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
     path, opened = _path_of(poses, path_unit, out, on), partial(hapticdb.open, url, read_only=True)
     with _output(csv, contacts_csv, out, json=json) as output, opened() as env:
-        name: LawName = law or ("smooth" if env.has_distances else "plane")
-        chosen: ForceLaw = smooth if name == "smooth" else plane
+        name: LawName = law or ("distance" if env.has_distances else "plane")
+        chosen: ForceLaw = distance if name == "distance" else plane
         felt = felt_objects(env, where, exclude)
         render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)

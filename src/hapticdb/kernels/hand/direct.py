@@ -1,7 +1,7 @@
 """Direct rendering: the wrench of a frame at the hand goes to the device, without a coupling.
 
-This is the loop of the paper (section 4, Figure 4). The tool is where the hand is, and nothing
-keeps it out of surfaces. The device's caps bound the wrench.
+This is the loop of the paper (section 4, Figure 4), under either law. The tool is where the hand
+is, and nothing keeps it out of surfaces. The device's caps bound the wrench.
 """
 
 import numpy as np

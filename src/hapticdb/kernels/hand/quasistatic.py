@@ -1,4 +1,4 @@
-"""The quasi-static coupling: the tool is where spring and contacts balance, a period at a time.
+"""Virtual coupling with contact constraints, quasi-static: spring and contacts balance each period.
 
 The tool has a pose and no velocity. Each period moves it to the pose that minimises the energy of
 the spring to the hand and of the contacts with the distance field (`step`), by Gauss-Newton steps

@@ -260,10 +260,9 @@ def run(stations, seats, rings, pace_record):
     """Run one period of all sessions, or periods until `pace.is_over` or `pace.most` deadlines.
 
     stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the board; pace_record ()
-    of PACE, which also has what moves all tools: the quasi-static coupling (`move_by_coupling`)
-    under the distance law; under every other law they are rendered directly (`move_directly`). If
-    the frames of a period take longer than it, the deadlines within that time are missed by all
-    sessions alike.
+    of PACE, which also has what moves all tools: the coupling (`move_by_coupling`), or
+    direct rendering (`move_directly`). If the frames of a period take longer than it, the deadlines
+    within that time are missed by all sessions alike.
     """
     pace = pace_record[()]
     is_alone = pace.period > 0

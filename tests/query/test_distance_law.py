@@ -89,10 +89,10 @@ def test_gaps_are_closed_by_what_rows_cost_with_their_distances(env: Environment
     costs = CostModel(1.0, 1.0, 0.0, 1e-9, 1.0, distances=1e15)
     env.store.save_costs(machine_name(), costs.figures())
     with hapticdb.open(env.url) as reader:
-        plane, smooth = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAW_NAMES)
+        plane, distance = (reader.touch(shell, pose, "cbgroup", law=law) for law in LAW_NAMES)
     assert plane.query.ranges == 1
-    assert smooth.query.ranges > 1
-    assert_same(smooth, expected(merged(), shell, pose, []))
+    assert distance.query.ranges > 1
+    assert_same(distance, expected(merged(), shell, pose, []))
 
 
 def test_calibrating_measures_rows_with_their_distances(env: Environment) -> None:
@@ -110,7 +110,7 @@ def test_calibrating_measures_rows_with_their_distances(env: Environment) -> Non
 
 def test_the_default_law_follows_the_objects(env: Environment) -> None:
     shell, pose = random_shell(1, 40), random_pose(1)
-    assert env.touch(shell, pose).law.name == "smooth"  # type: ignore[attr-defined]
+    assert env.touch(shell, pose).law.name == "distance"  # type: ignore[attr-defined]
     assert env.touch(shell, pose, law="plane").law.name == "plane"  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match="tangent-plane law alone"):
         env.touch(shell, pose, "statement")
@@ -118,8 +118,8 @@ def test_the_default_law_follows_the_objects(env: Environment) -> None:
         write_voxels(other.store, blob(1, (20, 20, 20)), "without")
     assert env.touch(shell, pose).law.name == "plane"  # type: ignore[attr-defined]
     with pytest.raises(UsageError, match=r"1 of 6 objects .*: give the law 'plane'"):
-        env.touch(shell, pose, law="smooth")
+        env.touch(shell, pose, law="distance")
     with pytest.raises(UsageError, match=r"1 of 6 objects .*: give the law 'plane'"):
-        env.touch(shell, poses=[pose], law="smooth")
-    with pytest.raises(UsageError, match="choose one of plane, smooth"):
+        env.touch(shell, poses=[pose], law="distance")
+    with pytest.raises(UsageError, match="choose one of plane, distance"):
         env.touch(shell, pose, law="soft")  # type: ignore[call-overload]

@@ -1,4 +1,4 @@
-"""Sessions in an environment with distances: the smooth law, the device's coupling, recordings."""
+"""Sessions with distances: both renderings, the device's coupling, recordings."""
 
 import json
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
-from hapticdb.query.law import DistanceField
+from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
@@ -42,7 +42,7 @@ RADIUS = 0.012
 
 @pytest.fixture(scope="module")
 def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    with make(tmp_path_factory.mktemp("smooth"), bits=6) as made:
+    with make(tmp_path_factory.mktemp("distance"), bits=6) as made:
         write_points(made.store, floor_points(HEIGHT), "floor")
         yield made
 
@@ -91,7 +91,7 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
 ) -> None:
     assert cells.has_distances
     report = felt(cells, ball, pressing(0.004), tmp_path / "s.hdbrec")
-    assert report.law == "smooth"
+    assert (report.law, report.rendering) == ("distance", "coupled")
     assert isinstance(report.coupling, SettledCoupling)
     assert report.coupling.stiffness == 1000.0
     # a sphere of 300 points touches with a point that lies up to a fifth of a millimetre higher
@@ -105,24 +105,33 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
     header = Recording(tmp_path / "s.hdbrec").header
     assert header.law == DistanceField()
     assert header.coupling["stiffness"] == 1000.0
-    assert json.loads(json.dumps(report.figures(), allow_nan=False))["law"] == "smooth"
+    assert json.loads(json.dumps(report.figures(), allow_nan=False))["law"] == "distance"
 
 
-def test_the_plane_law_is_felt_there_too_directly(
-    cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path
+@pytest.mark.parametrize("law", [TangentPlane(800.0), DistanceField(800.0)])
+def test_direct_rendering_sends_the_wrench_of_a_touch_up_to_the_caps(
+    cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path, law: ForceLaw
 ) -> None:
     """The tool is at the hand; the device gets each frame's wrench, once the force has risen."""
-    report = felt(cells, ball, pressing(0.004), tmp_path / "p.hdbrec", law="plane")
-    assert report.law == "plane"
+    coupling = Coupling(cap=1.0, torque_cap=1e-3)
+    report = felt(
+        cells, ball, pressing(0.004), tmp_path / "d.hdbrec", law=law, rendering="direct",
+        coupling=coupling,
+    )  # fmt: skip
+    assert (report.law, report.rendering) == (law.name, "direct")  # type: ignore[attr-defined]
     assert type(report.coupling) is DirectRendering
-    assert Recording(tmp_path / "p.hdbrec").header.law == TangentPlane()
-    frames = recorded(tmp_path / "p.hdbrec")
-    assert frames["contacts"].any()
+    header = Recording(tmp_path / "d.hdbrec").header
+    assert (header.law, header.rendering) == (law, "direct")
+    frames = recorded(tmp_path / "d.hdbrec")
     assert (frames["tool"] == frames["hand"]).all()
     assert not frames["applied"][0].any()
     late = frames[frames["time"] > 0.1]
-    forces = felt_at(env, ball, late, TangentPlane())[:, :3]
-    np.testing.assert_array_equal(late["applied"][:, :3], forces)
+    wrenches = felt_at(env, ball, late, law)
+    for part, cap in ((slice(0, 3), 1.0), (slice(3, 6), 1e-3)):  # about the centre, the origin here
+        sizes = np.linalg.norm(wrenches[:, part], axis=1, keepdims=True)
+        capped = wrenches[:, part] * np.minimum(1.0, cap / np.maximum(sizes, 1e-30))
+        np.testing.assert_allclose(late["applied"][:, part], capped, rtol=1e-9, atol=1e-12)
+    assert report.peak_force == pytest.approx(1.0)
 
 
 def test_a_stiffness_too_great_for_the_device_is_lowered_and_reported(
@@ -187,17 +196,21 @@ def test_a_tool_that_comes_free_feels_again_and_its_report_and_recording_say_whe
 def test_a_law_and_a_coupling_that_do_not_fit_are_refused(
     cells: ResidentCells, ball: PointShell, tmp_path: Path
 ) -> None:
-    with pytest.raises(UsageError, match="does not go with the plane law"):
+    with pytest.raises(UsageError, match="does not go with the rendering direct"):
         Session(cells, ball, still(0.03), law="plane", coupling=Coupling(stiffness=100.0))
-    with pytest.raises(UsageError, match="law 'hard': choose one of plane, smooth"):
+    with pytest.raises(UsageError, match="the rendering coupled needs distances to surfaces"):
+        Session(cells, ball, still(0.03), law="plane", rendering="coupled")
+    with pytest.raises(UsageError, match="rendering 'soft': choose one of coupled, direct"):
+        Session(cells, ball, still(0.03), rendering="soft")  # type: ignore[arg-type]
+    with pytest.raises(UsageError, match="law 'hard': choose one of plane, distance"):
         Session(cells, ball, still(0.03), law="hard")  # type: ignore[arg-type]
     with floored(make(tmp_path, bits=5)) as without:
         with pytest.raises(UsageError, match="has no distances to its surface"):
-            Session(without.url, ball, still(0.03), law="smooth")
+            Session(without.url, ball, still(0.03), law="distance")
         with pytest.raises(UsageError, match=r"import with distances .* --law plane$"):
             Session(without.url, ball, still(0.03))
         with (
             ResidentCells(without.url, budget_bytes=1 << 20) as plain,
-            pytest.raises(UsageError, match="the smooth law needs cells with distances"),
+            pytest.raises(UsageError, match="the law distance needs cells with distances"),
         ):
             Session(plain, ball, still(0.03), law=DistanceField())

@@ -87,6 +87,11 @@ class Clutched(Slow):
         super().__init__(hand, 1 << 30, 0.0)
         self.over_after = 500
 
+    def rewind(self) -> None:
+        """Begin path and reads again, however often the loop read before its first frame."""
+        self.hand.rewind()
+        self.reads = 0
+
     def read(self) -> Reading:
         reading = super().read()
         return reading._replace(buttons=(self.reads // 100) & 1)

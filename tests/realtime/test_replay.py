@@ -78,7 +78,7 @@ def env(
 def test_what_the_device_received_is_recorded_and_replays_bit_for_bit(
     env: Environment, sphere: PointShell, tmp_path: Path, law: LawName, rendering: Rendering
 ) -> None:
-    hand = NotedClutched(sliding(0.010), tmp_path / "received")
+    hand = NotedClutched(sliding(0.004), tmp_path / "received")
     handle = Handle(clutch=0)
     frames = record(env, sphere, tmp_path / "s.hdbrec", hand, law, rendering, handle=handle)
     received = np.fromfile(hand.path).reshape(-1, 6)

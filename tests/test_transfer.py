@@ -362,7 +362,7 @@ def test_distances_are_copied_as_they_are_where_they_are_wanted(
         for n, place in enumerate(PLACES[:2]):
             ijk = blob(n, place)
             rows = with_packed(ijk, grid, n) if n else rows_of_voxels(ijk, grid, "brick")
-            env.store.add(voxel_object(grid, ijk, f"{n}"), rows)
+            write_voxels(env.store, ijk, f"{n}", rows)
         was = env.store.scan(*everywhere, distances=True)
     copy_environment(tmp_path / "a.db", tmp_path / "b.db", curve=second)
     hapticdb.create(tmp_path / "c.db", grid, distances=False).close()

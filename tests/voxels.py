@@ -25,10 +25,12 @@ EVERYWHERE = [np.array([bound], dtype=np.int64) for bound in (0, 2**62)]
 """Lows and highs of one range that holds every key."""
 
 
-def write_voxels(store: Store, ijk: NDArray[np.int64], name: str = "voxels") -> int:
-    """Write voxels (n, 3) as an object of no file; returns its id."""
+def write_voxels(
+    store: Store, ijk: NDArray[np.int64], name: str = "voxels", rows: Rows | None = None
+) -> int:
+    """Write voxels (n, 3), or their rows, as an object of no file; returns its id."""
     surface = packed_surface(_cloud_of(store.grid, ijk))
-    rows = rows_of_voxels(ijk, *kind(store))
+    rows = rows_of_voxels(ijk, *kind(store)) if rows is None else rows
     return store.add(voxel_object(store.grid, ijk, name), rows, surface)
 
 
@@ -40,14 +42,14 @@ def _cloud_of(grid: Grid, ijk: NDArray[np.int64]) -> Part:
 
 def voxel_object(grid: Grid, ijk: NDArray[np.int64], name: str = "voxels") -> Object:
     """Record of an object made of voxels (n, 3)."""
-    bounds = np.array(grid.origin) + grid.voxel_size * np.stack([ijk.min(0), ijk.max(0) + 1])
+    cloud = _cloud_of(grid, ijk)
     return Object(
         name=name,
         link="made",
-        digest=_cloud_of(grid, ijk).digest,
+        digest=cloud.digest,
         transform=np.eye(4),
         voxels=len(ijk),
-        bounds=bounds,
+        bounds=cloud.bounds,
         attributes={"made": True},
     )
 

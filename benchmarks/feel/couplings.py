@@ -10,12 +10,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from feel.ground import Ground
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.protocol import Reading
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.records import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import clusters_of
 

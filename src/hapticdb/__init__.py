@@ -32,6 +32,7 @@ if TYPE_CHECKING:
     from hapticdb.clashes.result import Clashes as Clashes
     from hapticdb.clashes.run import accept_clash as accept_clash
     from hapticdb.clashes.run import find_clashes as find_clashes
+    from hapticdb.devices.handle import Handle as Handle
     from hapticdb.difference import Difference as Difference
     from hapticdb.difference import diff_environments as diff_environments
     from hapticdb.environment import Environment as Environment
@@ -57,7 +58,6 @@ if TYPE_CHECKING:
     from hapticdb.query.touches import Touch as Touch
     from hapticdb.ready import warm_up as warm_up
     from hapticdb.realtime.coupling import Coupling as Coupling
-    from hapticdb.realtime.handle import Handle as Handle
     from hapticdb.realtime.replay import Replayed as Replayed
     from hapticdb.realtime.replay import replay as replay
     from hapticdb.realtime.report import Report as Report

@@ -9,6 +9,7 @@ import pytest
 from numpy.typing import NDArray
 
 from hapticdb import PointShell, TangentPlane
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
@@ -17,7 +18,6 @@ from hapticdb.kernels import law as laws
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest, work
 from hapticdb.realtime.report import LoopAnswer, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells

@@ -15,6 +15,7 @@ import hapticdb
 from banded import write_points
 from feel.tools import flat_tool
 from hapticdb import Grid, TangentPlane
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import DeviceError
@@ -23,7 +24,6 @@ from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, DirectRendering, rendering_of
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import Loop, LoopRequest, work
 from hapticdb.realtime.timing import Timing
 from hapticdb.resident.residency import Residency

@@ -270,9 +270,7 @@ def test_an_interrupted_touch_leaves_nothing_behind(
         touching.send_signal(signal.SIGINT)
         _, err = touching.communicate(timeout=PATIENCE)
     assert touching.returncode == 130, err
-    far, interrupted = err.splitlines()
-    assert far.startswith("hapticdb: no pose comes within ")
-    assert interrupted == "hapticdb: interrupted"
+    assert err == "hapticdb: interrupted\n"
     left = (
         "SELECT 1 FROM pg_stat_activity WHERE application_name = 'hapticdb'"
         " AND datname = current_database() AND query LIKE '%brick%'"

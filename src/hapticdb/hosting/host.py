@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from hapticdb.closing import Closes
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.scripted import pose_at
 from hapticdb.errors import HapticDBError, UsageError
@@ -29,7 +30,6 @@ from hapticdb.poses import row_of_pose
 from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
 from hapticdb.realtime.timing import Timing

@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.protocol import (
     Device,
     Reader,
@@ -35,7 +36,6 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import DirectRendering, Rendering
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.processes import MessageSender, parent_is_gone
 from hapticdb.realtime.report import LoopAnswer, LoopFigures
 from hapticdb.realtime.stations import Station, Stations

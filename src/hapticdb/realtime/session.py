@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from hapticdb.closing import Closes
+from hapticdb.devices.handle import Handle
 from hapticdb.devices.profiles import profile_of
 from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
@@ -22,7 +23,6 @@ from hapticdb.realtime.coupling import (
     radius_of,
     rendering_of,
 )
-from hapticdb.realtime.handle import Handle
 from hapticdb.realtime.loop import LoopRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.report import LoopAnswer, Report, counts_of

@@ -9,11 +9,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 
+from hapticdb.devices.handle import Hand, Handle
 from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import HAND, pose_numbers
 from hapticdb.poses import poses_of
-from hapticdb.realtime.handle import Hand, Handle
 from realtime.worlds import turned
 
 Floats = NDArray[np.float64]

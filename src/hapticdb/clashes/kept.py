@@ -7,13 +7,13 @@ from typing import NamedTuple
 
 import numpy as np
 
-from hapticdb.clashes.run import BUDGET, Asked, Search, is_same
+from hapticdb.clashes.run import BUDGET, PairQuery, PairSearch, is_same
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Store
 from hapticdb.store.pairs import PairRow
 
 SETTING = re.compile(r"within (\S+) contact (\S+) by motions")
-"""`Asked.setting`, read back."""
+"""`PairQuery.setting`, read back."""
 SHARE = 1e-4
 """Share by which a length may differ from the one that is measured again, on another machine."""
 NEAR = 1e-6
@@ -59,11 +59,11 @@ def pair_faults(store: Store, objects: Mapping[int, Object]) -> Iterator[PairFau
             yield PairFault(f"pair {a}, {b} has no row, and their boxes are near", None)
 
 
-def _search(store: Store, setting: str) -> Search:
+def _search(store: Store, setting: str) -> PairSearch:
     found = SETTING.fullmatch(setting)
     assert found is not None  # noqa: S101 - `_misfit` has refused others
     within, contact = map(float, found.groups())
-    return Search(store, Asked(within, contact, (), (), np.inf, BUDGET, None))
+    return PairSearch(store, PairQuery(within, contact, (), (), np.inf, BUDGET, None))
 
 
 def _written(pair: tuple[int, int], objects: Mapping[int, Object]) -> float:
@@ -90,7 +90,7 @@ def _misfit(row: PairRow, known: set[int], bare: set[int], revision: int) -> str
 
 
 def _judged_again(
-    search: Search, rows: Sequence[PairRow], objects: Mapping[int, Object], revision: int
+    search: PairSearch, rows: Sequence[PairRow], objects: Mapping[int, Object], revision: int
 ) -> Iterator[PairFault]:
     make_ready("clashes")
     old = {(row.a, row.b): row for row in rows}

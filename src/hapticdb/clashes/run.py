@@ -98,11 +98,11 @@ def find_clashes(
         raise UsageError(f"a search of {seconds} seconds: give more than 0")
     began = time.monotonic()
     until = np.inf if seconds is None else began + seconds
-    asked = Asked(within, contact, tuple(of), tuple(against), until, budget, progress)
+    asked = PairQuery(within, contact, tuple(of), tuple(against), until, budget, progress)
     with connected(on) as workers:
         if workers is None:
             make_ready("clashes")
-        return Search(env.store, asked, env.address, workers).found(began)
+        return PairSearch(env.store, asked, env.address, workers).found(began)
 
 
 def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> list[PairRow]:
@@ -133,7 +133,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     return rows
 
 
-class Asked(NamedTuple):
+class PairQuery(NamedTuple):
     """What is asked, as for `find_clashes`; until : time of `time.monotonic`."""
 
     within: float
@@ -150,11 +150,11 @@ class Asked(NamedTuple):
         return f"within {self.within!r} contact {self.contact!r} by motions"
 
 
-class Search:
+class PairSearch:
     """State of one search."""
 
     def __init__(
-        self, store: Store, asked: Asked, address: str = "", workers: Cluster | None = None
+        self, store: Store, asked: PairQuery, address: str = "", workers: Cluster | None = None
     ) -> None:
         self._store, self._asked = store, asked
         self._address, self._workers = address, workers

@@ -73,7 +73,10 @@ class Pair:
             self.gpu.check()
         assert ours.state.tobytes() == theirs.state.tobytes()
         assert ours.servo["sent"].tobytes() == theirs.servo["sent"].tobytes()
-        near = [(hand.follower["n_near"], hand.follower["side"]) for hand in self.hands]
+        near = [
+            (hand.follower["n_near"], hand.follower["side"], hand.follower["merged"])
+            for hand in self.hands
+        ]
         assert near[0] == near[1]
         n_near, side = int(near[0][0]), int(near[0][1])
         first, end = NEAR + side * NEAR_ROWS, NEAR + (side + 1) * NEAR_ROWS
@@ -89,16 +92,14 @@ class Pair:
 
 def a_flat_tool_is_pressed_on_a_plane_and_leaves() -> None:
     low = 1.5 * SIZE
-    for is_large in (0, 1):
+    for more in ({}, {"is_large": 1, "merges_from": 12}):
         pair = Pair(
-            field_of(plane([0.0, 0.0, 1.0]), SIZE),
-            punch(5, 0.004),
-            [0.0, 0.0, low + 0.03],
-            is_large=is_large,
+            field_of(plane([0.0, 0.0, 1.0]), SIZE), punch(5, 0.004), [0.0, 0.0, low + 0.03], **more
         )
         for height in (0.03, 0.01, 0.001, -0.002, -0.003):
             pair.move([0.0, 0.0, low + height])
         assert pair.hands[1].sent.contacts > 0
+        assert (pair.hands[1].follower["merged"] > 1) == ("merges_from" in more)
         for height in (-0.003, 0.02, 0.04):
             pair.move([0.002, 0.0, low + height])
         assert not pair.hands[1].sent.contacts
@@ -109,7 +110,7 @@ def no_point_passes_a_sheet() -> None:
     start = np.array([0.0, 0.0, 0.04])
     pair = Pair(
         field_of(sheet([0.0, 0.0, 1.0]), SIZE), punch(5, 0.006), start, (0.995, 0.0995, 0.0, 0.0),
-        is_large=1,
+        merges_from=6, is_large=1,
     )  # fmt: skip
     for n in range(8):
         pair.move(start - [0.0, 0.0, 0.02 * n])

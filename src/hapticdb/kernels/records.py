@@ -186,11 +186,14 @@ FOLLOWER: Layout = _record(
         ("reversals", "<f8"),  # of the force, forgotten as time passes
         ("extreme", "<f8"),  # N, greatest or least force since the last reversal
         ("is_rising", "?"),  # the force, since then
-        ("is_large", "?"),  # a run is tested by its sphere before its points are; by the caller
+        # of large tools
+        ("is_large", "?"),  # set by the caller: a run's sphere is tested before its points
+        ("merges_from", "<i8"),  # set by the caller: near points that are merged; 0: none
+        ("merged", "<i8"),  # points for which one contact stands; 0 counts as 1
         # where a GPU looks
         ("looker", "<i8"),  # address of what is called for a look; 0: the period's kernel looks
         ("way", "<f8"),  # voxels that the farthest point has moved since the last look
-        ("is_anew", "<i8"),  # the next look forgets first when points and runs are due
+        ("anew", "<i8"),  # what the next look forgets first, named in `near_points`
     ]
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""

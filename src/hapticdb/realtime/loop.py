@@ -107,6 +107,7 @@ class Loop:
             from hapticdb.realtime import on_gpu  # noqa: PLC0415 - loads numba.cuda
 
             self.gpu = on_gpu.GpuLooks(self.station, self.table)
+            self.station.follower["merges_from"] = on_gpu.MERGES_FROM
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])

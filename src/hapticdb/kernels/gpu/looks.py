@@ -36,10 +36,11 @@ at which a run is due; their number."""
 _moved, _slot_of, _cell_key, _spread = map(
     on_gpu, (rigid.moved, cells.slot_of, cells.cell_key, cells.spread_key)
 )
-_clamped_into, _distance_at, _write_near, _rest_of_sphere = map(
+_clamped_into, _bound_at, _distance_at, _write_near, _rest_of_sphere = map(
     on_gpu,
     (
         near_points.clamped_into,
+        near_points.bound_at,
         near_points.distance_at,
         near_points.write_near,
         near_points.rest_of_sphere,
@@ -90,6 +91,7 @@ class Look(NamedTuple):
     is_large: int
     is_anew: int
     is_bent: int
+    merged: int
     last: int
     n_due: int
     travelled: float
@@ -97,7 +99,7 @@ class Look(NamedTuple):
     pose: tuple[float, ...]
 
 
-ASKED = 22
+ASKED = 23
 """Numbers of a `Look`."""
 
 
@@ -106,10 +108,10 @@ def _look_of(asked):
     """The `Look` that is in asked (ASKED,)."""
     return Look(
         int64(asked[0]), int64(asked[1]), int64(asked[2]), int64(asked[3]), int64(asked[4]),
-        int64(asked[5]), int64(asked[6]), int64(asked[7]), asked[8], asked[9],
+        int64(asked[5]), int64(asked[6]), int64(asked[7]), int64(asked[8]), asked[9], asked[10],
         (
-            asked[10], asked[11], asked[12], asked[13], asked[14], asked[15], asked[16], asked[17],
-            asked[18], asked[19], asked[20], asked[21],
+            asked[11], asked[12], asked[13], asked[14], asked[15], asked[16], asked[17], asked[18],
+            asked[19], asked[20], asked[21], asked[22],
         ),
     )  # fmt: skip
 
@@ -160,6 +162,10 @@ def _look_at_point(n, place, asked, seen, payload, sight):
     if slot > EMPTY_SLOT:
         seen.used[slot] = 1
         mask = seen.masks[slot]
+    if n & (asked.merged - 1):  # another point's contact stands for this one
+        bound = _bound_at(payload, slot, mask, inside)
+        if bound >= LEAST_BOUND:
+            return asked.travelled + bound - FAR
     looked = _distance_at(payload, slot, mask, inside)
     u, bound = looked[0], looked[4]
     if u < ONSET + MARGIN or bound < LEAST_BOUND:

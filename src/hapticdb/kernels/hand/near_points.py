@@ -74,11 +74,19 @@ FIELD_ROWS = NEAR + 2 * NEAR_ROWS
 FELT_POINTS, NEAR_POINTS, MET_ROWS = 0, 1, 3
 """Rows of `met` (MET_ROWS, N) int64: FELT_POINTS takes the indices of the points that are felt, and
 two rows from NEAR_POINTS on those of the near points, in the order of `field`'s numbers."""
-OPEN, SHUT, NOT_KNOWN = 0, 1, 2
-"""What a look finds: the tool may be there; a point may not; points are in unknown cells."""
+OPEN, SHUT, NOT_KNOWN, MANY = 0, 1, 2, 3
+"""What a look finds: the tool may be there; a point may not; points are in unknown cells; there are
+so many near points that they are merged."""
+MOST_MERGED = 64
+"""Most points for which one contact stands: a run. Larger: broad contacts cost less."""
 LONGEST_REST = 16.0
 """Most voxels that a run of a large tool may go before its sphere is tested again. Larger: fewer
 tests in free space, each of which reads more cells."""
+RUNS_ANEW, POINTS_ANEW = 1, 2
+"""What a look by another forgets first: when runs are due, or when points are, too."""
+ROOMY = 4
+"""Contacts are split again when fewer than this part of the most are near. Larger: points come back
+later, and the number of contacts changes less often."""
 
 
 @leaf
@@ -119,6 +127,21 @@ def distance_at(payload, slot, mask, at):
     if dx != 0.0 or dy != 0.0 or dz != 0.0:
         u, gx, gy, gz, bound = _outside_grid(u, gx, gy, gz, bound, dx, dy, dz)
     return u, gx, gy, gz, bound
+
+
+@inlined
+def bound_at(payload, slot, mask, at):
+    """The bound of `distance_at` alone."""
+    x, y, z, dx, dy, dz = at
+    if (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
+        bound = nearest_bound(payload, slot, x, y, z)
+        if bound < ENOUGH:
+            bound = lower_bound(payload, slot, x, y, z)
+    else:
+        bound = bound_in_free_block(x, y, z, 5 if slot == EMPTY_SLOT else 3)
+    if dx != 0.0 or dy != 0.0 or dz != 0.0:
+        bound = max(bound, math.sqrt(dx * dx + dy * dy + dz * dz))
+    return bound
 
 
 @leaf
@@ -224,7 +247,7 @@ class Grasp(NamedTuple):
 
 @leaf
 def _look_at_run(grasp, run, transform, center):
-    """Look at the points of run number `run` -> OPEN or SHUT; see `look`."""
+    """Look at the points of run number `run` -> OPEN, SHUT or MANY; see `look`."""
     cells, which, shell, place, follower, field, met, missed = grasp
     seen, points = seen_in(cells, which, cells.words), shell.points
     start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
@@ -232,6 +255,7 @@ def _look_at_run(grasp, run, transform, center):
     half = 1 - follower.side
     base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
     travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
+    merged, most_near = follower.merged, follower.merges_from
     last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
     run_due = NEVER
     for n in range(start, end):
@@ -248,6 +272,12 @@ def _look_at_run(grasp, run, transform, center):
             follower.n_unknown += 1
             field[DUE, n] = run_due = -NEVER
             continue
+        if n & (merged - 1):  # another point's contact stands for this one
+            bound = bound_at(payload, slot, mask, at)
+            if bound >= LEAST_BOUND:
+                field[DUE, n] = travelled + bound - FAR
+                run_due = min(run_due, field[DUE, n])
+                continue
         looked = distance_at(payload, slot, mask, at)
         u, bound = looked[0], looked[4]
         field[DUE, n] = travelled + bound - FAR
@@ -256,6 +286,8 @@ def _look_at_run(grasp, run, transform, center):
             continue
         if follower.is_walking and _goes_nearer(u, bound, field[LAST_U, n], field[LAST_BOUND, n]):
             return SHUT
+        if 0 < most_near <= n_near and merged < MOST_MERGED:
+            return MANY
         met[near, n_near] = n
         lever = px - cx, py - cy, pz - cz
         write_near(payload, slot, mask, at, lever, looked, follower.is_bent, field, base, n_near)
@@ -280,7 +312,7 @@ def n_runs_of(shell):
 
 @leaf
 def _look_at_due_runs(grasp, transform, center, way):
-    """Look at the points of all runs that are due -> OPEN or SHUT.
+    """Look at the points of all runs that are due -> OPEN, SHUT or MANY.
 
     The sphere of a run that was near at the last look, a way ago, is not tested.
     """
@@ -298,8 +330,9 @@ def _look_at_due_runs(grasp, transform, center, way):
             if rest > 0.0:
                 field[RUN_DUE, run] = travelled + rest
                 continue
-        if _look_at_run(grasp, run, transform, center) == SHUT:
-            return SHUT
+        found = _look_at_run(grasp, run, transform, center)
+        if found != OPEN:
+            return found
     return OPEN
 
 
@@ -310,17 +343,26 @@ def look(grasp, pose, way, is_walking):
     way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
     is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The near
     points go into the half of `field` and `met` that the tool's pose does not use; SHUT leaves it
-    unfinished. A GPU may look instead (`kernels.gpu.looks`): then it is called.
+    unfinished. A GPU may look instead (`kernels.gpu.looks`): then it is called. Its sessions merge
+    contacts: where `merges_from` points are near, one contact stands for 2, 4, 8 ... neighbours by
+    index, up to `MOST_MERGED`. Of the others only the bounds are computed, so that no point passes
+    a surface. The processor does the same here, as the oracle of the GPU.
     """
     shell, follower, field = grasp.shell, grasp.follower, grasp.field
     follower.travelled += way
     follower.is_walking, follower.way = is_walking, way
     follower.n_looks += 1
+    follower.merged = max(follower.merged, 1)
     if follower.looker != 0:
         return call(follower.looker)
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
-    if _look_at_due_runs(grasp, transform, center, way) == SHUT:
+    while True:
+        found = _look_at_due_runs(grasp, transform, center, way)
+        if found != MANY:
+            break
+        follower.merged *= 2
+    if found == SHUT:
         return SHUT
     travelled, least = follower.travelled, NEVER
     for run in range(n_runs_of(shell)):
@@ -350,10 +392,23 @@ def settle(follower, field, met):
 
 
 @leaf
+def take_more_points(follower, field):
+    """Let the next look merge half as many contacts, if there is room -> whether it does."""
+    if follower.merged <= 1 or ROOMY * follower.n_near > follower.merges_from:
+        return False
+    follower.merged //= 2
+    follower.anew = max(follower.anew, RUNS_ANEW)
+    if follower.looker == 0:
+        for n in range(field.shape[1]):
+            field[RUN_DUE, n] = -NEVER
+    return True
+
+
+@leaf
 def look_anew(follower, field):
     """Forget all ways, so that the next look looks at every point; near points stay as they are."""
     follower.travelled = follower.astray = 0.0
-    follower.is_anew = 1
+    follower.anew = POINTS_ANEW
     if follower.looker != 0:
         return
     for n in range(field.shape[1]):

@@ -50,6 +50,7 @@ from hapticdb.kernels.hand.near_points import (
     look,
     look_anew,
     settle,
+    take_more_points,
 )
 from hapticdb.kernels.hand.path import MOST_LOOKS, keep_pose, place_on_way, walk, way_of_step
 from hapticdb.kernels.hand.steadying import (
@@ -138,6 +139,22 @@ def _look_here(grasp, tool):
         is_sunk = least_distance(follower, field) < FLOOR
     follower.is_loose = follower.is_loose or is_sunk
     return True
+
+
+@leaf
+def _look_at_more(grasp, tool):
+    """Look where the tool is, at contacts merged before -> OPEN or NOT_KNOWN.
+
+    A point that comes back feels contact from where it is, so that no force jumps. It goes no
+    nearer to a surface than it is, if it is nearer than FLOOR.
+    """
+    follower, field, met = grasp.follower, grasp.field, grasp.met
+    pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
+    found = look(grasp, tool.tried_pose, follower.astray, np.bool_(False))
+    if found == OPEN:
+        _meet_change(follower, field, met)
+        settle(follower, field, met)
+    return found
 
 
 @leaf
@@ -275,10 +292,15 @@ def finish(grasp, spring, servo, is_held, found, dt):
 @leaf
 def _move_tool(grasp, version, spring, tool, hand):
     """Move the tool after the hand, in the present version of the cells -> what was found."""
+    found = OPEN
     if tool.version != version or has_moved(tool, grasp.follower):
         if not _look_here(grasp, tool):
             return NOT_KNOWN
         tool.version = version
+    elif take_more_points(grasp.follower, grasp.field):
+        found = _look_at_more(grasp, tool)
+    if found != OPEN:
+        return found
     if grasp.follower.is_loose:
         return _follow_loosely(grasp, spring, tool, hand)
     return follow(grasp, spring, tool, hand)

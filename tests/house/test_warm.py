@@ -110,7 +110,8 @@ def test_warm_up_leaves_nothing_to_compile(tmp_path: Path) -> None:
     A session's loop runs in its own process and raises an error if a kernel is compiled while it
     runs (`realtime.loop.work`).
     """
-    done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], check=True)
+    paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+    done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], env=paths, check=True)
     found = json.loads(done.stdout)
     assert set(found) == {name.partition("@")[0] for name in NAMES}
     assert {name: both for name, both in found.items() if both[0] != both[1]} == {}

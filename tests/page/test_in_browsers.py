@@ -206,6 +206,10 @@ def test_one_feels_a_part_until_another_takes_it_out(
         ben.get_by_role("button", name="Take out", exact=True).click()
         until(lambda: force_on(ada) == 0.0, "the force is zero", ada)
         ben.get_by_role("button", name="Put back", exact=True).click()
+        until(lambda: "The tool lies in a part" in ada.locator("body").inner_text(), "it is", ada)
+        type_place(ada, aim.contact + aim.facts.up * (3.0 * aim.radius))
+        ada.wait_for_timeout(1000)
+        type_place(ada, aim.contact)
         until(lambda: (force_on(ada) or 0.0) > 0.5, "the part is felt again", ada)
 
         # what is hidden is not felt

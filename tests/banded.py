@@ -59,4 +59,4 @@ def move_points(store: Store, object_id: int, points: Points) -> None:
     record = dataclasses.replace(
         before, voxels=after.voxels, bounds=after.bounds, digest=after.digest
     )
-    store.replace(record, rows_of_points(points, store.grid), lambda _: [(0, 2**62)])
+    store.replace(record, rows_of_points(points, store.grid))

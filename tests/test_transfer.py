@@ -26,7 +26,6 @@ from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
 from hapticdb.store.base import Band, Layout, Rows
-from hapticdb.store.covering import covering
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.transfer import CopyReport
 from voxels import blob, voxel_object, with_distances, write_voxels
@@ -258,7 +257,7 @@ def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
                     voxel_object(env.grid, moved, "blob 2"), id=5, transform=placement(1, 0, 0)
                 )
                 rows = rows_of_voxels(moved, env.grid, env.layout)
-                env.store.replace(turned, rows, covering(env.store))
+                env.store.replace(turned, rows)
 
     report = copy_environment(source, tmp_path / "b.db", curve="hilbert", progress=edit)
     assert report.copied == 4

@@ -25,6 +25,7 @@ from hapticdb.store.base import (
     Progress,
     Rows,
     Store,
+    is_ascending,
     row_shift,
 )
 from hapticdb.store.connect import open_store
@@ -46,24 +47,14 @@ BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
 class CheckReport:
     """Result of a check.
 
-    Attributes
-    ----------
-    url : str
-        The environment, as messages name it.
-    findings : list of str
-        One line for each fault, at most the first `MOST_FINDINGS`.
-    n_findings : int
-        Number of all faults.
-    objects, voxels, rows, surfaces : int
-        Numbers of objects, voxels, rows and surfaces that were read.
-    wrong : list of int
-        Objects whose rows or distances are not those that were written.
-    strays : list of int
-        Ids of rows or distances that no object has.
-    pairs : list of PairRow
-        Rows of pairs that are not what their surfaces are.
-    lacks_pairs : bool
-        Whether rows of pairs are missing.
+    url : the environment, as messages name it
+    findings : one line for each fault, at most the first `MOST_FINDINGS`
+    n_findings : number of all faults
+    objects, voxels, rows, surfaces : numbers of objects, voxels, rows and surfaces that were read
+    wrong : objects whose rows or distances are not those that were written
+    strays : ids of rows or distances that no object has
+    pairs : rows of pairs that are not what their surfaces are
+    lacks_pairs : whether rows of pairs are missing
     """
 
     url: str
@@ -106,27 +97,16 @@ def check_environment(
 ) -> CheckReport:
     """Read all of an environment and say what is wrong with it.
 
-    The check runs the engine's own check of its structure. Every row must belong to an object, be
-    in order, and lie in the grid and in its object's bounds. A brick must hold a voxel, and none
-    outside the grid. Every object must have its number of voxels, and its rows the checksum that
-    was written with them; so must its distances, if it has any, and every brick that holds a voxel
-    of it must have distances. Every surface must be the one of its digest, and an object must have
-    that digest; at the object's transform it must have the object's bounds, lie in the grid, and be
-    where the object's voxels are. Every pair is judged again. The log of changes must have no gaps
-    and agree with the objects. Rows are read in batches, and surfaces one by one, so memory does
-    not grow with their number.
+    The engine checks its own structure. Every row must belong to an object, be in order, and lie in
+    the grid and in its object's bounds. A brick must hold a voxel, and none outside the grid. Every
+    object must have its number of voxels, the checksums of its rows and distances, and distances in
+    every brick with a voxel. Every surface must have its digest and an object, whose bounds and
+    voxels are at its transform, within the grid. Every pair is judged again. The log of changes
+    must have no gaps and agree with the objects. Memory does not grow with the number of rows.
 
-    Parameters
-    ----------
-    url : str or path
-        The environment; it is only read.
-    progress : callable or None
-        Called after each batch of rows with how many were read, and how many there are.
+    progress : called after each batch with the rows that were read, and that there are.
 
-    Raises
-    ------
-    DatabaseError
-        When the environment cannot be read for another reason than damage.
+    Raises `DatabaseError` when the environment cannot be read for another reason than damage.
     """
     report = CheckReport(os.fspath(url))
     try:
@@ -143,9 +123,9 @@ def repair_environment(
 ) -> None:
     """Mend what a check has found about rows and pairs: a transaction an object.
 
-    Rows that are not those that were written, and bounds, are made anew from the object's surface.
-    Rows of no object, as a crash between the servers of partitions leaves them, are removed. Pairs
-    are marked, so that the next search for clashes measures them again; they stay accepted.
+    Wrong rows and bounds are made anew from the object's surface. Rows of no object, as a crash
+    between the servers of partitions leaves them, are removed. Pairs are marked for the next search
+    for clashes; they stay accepted.
     """
     with closing(open_store(url)) as store:
         total = len(report.wrong) + len(report.strays)
@@ -249,7 +229,7 @@ class _Sums:
         """All rows, added to the sums; ends where they are in `disorder`."""
         key, object_id = -1, 0
         while len(rows := self._store.rows_after(key, object_id, at_once, distances=distances)):
-            if not _is_ascending(rows, key, object_id):
+            if not is_ascending(np.append(key, rows.keys), np.append(object_id, rows.ids)):
                 self.disorder = f"after key {key} are not in order"
                 return
             key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
@@ -374,12 +354,6 @@ def _surface_findings(
             if found == [OTHER_BOUNDS] and obj.id not in report.wrong:
                 report.wrong.append(obj.id)
             yield from (f"object {obj.id} ({obj.name}): {fault}" for fault in found)
-
-
-def _is_ascending(rows: Rows, key: int, object_id: int) -> bool:
-    keys, ids = np.append(key, rows.keys), np.append(object_id, rows.ids)
-    later = (keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))
-    return bool(later.all())
 
 
 class _Places:

@@ -48,7 +48,7 @@ def test_info_speaks_to_people(run: Run, scene: Scene) -> None:
 def test_statistics_are_renewed_after_many_edits(run: Run, scene: Scene) -> None:
     """Of 3 objects each edit is many; a store alone counts what passes."""
     with hapticdb.open(scene) as env:
-        env.store.remove(2, lambda _: ((0, 2**62),))
+        env.store.remove(2)
     assert "1 write behind" in run("info", scene)[1]
     assert run("move", scene, 3, "--translate", "0,0,0.01")[0] == 0
     found = json.loads(run("info", scene, "--json")[1])["statistics"]
@@ -66,7 +66,7 @@ def test_objects_are_listed_by_id(run: Run, scene: Scene) -> None:
 
 def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> None:
     with hapticdb.open(scene) as env:
-        env.store.remove(2, lambda _: ((0, 2**62),))
+        env.store.remove(2)
     found = json.loads(succeeded(run("info", scene, "--calibrate", "--json")))
     assert found["statistics"]["changes"] == 0
     assert found["costs"]["kept"] is True

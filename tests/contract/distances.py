@@ -11,7 +11,6 @@ from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import parsing
 from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
-from hapticdb.store.covering import covering
 from voxels import EVERYWHERE, blob, voxel_object, with_distances
 
 GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)
@@ -110,8 +109,8 @@ class DistancesContract(StoreCase):
         n_rows = len(self.expected(band, 1, 3))
         assert band.size().band_rows == n_rows > 0
         assert 0 < band.size().band_bytes <= band.size().bytes
-        band.remove(1, covering(band))
-        band.remove(3, covering(band))
+        band.remove(1)
+        band.remove(3)
         assert band.size().band_rows == 0
 
     def test_nothing_asked_has_no_distances(self, band: Store) -> None:
@@ -139,9 +138,9 @@ class DistancesContract(StoreCase):
         assert band.revision() == 3
 
     def test_distances_go_with_their_object(self, band: Store) -> None:
-        band.remove(1, covering(band))
+        band.remove(1)
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
-        band.remove(2, covering(band))
+        band.remove(2)
         assert _content_of(band.scan(*EVERYWHERE, distances=True)) == self.expected(band, 3)
         for change in band.changes():
             if change.id != 2:
@@ -151,7 +150,7 @@ class DistancesContract(StoreCase):
         known, rows = band.object(1), self.rows(band, 1)
         voxels = band.rows_of(1, *EVERYWHERE)
         for new in (rows.occupied(), rows):
-            band.replace(replace(known, revision=0), new, covering(band))
+            band.replace(replace(known, revision=0), new)
             has_distances = new.distances is not None
             assert band.object(1).has_distances == has_distances
             wanted = self.expected(band, *([1, 3] if has_distances else [3]))

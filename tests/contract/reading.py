@@ -7,7 +7,6 @@ from contract.case import StoreCase
 from hapticdb.grid import Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import LocatedShell, Store
-from hapticdb.store.covering import covering
 from voxels import EVERYWHERE, blob, kind
 
 
@@ -87,7 +86,7 @@ class ReadingContract(StoreCase):
         store.analyze(10)
         kept = store.quantiles(10)
         assert kept.source == "kept"
-        store.remove(1, covering(store))
+        store.remove(1)
         anew = store.quantiles(10)
         assert anew.source == "computed"
         assert anew.n_rows < kept.n_rows
@@ -96,7 +95,7 @@ class ReadingContract(StoreCase):
         assert store.freshness(10).revision is None
         store.analyze(10)
         assert store.freshness(10) == (2, 0)
-        store.remove(1, covering(store))
+        store.remove(1)
         assert store.freshness(10) == (2, 1)
         store.analyze(10)
         assert store.freshness(10) == (3, 0)

@@ -11,7 +11,6 @@ from contract.case import StoreCase
 from hapticdb.errors import DatabaseError, EnvironmentExistsError, ReadOnlyError, UsageError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Store
-from hapticdb.store.covering import covering
 from voxels import EVERYWHERE, blob, is_noticed, kind, write_voxels
 
 
@@ -23,7 +22,7 @@ class SharingContract(StoreCase):
         before = reader.size().rows
         with reader.snapshot():
             assert len(reader.objects()) == 2
-            store.remove(1, covering(store))
+            store.remove(1)
             assert len(reader.objects()) == 2
             assert reader.size().rows == before
             version = reader.version()
@@ -67,8 +66,8 @@ class SharingContract(StoreCase):
             write_voxels(store, blob(3, (20, 20, 20)), "one")
         writes: list[Callable[[], object]] = [
             lambda: write_voxels(store, blob(3, (20, 20, 20)), "three"),
-            lambda: store.replace(store.object(1), rows, covering(store)),
-            lambda: store.remove(2, covering(store)),
+            lambda: store.replace(store.object(1), rows),
+            lambda: store.remove(2),
         ]
         for write in writes:
             write()
@@ -97,7 +96,7 @@ class SharingContract(StoreCase):
             reader.scan(*EVERYWHERE)
             reader.objects()
             assert not reader.has_changed()
-        store.remove(1, covering(store))
+        store.remove(1)
         assert set(reader.scan(*EVERYWHERE).ids.tolist()) == {2}
         assert len(reader.objects()) == 1
         assert is_noticed(reader)
@@ -109,7 +108,7 @@ class SharingContract(StoreCase):
         reader.watch()
         with reader.snapshot():
             assert len(reader.objects()) == 2
-            store.remove(1, covering(store))
+            store.remove(1)
             with pytest.raises(UsageError, match="inside a snapshot nothing changes"):
                 reader.has_changed()
             assert len(reader.objects()) == 2

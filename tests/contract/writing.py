@@ -16,7 +16,6 @@ from hapticdb.errors import (
 )
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows, Store
-from hapticdb.store.covering import covering
 from hapticdb.store.pairs import Mark, PairRow
 from voxels import EVERYWHERE, blob, kind, voxel_object, write_voxels
 
@@ -91,29 +90,29 @@ class WritingContract(StoreCase):
     def test_an_object_written_meanwhile_is_not_replaced(self, store: Store) -> None:
         rows = rows_of_voxels(blob(7, (44, 30, 10)), *kind(store))
         seen = store.object(1)
-        store.replace(seen, rows, covering(store))
+        store.replace(seen, rows)
         with pytest.raises(ConflictError, match="written by another meanwhile"):
-            store.replace(seen, rows, covering(store))
+            store.replace(seen, rows)
         assert store.revision() == 3
         with pytest.raises(ObjectNotFoundError):
-            store.replace(replace(seen, id=7), rows, covering(store))
+            store.replace(replace(seen, id=7), rows)
 
     def test_remove_takes_one_object_and_leaves_the_others(self, store: Store) -> None:
-        store.remove(1, covering(store))
+        store.remove(1)
         assert [obj.id for obj in store.objects()] == [2]
         rows = store.scan(*EVERYWHERE)
         assert set(rows.ids.tolist()) == {2}
         assert len(rows) == len(rows_of_voxels(blob(2, (24, 20, 20)), *kind(store)))
         assert write_voxels(store, blob(1, (20, 20, 20)), "one") == 3
-        store.remove(2, covering(store))
+        store.remove(2)
         with pytest.raises(ObjectNotFoundError):
-            store.remove(2, covering(store))
+            store.remove(2)
 
     def test_removed_parts_are_known_until_they_are_there_again(self, store: Store) -> None:
         link = store.object(1).link
         assert store.removed(link) == set()
-        store.remove(1, covering(store))
-        store.remove(2, covering(store))
+        store.remove(1)
+        store.remove(2)
         assert store.removed(link) == {"one", "two"}
         assert store.removed(f"{link}.other") == set()
         write_voxels(store, blob(1, (20, 20, 20)), "one")
@@ -124,7 +123,7 @@ class WritingContract(StoreCase):
         new = voxel_object(store.grid, ijk, "one")
         moved = Object(**{**vars(new), "id": 1})
         rows = rows_of_voxels(ijk, *kind(store))
-        store.replace(moved, rows, covering(store))
+        store.replace(moved, rows)
         found = store.scan(*EVERYWHERE)
         np.testing.assert_array_equal(found.keys[found.ids == 1], rows.keys)
         np.testing.assert_array_equal(store.objects()[0].bounds, new.bounds)
@@ -147,7 +146,7 @@ class WritingContract(StoreCase):
                 yield one
                 seen.append((reader.revision(), [obj.revision for obj in reader.objects()]))
 
-        store.replace_all(made, covering(store))
+        store.replace_all(made)
         assert seen == [(2, [1, 2])] * 2
         assert [obj.revision for obj in reader.objects()] == [3, 4]
         changes = [(c.revision, c.action, c.id) for c in reader.changes(since=2)]
@@ -166,7 +165,7 @@ class WritingContract(StoreCase):
             raise KeyboardInterrupt
 
         with pytest.raises(KeyboardInterrupt):
-            store.replace_all(made, covering(store))
+            store.replace_all(made)
         store = self.reopen(store)
         for found, expected in zip(store.scan(*EVERYWHERE), before, strict=True):
             np.testing.assert_array_equal(found, expected)
@@ -180,7 +179,7 @@ class WritingContract(StoreCase):
         ranges = changes[1].ranges
         inside = (keys[:, None] >= ranges[:, 0]) & (keys[:, None] <= ranges[:, 1])
         assert inside.any(axis=1).all()
-        store.remove(1, covering(store))
+        store.remove(1)
         assert [c.action for c in store.changes(since=2)] == ["remove"]
 
     def part(self, store: Store, digest: str, name: str) -> tuple[Object, Rows]:
@@ -208,16 +207,16 @@ class WritingContract(StoreCase):
     def test_a_move_leaves_the_surface(self, shapes: Store) -> None:
         for object_id, name in ((3, "three"), (5, "five")):
             record, rows = self.part(shapes, shapes.object(object_id).digest, name)
-            shapes.replace(replace(record, id=object_id), rows, covering(shapes))
+            shapes.replace(replace(record, id=object_id), rows)
         assert shapes.surfaces(["ball", "cone"]) == {"ball": BALL, "cone": CONE}
 
     def test_a_surface_goes_with_the_last_object_that_has_it(self, shapes: Store) -> None:
-        shapes.remove(3, covering(shapes))
+        shapes.remove(3)
         assert made_up(shapes) == {"ball", "cone"}
         record, rows = self.part(shapes, "cube", "four")
-        shapes.replace(replace(record, id=4), rows, covering(shapes), b"cube")
+        shapes.replace(replace(record, id=4), rows, b"cube")
         assert shapes.surfaces(["ball", "cube"]) == {"cube": b"cube"}
-        shapes.remove(5, covering(shapes))
+        shapes.remove(5)
         assert made_up(shapes) == {"cube"}
         shapes.add(*self.part(shapes, "ball", "again"), BALL)
         assert shapes.surfaces(["ball"]) == {"ball": BALL}
@@ -231,7 +230,7 @@ class WritingContract(StoreCase):
         reader = self.reopen(shapes)
         with reader.snapshot():
             assert reader.object(5).digest == "cone"
-            shapes.remove(5, covering(shapes))
+            shapes.remove(5)
             assert reader.surfaces(["cone"]) == {"cone": CONE}
         assert reader.surfaces(["cone"]) == {}
         reader.close()

@@ -21,7 +21,6 @@ from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.resident.table import LEAST_BUDGET
 from hapticdb.store.base import Layout, Store
-from hapticdb.store.covering import covering
 from naive import Voxel
 from query.test_frame import (  # noqa: F401 - a fixture among them
     BITS,
@@ -189,7 +188,7 @@ def test_what_others_add_or_rename_is_felt_by_the_words(tmp_path: Path) -> None:
         old = writer.object(1)
         rows = rows_of_voxels(writer.voxels(1), writer.grid, writer.layout)
         changed = replace(old, attributes={"material": "wood"})
-        writer.store.replace(changed, rows, covering(writer.store))
+        writer.store.replace(changed, rows)
         assert felt(steel) == {3, new}
         assert felt(["material=wood"]) == {1, wood}
         writer.remove(wood)

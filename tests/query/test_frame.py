@@ -16,7 +16,6 @@ from hapticdb import Environment, Grid, PointShell
 from hapticdb.grid import CurveName
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
-from hapticdb.store.covering import covering
 from naive_frame import NaiveTouch, touch_of_shell
 from realtime import worlds
 from servers import ENGINES, Place, named, url_on
@@ -196,7 +195,7 @@ def test_a_frame_after_edits_reads_the_objects_that_they_wrote_and_no_others(
         assert known.by_id[6].name == "new"
         other.store.replace(
             replace(other.object(1), attributes={"a": 1}, revision=0),
-            other.store.rows_of(1, *EVERYWHERE), covering(other.store),
+            other.store.rows_of(1, *EVERYWHERE),
         )  # fmt: skip
         other.store.add(old, rows)
         env.touch(shell, pose)

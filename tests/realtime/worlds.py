@@ -73,7 +73,7 @@ def move(store: Store, object_id: int, ijk: Voxels) -> None:
     record = dataclasses.replace(
         before, voxels=after.voxels, bounds=after.bounds, digest=after.digest
     )
-    store.replace(record, rows_of_voxels(ijk, store.grid, store.layout), lambda _: [(0, 2**62)])
+    store.replace(record, rows_of_voxels(ijk, store.grid, store.layout))
 
 
 def block(low: Iterable[int], high: Iterable[int]) -> Voxels:

@@ -17,7 +17,6 @@ from contract.store import StoreContract
 from hapticdb import Grid
 from hapticdb.errors import DatabaseError
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
-from hapticdb.store.covering import covering
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.postgres.tables import statements
@@ -243,7 +242,7 @@ def test_a_write_behind_a_pooler_of_transactions_is_refused(place: Place, reset:
     one._connection.driver.execute(text)
     writes: list[Callable[[], object]] = [
         lambda: write_voxels(one, blob(1, (20, 20, 20)), "blob"),
-        lambda: one.remove(1, covering(one)),
+        lambda: one.remove(1),
         lambda: one.save_costs("here", {}),
     ]
     for write in writes:

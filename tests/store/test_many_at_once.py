@@ -32,7 +32,6 @@ from hapticdb.ingest.geometry import parts_of
 from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Object, Rows
-from hapticdb.store.covering import covering
 from hapticdb.store.postgres.address import parse
 from hapticdb.store.postgres.connecting import link
 from servers import Place
@@ -174,7 +173,7 @@ def test_every_frame_of_eight_readers_answers_from_one_revision(url: str, folder
             assert time.monotonic() < deadline
             assert all(child.is_alive() for child in children)
             n_moves += 1
-            env.store.replace(*places[n_moves % 2], covering(env.store))
+            env.store.replace(*places[n_moves % 2])
             waiting = [
                 child for (ours, _), child in zip(pipes, children, strict=True) if not ours.poll()
             ]

@@ -40,7 +40,7 @@ def moved(path: Path) -> None:
 
 WRITES: list[Callable[[SQLiteStore], object]] = [
     lambda store: write(store, 2),
-    lambda store: store.remove(1, lambda _: EVERYWHERE),
+    lambda store: store.remove(1),
     lambda store: store.save_costs("here", {}),
     lambda store: store.analyze(10),
 ]

@@ -2,7 +2,6 @@
 
 import os
 from collections.abc import Iterable
-from dataclasses import replace
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -23,10 +22,9 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import as_id
 from hapticdb.query.law import inset_of
 from hapticdb.store.base import Layout, Object, Size, Store
-from hapticdb.store.covering import covering, object_ranges
+from hapticdb.store.covering import object_ranges
 from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words, find_objects
-from hapticdb.store.refusals import check_unwritten
 from hapticdb.store.urls import scheme_of
 
 
@@ -81,10 +79,10 @@ class Environment(Queries, Closes):
 
     @property
     def has_distances(self) -> bool:
-        """Whether there is an object, and distances to the surface of every object are stored.
+        """Whether there is an object, and every object has distances to its surface.
 
-        As of the revision that was read last, by a frame or a list; before, of the newest. It
-        costs a statement only before the first frame and after an edit of this environment.
+        As of the revision that was read last. Costs a statement only before the first frame and
+        after an edit of this environment.
         """
         if self._query.known.version is None:
             self.objects()
@@ -101,32 +99,19 @@ class Environment(Queries, Closes):
         return self._query.known.newest()
 
     def object(self, object_id: int) -> Object:
-        """Return one object.
-
-        Raises
-        ------
-        ObjectNotFoundError
-            If no object has this id.
-        """
+        """One object; raises `ObjectNotFoundError` if no object has this id."""
         return self._store.object(as_id(object_id))
 
     def find(self, *words: int | str) -> list[Object]:
         """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
 
-        ``env.find(7, "wheel*", "body/door_*", "material=steel")``: the rules, and the errors, are
-        those of `hapticdb.store.finding.find_objects`. A sub-assembly's name chooses all that is
-        below it.
+        ``env.find(7, "wheel*", "body/door_*", "material=steel")``: rules and errors are those of
+        `hapticdb.store.finding.find_objects`.
         """
         return find_objects(self, words)
 
     def felt(self, where: Words = (), exclude: Words = ()) -> list[Object]:
-        """Objects that a touch with the same `where` and `exclude` feels, ordered by id.
-
-        Raises
-        ------
-        ObjectNotFoundError, UsageError
-            As for `touch`.
-        """
+        """Objects under a touch's `where` and `exclude`, ordered by id; errors as for `touch`."""
         return Filter(where, exclude).felt(self.objects(), self.url)
 
     def shell(
@@ -139,23 +124,12 @@ class Environment(Queries, Closes):
     ) -> PointShell:
         """Make one rigid tool from objects at their places.
 
-        The shell is in the world's frame, metres. So its present pose is the identity, and the
-        poses of a path are displacements. Exclude the objects from the force:
-        ``exclude=words``.
+        The shell is in the world's frame, metres: its present pose is the identity, and the poses
+        of a path are displacements. Exclude the objects from the force: ``exclude=words``.
+        Arguments are as for `find` and `tool`, for all surfaces together.
 
-        Parameters
-        ----------
-        words : int or str
-            As for `find`.
-        points, spacing, seed, inset
-            As for `tool`, for all surfaces together.
-
-        Raises
-        ------
-        ObjectNotFoundError
-            If a word chooses nothing.
-        UsageError
-            If no word is given, or an object is a point cloud, which has no surface.
+        Raises `ObjectNotFoundError` if a word chooses nothing; `UsageError` for no word, or for a
+        point cloud, which has no surface.
         """
         drawn = self._inset if inset is None else inset
         return shell_of_objects(self._store, self.find(*words), points, spacing, seed, drawn)
@@ -172,12 +146,8 @@ class Environment(Queries, Closes):
     ) -> PointShell:
         """Make a tool of a file as the verbs and the page do.
 
-        Parameters
-        ----------
-        file, points, spacing, unit, seed
-            As for `PointShell.from_file`.
-        inset : float or None
-            How far points are drawn inward, metres. Unless given, so far that contact begins at
+        file, points, spacing, unit, seed : as for `PointShell.from_file`
+        inset : how far points are drawn inward, metres. Unless given, so far that contact begins at
             the tool's surface: 1.5 voxels where objects have distances, for the distance law.
         """
         drawn = self._inset if inset is None else inset
@@ -202,28 +172,19 @@ class Environment(Queries, Closes):
     ) -> FileReport:
         """Import a file's parts on this environment's grid, each in a transaction of its own.
 
-        Parameters
-        ----------
-        file : path
-            Mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`.
-        unit : str or None
-            Unit of a file that names none, one of `hapticdb.mesh.UNITS`; metres unless given.
-        jobs : int or None
-            Threads that voxelize; one for each processor unless given.
-        keep_removed : bool
-            Skip parts that were removed from the environment; otherwise they are added again.
-        replace : bool
-            Replace objects whose parts have changed in the file, and remove objects whose parts it
-            no longer has.
-        chord : float or None
-            Greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 unless given.
-        progress : callable or None
-            Called after each part with a `hapticdb.ingest.files.ImportProgress`.
+        file : mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`
+        unit : unit of a file that names none, one of `hapticdb.mesh.UNITS`; metres unless given
+        jobs : threads that voxelize; one for each processor unless given
+        keep_removed : skip parts that were removed from the environment; otherwise they are added
+            again
+        replace : replace objects whose parts have changed in the file, and remove objects whose
+            parts it no longer has
+        chord : greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 unless
+            given
+        progress : called after each part with a `hapticdb.ingest.files.ImportProgress`
 
-        Raises
-        ------
-        FileError
-            If the file cannot be used, or a part lies outside the grid; then nothing is written.
+        Raises `FileError` if the file cannot be used, or a part lies outside the grid; then nothing
+        is written.
         """
         self._check_writable()
         options = ImportOptions(
@@ -239,48 +200,20 @@ class Environment(Queries, Closes):
         return report
 
     def remove(self, object_id: int, *, revision: int | None = None) -> Object:
-        """Remove an object and its rows, in one transaction; returns the object as it was.
+        """Remove an object in one transaction; returns it with its surface, for `restore`.
 
-        The returned object has its surface, so that `restore` can put it back.
-
-        Parameters
-        ----------
-        revision : int or None
-            The `Object.revision` on which the decision is based.
-
-        Raises
-        ------
-        ConflictError
-            If `revision` is given and the object has been written since; then it stays.
+        Raises `ConflictError` if `revision` is given and the object has been written since.
         """
         self._check_writable()
-        removed: list[Object] = []
-
-        def ranges(known: Object) -> Iterable[tuple[int, int]]:
-            if revision is not None:  # inside the transaction
-                check_unwritten(replace(known, revision=revision), known, self.url)
-            surface = self._store.surfaces([known.digest]).get(known.digest)
-            removed.append(replace(known, surface=surface))
-            return covering(self._store)(known)
-
-        self._store.remove(as_id(object_id), ranges)
+        removed = self._store.remove(as_id(object_id), revision)
         self._forget()
-        return removed[-1]
+        return removed
 
     def restore(self, removed: Object) -> Object:
-        """Put a removed object back, in one transaction.
+        """Put back an object as `remove` has returned it, with its id, in one transaction.
 
-        Parameters
-        ----------
-        removed : Object
-            As `remove` has returned it: its id, transform and attributes are kept.
-
-        Raises
-        ------
-        EnvironmentExistsError
-            If the part is in the environment.
-        UsageError
-            If neither `removed` nor the environment has its surface.
+        Raises `EnvironmentExistsError` if the part is in the environment; `UsageError` if neither
+        `removed` nor the environment has its surface.
         """
         self._check_writable()
         object_id = restore_object(self._store, removed)
@@ -290,21 +223,10 @@ class Environment(Queries, Closes):
     def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
         """Move an object to a new placement, in one transaction.
 
-        Parameters
-        ----------
-        object_id : int
-            Id of the object.
-        transform : (4, 4) array
-            world_from_part, metres; replaces the present transform with its scale.
-        revision : int or None
-            The `Object.revision` on which the new placement is based.
+        transform (4, 4) : world_from_part, metres; replaces the present transform with its scale.
 
-        Raises
-        ------
-        ConflictError
-            If `revision` is given and the object has been written since.
-        OutsideGridError
-            If the object would leave the grid.
+        Raises `ConflictError` if `revision` is given and the object has been written since;
+        `OutsideGridError` if the object would leave the grid.
         """
         self._check_writable()
         old = self.object(object_id)
@@ -313,21 +235,10 @@ class Environment(Queries, Closes):
         return self.object(object_id)
 
     def shift(self, object_ids: Iterable[int], way: ArrayLike) -> list[Object]:
-        """Shift all objects by the same vector, in one transaction: all of them, or none.
+        """Shift all objects by the vector `way` (3,), metres, world frame: all of them, or none.
 
-        Other writers wait meanwhile; readers do not.
-
-        Parameters
-        ----------
-        object_ids : iterable of int
-            Ids of the objects; `find` chooses them by name.
-        way : (3,) array
-            Metres, world frame.
-
-        Raises
-        ------
-        OutsideGridError
-            As for `move`; then no object is shifted.
+        One transaction: other writers wait meanwhile; readers do not. Raises `OutsideGridError` as
+        for `move`.
         """
         self._check_writable()
         shifted = shift_objects(self._store, object_ids, way)
@@ -353,15 +264,9 @@ class Environment(Queries, Closes):
         return self._figures.analyze()
 
     def calibrate(self, *, keep: bool = True, cold: bool = False) -> CostModel:
-        """Measure the cost of queries on this database; the figures are used and stored.
+        """Measure the cost of queries on this database, for use and, if `keep`, to be stored.
 
-        Parameters
-        ----------
-        keep : bool
-            Write the figures into the database, if it can be written.
-        cold : bool
-            Measure with empty caches, if this process can empty them: for environments that are
-            larger than memory.
+        cold : with empty caches, for environments larger than memory.
         """
         return self._figures.calibrate(keep=keep, cold=cold)
 

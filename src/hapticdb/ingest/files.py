@@ -37,15 +37,11 @@ from hapticdb.mesh.chord import checked_chord
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
-from hapticdb.store.covering import covering
 from hapticdb.store.refusals import wants_distances
 
 
 class ImportProgress(NamedTuple):
-    """Progress of an import: sent after each part, and five times a second during a long part.
-
-    share : done share of the present part, 0 to 1; 0 after a part.
-    """
+    """Progress of an import: after each part, and five times a second with its `share`, 0 to 1."""
 
     link: str
     parts_done: int
@@ -115,8 +111,8 @@ class ImportOptions:
     """Greatest chord error wanted of the tessellations of STEP files, metres; 0.00001 unless given.
     Chord errors are stored with the surfaces (`hapticdb.mesh.Part.chord`)."""
     replace: bool = False
-    """Make the environment agree with the file: replace objects, under their ids, whose parts have
-    another geometry, placement or unit now, and remove objects whose parts the file lacks."""
+    """Also replace objects, under their ids, whose geometry, placement or unit is another now, and
+    remove those whose parts the file lacks."""
     distances: bool | None = None
     """Whether parts of a new environment get distances to their surfaces, which the force
     law needs. Unless given, they do in the layout brick. The layout voxel has none."""
@@ -148,31 +144,13 @@ def import_files(
 ) -> list[FileReport]:
     """Import files into an environment, which is made if it does not exist.
 
-    A file that cannot be used is reported and skipped; the others are imported. If nothing was
-    written to a new environment, it is removed.
+    A file that cannot be used is reported and skipped; the others are imported. The first usable
+    one decides on the grid of a new environment, which is removed if nothing was written.
 
-    Parameters
-    ----------
-    url : str or path
-        The environment: a path, ``sqlite:///path``, or ``postgresql://host/database``.
-    files : sequence of paths
-        The first usable file decides on the grid of a new environment.
-    options : ImportOptions or None
-        Units, grid, layout, jobs.
-    progress : callable or None
-        Called with an `ImportProgress`.
+    Returns a report for each file, in order.
 
-    Returns
-    -------
-    list of FileReport
-        One for each file, in order.
-
-    Raises
-    ------
-    GridError, UsageError
-        If the options are invalid, or contradict an existing environment.
-    DatabaseError
-        If the environment cannot be opened or written.
+    Raises `GridError` or `UsageError` if the options are invalid, or contradict an existing
+    environment; `DatabaseError` if the environment cannot be opened or written.
     """
     chosen = options or ImportOptions()
     if isinstance(files, (str, bytes, os.PathLike)):
@@ -281,12 +259,8 @@ def ingest_file(
 ) -> FileReport:
     """Write the parts of a file that the environment does not have yet.
 
-    Raises
-    ------
-    OutsideGridError
-        If a part leaves the grid; then no part of the file is written.
-    GeometryChangedError
-        If a part has another geometry than the object of its name, which is not to be replaced.
+    Raises `OutsideGridError` if a part leaves the grid; then nothing is written. Raises
+    `GeometryChangedError` if a part that is not to be replaced has another geometry.
     """
     check_names(mesh_file)
     known = KnownParts(store, mesh_file.link)
@@ -299,7 +273,7 @@ def ingest_file(
     n_dropped = 0
     for object_id in plan.dropped:
         with contextlib.suppress(ObjectNotFoundError):  # another process has removed it
-            store.remove(object_id, covering(store))
+            store.remove(object_id)
             n_dropped += 1
     written = tuple(store.objects(added)) if added else ()
     n_kept = len(plan.removed) if options.keep_removed else 0
@@ -346,7 +320,7 @@ def _write_parts(
                 else:
                     new = replace(obj, id=id_of[obj.name])
                     with contextlib.suppress(ObjectNotFoundError):  # another has removed it
-                        store.replace(new, rows, covering(store), surface)
+                        store.replace(new, rows, surface)
                         n_replaced += 1
                 n_done, voxels = places[obj.name], voxels + obj.voxels
             if progress is not None:

@@ -15,8 +15,6 @@ from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
 from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Rows, Store
-from hapticdb.store.covering import covering
-from hapticdb.store.finding import MOST_IDS
 
 Floats = NDArray[np.float64]
 
@@ -26,7 +24,7 @@ def move_object(store: Store, old: Object, transform: ArrayLike, revision: int |
     placed = _as_transform(transform)
     ((_, part),) = parts_of(store, [old])
     new, rows = _moved(store, old, part, placed)
-    store.replace(replace(new, revision=revision or 0), rows, covering(store))
+    store.replace(replace(new, revision=revision or 0), rows)
 
 
 def restore_object(store: Store, record: Object) -> int:
@@ -57,7 +55,7 @@ def restore_object(store: Store, record: Object) -> int:
 def rewrite_object(store: Store, obj: Object) -> None:
     """Write an object's rows anew from its surface, wherever rows of it may be."""
     ((_, part),) = parts_of(store, [obj])
-    store.replace(*_moved(store, obj, part, obj.transform), lambda _: [(0, MOST_IDS - 1)])
+    store.replace(*_moved(store, obj, part, obj.transform), everywhere=True)
 
 
 def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Object]:
@@ -75,7 +73,7 @@ def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Obje
             yield _moved(store, obj, part, shift @ obj.transform)
 
     if chosen:
-        store.replace_all(moved, covering(store))
+        store.replace_all(moved)
     return [store.object(i) for i in chosen]
 
 

@@ -35,9 +35,8 @@ def up_axis(objects: Iterable[Object]) -> int:
 def having_attribute(objects: Sequence[Object], word: str) -> list[Object]:
     """Objects that ``attribute=value`` chooses, in their order; none if the word has no ``=``.
 
-    The attribute ends at the first ``=``. An attribute that is itself an object of JSON is entered
-    by ``outer.inner``, unless there is an attribute whose whole name is that. The value is compared
-    with the attribute's text; if it is not the same, it counts as a pattern as of `fnmatch`. A
+    The attribute ends at the first ``=``; ``outer.inner`` enters an object of JSON, unless it is a
+    whole name. The value is compared with the attribute's text, then as a pattern of `fnmatch`. A
     number equals every way to write it; true, false and null are written so; of a list any element
     may fit; anything else is compared as JSON without spaces.
     """

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
-from hapticdb.store.pairs import KeepsPairs
+from hapticdb.store.pairs import Ids, KeptPairs, MaybeMark, Outlines, PairRow
 from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
@@ -23,8 +23,7 @@ CELL_SHIFT = 15
 BRICK_BYTES = 64
 """Bytes of a brick's occupancy: a bit for each of its 512 voxels."""
 LONGEST_BAND = 2048
-"""Most bytes of a row's packed distances, more than `kernels.field.packing` ever makes. A larger
-value believes longer rows of a database that means harm."""
+"""Most bytes of a row's packed distances, more than `kernels.field.packing` ever makes."""
 
 Keys = NDArray[np.int64]
 Progress = Callable[[int, int], object]
@@ -67,9 +66,8 @@ class Rows(NamedTuple):
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
     occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
-    distances : the rows' distances to surfaces. None if they were not asked for, or the object has
-        none. With distances there is a row for each brick near the object's surface; the occupancy
-        of a brick without a voxel is zero.
+    distances : to surfaces, for each brick near one, even without a voxel; None if the object has
+        none, or they were not read.
     """
 
     keys: Keys
@@ -134,6 +132,12 @@ def joined(parts: Sequence[Rows], *, distances: bool) -> Rows:
     return Rows(keys, ids, bits, band)
 
 
+def is_ascending(keys: Keys, ids: Keys) -> bool:
+    """Whether rows are in ascending order of key and id."""
+    later = (keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))
+    return bool(later.all())
+
+
 def row_shift(layout: Layout) -> int:
     """Bits of a voxel's key below the key of its row."""
     return BRICK_SHIFT if layout == "brick" else 0
@@ -143,30 +147,17 @@ def row_shift(layout: Layout) -> int:
 class Object:
     """One object, as the table `object` holds it.
 
-    Attributes
-    ----------
-    id : int
-        The store assigns it when the object is written, and never reuses it. 0 before that.
-    name : str
-        Path of the part inside its file.
-    link : str
-        Absolute path of the file that holds its surface.
-    digest : str
-        Digest of its geometry in its own frame.
-    transform : (4, 4) float64
-        world_from_part, metres.
-    voxels : int
-        How many voxels its surface touches.
-    bounds : (2, 3) float64
-        Lower and upper corner, metres, world frame.
-    attributes : mapping
-        The rest, as JSON: ``unit`` of its file, ``up``: the axis x, y or z that the file says.
-    revision : int
-        Revision of the environment that last wrote the object.
-    rows_crc, distances_crc : int or None
-        Checksums of its rows, and of its rows of distances, as they were written; None without.
-    surface : bytes or None
-        Its packed surface. Only `Environment.remove` gives it, so that the object can be restored.
+    id : assigned when the object is written, and never reused; 0 before that
+    name : path of the part inside its file
+    link : absolute path of the file that holds its surface
+    digest : digest of its geometry in its own frame
+    transform (4, 4) float64 : world_from_part, metres
+    voxels : how many voxels its surface touches
+    bounds (2, 3) float64 : lower and upper corner, metres, world frame
+    attributes : JSON: ``unit`` of its file; ``up``, its axis x, y or z
+    revision : revision of the environment that last wrote the object
+    rows_crc, distances_crc : checksums of its rows and distances as they were written, or None
+    surface : its packed surface, from `Environment.remove` alone, for `restore`
     """
 
     name: str
@@ -211,8 +202,6 @@ class Change:
     ranges: NDArray[np.int64]
 
 
-Covering = Callable[[Object], Iterable[tuple[int, int]]]
-"""Gives, for an object as it is when a write begins, closed key ranges that hold its rows."""
 Replacements = Callable[[], Iterable[tuple[Object, Rows]]]
 """Gives objects to be replaced, each once, with their new rows."""
 
@@ -252,136 +241,6 @@ class Size(NamedTuple):
     surface_bytes: int = 0
 
 
-class _ReadsRows(Protocol):
-    """Reads rows of the index table, in ascending order of key and id.
-
-    Each call is one statement, but for `lookup_each`. Arrays of keys and of bounds are ascending,
-    distinct and contiguous. With `distances`, the rows come from the table of distances, with
-    their occupancy, zero where a brick holds no voxel; objects without distances have no rows then.
-    """
-
-    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
-
-    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """The rows that `lookup` returns, by one statement a key: the paper's point queries."""
-
-    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows with a key in any closed range, ascending and disjoint, in one statement."""
-
-    def count(self, lows: Keys, highs: Keys) -> int:
-        """Number of rows that `scan` would return, counted inside the engine."""
-
-    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows of one object with a key in any closed range, ascending and disjoint."""
-
-
-class _ReadsObjects(Protocol):
-    """Reads objects and committed changes."""
-
-    def revision(self) -> int:
-        """Number of the last committed write; 0 for an empty environment."""
-
-    def version(self) -> int:
-        """Give a number that differs when the last read may have seen another revision."""
-
-    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
-        """All objects, or those of some ids that are there, ordered by id."""
-
-    def object(self, object_id: int) -> Object:
-        """One object; raises ObjectNotFoundError when there is none of that id."""
-
-    def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
-
-    def changes(self, since: int = 0) -> Iterator[Change]:
-        """Committed writes after that revision, oldest first."""
-
-    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
-        """Packed surfaces of the digests that have one, in one statement."""
-
-    def surface_digests(self) -> set[str]:
-        """Digests of all surfaces."""
-
-
-class _WritesObjects(Protocol):
-    """Writes objects, each in one transaction: its rows, its record and its `Change`.
-
-    A given surface, packed, is stored under the record's digest, unless there is one already. The
-    last object of a digest takes the surface along when it is removed or gets another digest.
-    Rows with distances are written into both tables, and the object has distances from then on.
-    Rows without are written into the index table alone, and the object has none.
-    Raises ReadOnlyError when the store was opened to read, or the user may not write.
-    """
-
-    def loading(self) -> AbstractContextManager[None]:
-        """A context in which many objects are written. May be nested.
-
-        Inside, an engine may postpone work that only readers need, such as an index. At the end it
-        does this work, after an error, too. Writes that were committed inside are safe.
-        """
-
-    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
-        """Write an object and its rows (any ids in them) in one transaction; returns its id.
-
-        The record's own id is kept when it is above 0 and no object has it.
-        """
-
-    def replace(
-        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
-    ) -> None:
-        """Exchange an object's rows in one transaction; `covering` says where the old ones are.
-
-        A record with a revision above 0 was derived from the object of that revision. Raises
-        ConflictError when the object has been written since.
-        """
-
-    def replace_all(self, made: Replacements, covering: Covering) -> None:
-        """As `replace` for several objects, in one transaction: after an error, for none of them.
-
-        `made` is called inside the transaction, and again when a lost connection is replaced. It
-        may read this store. Rows are written as they come. Each object gets its own revision.
-        """
-
-    def remove(self, object_id: int, covering: Covering) -> None:
-        """Remove an object and its rows in one transaction; `covering` says where they are."""
-
-
-class _KeepsStatistics(Protocol):
-    """Knows how large the environment is and how its keys are distributed; keeps cost figures."""
-
-    def size(self) -> Size:
-        """Rows, bytes and leaf blocks."""
-
-    def quantiles(self, resolution: int) -> Histogram:
-        """Equi-count histogram of all row keys, of R buckets."""
-
-    def freshness(self, resolution: int) -> Freshness:
-        """How old the statistics are that `quantiles` uses at that resolution."""
-
-    def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Renew the statistics that `quantiles` uses; fresh ones are renewed only if `anew`."""
-
-    def costs(self, machine: str) -> Mapping[str, float] | None:
-        """Figures that `save_costs` kept for that machine."""
-
-    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
-        """Keep the fitted cost figures of a machine."""
-
-
-class _IsChecked(Protocol):
-    """Answers `hapticdb check`: pages, indexes, and all rows in their order."""
-
-    def findings(self) -> Iterator[str]:
-        """What is wrong with pages, indexes and kept statistics, a line each."""
-
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most `limit` rows after (key, id), ascending by both; (-1, 0) starts at the first.
-
-        With `distances`, rows of the table of distances, as `_ReadsRows` says.
-        """
-
-
 class LocatedShell(NamedTuple):
     """A shell at its pose, as `Store.statement` takes it: arrays in the order of the points.
 
@@ -396,9 +255,7 @@ class LocatedShell(NamedTuple):
     exclude: Keys
 
 
-class Store(
-    _ReadsRows, _ReadsObjects, _WritesObjects, KeepsPairs, _KeepsStatistics, _IsChecked, Protocol
-):
+class Store(Protocol):
     """An opened environment. Methods take and return whole batches.
 
     A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
@@ -444,13 +301,45 @@ class Store(
         """Close the environment, and delete it if nothing was ever written to it."""
 
     def snapshot(self) -> AbstractContextManager[None]:
-        """All reads inside see one committed revision."""
+        """All reads inside see one committed revision. May be nested."""
+
+    # -- rows: arrays of keys and of bounds are ascending, distinct and contiguous -----------------
+    #
+    # Rows come in ascending order of key and id, by one statement, but for `lookup_each`. With
+    # `distances` they come from the table of distances, with their occupancy, zero where a brick
+    # holds no voxel; objects without distances have no rows then.
+
+    def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
+
+    def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
+        """Rows as by `lookup`, one statement a key: the paper's point queries."""
+
+    def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows with a key in any closed range, ascending and disjoint."""
+
+    def count(self, lows: Keys, highs: Keys) -> int:
+        """Number of rows that `scan` would return, counted inside the engine."""
+
+    def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
+        """Rows of one object with a key in any closed range, ascending and disjoint."""
+
+    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
+        """At most `limit` rows after (key, id); (-1, 0) starts at the first."""
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame, N and N m about its centre, by one statement: Figure 3."""
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
         """Every hit with every object in its voxel: points' ordinals (P,) and object ids (P,)."""
+
+    # -- objects and committed changes ------------------------------------------------------------
+
+    def revision(self) -> int:
+        """Number of the last committed write; 0 for an empty environment."""
+
+    def version(self) -> int:
+        """Counter that changes when the last read may have seen another revision."""
 
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
@@ -462,6 +351,107 @@ class Store(
         first call without a `watch`. It is not false when a commit came before the call, but on
         a server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
         """
+
+    def objects(self, ids: Collection[int] | None = None) -> list[Object]:
+        """All objects, or those of some ids that are there, ordered by id."""
+
+    def object(self, object_id: int) -> Object:
+        """One object; raises ObjectNotFoundError when there is none of that id."""
+
+    def outlines(self) -> Outlines:
+        """Summary rows of all objects, ordered by id, a twentieth of the time of `objects`."""
+
+    def removed(self, link: str) -> set[str]:
+        """Names of a file's parts that were removed and are not there again."""
+
+    def changes(self, since: int = 0) -> Iterator[Change]:
+        """Committed writes after that revision, oldest first."""
+
+    def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
+        """Packed surfaces of the digests that have one, in one statement."""
+
+    def surface_digests(self) -> set[str]:
+        """Digests of all surfaces."""
+
+    # -- writes: an object's rows, its record and its `Change`, in one transaction -----------------
+    #
+    # A given surface, packed, is stored under the record's digest, unless there is one already. The
+    # last object of a digest takes the surface along when it is removed or gets another digest.
+    # Rows with distances are written into both tables; rows without into the index table alone,
+    # and the object has no distances then. All raise ReadOnlyError where writes are refused.
+
+    def loading(self) -> AbstractContextManager[None]:
+        """A context in which many objects are written. May be nested.
+
+        Inside, an engine may postpone work that only readers need, such as an index. At the end it
+        does this work, after an error, too. Writes that were committed inside are safe.
+        """
+
+    def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
+        """Write an object and its rows (any ids in them); its id is its own if above 0 and free."""
+
+    def replace(
+        self, record: Object, rows: Rows, surface: bytes | None = None, *, everywhere: bool = False
+    ) -> None:
+        """Exchange an object's rows; `everywhere` deletes old ones outside its bounds, too.
+
+        A record with a revision above 0 was derived from the object of that revision. Raises
+        ConflictError when the object has been written since.
+        """
+
+    def replace_all(self, made: Replacements) -> None:
+        """As `replace` for several objects, in one transaction: after an error, for none of them.
+
+        `made` is called inside the transaction, and again when a lost connection is replaced. It
+        may read this store. Rows are written as they come. Each object gets its own revision.
+        """
+
+    def remove(self, object_id: int, revision: int | None = None) -> Object:
+        """Remove an object and its rows; returns the object as it was, with its surface.
+
+        Raises ConflictError when a revision is given and the object has been written since.
+        """
+
+    # -- pairs of objects; they change no revision -------------------------------------------------
+
+    def pairs(self) -> KeptPairs:
+        """All rows, and the mark, in one statement."""
+
+    def put_pairs(
+        self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
+    ) -> MaybeMark:
+        """Delete rows and write others, in one transaction.
+
+        Rows of a later revision than a given one stay, and so does what `accept_pair` has written.
+        The mark becomes `now` if it is `was`, and else, or without `now`, one that is new. Returns
+        what it became if it was `was`: then nobody else has written since that was read.
+        """
+
+    def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
+        """Note why a pair is accepted, and the shapes of both; nothing if it has no row."""
+
+    # -- statistics, cost figures, checks ----------------------------------------------------------
+
+    def size(self) -> Size:
+        """Rows, bytes and leaf blocks."""
+
+    def quantiles(self, resolution: int) -> Histogram:
+        """Equi-count histogram of all row keys, of R buckets."""
+
+    def freshness(self, resolution: int) -> Freshness:
+        """How old the statistics are that `quantiles` uses at that resolution."""
+
+    def analyze(self, resolution: int, *, anew: bool = False) -> None:
+        """Renew the statistics that `quantiles` uses; fresh ones are renewed only if `anew`."""
+
+    def costs(self, machine: str) -> Mapping[str, float] | None:
+        """Figures that `save_costs` kept for that machine."""
+
+    def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
+        """Keep the fitted cost figures of a machine."""
+
+    def findings(self) -> Iterator[str]:
+        """What is wrong with pages, indexes and kept statistics, a line each."""
 
 
 @runtime_checkable

@@ -1,7 +1,4 @@
-"""Opens, makes and copies environments by their URLs, and grants rights on them.
-
-A URL's scheme picks the engine (`hapticdb.store.engines`).
-"""
+"""Opens, makes and copies environments by their URLs, and grants rights on them."""
 
 import os
 
@@ -47,13 +44,8 @@ def exists(url: Url) -> bool:
 def grant(url: Url, role: str, right: Right) -> None:
     """Give a role of the server one right on an environment; see `hapticdb.store.postgres.rights`.
 
-    Raises
-    ------
-    AccessError
-        When the URL's user does not own the environment.
-    UsageError
-        When there is no such role, when the role may do everything anyway, or when the engine has
-        no roles.
+    Raises `AccessError` for another user than the owner; `UsageError` when there is no such role,
+    when the role may do everything anyway, or when the engine has no roles.
     """
     engine = engine_of(url)
     if not isinstance(engine, SupportsGrant):
@@ -73,31 +65,15 @@ def backup_environment(
 ) -> BackupReport:
     """Copy a whole SQLite environment as of one moment, while others read and write it.
 
-    Parameters
-    ----------
-    url : str or path
-        The environment: a path or ``sqlite:///path``.
-    file : path
-        Where the copy goes. The copy is an environment, too. It appears whole or not at all.
-    replace : bool
-        Replace an environment that is there, and its log, unless somebody has it open. It stays as
-        it is until the copy is whole beside it. So a copy is put back, too.
-    progress : callable or None
-        Called after each 4 MiB with the bytes done and in all.
+    file : path of the copy, an environment, too, which appears whole or not at all
+    replace : replace an environment that is there, and its log, unless somebody has it open: after
+        the copy is whole beside it. So a copy is put back, too.
+    progress : called after each 4 MiB with the bytes done and in all
 
-    Raises
-    ------
-    EnvironmentExistsError
-        When `file` is there and `replace` is false.
-    BusyError
-        When the file that is to be replaced is open. A reader that cannot write the folder is not
-        noticed.
-    NotAnEnvironmentError
-        When the file that is to be replaced is no environment.
-    DamagedError
-        When the structure of the copy is damaged. Nothing is replaced then.
-    UsageError
-        When either is on PostgreSQL, or both are one file.
+    Raises `EnvironmentExistsError` when `file` is there and `replace` is false; `BusyError` when it
+    is open, unless by a reader that cannot write the folder; `NotAnEnvironmentError` when it is no
+    environment; `DamagedError`, and replaces nothing, when the copy is damaged; `UsageError` when
+    either is on PostgreSQL, or both are one file.
     """
     engine, other = engine_of(url), engine_of(file)
     if not isinstance(engine, SupportsBackup):

@@ -1,6 +1,5 @@
 """Ranges of row keys that cover an object or a box."""
 
-from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
@@ -8,14 +7,13 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.kernels.query.grouping import ranges_of_box
-from hapticdb.store.base import Covering, Keys, Layout, Object, Store, row_shift
+from hapticdb.store.base import Keys, Layout, Object, row_shift
 
 BOX_CUBES = 16
-"""Cubes along a box's longest edge when it is covered by key ranges. A larger value gives more
-ranges, which hold fewer keys outside the box."""
+"""Cubes along a box's longest edge: more give more ranges with fewer keys outside the box."""
 BAND_MARGIN = 5
 """Voxels around an object's bounds in which its rows of distances lie: the half width of the band,
-a voxel more since a row also has the centres beside its brick, and rounding."""
+a voxel for the centres beside a brick, and rounding."""
 
 
 class Ranges(NamedTuple):
@@ -25,24 +23,15 @@ class Ranges(NamedTuple):
     highs: Keys
 
 
-def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
-    """Ranges of row keys that cover an object's bounds, enlarged by a voxel on each side.
+EVERYWHERE = Ranges(np.zeros(1, np.int64), np.full(1, np.iinfo(np.int64).max))
+"""All row keys."""
 
-    If the object has distances, the ranges also cover the bricks around it that hold distances.
-    """
+
+def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
+    """Ranges of row keys over an object's bounds, a voxel wider; `BAND_MARGIN` with distances."""
     low, high = grid.voxels_of(obj.bounds)
     margin = BAND_MARGIN if obj.has_distances else 1
     return box_ranges(grid, layout, low - margin, high + margin)
-
-
-def covering(store: Store) -> Covering:
-    """Argument `covering` of a write: `object_ranges` of a store's objects."""
-
-    def ranges(obj: Object) -> Iterator[tuple[int, int]]:
-        lows, highs = object_ranges(store.grid, store.layout, obj)
-        return zip(lows.tolist(), highs.tolist(), strict=True)
-
-    return ranges
 
 
 def box_ranges(

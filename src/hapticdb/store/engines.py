@@ -1,8 +1,4 @@
-"""Which engine a URL means.
-
-An engine's module is imported when a URL first names it, so that a verb on a file loads no driver
-of a server.
-"""
+"""Engines by the schemes of URLs, imported when first named: a verb on a file loads no driver."""
 
 import os
 from importlib import import_module
@@ -19,10 +15,7 @@ Right = Literal["viewer", "toucher", "editor", "nobody"]
 
 
 class BackupReport(NamedTuple):
-    """Result of a backup.
-
-    revision : of the environment in the copy; objects : how many it holds; bytes : of its file.
-    """
+    """Result of a backup: the copy's revision, number of objects, and bytes of its file."""
 
     source: str
     target: str
@@ -68,9 +61,8 @@ class SupportsGrant(Protocol):
 class Lag(NamedTuple):
     """How far a standby is behind its primary, as the standby states it.
 
-    replayed : position in the primary's log up to which it has replayed it; seconds : since the
-    commit that it has replayed last, None before the first. Where nothing is written, that time
-    grows although nothing is missing.
+    replayed : position in the primary's log; seconds : since the last replayed commit, None before
+    the first. They grow where nothing is written, too.
     """
 
     replayed: str
@@ -108,14 +100,9 @@ FOLDERS = {"": "sqlite", "sqlite": "sqlite", "postgresql": "postgres", "postgres
 
 
 def engine_of(url: Url) -> Engine:
-    """Engine that a URL or a path means.
+    """Engine of a URL or a path.
 
-    Raises
-    ------
-    UsageError
-        When no engine has the URL's scheme.
-    MissingExtraError
-        When the engine's driver is not installed.
+    Raises `UsageError` for an unknown scheme; `MissingExtraError` without the engine's driver.
     """
     # a Path object is a path, whatever its name looks like
     scheme = scheme_of(url) if isinstance(url, str) else ""

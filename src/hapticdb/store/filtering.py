@@ -13,8 +13,7 @@ from hapticdb.store.finding import MOST_IDS, Listing, Words, checked_words
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 MOST_KEPT = 16
-"""Filters whose objects are kept for the next frame. A larger value serves more filters in turns
-without choosing objects again, and takes more memory."""
+"""Filters whose objects are kept for the next frame."""
 
 
 class Unfelt(NamedTuple):
@@ -30,13 +29,10 @@ class Unfelt(NamedTuple):
 class Filter:
     """Which objects are felt: those that `where` chooses, or all, without those of `exclude`.
 
-    It holds words and no objects, so that an object that is added later, or has another name or
-    other attributes later, is felt or not by the same words.
+    It holds words and no objects, and so applies to later objects, names and attributes, too.
 
-    where, exclude : words as `hapticdb.store.finding.find_objects` reads them, all objects if
-    `where` has none; as attributes, texts of digits have become ids.
-    is_empty, is_fixed : whether every object is felt; whether the same ids are left out, whatever
-    objects there are.
+    where, exclude : words of `hapticdb.store.finding.find_objects`, texts of digits as ids; all
+    objects if `where` has none; is_empty : every object is felt; is_fixed : by excluded ids alone.
 
     Raises `UsageError` when a word is neither an int nor a text.
     """
@@ -68,11 +64,7 @@ class Filter:
         return np.array(sorted(ids), dtype=np.int64)
 
     def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
-        """Objects that are not felt; a word that chooses nothing is noted, and chooses nothing.
-
-        objects : all objects of one revision, ascending by id; url : their environment, for
-        messages.
-        """
+        """Objects not felt, of all of one revision, ascending by id, and words without a match."""
         missing: list[ObjectNotFoundError] = []
         listing = Listing(objects, url)
         out = {obj.id for obj in _chosen(listing, "exclude", self.exclude, missing)}
@@ -110,19 +102,13 @@ ALL = Filter()
 
 
 class FiltersOfWords:
-    """Makes filters of words, and keeps the last ones: frames give the same words again and again.
-
-    Thousands of ids are looked up in a tenth of a millisecond where an earlier frame gave the same.
-    """
+    """Cache of filters by their words: thousands of ids take 0.1 ms when repeated."""
 
     def __init__(self) -> None:
         self._filters: dict[tuple[tuple[object, ...], tuple[object, ...]], Filter] = {}
 
     def of(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; the same one for the same words.
-
-        Raises `UsageError` as for `Filter`.
-        """
+        """Filter of the words; the same one for the same words; UsageError as for `Filter`."""
         if not isinstance(where, (tuple, list)) or not isinstance(exclude, (tuple, list)):
             return Filter(where, exclude)
         if not where and not exclude:

@@ -39,27 +39,17 @@ class HasObjects(Protocol):
 def find_objects(store: HasObjects, words: Words) -> list[Object]:
     """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
 
-    Parameters
-    ----------
-    store : HasObjects
-        It is asked for all objects once, and only if a word is no id.
-    words : iterable of int or str
-        An int, or a text of digits, is an id; ``3,4`` is several. Any other text, such as ``007``,
-        is a name or a pattern as of `fnmatch`: ``*`` stands for any characters, ``?`` for one,
-        ``[ab]`` for one of those; case counts. Names are paths, such as ``body/door/handle``: a
-        text without ``/`` is compared with every element of the path, one with ``/`` with the path
-        from its beginning.
-        If the match is a sub-assembly, everything below it is chosen. A text that is exactly a name
-        is no pattern. A text that fits no name, but has ``=``, is ``attribute=value``: see
-        `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name, too. A text with commas
-        is several words, unless it chooses something as a whole.
+    The store lists all objects once, and only if a word is no id. An int, or a text of digits, is
+    an id; ``3,4`` is several. Any other text, such as ``007``, is a name or a pattern as of
+    `fnmatch`; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
+    compared with every element of the path, one with ``/`` with the path from its beginning. A
+    sub-assembly chooses everything below it. A text that is exactly a name is no pattern. A text
+    that fits no name, but has ``=``, is ``attribute=value``: see
+    `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name, too. A text with commas is
+    several words, unless it chooses something as a whole.
 
-    Raises
-    ------
-    ObjectNotFoundError
-        When a word chooses nothing.
-    UsageError
-        When a word is neither an int nor a text.
+    Raises `ObjectNotFoundError` when a word chooses nothing; `UsageError` when a word is neither an
+    int nor a text.
     """
     checked = checked_words(words)
     if all(isinstance(word, int) for word in checked):
@@ -69,10 +59,7 @@ def find_objects(store: HasObjects, words: Words) -> list[Object]:
 
 
 class Listing:
-    """All objects of one revision, for words to choose from by the rules of `find_objects`.
-
-    objects : in the order in which they are chosen; url : URL of their environment, for messages.
-    """
+    """All objects of one revision, in order, for `find_objects`; url : for messages."""
 
     def __init__(self, objects: Sequence[Object], url: str) -> None:
         self._objects = objects
@@ -84,8 +71,7 @@ class Listing:
     ) -> list[Object]:
         """Objects that words choose, each once.
 
-        words : as for `find_objects`; missing : takes the errors of words that choose nothing;
-        without it, the first one is raised.
+        missing : takes the errors of words without a match; without it, the first one is raised.
         """
         errors: list[ObjectNotFoundError] = []
         found: set[int] = set()
@@ -128,10 +114,7 @@ class Listing:
 
 
 def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
-    """Words as ids and texts, texts of digits as ids; refuses anything else.
-
-    what : what the words are, for messages.
-    """
+    """Words as ids and texts, texts of digits as ids; refuses anything else, named `what`."""
     if isinstance(words, (str, bytes, bytearray, memoryview)) or not isinstance(words, Iterable):
         raise UsageError(f"{what} {words!r}: give ids, names and patterns in a list")
     checked: list[int | str] = []

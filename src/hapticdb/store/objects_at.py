@@ -10,10 +10,9 @@ from hapticdb.store.base import BRICK_BYTES, BRICK_SHIFT, NO_KEYS, Keys, Rows, S
 
 
 def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
-    """Ids of the objects in voxels (n,), distinct and ascending.
+    """Ids of the objects in voxels (n,), distinct and ascending, without those in `exclude` (E,).
 
-    keys (n,) int64: of voxels on the environment's curve, distinct and ascending; exclude (E,) ids
-    that are left out.
+    keys (n,) int64 : on the environment's curve, distinct and ascending.
     """
     if store.layout == "voxel":
         ids = np.unique(store.lookup(keys).ids)
@@ -28,9 +27,8 @@ def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
 def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
     """Ids of the objects whose surface is near the centres of voxels (n,), distinct and ascending.
 
-    Near is at most `within` voxels, and no more than the half width of the band; an object in a
-    voxel counts, too. The other arguments are those of `ids_of_voxels`. Every object must have
-    distances, which the layout brick alone has.
+    Near is at most `within` voxels and the half width of the band; an object in a voxel counts,
+    too. Every object must have distances. Otherwise as `ids_of_voxels`.
     """
     bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
     rows = store.lookup(bricks, distances=True)

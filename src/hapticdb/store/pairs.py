@@ -2,7 +2,7 @@
 
 import os
 from collections.abc import Callable, Container, Iterator, Sequence
-from typing import Any, Literal, NamedTuple, Protocol, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,12 +38,11 @@ MARK = (0, 1)
 class PairRow(NamedTuple):
     """What was found about two objects.
 
-    a, b : ids, the lesser one first; kind : ``far`` for a pair that was looked at and is farther
-    apart than was asked for; at_least, at_most : metres, of the gap, or of the depth of an overlap,
-    at_most None where no bound is known; place : x, y, z on a, then on b, metres, world frame;
-    status : since the last call that came to its end; revision : of the environment that was read;
-    setting : what was asked for; because, shapes : why the pair is accepted, and both digests then;
-    None where it is not.
+    a, b : ids, the lesser one first; kind : ``far`` beyond the distance of the search; at_least,
+    at_most : metres, of the gap, or of the depth of an overlap, at_most None without a bound;
+    place : x, y, z on a, then on b, metres, world frame; status : since the last complete search;
+    revision : of the environment that was read; setting : of the search; because, shapes : why the
+    pair is accepted, and both digests then, or None.
     """
 
     a: int
@@ -65,10 +64,10 @@ class PairRow(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """What the table is, so that a search need not look at pairs of unchanged objects again.
+    """State of the table, so that a search need not look at pairs of unchanged objects again.
 
     After a search of everything, alone from its reading to its end: the setting and the revision
-    of which the table has all pairs of near boxes. Otherwise a setting that nobody has given.
+    of all pairs of near boxes. Otherwise a setting that nobody has given.
     """
 
     setting: str = ""
@@ -91,10 +90,10 @@ Ids = Sequence[tuple[int, int]]
 
 
 class KeptPairs:
-    """Rows of the table, read together, and each checked when it is asked for.
+    """Rows of the table, read together, and each checked when it is used.
 
-    rows : as the engine gave them, ordered by a and b: `COLUMNS`, because and shapes; checked :
-    makes a `PairRow` of one, or raises `DamagedError`.
+    rows : as the engine gave them, by a and b: `COLUMNS`, because and shapes; checked : makes a
+    `PairRow` of one, or raises `DamagedError`.
     """
 
     def __init__(
@@ -137,26 +136,3 @@ class Outlines(NamedTuple):
     ids: NDArray[np.int64]
     revisions: NDArray[np.int64]
     bounds: NDArray[np.float64]
-
-
-class KeepsPairs(Protocol):
-    """Keeps what was found about pairs of objects. It changes no revision."""
-
-    def outlines(self) -> Outlines:
-        """What is short of all objects, ordered by id, a twentieth of the time of `objects`."""
-
-    def pairs(self) -> KeptPairs:
-        """All rows, and the mark, in one statement."""
-
-    def put_pairs(
-        self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
-    ) -> MaybeMark:
-        """Delete rows and write others, in one transaction.
-
-        Rows of a later revision than a given one stay, and so does what `accept_pair` has written.
-        The mark becomes `now` if it is `was`, and else, or without `now`, one that is new. Returns
-        what it became if it was `was`: then nobody else has written since that was read.
-        """
-
-    def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
-        """Note why a pair is accepted, and the shapes of both; nothing if it has no row."""

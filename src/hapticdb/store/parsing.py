@@ -1,8 +1,7 @@
 """Checks of everything that is read from an environment's tables, the same for every engine.
 
-An environment may be damaged, or made by somebody who means harm. Every value that is read, apart
-from the rows of the index, passes through here. The result has the right type and lies within its
-bounds; otherwise DamagedError names the place.
+An environment may be damaged, or made by somebody who means harm. Every value, apart from the rows
+of the index, gets the right type within its bounds here, or a DamagedError that names the place.
 """
 
 import contextlib
@@ -55,8 +54,7 @@ def damaged(url: str, cause: str) -> DamagedError:
 class Checksum:
     """CRC-32 of an object's keys, and of its bricks or distances, over its rows in order of keys.
 
-    With distances, keys and lengths are taken as pairs, so that no byte can pass to the next row
-    unseen.
+    With distances, keys and lengths count as pairs, so that no byte can pass to the next row.
     """
 
     __slots__ = ("_contents", "_keys")
@@ -142,9 +140,9 @@ def grid_of(url: str, rows: Sequence[Sequence[Any]]) -> tuple[Grid, Layout]:
 
 
 def check_tables(url: str, kinds: Mapping[str, str]) -> None:
-    """Refuse an environment in which a table is missing, or is a view: a view can return anything.
+    """Refuse an environment with a missing table, or a view instead: a view can return anything.
 
-    `kinds` : for each name ``table``, or the kind of object that it names instead.
+    kinds : ``table``, or another kind of object, by name.
     """
     for name in TABLES:
         kind = kinds.get(name)

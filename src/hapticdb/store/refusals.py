@@ -64,10 +64,7 @@ def check_distances(layout: Layout, *, distances: bool) -> None:
 
 
 def wants_distances(layout: Layout, wish: bool | None) -> bool:  # noqa: FBT001 - a wish as given
-    """Whether a new environment has distances, by a wish or by its layout; bricks do unless told.
-
-    Raises `UsageError` as for `check_distances`.
-    """
+    """Whether a new environment has distances: as wished, else bricks do; or UsageError."""
     distances = layout == "brick" if wish is None else wish
     check_distances(layout, distances=distances)
     return distances

@@ -1,12 +1,10 @@
-"""An environment in tables of SQL: what all engines that keep one in this way have in common.
-
-Each of them understands the statements here. Their parameters are written ``%s``.
-"""
+"""An environment in tables of SQL: what the engines have in common. Parameters are ``%s``."""
 
 import json
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Collection, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
+from dataclasses import replace
 from functools import partial
 from typing import Any, ClassVar, Literal, Protocol, TypeVar
 
@@ -19,7 +17,6 @@ from hapticdb.store.base import (
     CELL_SHIFT,
     NO_KEYS,
     Change,
-    Covering,
     Freshness,
     Histogram,
     Keys,
@@ -29,6 +26,7 @@ from hapticdb.store.base import (
     Rows,
     row_shift,
 )
+from hapticdb.store.covering import EVERYWHERE, Ranges, object_ranges
 from hapticdb.store.pairs import (
     ALL,
     COUNT,
@@ -41,11 +39,7 @@ from hapticdb.store.pairs import (
     Outlines,
     PairRow,
 )
-from hapticdb.store.refusals import (
-    check_unwritten,
-    no_object,
-    present_already,
-)
+from hapticdb.store.refusals import check_unwritten, no_object, present_already
 
 Result = TypeVar("Result")
 Form = Literal["lookup", "lookup_one", "scan", "rows_of", "after"]
@@ -75,8 +69,7 @@ INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = e
 def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
     """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
 
-    Ranges are rounded outwards to cells. In lexicographic order a cell is not a range of keys:
-    there the ranges are rounded to slabs, each of all voxels of one i.
+    Rounded outwards to cells; in lexicographic order to slabs, each of all voxels of one i.
     """
     shift = CELL_SHIFT if grid.is_hierarchical else 2 * grid.bits
     cubes = np.unique(row_keys >> (shift - row_shift(layout)))
@@ -97,8 +90,7 @@ class _Connection(Protocol):
 class Tables(ABC):
     """The tables of one environment: objects, changes, surfaces, pairs, kept statistics, writes.
 
-    A subclass says how its engine runs statements, and reads and writes the tables of rows. The
-    attributes are those of `hapticdb.store.base.Store`.
+    A subclass runs statements, and reads and writes the tables of rows; attributes as of `Store`.
     """
 
     AMONG: ClassVar[str]
@@ -164,11 +156,8 @@ class Tables(ABC):
         """Write the rows of an object that has none."""
 
     @abstractmethod
-    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
-        """Delete the rows of an object as it is now, from all tables; returns their keys.
-
-        keys : of its new rows.
-        """
+    def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
+        """Delete the rows of an object in ranges from all its tables; keys : of its new rows."""
 
     @abstractmethod
     def _note(self, change: tuple[Any, ...]) -> None:
@@ -189,52 +178,42 @@ class Tables(ABC):
     # -- the connection --------------------------------------------------------------------------
 
     def close(self) -> None:
-        """Close the connection."""
         self._connection.close()
 
     def snapshot(self) -> AbstractContextManager[None]:
-        """All reads inside see one committed revision. May be nested."""
         return self._connection.snapshot()
 
     # -- reads of rows ---------------------------------------------------------------------------
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), in one statement."""
         return self._read("lookup", keys, distances=distances)
 
     def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), one statement a key."""
         return self._read("lookup_one", keys, distances=distances)
 
     def scan(self, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows with a key in any of the closed ranges, ascending and disjoint."""
         return self._read("scan", lows, highs, distances=distances)
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
-        """Rows of one object with a key in any of the closed ranges, ascending and disjoint."""
         return self._read("rows_of", lows, highs, object_id, distances=distances)
 
     def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most that many rows after (key, id), ascending by both."""
         return self._read("after", key, object_id, limit, distances=distances)
 
     # -- reads -----------------------------------------------------------------------------------
 
     def objects(self, ids: Collection[int] | None = None) -> list[Object]:
-        """All objects, or those of some ids that are there, ordered by id."""
         if ids is not None:
             return self._objects(self.AMONG, json.dumps(list(ids)))
         self.revision()  # first: a write between the two statements is noticed by the next read
         return self._objects("TRUE")
 
     def object(self, object_id: int) -> Object:
-        """One object; raises ObjectNotFoundError when there is none of that id."""
         for found in self._objects("id = %s", object_id):
             return found
         raise no_object(object_id, self.url)
 
     def outlines(self) -> Outlines:
-        """What is short of all objects, ordered by id."""
         text = "SELECT name, digest, id, revision, bounds FROM object ORDER BY id"
         return parsing.outlines_of(self.url, self._rows(text, binary=True))
 
@@ -247,34 +226,27 @@ class Tables(ABC):
         return [parsing.object_of(self.url, row) for row in found]
 
     def changes(self, since: int = 0) -> Iterator[Change]:
-        """Committed writes after that revision, oldest first."""
         text = "SELECT revision, action, id, ranges FROM change WHERE revision > %s"
         for row in self._rows(f"{text} ORDER BY revision", (since,)):
             yield parsing.change_of(self.url, row)
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
-        """Packed surfaces of the digests that have one, in one statement."""
         text = f"SELECT digest, geometry FROM surface WHERE digest IN ({self.LISTED})"
         found = self._rows(text, (json.dumps(list(digests)),), binary=True)
         return parsing.surfaces_of(self.url, found)
 
     def surface_digests(self) -> set[str]:
-        """Digests of all surfaces."""
         return parsing.digests_of(self.url, self._rows("SELECT digest FROM surface"))
 
     def pairs(self) -> KeptPairs:
-        """All rows of the table `pair`, and the mark, in one statement."""
         return KeptPairs(self._rows(ALL, binary=True), partial(parsing.pair_of, self.url))
 
     def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
         return {row[0] for row in self._rows("SELECT name FROM removed WHERE link = %s", (link,))}
 
     # -- writes ----------------------------------------------------------------------------------
 
     def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
-        """Write an object, its rows and its surface in one transaction; returns its id."""
-
         def work() -> int:
             revision = self._next_revision()
             own: int | None = record.id
@@ -294,26 +266,20 @@ class Tables(ABC):
         return self._commit(work)
 
     def replace(
-        self, record: Object, rows: Rows, covering: Covering, surface: bytes | None = None
+        self, record: Object, rows: Rows, surface: bytes | None = None, *, everywhere: bool = False
     ) -> None:
-        """Exchange an object's rows in one transaction; `covering` says where the old ones are."""
-
         def work() -> None:
-            self._exchange(self._next_revision(), record, rows, covering, surface)
+            ranges = EVERYWHERE if everywhere else None
+            self._exchange(self._next_revision(), record, rows, surface, ranges)
 
         self._commit(work)
 
-    def replace_all(self, made: Replacements, covering: Covering) -> None:
-        """As `replace` for several objects, in one transaction: after an error, for none of them.
-
-        Each object gets its own revision.
-        """
-
+    def replace_all(self, made: Replacements) -> None:
         def work() -> None:
             revision = self._next_revision()  # locks, so that nobody writes what `made` reads
             for n, (record, rows) in enumerate(made()):
                 revision = self._next_revision() if n else revision
-                self._exchange(revision, record, rows, covering)
+                self._exchange(revision, record, rows)
 
         self._commit(work)
 
@@ -322,37 +288,39 @@ class Tables(ABC):
         revision: int,
         record: Object,
         rows: Rows,
-        covering: Covering,
         surface: bytes | None = None,
+        ranges: Ranges | None = None,
     ) -> None:
         """Exchange an object's rows, inside a transaction."""
         known = self.object(record.id)
         check_unwritten(record, known, self.url)
-        gone = self._take(known, covering, rows.keys)
+        gone = self._take(known, ranges or self._ranges_of(known), rows.keys)
         self._do(UPDATE_OBJECT, (*self._contents(record, rows), revision, record.id))
         self._put(rows, record.id)
         self._drop_surface(known.digest)
         self._put_surface(record.digest, surface)
         self._log(revision, "move", record.id, np.concatenate([gone, rows.keys]))
 
-    def remove(self, object_id: int, covering: Covering) -> None:
-        """Remove an object and its rows in one transaction; `covering` says where they are."""
+    def _ranges_of(self, known: Object) -> Ranges:
+        return object_ranges(self.grid, self.layout, known)
 
-        def work() -> None:
-            revision = self._next_revision()
+    def remove(self, object_id: int, revision: int | None = None) -> Object:
+        def work() -> Object:
+            own = self._next_revision()
             known = self.object(object_id)
-            gone = self._take(known, covering)
+            check_unwritten(replace(known, revision=revision or 0), known, self.url)
+            surface = self.surfaces([known.digest]).get(known.digest)
+            gone = self._take(known, self._ranges_of(known))
             self._do("DELETE FROM object WHERE id = %s", (object_id,))
             self._drop_surface(known.digest)
-            self._log(revision, "remove", object_id, gone)
+            self._log(own, "remove", object_id, gone)
+            return replace(known, surface=surface)
 
-        self._commit(work)
+        return self._commit(work)
 
     def put_pairs(
         self, rows: Sequence[PairRow], gone: Ids = (), was: MaybeMark = None, now: MaybeMark = None
     ) -> MaybeMark:
-        """Delete rows, write others unless a later revision's are there, and set the mark."""
-
         def work() -> MaybeMark:
             mark, row = Mark.after(self._do(HELD, MARK), was, now)
             self._exchange_pairs([*gone, MARK], [*rows, row])
@@ -362,7 +330,6 @@ class Tables(ABC):
         return self._alone(work)
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
-        """Note why a pair is accepted, and the shapes of both."""
         text = "UPDATE pair SET because = %s, shapes = %s WHERE (a, b) = (%s, %s)"
         self._save(text, (because, shapes, a, b))
 
@@ -393,10 +360,7 @@ class Tables(ABC):
     # -- statistics ------------------------------------------------------------------------------
 
     def quantiles(self, resolution: int) -> Histogram:
-        """Equi-count histogram of all row keys, of R buckets.
-
-        The kept one while no object was written since, else by a scan of the whole index.
-        """
+        """The kept one while no object was written since, else by a scan of the whole index."""
         kept = self._rows(
             "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL"
             f" AND revision = {LAST_REVISION}",
@@ -407,7 +371,6 @@ class Tables(ABC):
         return Histogram(*self._exact(resolution), "computed")
 
     def freshness(self, resolution: int) -> Freshness:
-        """How old the histogram of that resolution is, by the revision stored with it."""
         text = f"SELECT {LAST_REVISION}, (SELECT revision FROM quantile WHERE resolution = %s)"
         ((revision, made),) = self._rows(text, (resolution,))
         return Freshness(made, int(revision) - int(made or 0))
@@ -428,17 +391,14 @@ class Tables(ABC):
         return revision, n_rows, bounds
 
     def findings(self) -> Iterator[str]:
-        """What is wrong with kept statistics, a line each."""
         kept = self._rows("SELECT bounds, n_rows FROM quantile WHERE bounds IS NOT NULL")
         costs = self._rows(f"SELECT figures{self.AS_TEXT} FROM cost")
         yield from parsing.findings_of_kept(self.url, kept, costs)
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
-        """Figures that `save_costs` kept for that machine."""
         text = f"SELECT figures{self.AS_TEXT} FROM cost WHERE machine = %s"
         kept = self._rows(text, (machine,))
         return parsing.figures_of(self.url, kept[0][0]) if kept else None
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
-        """Keep the fitted cost figures of a machine."""
         self._save(KEEP_COSTS, (machine, json.dumps(dict(figures))))

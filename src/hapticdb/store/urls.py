@@ -21,10 +21,7 @@ def scheme_of(url: str) -> str:
 
 
 def redact(url: str) -> str:
-    """Hide the passwords of a URL, wherever they stand, and its partitions, which have some, too.
-
-    If a password contains an unescaped @, everything up to the last @ is hidden.
-    """
+    """Hide the passwords of a URL, up to the last @, and its partitions, which have some, too."""
     if "://" not in url:
         return url
     secret = PASSWORD.match(url)
@@ -40,10 +37,7 @@ def redact(url: str) -> str:
 
 
 def with_partitions(url: str, servers: str) -> str:
-    """URL of a new environment whose rows get onto those servers: hosts or URLs, commas between.
-
-    Raises `UsageError` when its engine has no partitions.
-    """
+    """URL of a new environment whose rows get onto servers, hosts or URLs with commas between."""
     if scheme_of(url) not in {"postgresql", "postgres"}:
         raise UsageError(f"{redact(url)}: only environments on PostgreSQL have partitions")
     named = ",".join(quote(one.strip(), safe="") for one in servers.split(","))

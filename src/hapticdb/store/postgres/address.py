@@ -22,8 +22,8 @@ LONGEST_NAME = 63
 class Address(NamedTuple):
     """A URL taken apart.
 
-    conninfo : for libpq; environment : the schema; shown : the URL as messages may show it;
-    partitions : servers of the rows, for `partition_addresses`.
+    conninfo : for libpq; environment : the schema; shown : the redacted URL; partitions : servers
+    of the rows.
     """
 
     conninfo: str
@@ -33,11 +33,7 @@ class Address(NamedTuple):
 
 
 def parse(url: str) -> Address:
-    """Take a URL apart.
-
-    Raises `UsageError` when libpq does not read it, when a name in it is none that a server can
-    have, or when it names two environments.
-    """
+    """Take a URL apart; UsageError for one that libpq or the server cannot use, or of two names."""
     shown = redact(url)
     head, _, query = url.partition("?")
     authority, _, path = head.partition("://")[2].partition("/")
@@ -82,10 +78,7 @@ def with_environment(url: str, name: str) -> str:
 
 
 def partition_addresses(address: Address) -> list[Address]:
-    """Addresses of the partitions: each a URL, or a host with the address's user and database.
-
-    Raises `UsageError` when one is neither.
-    """
+    """Addresses of the partitions: URLs, or hosts with the address's user and database."""
     own = conninfo_to_dict(address.conninfo, host=None, hostaddr=None, port=None)
     found = []
     for given in address.partitions:
@@ -105,10 +98,7 @@ def partition_addresses(address: Address) -> list[Address]:
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that the server refuses, or that it would cut off at 63 bytes.
-
-    Raises `UsageError` when it is no text, empty, or longer than 63 bytes in UTF-8.
-    """
+    """Refuse a name that is no text, empty, or longer than the server's 63 bytes."""
     if not isinstance(name, str):
         raise UsageError(f"{what} {name!r}: give a str, not {type(name).__name__}")
     try:

@@ -1,13 +1,12 @@
 """Rows on other servers: the tables of rows, partitioned by ranges of their keys.
 
-PostgreSQL does all of it. The tables of a layout's rows are declared partitioned; each partition is
-a foreign table of `postgres_fdw`, which leads to a schema of the environment's name on another
-server. Objects, surfaces and the log of changes stay where the environment is.
+The tables of a layout's rows are declared partitioned; each partition is a foreign table of
+`postgres_fdw` in a schema of the environment's name on another server. Objects, surfaces and the
+log of changes stay where the environment is.
 
-A partition's ends lie between cells of 32 x 32 x 32 voxels, so the rows of a cell are on one
-server. postgres_fdw commits on the partitions before the environment commits; after a crash in
-between they hold rows that no object has, which no frame reads (`tables/statements`) and
-`check --repair` removes.
+A partition's ends lie between cells of 32 x 32 x 32 voxels. postgres_fdw commits on the partitions
+before the environment commits; after a crash in between they hold rows of no object, which no frame
+reads (`tables/statements`) and `check --repair` removes.
 """
 
 import re
@@ -36,8 +35,7 @@ SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0
        coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relname = 'band'), 0)::bigint AS band
   FROM pg_class
  WHERE relnamespace = quote_ident({name})::regnamespace"""
-"""On a partition: bytes of its tables and indexes, pages of the index of its rows, and the bytes of
-its distances."""
+"""On a partition: bytes of tables and indexes, pages of the rows' index, bytes of distances."""
 SERVER = """
 CREATE SERVER {server} FOREIGN DATA WRAPPER postgres_fdw
 OPTIONS (host {host}, port {port}, dbname {database}, async_capable 'true', fetch_size '10000',
@@ -54,10 +52,7 @@ SELECT DISTINCT srvname::text
 
 
 def ends(grid: Grid, layout: Layout, table: Table, n: int) -> list[int]:
-    """Keys (n - 1,) at which the second to the last of n partitions begin.
-
-    Between cells, or, in a grid of fewer cells than partitions, between its rows.
-    """
+    """Keys (n - 1,) at which all but the first of n partitions begin: cells if possible."""
     shift = row_shift(layout)
     within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
     cells = 1 << max(3 * grid.bits - within, 0)
@@ -82,10 +77,7 @@ def spread(
     grid: Grid,
     layout: Layout,
 ) -> "Callable[[ServerConnection], None]":
-    """Make the partitions of a new environment; returns what its own transaction does then.
-
-    address : of the environment, with its `partitions`; connect : connects to a partition.
-    """
+    """Make the partitions of a new environment; returns what its own transaction does then."""
     partitions = partition_addresses(address)
     if not partitions:
         return lambda _: None

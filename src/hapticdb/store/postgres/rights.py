@@ -1,6 +1,6 @@
-"""Who may do what with an environment: rights of roles. The server itself enforces them.
+"""Rights of roles on an environment, enforced by the server.
 
-A viewer reads and touches. A toucher also keeps fitted cost figures. An editor also adds, moves and
+A viewer reads and touches. A toucher also keeps cost figures. An editor also adds, moves and
 removes objects. Only the owner, who made the environment, may change its tables and grant rights.
 """
 
@@ -58,15 +58,13 @@ SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
 
 
 def grant(connection: ServerConnection, role: str, right: Right) -> None:
-    """Give a role that right on an environment, and no more; one transaction.
+    """Give a role that right on an environment instead of its former one; one transaction.
 
-    connection : of the environment's owner; role : a person's or a group's, written as it is;
-    right : replaces the role's former one on this environment. Rights that the role has through a
-    group stay.
+    connection : of the environment's owner; role : a person's or a group's, as it is written.
+    Rights that the role has through a group stay.
 
-    Raises `AccessError` when the connection's user does not own the environment. Raises
-    `UsageError` when there is no such role; when the role may do everything anyway; when the name
-    is longer than 63 bytes, so that the server would cut it off to another name.
+    Raises `AccessError` for another user than the owner; `UsageError` when there is no such role,
+    when it may do everything anyway, or when the server would cut its name off at 63 bytes.
     """
     check_name(role, "a role's name")
     if right not in GRANTED:

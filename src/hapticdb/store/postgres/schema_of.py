@@ -91,10 +91,7 @@ def check(connection: ServerConnection) -> None:
 
 
 def _check_writable(connection: ServerConnection) -> None:
-    """Refuse a user without the right to write, before minutes of work.
-
-    A toucher may write cost figures; `Loading` refuses a toucher who begins to write objects.
-    """
+    """Refuse a user without a right to write, before minutes of work; a toucher has one."""
     if connection.rows("SELECT has_table_privilege('cost', 'INSERT')") != [(True,)]:
         raise ReadOnlyError(
             f"{connection.shown} can only be read by this user; its owner can allow more with "
@@ -110,11 +107,7 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'p' THEN 'table' W
 
 
 class Made(NamedTuple):
-    """What is fixed when an environment is made.
-
-    identity : an oid that differs if the environment is remade; is_spread : whether the rows are on
-    partitions.
-    """
+    """The row `environment`; identity : an oid, new if remade; is_spread : onto partitions."""
 
     grid: Grid
     layout: Layout

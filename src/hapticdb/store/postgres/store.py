@@ -18,6 +18,7 @@ from hapticdb.store.base import (
     Rows,
     Store,
     Table,
+    is_ascending,
     joined,
     no_rows,
     row_shift,
@@ -42,8 +43,8 @@ SELECT pg_last_wal_replay_lsn()::text,
        extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp())::float8
  WHERE pg_is_in_recovery()"""
 MOST_BITS = 1 << 20
-"""Ids from the least to the greatest excluded one up to which a bit for each is sent: 128 KiB. A
-larger value sends more; beyond it the ids are sent, and each row is compared with each of them."""
+"""Range of excluded ids up to which a bit for each is sent, 128 KiB; else each row is compared with
+each id."""
 
 
 class PostgresStore(ServerTables):
@@ -83,7 +84,6 @@ class PostgresStore(ServerTables):
         return cls.open(url)
 
     def discard(self) -> None:
-        """Close and delete an environment without any write, unless another writes to it."""
         self._loading.drop_unused()
         self.close()
 
@@ -93,17 +93,13 @@ class PostgresStore(ServerTables):
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
-        """All reads inside see one committed revision. May be nested.
-
-        Partitions have snapshots of their own, taken one after the other when it begins.
-        """
+        """As of the base; those of partitions are taken one after the other when it begins."""
         with self._connection.snapshot():
             if self._is_spread:
                 self._connection.rows(SIZE_OF_PARTITIONS)
             yield
 
     def lag(self) -> Lag | None:
-        """How far the server that answers is behind its primary; None if it is no standby."""
         if not self._connection.is_standby:
             return None
         found = self._connection.rows(REPLAYED)
@@ -123,7 +119,8 @@ class PostgresStore(ServerTables):
         if distances:
             lengths = wire.read_int8s(found[4])
             rows = rows.having(parsing.band_of(self.url, found[3] or b"", lengths))
-        return rows if _is_in_order(rows) else rows.picked(np.lexsort((ids, keys)))
+        # not in order while a first import has no index
+        return rows if is_ascending(keys, ids) else rows.picked(np.lexsort((ids, keys)))
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
         table: Table = "band" if distances else self.layout
@@ -138,7 +135,6 @@ class PostgresStore(ServerTables):
         return self._unpacked(self._connection.fetch(text, *parameters), distances=distances)
 
     def count(self, lows: Keys, highs: Keys) -> int:
-        """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
         text = self._sql.counts[self.layout]
@@ -146,7 +142,6 @@ class PostgresStore(ServerTables):
         return wire.read_int8(found or b"")
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
-        """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         text = self._sql.wrench[self.layout]
         parameters = wire.shell(frame)
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
@@ -154,7 +149,6 @@ class PostgresStore(ServerTables):
         return np.zeros(6) if found is None else wire.read_float8s(found)
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         text = self._sql.hits[self.layout]
         parameters = [wire.int8s(frame.addresses)]
         text, parameters = self._without_excluded(text, parameters, frame.exclude)
@@ -188,21 +182,12 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
     return [wire.int8(low), wire.int8(high), wire.Parameter(wire.BYTEA, bits)]
 
 
-def _is_in_order(rows: Rows) -> bool:
-    """Whether rows are ordered by key and id. They are not while a first import has no index."""
-    keys, ids = rows.keys, rows.ids
-    if len(keys) < 2:
-        return True
-    return bool(((keys[1:] > keys[:-1]) | ((keys[1:] == keys[:-1]) & (ids[1:] > ids[:-1]))).all())
-
-
 class _PostgresEngine:
     """Environments on servers."""
 
     title = "PostgreSQL"
 
     def open(self, url: str, *, read_only: bool) -> Store:
-        """Connect to an existing environment."""
         return PostgresStore.open(url, read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
@@ -210,11 +195,9 @@ class _PostgresEngine:
         return PostgresStore.create(url, grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
-        """Whether a schema of that name is there. Connects."""
         return schema_of.exists(url)
 
     def grant(self, url: str, role: str, right: Right) -> None:
-        """Give a role of the server one right; see `hapticdb.store.postgres.rights`."""
         with schema_of.connected(url) as connection:
             schema_of.check(connection)
             rights.grant(connection, role, right)

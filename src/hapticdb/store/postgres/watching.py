@@ -1,15 +1,12 @@
 """How a reader learns that others have committed: by LISTEN, and by asking for the revision.
 
-Each write notifies the environment's channel in its own transaction, with its revision as payload
-(PostgreSQL's manual: NOTIFY). After the commit the server sends the notification to every listener.
-Looking whether one has arrived costs no round trip.
+Each write notifies the environment's channel in its own transaction (PostgreSQL's manual: NOTIFY).
+Looking whether a notification has arrived costs no round trip. Any role of the database may send
+one: it is only a hint to ask for the revision, which only editors can raise.
 
-Any role of the database may notify the channel, with any payload. So a notification is only a hint
-to ask for the revision, which only editors can raise; the payload is not read.
-
-The revision is also asked for now and then without a hint. That finds commits where the server
-refuses LISTEN, as a standby does, and commits of writers that do not notify. It also finds that the
-environment was dropped and made anew: the oid of its table is another one.
+The revision is also asked for now and then without a hint: for servers that refuse LISTEN, as a
+standby does, for writers that do not notify, and for an environment that was dropped and made anew,
+whose table has another oid.
 """
 
 import hashlib
@@ -26,14 +23,11 @@ REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
 """Hex digits of the digest that replaces too long a name. Fewer digits risk equal channels."""
 HEARING_S = 1.0
-"""Longest time that a commit without a notification goes unnoticed, where LISTEN works. A smaller
-value costs each watching reader more round trips."""
+"""Longest time until a commit without a notification is noticed, where LISTEN works."""
 DEAF_S = 0.02
-"""Longest time that a commit goes unnoticed where LISTEN does not work. A smaller value costs each
-watching reader more round trips."""
+"""Longest time until a commit is noticed where LISTEN does not work."""
 HINTED_S = 0.005
-"""Shortest time between two round trips because of notifications. It keeps a flood of forged
-notifications at 200 round trips a second."""
+"""Shortest time between two hinted round trips: 200 a second under forged notifications."""
 
 
 def channel_of(environment: str) -> str:
@@ -66,9 +60,9 @@ class Watch:
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
 
-        The call costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one,
-        and after a lost connection. After a lost connection it returns true, because notifications
-        may have been missed. Raises ConnectionLostError when the environment was remade.
+        Costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one, and
+        after a lost connection; then true, because notifications may have been missed. Raises
+        ConnectionLostError when the environment was remade.
         """
         self._connection.check_outside()
         if self._connection.again(self._listen):

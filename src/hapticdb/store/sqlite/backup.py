@@ -85,10 +85,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
 def _copied(
     source: Path, unfinished: Path, target: Path, progress: Progress | None
 ) -> tuple[int, int]:
-    """Copy all pages as of one moment; returns the revision and the number of objects.
-
-    target : what errors name: the file that was asked for.
-    """
+    """Copy all pages as of one moment; revision and number of objects; errors name `target`."""
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(connection), named_errors(str(source)):
         connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
@@ -138,10 +135,10 @@ def _sync(path: Path) -> None:
 
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Lock all others out of an existing database inside; refuse if another has it open.
+    """Lock all others out of an existing database inside; BusyError if another has it open.
 
-    A connection that has read from a database in WAL mode holds a lock on it until it is closed.
-    Readers that cannot write the folder hold no lock; they notice the change by the file's time.
+    A reader in WAL mode holds a lock until it is closed; one that cannot write the folder holds
+    none, and notices the change by the file's time.
     """
     with contextlib.ExitStack() as held:
         if path.exists():
@@ -158,10 +155,7 @@ def _alone(path: Path) -> Iterator[None]:
 
 
 def _put_in_place(unfinished: Path, path: Path) -> None:
-    """Replace a database, and remove the files beside the former one.
-
-    The log goes first: SQLite would apply it to the new file if the process were killed in between.
-    """
+    """Replace a database, its log first: SQLite would apply it to the new file after a kill."""
     with _alone(path):
         for suffix in ("-wal", "-shm"):
             Path(f"{path}{suffix}").unlink(missing_ok=True)

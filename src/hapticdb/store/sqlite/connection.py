@@ -16,8 +16,7 @@ from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.threads import check_thread, this_thread
 
 MOST_COMPACTED = 1 << 29
-"""Bytes of a file up to which `compact` writes it anew. A larger value lets other writers wait
-longer, 1 s for 100 MB, and takes as much room for temporary files."""
+"""Bytes of a file up to which `compact` writes it anew; other writers wait 1 s for 100 MB."""
 NO_ROOM = (apsw.BusyError, apsw.FullError, apsw.CantOpenError, apsw.IOError)
 """Errors on which `compact` leaves the file as it is: also where no temporary file can be made."""
 
@@ -25,8 +24,7 @@ NO_ROOM = (apsw.BusyError, apsw.FullError, apsw.CantOpenError, apsw.IOError)
 class FileConnection:
     """One connection to one environment's file; belongs to the thread that opened it.
 
-    It takes no locks between threads, which makes a lookup of 40 bricks 13 % faster. Instead every
-    call checks that it comes from the thread that owns the connection.
+    Instead of locks, which take 13 % of a lookup of 40 bricks, every call checks its thread.
 
     driver : apsw's connection; file : the opened file, and whether its path still leads to it.
     """
@@ -114,9 +112,9 @@ class FileConnection:
     def has_changed(self) -> bool:
         """Whether another connection has committed since `watch` or the last call.
 
-        The pragma looks at the file's log; apsw's own `data_version` only says what the last read
-        has seen. A file that was opened as immutable is judged by its stamp, and once changed, it
-        stays so. Raises ConnectionLostError when the path leads to another file than before.
+        The pragma reads the file's log; apsw's own `data_version` is that of the last read. An
+        immutable file is judged by its stamp, and once changed, stays so. Raises
+        ConnectionLostError when the path leads to another file than before.
         """
         check_outside(self._depth, self.url)
         if self.file.stamp is not None:

@@ -30,8 +30,7 @@ SCHEMA = Path(__file__).with_name("schema.sql")
 BUSY_TIMEOUT_MS = 10_000
 """Milliseconds that a write waits for another process's write before it gives up."""
 CACHE_KIB = 256 * 1024
-"""KiB of one connection's page cache, enough for the bricks of a large car. Memory is taken as
-pages are read. A smaller cache reads pages again from the operating system."""
+"""KiB of a connection's page cache, enough for a large car; taken as pages are read."""
 SHARED_BYTES = 32 << 10
 """Bytes of the file -shm, without which no connection reads an environment in WAL mode."""
 MOUNTS = Path("/proc/self/mountinfo")
@@ -89,8 +88,8 @@ def damaged(path: str, cause: str) -> DamagedError:
 def _check_kind(path: Path) -> None:
     """Refuse a missing file, a folder, a file of another kind, a file that is cut off.
 
-    Reads the file's header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before
-    SQLite opens the file, so that a foreign file is never touched.
+    Reads the header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before SQLite
+    opens the file, so that a foreign file is never touched.
     """
     try:
         is_there = path.exists()
@@ -149,10 +148,7 @@ def open_file(path: Path, *, read_only: bool) -> tuple[apsw.Connection, OpenedFi
 
 
 def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
-    """Make an environment; `fill` writes its first rows.
-
-    The file is made under another name beside its path: it appears whole or not at all.
-    """
+    """Make an environment, whole or not at all; `fill` writes its first rows."""
     check_free(path)
     check_folder(path)
     if network := network_of(path):
@@ -246,8 +242,7 @@ def needs_immutable(path: Path) -> bool:
     """Whether this file can only be opened as immutable.
 
     A database in WAL mode needs its ``-shm`` beside it. Where this user cannot make that, or on a
-    network file system, SQLite can still read the file alone, if there is no log whose pages would
-    be missed.
+    network file system, SQLite can still read the file alone, if there is no log.
     """
     real, network = path.resolve(), network_of(path)
     if not network and (os.access(real.parent, os.W_OK) or Path(f"{real}-shm").exists()):

@@ -10,19 +10,16 @@ from pathlib import Path
 from hapticdb.errors import BusyError, ConnectionLostError
 
 LOOK_SECONDS = 0.25
-"""Longest time until a reader notices that its path leads to another file. A smaller value costs
-more calls of the operating system."""
+"""Longest time until a reader notices that its path leads to another file."""
 
 Stamp = tuple[int, int, bool]
 """Time of the last write, size, and whether a log is there."""
 
 
 class OpenedFile:
-    """The file that a path led to when it was opened; its engine keeps reading that one.
+    """The file that a path led to when it was opened; ConnectionLostError when it is gone.
 
     identity : device and inode; stamp : of a file that was opened as immutable, else None.
-
-    Raises `ConnectionLostError` when it cannot be reached.
     """
 
     def __init__(self, path: Path) -> None:
@@ -32,10 +29,7 @@ class OpenedFile:
         self.identity = self._found()
 
     def settle(self, *, is_immutable: bool) -> None:
-        """Note, after the first read, what is compared later.
-
-        Raises `ConnectionLostError` when the path leads to another file by now.
-        """
+        """Note the stamp after the first read; ConnectionLostError for another file."""
         if is_immutable:
             self.stamp = _stamp(self._path)
         self.look()
@@ -46,10 +40,7 @@ class OpenedFile:
             self.look()
 
     def look(self, *, has_committed: bool = False) -> None:
-        """Refuse to go on when the path leads to another file, or to none.
-
-        Raises `ConnectionLostError`.
-        """
+        """Raise `ConnectionLostError` when the path leads to another file, or to none."""
         if self._found() != self.identity:
             lost = "what was written last is not in it; " if has_committed else ""
             raise ConnectionLostError(
@@ -58,12 +49,7 @@ class OpenedFile:
         self.due = time.monotonic() + LOOK_SECONDS
 
     def check_stamp(self) -> None:
-        """Refuse to read on after somebody else has written.
-
-        For files that were opened as immutable: SQLite takes no locks on them.
-
-        Raises `BusyError` when somebody has written.
-        """
+        """Raise `BusyError` after a write to an immutable file, on which SQLite takes no locks."""
         if self.has_new_stamp():
             raise BusyError(f"{self._path} has been written since it was opened: open it again")
 

@@ -22,10 +22,7 @@ PAGE_BYTES = 8192
 
 @contextlib.contextmanager
 def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
-    """Give access to the bytes of a database file, for as long as the block lasts.
-
-    Raises `OSError` when the file is not there or may not be read.
-    """
+    """Access to the bytes of a database file inside; OSError when it may not be read."""
     os.stat(path)  # noqa: PTH116 - its error says why; SQLite's would not
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
@@ -60,10 +57,7 @@ def descriptor_of(identity: tuple[int, int]) -> int | None:
 
 
 def forget_pages(path: Path) -> None:
-    """Ask the operating system to drop the cached pages of an open database.
-
-    Pages that are not yet on disk stay. Does nothing when this process does not have the file open.
-    """
+    """Drop the operating system's cached pages of a database that this process has open."""
     status = path.stat()
     descriptor = descriptor_of((status.st_dev, status.st_ino))
     if descriptor is not None:

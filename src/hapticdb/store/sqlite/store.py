@@ -110,24 +110,19 @@ class SQLiteStore(FileTables):
         return cls.open(path)
 
     def discard(self) -> None:
-        """Close and delete an environment to which nothing was written."""
         self._connection.file.look()  # another environment's file must not be deleted
         self.close()
         sqlite_file.remove_file(self.path)
 
     @contextlib.contextmanager
     def loading(self) -> Iterator[None]:
-        """At the end the pages of an environment that was empty are filled.
-
-        Rows of each object go between those of others, which leaves an eighth of the pages unused.
-        """
+        """At the end, fill the pages of one that was empty: an eighth of them is unused."""
         was_empty = not self.revision()
         yield
         if was_empty and self.revision():
             self._connection.compact()
 
     def drop_caches(self) -> None:
-        """Forget all pages: the connection's, and the file's in the operating system's cache."""
         self._connection.check_thread()
         self._connection.driver.release_memory()
         sqlite_bytes.forget_pages(self.path)
@@ -154,18 +149,15 @@ class SQLiteStore(FileTables):
         return _rows_of(self.url, found, table)
 
     def count(self, lows: Keys, highs: Keys) -> int:
-        """How many rows `scan` would return, counted inside the engine."""
         if not lows.size:
             return 0
         return int(self._connection.fetch(*self._ranges.count(lows, highs))[0][0])
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
-        """Wrench (6,) of the frame by one statement, computed by force() inside the engine."""
         found = self._connection.fetch(*sqlite_force.wrench_statement(self.layout, frame))
         return np.frombuffer(found[0][0], dtype=np.float64)
 
     def statement_hits(self, frame: LocatedShell) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        """Ordinals (P,) and object ids (P,) of all hits, by the second statement."""
         found = self._connection.fetch(*sqlite_force.hits_statement(self.layout, frame))
         pairs = _pairs_of(self.url, found)
         return pairs[:, 0] - 1, pairs[:, 1].copy()
@@ -214,21 +206,17 @@ class _SQLiteEngine:
     title = "SQLite"
 
     def open(self, url: str, *, read_only: bool) -> Store:
-        """Open an existing file."""
         return SQLiteStore.open(_path_of(url), read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        """Make a new file, which appears whole or not at all."""
         return SQLiteStore.create(_path_of(url), grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:
-        """Whether a file of that name is there."""
         return _path_of(url).exists()
 
     def back_up(
         self, url: str, copy: str, *, replace: bool, progress: Progress | None
     ) -> BackupReport:
-        """Copy a file whole, as of one moment."""
         from hapticdb.store.sqlite.backup import back_up  # noqa: PLC0415 - seldom needed
 
         return back_up(_path_of(url), _path_of(copy), replace=replace, progress=progress)

@@ -20,8 +20,7 @@ from hapticdb.store.threads import check_thread, this_thread
 Result = TypeVar("Result")
 
 RECONNECT_SECONDS = 15.0
-"""Seconds of tries to reach a lost server. A larger value survives a slower restart, but a read
-waits longer for its error."""
+"""Seconds of tries to reach a lost server, after which a read raises its error."""
 FIRST_PAUSE_SECONDS = 0.05
 """Pause between the first two tries to connect again; each next pause is twice as long."""
 MOST_PAUSE_SECONDS = 0.5
@@ -33,8 +32,7 @@ WRITE_TRIES = 3
 class ServerConnection(Link, Closes):
     """One connection to one environment's schema; belongs to the thread that opened it.
 
-    is_loading : whether `Loading` is under way; is_closed : whether `close` was called; a lost
-    connection, which comes back by itself, is not closed.
+    is_loading : during `Loading`; is_closed : by `close`; a lost connection comes back by itself.
     """
 
     def __init__(self, address: Address, *, read_only: bool = False) -> None:
@@ -110,10 +108,7 @@ class ServerConnection(Link, Closes):
     def rows(
         self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
     ) -> list[tuple[Any, ...]]:
-        """All rows of a statement as Python values: for statements outside frames.
-
-        binary : whether they come as the server holds them, which is faster for bytes and doubles.
-        """
+        """All rows as Python values, outside frames; `binary` is faster for bytes and doubles."""
         return self.again(
             lambda: self.driver.execute(text, parameters or None, binary=binary).fetchall()
         )
@@ -145,8 +140,8 @@ class ServerConnection(Link, Closes):
         """Run `work` in one transaction, without a frame's time limit.
 
         When the connection is lost before the commit was sent, everything is done again. When it is
-        lost during the commit, `is_committed` tells, on the new connection, whether the commit was
-        done. Without `is_committed`, `work` must be harmless when it is done twice.
+        lost during the commit, `is_committed` decides on the new connection; without it, `work`
+        must be harmless when it is done twice.
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
@@ -207,8 +202,8 @@ class ServerConnection(Link, Closes):
     def begin(self, *settings: str) -> None:
         """Begin a transaction that writes, with settings of its own, in one round trip.
 
-        Refuses a server connection that is not the one whose search path was set: a pooler in
-        transaction mode gives each transaction another, and it would write to another schema.
+        Refuses a pooler in transaction mode, which gives each transaction another server
+        connection: it would write to another schema than that of the search path.
         """
         local = [f"SET LOCAL {setting}" for setting in settings]
         asked = "SELECT current_setting('search_path')"

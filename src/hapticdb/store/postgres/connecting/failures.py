@@ -109,10 +109,7 @@ def is_lost(error: BaseException) -> bool:
 
 
 def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
-    """Error for a connection that could not be made.
-
-    libpq gives no code here, only text. The text tells the usual causes apart.
-    """
+    """Error for a failed connection, by its text: libpq gives no code here."""
     if _line(error).startswith("connection is bad: invalid"):  # what libpq does not know
         return unusable(_line(error), shown)
     hosts = _reasons(str(error))
@@ -156,8 +153,8 @@ def _reasons(text: str) -> list[str]:
 def unusable(cause: str, shown: str) -> UsageError:
     """Error for a URL that libpq refuses.
 
-    libpq quotes what it does not understand, which may be a piece of a password. The quotation is
-    shown only if the redacted URL contains it.
+    libpq quotes what it does not understand, perhaps a piece of a password: the quotation is shown
+    only if the redacted URL contains it.
     """
     cause = " ".join(cause.removeprefix("connection is bad: ").split())
     if not cause or any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):

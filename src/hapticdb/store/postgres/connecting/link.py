@@ -1,14 +1,12 @@
 """The link to a server: psycopg's connection with our settings, waited for with a limit.
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
-statement. psycopg waits for the answer in short steps. So Ctrl-C interrupts the
-wait, and a server that stops answering causes an error instead of a hang, also during statements
-that may take long.
+statement. psycopg waits in short steps, so that Ctrl-C interrupts a wait, and a server that hangs
+causes an error, also during statements that may take long.
 
 Such a statement may be silent for minutes because the server works on it. A server that works also
-answers a new client; one that hangs, or whose network is cut, does not. The question is
-PostgreSQL's SSLRequest ("SSL Session Encryption" in its manual): it needs no password and takes
-none of the server's connections.
+answers a new client's SSLRequest ("SSL Session Encryption" in PostgreSQL's manual), which needs no
+password and none of the server's connections; one that hangs, or whose network is cut, does not.
 """
 
 import contextlib
@@ -59,11 +57,9 @@ GRACE_MS = 3000
 STEP_S = 0.1
 """Seconds between two looks at the limit of a wait. A larger value exceeds it by more."""
 SILENCE_S = 5.0
-"""Seconds without a byte from a server, after which it is asked whether it answers at all. A larger
-value asks a busy server less often, and notices later that it hangs."""
+"""Seconds without a byte from a server, after which its answer to a new client is tested."""
 ANSWER_S = 5.0
-"""Seconds that a server has to accept such a question, and again to answer it. A larger value bears
-slower servers, and notices later that one hangs."""
+"""Seconds that a server has to accept such a test, and again to answer it."""
 SSL_REQUEST = struct.pack("!ii", 8, 80877103)
 
 
@@ -124,9 +120,8 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
 class Link:
     """Holds one psycopg connection at a time; `connect` makes a new one.
 
-    shown : the URL as messages may show it; driver : psycopg's connection, autocommit, for
-    statements that no frame waits on; given_up : why this connection was given up while psycopg
-    waited for a statement, else None.
+    shown : the redacted URL; driver : psycopg's connection, autocommit, for statements outside
+    frames; given_up : the error for which psycopg's wait was given up, else None.
     """
 
     def __init__(self, address: Address, *, read_only: bool) -> None:
@@ -143,7 +138,7 @@ class Link:
     def connect(self, seconds: float = CONNECT_SECONDS) -> None:
         """Connect once, with `SETTINGS`; settings in the URL's `options` override them.
 
-        seconds : that the server may take to accept the connection, unless the URL says otherwise.
+        seconds : to accept the connection, unless the URL has `connect_timeout`.
         """
         given = "connect_timeout=" in self.address.conninfo
         try:
@@ -245,8 +240,7 @@ class Link:
     def hear(self) -> None:
         """Give notifications that have arrived to the notify handlers. Never waits.
 
-        Notifications that arrive during a statement stay in libpq until the next call, unless
-        psycopg has already given them to the handlers.
+        Those that arrive during a statement stay in libpq until then, or psycopg gives them.
         """
         self._pgconn.consume_input()
         while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:

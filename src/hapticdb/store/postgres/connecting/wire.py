@@ -1,10 +1,7 @@
 """Arrays in PostgreSQL's binary format, packed and read by NumPy without a Python loop.
 
-Statements take and return such arrays, and COPY loads them.
-
-An array is a header (dimensions, flags, element type, length, lower bound), then for each element
-its length and its value, all big-endian (PostgreSQL: array_send in arrayfuncs.c;
-for COPY its manual, "Binary Format").
+A header (dimensions, flags, element type, length, lower bound), then the length and the value of
+each element, all big-endian (array_send in arrayfuncs.c; for COPY the manual, "Binary Format").
 """
 
 import struct
@@ -93,10 +90,7 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
 
 
 def copy_rows(rows: Rows, object_id: int) -> bytes:
-    """Rows of an object in the form of COPY, without header and trailer.
-
-    Rows with distances are rows of the table `band`, others of the index table.
-    """
+    """Rows of an object, of `band` if they have distances, for COPY without header and trailer."""
     if rows.distances is not None:
         return _copy_band(rows.keys, rows.distances, object_id)
     has_bits = rows.occupancy.size > 0

@@ -79,10 +79,7 @@ class _Indexes:
 
 
 class Loading:
-    """The context in which a connection writes many objects. May be nested.
-
-    Indexes on partitions stay as they are.
-    """
+    """The context in which a connection writes many objects; indexes on partitions stay."""
 
     def __init__(self, connection: ServerConnection, layout: Layout, *, is_spread: bool) -> None:
         self._connection = connection
@@ -185,10 +182,7 @@ class Loading:
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
     def _make_index(self) -> None:
-        """Make the indexes, while readers go on and writers wait.
-
-        A lock lets one connection at a time do so: IF NOT EXISTS alone would let two begin.
-        """
+        """Make the indexes, one connection at a time: IF NOT EXISTS alone would let two begin."""
         connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:

@@ -7,18 +7,8 @@ import numpy as np
 from numpy.typing import NDArray
 from psycopg import errors
 
-from hapticdb.store.base import (
-    LAYOUTS,
-    NO_KEYS,
-    Covering,
-    Histogram,
-    Keys,
-    Layout,
-    Object,
-    Rows,
-    Size,
-    Table,
-)
+from hapticdb.store.base import LAYOUTS, NO_KEYS, Histogram, Keys, Object, Rows, Size, Table
+from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures, wire
@@ -131,7 +121,6 @@ class ServerTables(Tables):
         return self._seen
 
     def revision(self) -> int:
-        """Number of the last committed write; 0 for an empty environment."""
         text = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
         ((self._seen, identity),) = self._rows(text)
         if identity != self.identity:
@@ -156,7 +145,7 @@ class ServerTables(Tables):
         self._alone(work)
 
     def _new_id(self, revision: int) -> int:
-        """One above all ids ever given. The write lock is held, so nobody else adds an object.
+        """One above all ids ever given, under the write lock.
 
         On partitions an id of an add that failed is never given again: rows of it may be there.
         """
@@ -194,15 +183,15 @@ class ServerTables(Tables):
         if rows.distances is not None:
             self._copy_into("band", rows, object_id)
 
-    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:
+    def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
         """Delete the rows of an object as it is now, from both tables; returns their keys.
 
         keys : of its new rows; on partitions a try that failed may have left such rows.
         """
-        ends = np.array(list(covering(known)), dtype=np.int64).reshape(-1, 2)
+        lows, highs = ranges
         if self._is_spread and keys.size:
-            ends = np.concatenate([ends, [[keys.min(), keys.max()]]])
-        chosen = wire.int8s(ends[:, 0]), wire.int8s(ends[:, 1]), wire.int8(known.id)
+            lows, highs = np.append(lows, keys.min()), np.append(highs, keys.max())
+        chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(known.id)
         tables: list[Table] = [self.layout]
         if known.has_distances:
             tables.append("band")
@@ -225,7 +214,6 @@ class ServerTables(Tables):
     # -- statistics ------------------------------------------------------------------------------
 
     def size(self) -> Size:
-        """Rows, bytes of all tables and indexes, leaf blocks; rows of distances; surfaces."""
         with self._connection.snapshot(), self._connection.without_limit():
             self.revision()
             counted = (
@@ -243,16 +231,35 @@ class ServerTables(Tables):
             return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
 
     def quantiles(self, resolution: int) -> Histogram:
-        """Equi-count histogram of all row keys, of R buckets.
+        """At 10,000 from the server's statistics once there are enough rows."""
+        found = self._server_histogram() if resolution == SERVER_RESOLUTION else None
+        return found or super().quantiles(resolution)
 
-        At 10,000 from the server's statistics once there are enough rows; else the kept one while
-        no object was written since, else computed exactly.
+    def _server_histogram(self) -> Histogram | None:
+        """Histogram of 10,000 buckets from `pg_stats`; None for few rows, or without an ANALYZE.
+
+        The bounds of `pg_stats` leave out the most common keys, which have shares of all rows. The
+        rows of a bucket count at its upper bound, those of a common key at that key. Bound i is the
+        least key up to which the share of rows is i / R, right to within a bucket.
         """
-        if resolution == SERVER_RESOLUTION:
-            found = server_histogram(self._connection, self.layout)
-            if found is not None and found[1] >= ENOUGH_ROWS:
-                return Histogram(*found, "server statistics")
-        return super().quantiles(resolution)
+        parameters = wire.text(self._connection.address.environment), wire.text(self.layout)
+        *found, frequencies, n_rows = self._connection.fetch(STATISTICS, *parameters)
+        rows = wire.read_int8(n_rows) if n_rows is not None else 0
+        if rows < ENOUGH_ROWS:
+            return None
+        bounds, common = map(wire.read_int8s, found)
+        shares = wire.read_float8s(frequencies) if frequencies else np.empty(0)
+        keys = np.concatenate([bounds[1:], common])
+        equal: Keys = np.zeros(SERVER_RESOLUTION + 1, dtype=np.int64)
+        if len(keys):
+            rest = max(1.0 - float(shares.sum()), 0.0)
+            in_buckets = np.full(len(bounds[1:]), rest / max(len(bounds) - 1, 1))
+            order = np.argsort(keys, kind="stable")
+            up_to = np.cumsum(np.concatenate([in_buckets, shares])[order])
+            targets = np.arange(SERVER_RESOLUTION + 1) / SERVER_RESOLUTION * up_to[-1]
+            equal = keys[order][np.searchsorted(up_to, targets)]
+            equal[0] = np.append(keys, bounds[:1]).min()
+        return Histogram(equal, rows, "server statistics")
 
     def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
         """The server's own statistics once there are enough rows."""
@@ -265,7 +272,18 @@ class ServerTables(Tables):
         return super()._measured(resolution)
 
     def _exact(self, resolution: int) -> tuple[Keys, int]:
-        return exact_histogram(self._connection, self.layout, resolution)
+        """By the paper's Definition 2: bound i is the key of the row of rank ceil(i N / R)."""
+        connection = self._connection
+        with connection.snapshot(), connection.without_limit():
+            counted = connection.execute(f"SELECT count(*) FROM {self.layout}").fetchone()
+            n_rows = int(counted[0]) if counted else 0
+            if n_rows == 0:
+                return np.zeros(2, dtype=np.int64), 0
+            ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
+            (bounds,) = connection.fetch(
+                EXACT[self.layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))
+            )
+        return wire.read_int8s(bounds), n_rows
 
     def _bytes(self) -> tuple[int, int]:
         """Bytes of all tables and indexes of the schema, and pages of the index of its rows."""
@@ -278,65 +296,3 @@ class ServerTables(Tables):
             (f"{self.layout}_key",),
         ).fetchall()
         return int(total), int(pages)
-
-
-def server_histogram(connection: ServerConnection, layout: Layout) -> tuple[Keys, int] | None:
-    """Bounds (10,001,) from `pg_stats` and the rows behind them; None before the first ANALYZE."""
-    bounds, common, frequencies, n_rows = connection.fetch(
-        STATISTICS,
-        wire.text(connection.address.environment),
-        wire.text(layout),
-    )
-    rows = wire.read_int8(n_rows) if n_rows is not None else 0
-    if rows <= 0:
-        return None
-    shares = wire.read_float8s(frequencies) if frequencies else np.empty(0)
-    return (
-        with_common_values(
-            wire.read_int8s(bounds), wire.read_int8s(common), shares, SERVER_RESOLUTION
-        ),
-        rows,
-    )
-
-
-def with_common_values(
-    bounds: Keys, common: Keys, shares: NDArray[np.float64], resolution: int
-) -> Keys:
-    """Equi-count bounds (R + 1,) of all rows, from a histogram without the most common keys.
-
-    bounds (B + 1,) : of the rows whose keys are not among the common ones; may be empty; common,
-    shares (C,) : most common keys, and the share of all rows that each has; resolution : R.
-
-    The rows of a bucket count at its upper bound, those of a common key at that key. Bound i is the
-    least key up to which the share of rows is i / R, right to within a bucket of the histogram.
-    """
-    keys = np.concatenate([bounds[1:], common])
-    if not len(keys):
-        return np.zeros(resolution + 1, dtype=np.int64)
-    rest = max(1.0 - float(shares.sum()), 0.0)
-    in_buckets = np.full(len(bounds[1:]), rest / max(len(bounds) - 1, 1))
-    order = np.argsort(keys, kind="stable")
-    up_to = np.cumsum(np.concatenate([in_buckets, shares])[order])
-    targets = np.arange(resolution + 1) / resolution * up_to[-1]
-    found: Keys = keys[order][np.searchsorted(up_to, targets)]
-    found[0] = np.append(keys, bounds[:1]).min()
-    return found
-
-
-def exact_histogram(
-    connection: ServerConnection, layout: Layout, resolution: int
-) -> tuple[Keys, int]:
-    """Bounds (R + 1,) by Definition 2 of the paper, over all rows, and their number N.
-
-    Bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
-    """
-    with connection.snapshot(), connection.without_limit():
-        counted = connection.execute(f"SELECT count(*) FROM {layout}").fetchone()
-        n_rows = int(counted[0]) if counted else 0
-        if n_rows == 0:
-            return np.zeros(2, dtype=np.int64), 0
-        ranks = -(-np.arange(resolution + 1, dtype=np.int64) * n_rows // resolution)
-        (bounds,) = connection.fetch(
-            EXACT[layout], wire.int8s(np.maximum(ranks, 1)), wire.float8(float(n_rows))
-        )
-    return wire.read_int8s(bounds), n_rows

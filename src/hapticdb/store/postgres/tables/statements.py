@@ -1,8 +1,7 @@
 """The SQL of the haptic query on PostgreSQL: one statement, which returns one row of packed arrays.
 
-Every statement also returns the revision that it has seen. So a reader learns without another round
-trip whether the environment has changed. Rows come in the order of the index; `PostgresStore`
-checks that.
+Every statement also returns its revision, so a reader notices an edit without another round trip.
+Rows come in the order of the index; `PostgresStore` checks that.
 """
 
 from typing import NamedTuple, get_args
@@ -100,9 +99,8 @@ SELECT array_agg(n), array_agg(id), {SEEN}
 def without_excluded(sql: str, layout: Layout, number: int) -> str:
     """Exclude objects from a statement.
 
-    Its parameters from that number on are the least excluded id, the greatest, and a bytea with a
-    bit for each id in between that is 1 where it is excluded: the server would compare each row
-    with each element of an array of ids.
+    Its parameters from that number on: least and greatest excluded id, and a bytea with a bit for
+    each in between. The server would compare each row with each element of an array of ids.
     """
     test = KEY_TEST[layout]
     low, high, bits = f"${number}", f"${number + 1}", f"${number + 2}"

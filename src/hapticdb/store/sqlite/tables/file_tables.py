@@ -10,17 +10,8 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
-from hapticdb.store.base import (
-    BRICK_BYTES,
-    NO_KEYS,
-    Covering,
-    Keys,
-    Layout,
-    Object,
-    Rows,
-    Size,
-    Table,
-)
+from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Keys, Layout, Object, Rows, Size, Table
+from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.tables import LAST_REVISION, Tables
@@ -41,8 +32,7 @@ INSERT_BAND = """
 INSERT INTO band SELECT value, ?2, substr(?3, nth(?4, rowid, 0), nth(?5, rowid, 0))
   FROM carray(?1)"""
 CHUNK = 1 << 14
-"""Rows that one statement inserts. A larger value takes more memory: to undo the statement, up to a
-page for each row."""
+"""Rows that one statement inserts; to undo it takes up to a page of memory for each."""
 PUT_PAIR = PUT.format(values=f"VALUES ({', '.join('?' * 14)})")
 DELETE_PAIR = "DELETE FROM pair WHERE (a, b) = (?, ?)"
 DELETE: dict[Table, str] = {
@@ -115,7 +105,6 @@ class FileTables(Tables):
         self._do("INSERT INTO change VALUES (?, ?, ?, ?)", change)
 
     def revision(self) -> int:
-        """Number of the last committed write; 0 for an empty environment."""
         return parsing.number_of(
             self.url, self._rows(f"SELECT {LAST_REVISION}")[0][0], "the revision"
         )
@@ -145,12 +134,12 @@ class FileTables(Tables):
             keys = apsw.carray(np.ascontiguousarray(band.keys))
             self._do(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
 
-    def _take(self, known: Object, covering: Covering, keys: Keys = NO_KEYS) -> Keys:  # noqa: ARG002
+    def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:  # noqa: ARG002
         tables: list[Table] = [self.layout]
         if known.has_distances:
             tables.append("band")
         gone: list[int] = []
-        for low, high in covering(known):
+        for low, high in zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True):
             for table in tables:
                 deleted = self._do(DELETE[table], (low, high, known.id))
                 gone += [row[0] for row in deleted]
@@ -159,7 +148,6 @@ class FileTables(Tables):
     # -- statistics ------------------------------------------------------------------------------
 
     def size(self) -> Size:
-        """Rows, bytes of the file and its log, leaf blocks; rows of distances; surfaces."""
         with self._connection.snapshot():
             rows = self._connection.fetch(f"SELECT count(*) FROM {self.layout}")[0][0]
             blocks = self._connection.fetch(
@@ -173,7 +161,6 @@ class FileTables(Tables):
         return Size(int(rows), total, n_blocks, *map(int, (*band, *surfaces)))
 
     def findings(self) -> Iterator[str]:
-        """What is wrong with indexes and kept statistics, a line each."""
         for (line,) in self._connection.fetch("PRAGMA integrity_check(100)"):
             if line != "ok":
                 yield " ".join(str(line).split())
@@ -182,10 +169,8 @@ class FileTables(Tables):
     def _exact(self, resolution: int) -> tuple[Keys, int]:
         """Bounds (v + 1,) of the v-quantile vector (the paper's Definition 2), and the rows N.
 
-        SQLite's own statistics (``sqlite_stat4``) hold only 24 samples.
-        Bound i is the key of the row of rank j = ceil(i N / v), i = 1 .. v; bound 0 is the lowest.
-        Each step skips, inside the engine, from the row of one rank to the row of the next, in the
-        order of (z_val, id). Rows with the same key count one by one.
+        Bound i is the key of the row of rank ceil(i N / v), bound 0 the lowest. Each step skips,
+        inside the engine, from one rank to the next. ``sqlite_stat4`` holds only 24 samples.
         """
 
         def row_of(sql: str, *bindings: int) -> tuple[int, int]:

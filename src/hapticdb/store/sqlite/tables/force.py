@@ -69,8 +69,7 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
 class _Force:
     """The user-defined aggregate ``force(shell, ordinal, key)``.
 
-    A step only collects a hit. The wrench is summed at the end, in the order of the ordinals. (An
-    ORDER BY inside the call would do the same, but SQLite drops a bound pointer when it sorts.)
+    It sums at the end, in the order of the ordinals: SQLite would drop a bound pointer in a sort.
     """
 
     def __init__(self, grid: Grid, layout: Layout) -> None:
@@ -103,10 +102,9 @@ class _Force:
 def _without_excluded(
     sql: str, layout: Layout, bindings: tuple[Any, ...], frame: LocatedShell
 ) -> tuple[str, tuple[Any, ...]]:
-    """Leave objects out of a statement: one more condition on the row's id.
+    """Leave objects out of a statement by one more condition on the row's id.
 
-    A set in Python: SQLite would build an index of the ids for each statement, which takes longer
-    than the frame where thousands are left out.
+    A set in Python: SQLite's index of thousands of ids takes longer than the frame.
     """
     if not frame.exclude.size:
         return sql, bindings

@@ -1,8 +1,7 @@
 """How ranges of keys reach SQLite: one prepared statement for any number of ranges.
 
-If one integer has room for the lower end and the width of a range, it carries both. This is so
-in every frame on a grid of 11 bits. Otherwise the lower ends are bound, and the SQL function `nth`
-returns the upper ends (docs/decisions/0004).
+One integer carries the lower end and the width of a range if it has room, as in every frame on a
+grid of 11 bits. Otherwise the SQL function `nth` returns the upper ends (docs/decisions/0004).
 """
 
 from typing import Any, cast

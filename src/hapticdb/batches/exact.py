@@ -23,10 +23,7 @@ def exact_clearance(
     reach: float,
     progress: Callable[[int, int], None] | None,
 ) -> ClearanceBatch:
-    """Distances at poses (B, 4, 4), rigid; boxes say which objects may be near, surfaces how near.
-
-    Raises `UsageError` if the shell has no surface.
-    """
+    """Distances at poses (B, 4, 4), rigid; broad phase by boxes; UsageError without a surface."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 
     tool = MovingSurface(shell)

@@ -32,11 +32,9 @@ if TYPE_CHECKING:
     from hapticdb.batches.on_gpu import GpuFrames
 
 PIECE_CHUNKS = 32
-"""Chunks of poses, for each thread, in a piece: cells are fetched between pieces, and `progress` is
-called. A larger value takes more memory and fetches more cells by one statement."""
+"""Chunks of poses, for each thread, in a piece: between pieces cells are fetched."""
 PIECE, TASK = 1 << 18, 1 << 16
-"""Poses of a long batch that are felt at once here, 60 MB, and by one task of a worker. Larger:
-cells are read less often, and more memory is taken, or fewer workers share."""
+"""Poses of a long batch that are computed at once here, 60 MB, and by one task of a worker."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -49,18 +47,12 @@ _Answer = TypeVar("_Answer")
 
 
 class Feeler(Closes):
-    """A tool in an environment, with the cells around it in memory, for batches of poses.
+    """A tool in an environment, with cells in memory from one batch of poses to the next.
 
-    `Environment.feeler` makes one. It uses the environment's connection, so only the thread that
-    opened the environment may use it. It is also a context manager. Its cells stay in memory
-    between calls. Each call reads one committed revision, the newest.
+    `Environment.feeler` makes one, on the environment's connection and for its thread. It is also a
+    context manager. Each call reads one committed revision, the newest.
 
-    Attributes
-    ----------
-    shell : PointShell
-        The tool.
-    law : ForceLaw
-        Law of every touch.
+    shell : the tool; law : law of every touch.
     """
 
     def __init__(
@@ -134,27 +126,18 @@ class Feeler(Closes):
     ) -> TouchBatch:
         """Force and torque at many poses; bit for bit those of `Environment.touch` at each pose.
 
-        On a GPU each point is felt by the same law, but the sum over the points has another order,
-        and multiplications may be fused with additions. It repeats bit for bit.
+        A GPU sums the points in another order, and may fuse multiplications with additions. It
+        repeats bit for bit.
 
-        Parameters
-        ----------
-        poses : (B, 4, 4) array
-            world_from_tool, rigid, metres, in any order. An array in a file that is mapped into
-            memory is read piece by piece.
-        objects : bool
-            Whether to name the objects that each pose touches. They are looked up in the database
-            for each pose in contact, which takes many times as long as the force.
-        progress : callable or None
-            Called after each piece with the poses done and their total.
+        poses (B, 4, 4) : world_from_tool, rigid, metres, in any order; a mapped array is read piece
+            by piece
+        objects : whether to name the objects of each pose in contact, by the database: many times
+            the time of the force
+        progress : called after each piece with the poses done and their total
 
-        Raises
-        ------
-        UsageError
-            If the poses have another shape, one is not rigid, or the cells that one pose needs do
-            not fit into the budget.
-        ObjectNotFoundError
-            If a word of `where` or `exclude` chooses no object.
+        Raises `UsageError` if the poses have another shape, one is not rigid, or its cells do not
+        fit into the budget; `ObjectNotFoundError` if a word of `where` or `exclude` chooses no
+        object.
         """
         places = as_poses(poses)
         order = self._order_of(places)
@@ -169,19 +152,9 @@ class Feeler(Closes):
     ) -> ClearanceBatch:
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
-        Parameters
-        ----------
-        poses : (B, 4, 4) array
-            As for `touch`.
-        reach : float or None
-            Greatest distance that is searched, metres; 32 voxels unless given.
-        progress : callable or None
-            As for `touch`.
+        reach : greatest distance that is searched, metres; 32 voxels unless given.
 
-        Raises
-        ------
-        UsageError, ObjectNotFoundError
-            As for `touch`; also if the reach is not a positive number, or needs too many cells.
+        Raises errors as for `touch`; also if the reach is not positive, or needs too many cells.
         """
         size = self._residency.grid.voxel_size
         limit = reach_of(reach, size)
@@ -204,23 +177,10 @@ class Feeler(Closes):
         return self._at_one_revision(searched)
 
     def collides(self, poses: ArrayLike, *, progress: PoseCallback | None = None) -> Bools:
-        """Whether any of the shell's points is in a voxel at many poses: `touch` has hits there.
+        """Whether any of the shell's points is in a voxel at many poses, (B,): `touch` has hits.
 
-        The search of a pose ends at the first hit, so it takes less time than the force.
-
-        Parameters
-        ----------
-        poses, progress
-            As for `touch`.
-
-        Returns
-        -------
-        (B,) array of bool
-
-        Raises
-        ------
-        UsageError, ObjectNotFoundError
-            As for `touch`.
+        The search of a pose ends at the first hit, so it takes less time than the force. Arguments
+        and errors are those of `touch`.
         """
         if self._gpu is not None:
             return self.touch(poses, progress=progress).hits > 0

@@ -21,8 +21,7 @@ CLOSE = 1.5, 4.0
 CELL = 32
 """Voxels of a cell on each axis."""
 RUN = 16
-"""Points of a run that is looked around as a whole. Larger: fewer balls and more points, each of
-which is looked up by itself; with 64 a search of 300 points takes a third longer."""
+"""Points of a run, which has one bounding sphere; with 64 a search takes a third longer."""
 
 
 def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) -> Ints:
@@ -40,10 +39,10 @@ def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) 
 
 
 class NearestSearch:
-    """Searches the voxels nearest to a shell, within a reach.
+    """Searches the voxels nearest to a shell, within a reach in voxels.
 
-    frames : frames of the shell; cells around its points are fetched into their table; threads :
-    of the same frames; reach : voxels; greater distances are not searched.
+    frames : of the shell; cells around its points are fetched into their table; threads : of the
+    same frames.
 
     Raises `UsageError` if the cells within reach of one point are more than the table can hold.
     """

@@ -122,10 +122,7 @@ class _Lane:
 
 
 class GpuFrames:
-    """Frames of one shell on the GPU, on the cells of its residency.
-
-    frames : frames of the shell on the processor, which fetch cells.
-    """
+    """Frames of one shell on the GPU; those of the processor, `frames`, fetch the cells."""
 
     def __init__(self, frames: ResidentFrames) -> None:
         check_gpu()
@@ -153,12 +150,10 @@ class GpuFrames:
         self._copiers.shutdown()
 
     def feel(self, pose: Floats) -> Floats:
-        """Results (RESULTS,) of a frame at one pose (4, 4), in the cells that are in memory.
+        """Results (RESULTS,) of a frame at a rigid pose (4, 4), else UsageError, in resident cells.
 
         The pose travels with the launch, and the results come without a copy: a tenth of the time
         of `run` for one pose.
-
-        Raises `UsageError` if the pose is not rigid.
         """
         if rigid.first_not_rigid(pose[None]) == 0:
             raise not_rigid(0)
@@ -191,10 +186,7 @@ class GpuFrames:
                 self._put(felt, ready[part], found)
 
     def run(self, poses: Floats) -> Iterator[tuple[slice, RawFrames]]:
-        """Results of poses (B, 4, 4), piece by piece, in the cells that are in memory.
-
-        Raises `UsageError` if a pose is not rigid.
-        """
+        """Results of rigid poses (B, 4, 4), else UsageError, piece by piece, in resident cells."""
         self.mirror.update()
         piece = min(self._piece, len(poses))
         if self._lanes and len(self._lanes[0].poses) < piece:

@@ -26,9 +26,8 @@ def order_of(
 ) -> NDArray[np.int64]:
     """Indices (B,) of poses (B, 4, 4), along the grid's curve, by the place of the tool's centre.
 
-    The poses may lie in a file that is mapped into memory. center (3,), tool frame, metres.
-
-    Raises `UsageError` if a pose is not rigid; it names the first one.
+    The poses may lie in a mapped file. center (3,), tool frame, metres. `UsageError` names the
+    first pose that is not rigid.
     """
     keys = np.empty(len(poses), dtype=np.int64)
     for start in range(0, len(poses), AT_ONCE):

@@ -30,21 +30,13 @@ class Named(NamedTuple):
 class TouchBatch:
     """What a tool felt at B poses, all of them at one committed revision.
 
-    Attributes
-    ----------
-    forces : (B, 3) float64
-        N, world frame, on the tool.
-    torques : (B, 3) float64
-        N m about the tool's centre of mass, world frame.
-    hits, n_contacts : (B,) int64
-        Number of the shell's points inside a voxel, and number of the points that the law feels.
-        Under `DistanceField` a contact need not be a hit.
-    deepest : (B,) float64
-        Depth of the deepest contact in metres, 0 without contacts.
-    law : ForceLaw
-        The force law that was felt.
-    revision : int
-        Revision of the environment that was felt.
+    forces (B, 3) float64 : N, world frame, on the tool
+    torques (B, 3) float64 : N m about the tool's centre of mass, world frame
+    hits, n_contacts (B,) int64 : number of the shell's points inside a voxel, and number of the
+        points that the law feels. Under `DistanceField` a contact need not be a hit.
+    deepest (B,) float64 : depth of the deepest contact in metres, 0 without contacts
+    law : the force law that was felt
+    revision : revision of the environment that was felt
     """
 
     def __init__(self, n_poses: int, law: ForceLaw) -> None:
@@ -89,14 +81,9 @@ class TouchBatch:
 
     @property
     def ids(self) -> Ints:
-        """Ids (P,) of the objects that each pose touches, pose after pose, ascending for each.
+        """Ids (P,) of the objects of hits and contacts, pose after pose, ascending for each.
 
-        They are those of the pose's hits and, under `DistanceField`, those that contacts touch.
-
-        Raises
-        ------
-        UsageError
-            If objects were not asked for.
+        Raises `UsageError` if objects were not asked for.
         """
         return self._named().ids
 
@@ -122,22 +109,13 @@ class TouchBatch:
 class ClearanceBatch:
     """Distances of a tool's points from the environment at B poses, at one committed revision.
 
-    Attributes
-    ----------
-    distances : (B,) float64
-        Metres from the nearest of the shell's points to the nearest occupied voxel's box: 0 for a
-        pose with a hit, `reach` where nothing is nearer. No surface of the environment is nearer to
-        a point, because each lies in occupied voxels. If they are exact: from the tool's surface to
-        the nearest surface of an object, never too large.
-    points : (B,) int64
-        Index of a nearest point, -1 where nothing is within reach.
-    reach : float
-        Greatest distance that was searched, metres.
-    cover : float or None
-        Covering radius of the shell, metres, if it is known: no place of the tool's surface is
-        farther from the nearest point.
-    revision : int
-        Revision of the environment that was searched.
+    distances (B,) float64 : metres from the nearest of the shell's points to the nearest occupied
+        voxel's box: 0 for a pose with a hit, `reach` where nothing is nearer, never more than to a
+        surface. If exact: from the tool's surface to the nearest surface of an object.
+    points (B,) int64 : index of a nearest point, -1 where nothing is within reach
+    reach : greatest distance that was searched, metres
+    cover : covering radius of the shell, metres, if it is known
+    revision : revision of the environment that was searched
     """
 
     def __init__(self, n_poses: int, reach: float, cover: float | None) -> None:

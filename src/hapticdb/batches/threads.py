@@ -17,13 +17,11 @@ from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.table import MOST_READERS
 
 CHUNK_POINTS = 1 << 18
-"""Points placed by one call of a kernel, but at least one pose. A larger value makes fewer calls;
-Ctrl-C then waits longer."""
+"""Points placed by one call of a kernel, after which Ctrl-C is noticed; but at least one pose."""
 CHUNK_POSES = 1024
 """Most poses of one call of a kernel. A larger value makes fewer calls, which share less evenly."""
 CUBES = 1 << 19
-"""Cubes of space whose nearest voxel each thread remembers, a power of two; 32 bytes each. A larger
-value forgets less, and no longer fits into a processor's cache."""
+"""Cubes of space in a thread's cache of nearest voxels, a power of two; 32 bytes each."""
 MOST_JOBS = MOST_READERS - 2
 """Most threads: each is a reader of the table, beside the shell's own and one more."""
 
@@ -43,10 +41,7 @@ ChunkWork = Callable[[ThreadMemory, slice], None]
 
 
 def available_jobs(jobs: int | None) -> int:
-    """Number of threads: as given, or one for each processor that this process may use.
-
-    Raises `UsageError` if it is less than 1, or more than `MOST_JOBS`.
-    """
+    """Number of threads: 1 to `MOST_JOBS`, or one for each processor that this process may use."""
     if jobs is None:
         able = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         return min(able or 1, MOST_JOBS)
@@ -56,10 +51,7 @@ def available_jobs(jobs: int | None) -> int:
 
 
 class BatchThreads:
-    """Runs kernels on slices of a batch, in as many threads as there are jobs.
-
-    frames : frames of the shell; its table is joined once for each thread; jobs : threads.
-    """
+    """Runs kernels on slices of a batch; each of `jobs` threads joins the table of `frames`."""
 
     def __init__(self, frames: ResidentFrames, jobs: int) -> None:
         self.jobs = jobs

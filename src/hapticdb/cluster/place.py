@@ -8,10 +8,7 @@ from hapticdb.store.connect import open_store
 
 
 class Whereabouts(NamedTuple):
-    """Where workers read the environment that is open here.
-
-    url : opens it, there as here; revision, write : its last write, by which it is known.
-    """
+    """URL of an environment, for workers; its revision and last write identify it."""
 
     url: str
     revision: int

@@ -1,8 +1,7 @@
-"""Work on other machines, by the scheduler of dask.distributed that people run already.
+"""Work on other machines, by a running scheduler of dask.distributed.
 
-A task is one call that can be pickled. It writes nothing, and the caller writes what it returns.
-So dask can run it again where its worker is lost, and an interrupted command leaves what the same
-work leaves here.
+A task is one call that can be pickled and writes nothing. So dask can run it again where its worker
+is lost, and an interrupted command leaves what the same work leaves here.
 """
 
 import asyncio
@@ -25,8 +24,7 @@ LONGEST_S = 10.0
 LOOK_EVERY_S = 1.0
 """Seconds after which it is asked again whether there are workers."""
 AHEAD = 3
-"""Tasks for each thread of the workers that are given out at once. Larger: workers wait less for
-the next one, and more results lie in their memory."""
+"""Tasks for each thread of the workers that are given out at once."""
 QUIET = dict.fromkeys(("distributed", "distributed.client"), "critical")
 """What dask logs: whatever a user must know is an error of ours."""
 
@@ -125,12 +123,8 @@ class Cluster:
 def connected(address: str | None) -> Iterator[Cluster | None]:
     """Connect to a scheduler, ``tcp://host:8786``, while the block runs; None without an address.
 
-    Raises
-    ------
-    MissingExtraError
-        If dask.distributed is not installed.
-    ClusterError
-        If no scheduler answers there.
+    Raises `MissingExtraError` if dask.distributed is not installed; `ClusterError` if no scheduler
+    answers there.
     """
     if address is None:
         yield None

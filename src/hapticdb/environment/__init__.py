@@ -14,17 +14,11 @@ __all__ = ["Environment", "create", "open"]
 def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open
     """Open an environment.
 
-    Parameters
-    ----------
-    url : str or path
-        A path, ``sqlite:///path``, or ``postgresql://user@host/database?environment=NAME``.
-    read_only : bool
-        Refuse every write; works on files and folders that cannot be written.
+    url : a path, ``sqlite:///path``, or ``postgresql://user@host/database?environment=NAME``;
+    read_only : refuse every write; works on files and folders that cannot be written.
 
-    Raises
-    ------
-    EnvironmentNotFoundError, NotAnEnvironmentError, NewerVersionError, DamagedError
-        If there is no environment, something else, or one that cannot be read.
+    Raises `EnvironmentNotFoundError`, `NotAnEnvironmentError`, `NewerVersionError` or
+    `DamagedError` if there is no environment, something else, or one that cannot be read.
     """
     return Environment(open_store(url, read_only=read_only), url)
 
@@ -38,19 +32,11 @@ def create(
 ) -> Environment:
     """Make an environment with a given grid and open it.
 
-    Parameters
-    ----------
-    layout : {"brick", "voxel"}
-        Rows of its index table.
-    distances : bool or None
-        Whether parts get distances for the force law distance; bricks do unless told otherwise.
+    layout : rows of its index table; distances : whether parts get distances for the force law
+    distance; bricks do unless told otherwise.
 
-    Raises
-    ------
-    EnvironmentExistsError
-        If something exists there already.
-    UsageError
-        Bricks in lexicographic order, or distances on the layout voxel.
+    Raises `EnvironmentExistsError` if something exists there already; `UsageError` for bricks in
+    lexicographic order, or distances on the layout voxel.
     """
     wish = wants_distances(layout, distances)
     return Environment(create_store(url, grid, layout, distances=wish), url)

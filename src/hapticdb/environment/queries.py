@@ -81,35 +81,23 @@ class Queries:
 
         Points outside the grid miss. All statements of a touch read one committed revision.
 
-        Parameters
-        ----------
-        shell : PointShell
-            Points in metres and inward unit normals, tool frame.
-        pose : (4, 4) array
-            world_from_tool, rigid, metres. A `Touch` is returned.
-        poses : (B, 4, 4) array
-            Many of them instead, for a `TouchBatch`, the same bit for bit, by all processors.
+        shell : points in metres and inward unit normals, tool frame
+        pose (4, 4) : world_from_tool, rigid, metres. A `Touch` is returned.
+        poses (B, 4, 4) : many of them instead, for a `TouchBatch`, the same bit for bit, by all
+            processors
         objects, progress, device : for many poses, as for `Feeler.touch` and `feeler`
-        strategy : str
-            For one pose, form of the query: ``statement``, ``array``, ``points``, ``maxgap``,
-            ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few ranges, else
-            ``array``. All strategies find the same hits, ids and wrench, bit for bit.
-        where, exclude : iterable of int or str
-            Felt are the objects that `where` chooses, all if it is empty, without those of
-            `exclude`: a part that is taken out must not hit itself. Ids, names, patterns and
-            ``attribute=value``, as for `find`; read again whenever others have written.
-        maxgap : int
-            For the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range.
-        law : TangentPlane, DistanceField, "plane", "distance" or None
-            By default ``distance`` (`DistanceField`) where `has_distances`, else ``plane``, with
+        strategy : for one pose, form of the query: ``statement``, ``array``, ``points``,
+            ``maxgap``, ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few
+            ranges, else ``array``. All strategies find the same hits, ids and wrench, bit for bit.
+        where, exclude : felt are the objects that `where` chooses, all if it is empty, without
+            those of `exclude`: a part that is taken out must not hit itself. Ids, names, patterns
+            and ``attribute=value``, as for `find`; read again whenever others have written.
+        maxgap : for the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range
+        law : by default ``distance`` (`DistanceField`) where `has_distances`, else ``plane``, with
             1000 N/m. The strategy ``statement`` computes ``plane`` alone.
 
-        Raises
-        ------
-        UsageError
-            If a pose is not rigid, the strategy unknown, or objects lack what the law reads.
-        ObjectNotFoundError
-            If a word of `where` or `exclude` chooses no object.
+        Raises `UsageError` if a pose is not rigid, the strategy unknown, or objects lack what the
+        law reads; `ObjectNotFoundError` if a word of `where` or `exclude` chooses no object.
         """
         if (pose is None) == (poses is None):
             raise UsageError("touch: give either one pose, or poses=...")
@@ -134,14 +122,9 @@ class Queries:
     ) -> Generator["TouchBatch", None, None]:
         """Touch at more poses than fit into memory, piece by piece, in their order.
 
-        Parameters
-        ----------
-        poses : (B, 4, 4) array
-            It may lie in a file.
-        shell, where, exclude, law
-            As for `touch`.
-        on : str
-            ``cpu``, ``cuda``, or a scheduler of dask.distributed, ``tcp://host:8786``. Its workers
+        poses (B, 4, 4) : may lie in a file
+        shell, where, exclude, law : as for `touch`
+        on : ``cpu``, ``cuda``, or a scheduler of dask.distributed, ``tcp://host:8786``. Its workers
             reach the environment by the URL that opened it. They feel the same, bit for bit.
         """
         from hapticdb.batches import feeler as feeling  # noqa: PLC0415 - loads numba
@@ -174,23 +157,9 @@ class Queries:
         device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> NDArray[np.bool_]:
-        """Whether the tool hits anything at many poses, (B,): `touch` has hits there.
+        """Whether the tool hits anything at rigid poses (B, 4, 4): `touch` has hits there.
 
-        Parameters
-        ----------
-        poses : (B, 4, 4) array
-            world_from_tool, rigid, metres, in any order.
-        shell, where, exclude
-            As for `touch`.
-        device
-            As for `feeler`.
-        progress
-            As for `Feeler.touch`.
-
-        Raises
-        ------
-        UsageError, ObjectNotFoundError
-            As for `touch`.
+        Arguments as for `touch`, `feeler` and `Feeler.touch`; errors as for `touch`.
         """
         with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.collides(poses, progress=progress)
@@ -210,27 +179,13 @@ class Queries:
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
         With `exact`, the distance of the tool's surface from the nearest one of an object, with
-        the index of the point nearest to the place; some hundred times slower.
+        the index of the point nearest to the place; some hundred times slower, on processors alone.
 
-        Parameters
-        ----------
-        poses : (B, 4, 4) array
-            world_from_tool, rigid, metres, in any order.
-        reach : float or None
-            Greatest distance that is searched, metres; 32 voxels unless given.
-        shell, where, exclude
-            As for `touch`.
-        device
-            As for `feeler`; what is `exact` is computed by the processors alone.
-        progress
-            As for `Feeler.clearance`.
+        poses (B, 4, 4) : world_from_tool, rigid, metres, in any order
+        reach : greatest distance that is searched, metres; 32 voxels unless given
 
-        Raises
-        ------
-        UsageError
-            If a pose is not rigid, the reach not positive, or the memory too small for it.
-        ObjectNotFoundError
-            As for `touch`.
+        Raises `UsageError` if a pose is not rigid, the reach not positive, or the memory too small
+        for it; `ObjectNotFoundError` as for `touch`.
         """
         if exact:
             from hapticdb.batches.exact import exact_clearance  # noqa: PLC0415 - loads kernels
@@ -256,25 +211,14 @@ class Queries:
     ) -> "Feeler":
         """Make a tool that keeps cells in memory from one batch of poses to the next.
 
-        Parameters
-        ----------
-        shell, where, exclude, law
-            As for `touch`. The law stays the one that fits the objects now.
-        budget_bytes : int or None
-            Memory for cells, never exceeded; 256 MiB unless given.
-        jobs : int or None
-            Threads; one for each processor unless given.
-        device : {"cpu", "cuda"}
-            What computes: the processors, or a GPU of NVIDIA with the extra ``gpu``. The cells are
-            in the GPU's memory, too, then.
+        shell, where, exclude, law : as for `touch`; the law stays the one for the present objects
+        budget_bytes : memory for cells, never exceeded; 256 MiB unless given
+        jobs : threads; one for each processor unless given
+        device : the processors, or a GPU of NVIDIA with the extra ``gpu`` and its memory
 
-        Raises
-        ------
-        MissingExtraError
-            If there is no GPU that numba can use.
-        UsageError
-            If the environment is in lexicographic order, which has no cells; if the budget is too
-            small, or larger than this machine's memory; if objects lack what the law reads.
+        Raises `MissingExtraError` if there is no GPU that numba can use; `UsageError` in
+        lexicographic order, which has no cells; if the budget is too small, or larger than this
+        machine's memory; if objects lack what the law reads.
         """
         from hapticdb.batches.feeler import Feeler  # noqa: PLC0415 - loads numba
 

@@ -24,8 +24,7 @@ Floats = NDArray[np.float64]
 CAUTIONS = tuple(2.0**n for n in range(-2, 8))
 """Candidate values of `CostModel.caution`; the one with the least cost is used."""
 TOO_MANY_ROWS = 20_000
-"""Rows of a statement above which it is not timed, because no frame reads so many. A larger value
-makes calibrating slower."""
+"""Rows of a statement above which it is not timed: no frame reads so many."""
 
 
 class _Probe(NamedTuple):
@@ -45,23 +44,14 @@ def calibrate(
     vector. Their keys are scanned in ranges of several widths, and the medians of the times are
     fitted by least squares with non-negative figures.
 
-    Parameters
-    ----------
-    store : Store
-        An environment with at least one row.
-    repeats : int
-        Timings of each statement, after an untimed run. Their median is used.
-    budget : float
-        Seconds after which no further place is measured. At least 12 places are measured, or 4
+    store : an environment with at least one row
+    repeats : timings of each statement, after an untimed run. Their median is used.
+    budget : seconds after which no further place is measured. At least 12 places are measured, or 4
         where that takes eight times as long, as on partitions.
-    cold : bool
-        Empty all caches before each query, to measure frames at places that are new to the hand.
+    cold : empty all caches before each query, to measure frames at places that are new to the hand
 
-    Raises
-    ------
-    UsageError
-        When the environment is empty, or when cold is asked of a server, whose caches hapticdb
-        cannot empty.
+    Raises `UsageError` when the environment is empty, or when cold is asked of a server, whose
+    caches hapticdb cannot empty.
     """
     size = store.size()
     if size.rows == 0:
@@ -171,10 +161,7 @@ def _cautious(
     quantiles: QuantileVector,
     count: Callable[[Keys, Keys], int],
 ) -> CostModel:
-    """Return the model with the caution that costs least over the given frames.
-
-    frames : row keys (U,) of each frame; count : returns the number of rows in ranges.
-    """
+    """The model with the caution that costs least over frames, given by their row keys (U,)."""
     trials = []
     for caution in CAUTIONS:
         cautious = replace(model, caution=caution)
@@ -200,7 +187,7 @@ def _least_squares(
 ) -> tuple[tuple[float, ...], tuple[float, ...]]:
     """Fit times (last column) to the columns before it; figures >= 0 and relative errors.
 
-    Rows are weighted by 1 / time, so that relative errors are minimised.
+    Weighted by 1 / time, for the least relative errors.
     """
     table = np.array(measured, dtype=np.float64)
     design, times = table[:, :-1], table[:, -1]
@@ -214,10 +201,10 @@ def _least_squares(
 
 
 def _non_negative(design: Floats, wanted: Floats) -> tuple[Floats, float]:
-    """Figures >= 0 that fit best, and the length of what is left over.
+    """Figures >= 0 of the best fit, and the length of its residual.
 
-    They are the best of all choices of columns whose own fit has no figure below 0. To load the
-    function for that, ``scipy.optimize``, takes as long as all timings.
+    The best of all choices of columns whose own fit has no figure below 0. ``scipy.optimize``
+    takes as long to load as all timings.
     """
     best, least = np.zeros(design.shape[1]), float(np.linalg.norm(wanted))
     for chosen in product((False, True), repeat=design.shape[1]):

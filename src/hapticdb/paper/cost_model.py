@@ -15,28 +15,18 @@ class CostModel:
     C_io is the navigation (descent) plus the scan (leaf blocks), and C_cpu = k C_scan is what each
     row costs the client.
 
-    Attributes
-    ----------
-    statement : float
-        Fixed cost of a statement of ranges.
-    descent : float
-        Each range: a descent of the index and the start of a scan.
-    block : float
-        Each leaf block scanned inside the engine.
-    row : float
-        Each row passed to the client.
-    rows_per_block : float
-        Rows N divided by leaf blocks B.
-    caution : float
-        Factor on the expected rows of a gap when CBGroup decides whether to close it. It is the
-        factor with the least cost at the places measured. Small gaps near a surface are empty or
-        full and seldom hold the expected number of rows. A larger factor closes fewer gaps.
-    distances : float
-        Cost of the rows in a range when their distances are read, too, divided by their cost
-        without. It counts rows of the index, so it includes that there are more rows of distances.
-        1 where there are no distances.
-    spread : mapping
-        Relative standard error of each fitted figure.
+    statement : fixed cost of a statement of ranges
+    descent : each range: a descent of the index and the start of a scan
+    block : each leaf block scanned inside the engine
+    row : each row passed to the client
+    rows_per_block : rows N divided by leaf blocks B
+    caution : factor on the expected rows of a gap when CBGroup decides whether to close it. It is
+        the factor with the least cost at the places measured. Small gaps near a surface are empty
+        or full and seldom hold the expected number of rows. A larger factor closes fewer gaps.
+    distances : cost of the rows in a range when their distances are read, too, divided by their
+        cost without. It counts rows of the index, so it includes that there are more rows of
+        distances. 1 where there are no distances.
+    spread : relative standard error of each fitted figure
     """
 
     statement: float

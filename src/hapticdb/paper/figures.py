@@ -9,8 +9,7 @@ from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.store.base import Store
 
 STALE = 0.2
-"""Writes since the statistics were made, as a share of the objects, after which they are renewed.
-Larger: edits renew them more seldom, and estimates of gaps are worse."""
+"""Writes since the statistics, as a share of the objects, after which they are renewed."""
 
 
 class QueryFigures:
@@ -48,10 +47,7 @@ class QueryFigures:
         return costs
 
     def rows_changed(self) -> None:
-        """Read the statistics again when they are needed next; renew them after many writes.
-
-        The write is done: where they cannot be renewed now, a later one does.
-        """
+        """Read the statistics anew when next needed; renew them after many writes, if possible."""
         self._quantiles = None
         with suppress(DatabaseError):
             n_writes = self._store.freshness(DEFAULT_RESOLUTION).changes

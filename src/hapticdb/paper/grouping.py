@@ -13,14 +13,8 @@ DEFAULT_MAXGAP = 500
 def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     """Group neighbouring keys p < q if and only if q - p <= gap, in voxel keys on both layouts.
 
-    Parameters
-    ----------
-    keys : (U,) int64
-        Distinct row keys, ascending.
-    first, last : (U,) int64
-        Lowest and highest voxel key asked for under each row key.
-    gap : int
-        MAXGAP; 0 is the point query sequence.
+    keys (U,) int64 : distinct row keys, ascending; first, last (U,) int64 : lowest and highest
+    voxel key asked for under each row key; gap : MAXGAP; 0 is the point query sequence.
     """
     # Keys have at most 63 bits, and so have the gaps between them.
     return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))
@@ -29,13 +23,9 @@ def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
 def cbgroup(lows: Keys, highs: Keys, quantiles: QuantileVector, costs: CostModel) -> Ranges:
     """Close a gap if and only if scanning it costs no more than another descent of the index.
 
-    The gap between keys p < q covers p+1 .. q-1. The costs of gaps add up, so deciding each gap by
-    itself gives the least cost over all groupings.
+    The costs of the gaps add up, so each can be decided by itself.
 
-    Parameters
-    ----------
-    lows, highs : (U,) int64
-        Closed spans of row keys, ascending and disjoint: single keys, or spans of cells.
+    lows, highs (U,) int64 : closed spans of row keys, ascending and disjoint.
     """
     lows, highs = lows.copy(), highs.copy()
     count = kernels.group_by_cost(

@@ -18,15 +18,9 @@ MAX_RESOLUTION = 1_000_000
 class QuantileVector:
     """Equi-count histogram of the row keys (the paper's Definition 2).
 
-    Attributes
-    ----------
-    bounds : (R + 1,) int64
-        Ascending; bound i is the key of the row of rank ceil(i N / R), bound 0 the lowest key.
-    n_rows : int
-        N, rows of the index table.
-    source : str
-        Where the bounds come from: ``computed``, ``kept`` since the last write, or the engine's own
-        ``server statistics``.
+    bounds (R + 1,) int64 : ascending; bound i is the key of the row of rank ceil(i N / R), bound 0
+    the lowest key; n_rows : N, rows of the index table; source : where the bounds come from:
+    ``computed``, ``kept`` since the last write, or the engine's own ``server statistics``.
     """
 
     bounds: Keys

@@ -31,13 +31,7 @@ STRATEGIES: tuple[Strategy, ...] = get_args(Strategy)
 class Strategies:
     """Frames against one store by any strategy; `auto` is `HapticQuery`'s own.
 
-    Parameters
-    ----------
-    store : Store
-        The opened environment.
-    quantiles_and_costs : callable
-        Returns the quantile vector and the cost model; called for each frame that is grouped by
-        cost.
+    quantiles_and_costs : called for each frame that is grouped by cost.
     """
 
     def __init__(

@@ -29,19 +29,15 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
 MOST_KEYS = 2048
-"""Row keys of successive poses after which one statement is sent for all of them. A larger value
-sends fewer statements, but then there are more rows of other poses among the rows of each pose."""
+"""Row keys of successive poses after which one statement is sent for all of them."""
 MOST_POINTS = 1 << 17
-"""Most shell points, summed over the poses that one statement serves: 12 MB. A larger value takes
-more memory."""
+"""Most shell points, summed over the poses that one statement serves: 12 MB."""
 LEAST_GROUPED = 1024
 """Distinct keys of a frame from which `auto` groups, on engines that set no number of their own.
 
-Measured on SQLite. A smaller value groups more frames whose lookup would have been faster; a larger
-one leaves more large frames to a lookup that is up to 1.1 times slower than their ranges."""
+Measured on SQLite: beyond it a lookup is up to 1.1 times slower than ranges."""
 KEYS_PER_RANGE = 2
-"""Mean keys of a range from which `auto` scans ranges. A larger value scans fewer frames: a range
-costs more than a key of a lookup, so ranges of one key each would be slower."""
+"""Mean keys of a range from which `auto` scans ranges: one costs more than a key's lookup."""
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 Asked = tuple[str, int, int, int]
@@ -65,19 +61,8 @@ class Form(Protocol):
 class HapticQuery:
     """Runs frames against one store.
 
-    Parameters
-    ----------
-    store : Store
-        The opened environment.
-    group : callable or None
-        Groups frames of many keys by cost; without it, all keys are looked up.
-
-    Attributes
-    ----------
-    known : KnownObjects
-        Objects of the revision that the last frame has read.
-    grid : () of `hapticdb.kernels.records.GRID`
-        The environment's grid.
+    group : groups frames of many keys by cost; without it, all keys are looked up; known : objects
+    of the last frame's revision; grid : the environment's.
     """
 
     def __init__(self, store: Store, group: Group | None = None) -> None:
@@ -164,10 +149,7 @@ class HapticQuery:
         return self.refined(located, rows, payload, exclude, law, asked, started)
 
     def _get_ready(self, form: Form | None, law: ForceLaw) -> bool:
-        """Compile and load what frames of a form and a law call.
-
-        Returns whether they read distances.
-        """
+        """Compile and load what frames of a form and a law call; whether they read distances."""
         purposes = [frames_by(law, "touch")] if form is None else form.purposes(law)
         make_ready(*purposes)
         load(entries_for(*purposes))
@@ -176,13 +158,7 @@ class HapticQuery:
         return reads
 
     def distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
-        """Distances (R, 1000) of rows. Rows whose keys are not among `keys` are left unset.
-
-        Raises
-        ------
-        UsageError
-            If the rows have no distances.
-        """
+        """Distances (R, 1000) of rows, unset beyond `keys`; UsageError without distances."""
         if not rows.keys.size:
             return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
         if rows.distances is None:
@@ -207,8 +183,7 @@ class HapticQuery:
     ) -> Touch:
         """Result of a frame from its rows, among which rows of other poses may lie.
 
-        payload : distances (R, 1000) of the rows, None for a law that reads none; started : when
-        the frame began, ns.
+        payload : distances (R, 1000) of the rows, if the law reads any; started : of the frame, ns.
         """
         row_keys, row_ids, occupancy, _ = rows
         total = located.asked.shape[1]
@@ -247,10 +222,7 @@ class HapticQuery:
     def run_many(
         self, shell: "PointShell", poses: NDArray[np.float64], exclude: Keys, law: ForceLaw
     ) -> Iterator[Touch]:
-        """Touches at rigid poses (n, 4, 4), in their order; one statement reads rows of several.
-
-        Such a statement is counted in the first pose's query only.
-        """
+        """Touches at rigid poses (n, 4, 4); a statement for several counts at the first."""
         make_ready(frames_by(law, "touch"))
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
@@ -287,13 +259,7 @@ class HapticQuery:
 
 
 def locate(shell: "PointShell", pose: ArrayLike, grid: NDArray[np.void]) -> "contact.Located":
-    """Place a shell at a pose, and find the rows that it asks for; grid () of `records.GRID`.
-
-    Raises
-    ------
-    UsageError
-        If the pose is no rigid (4, 4) matrix.
-    """
+    """Place a shell at a rigid pose, else UsageError, and find its row keys; grid of `GRID`."""
     given = as_floats(pose, "a pose")
     if given.shape != (4, 4):
         raise UsageError(f"a pose of shape {given.shape}: give a 4 x 4 matrix, world_from_tool")

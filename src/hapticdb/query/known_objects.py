@@ -11,24 +11,16 @@ from hapticdb.store.base import Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter, Unfelt, keep_last
 
 MOST_READ = 16
-"""Writes since the last listing after which all objects are listed. A larger value reads more of
-them one by one, each in a round trip."""
+"""Writes since the last listing after which all objects are listed, not one by one."""
 
 
 class KnownObjects:
-    """Objects of a store at one revision, kept so that a frame need not ask the database for them.
+    """Objects of a store at one revision, so that a frame need not ask the database.
 
-    Attributes
-    ----------
-    by_id : dict
-        The objects; replaced as a whole, so that a result that holds it does not change.
-    have_distances : bool
-        Whether there is an object, and every object has distances.
-    own_law : ForceLaw
-        The law of a frame that is given none: the distance one where they have distances.
-    version : int or None
-        The store's version when the objects were listed; None before that, and after an edit
-        through the same environment.
+    by_id : the objects; replaced as a whole, never changed
+    have_distances : whether there is an object, and every object has distances
+    own_law : the law of a frame that is given none: the distance one where they have distances
+    version : the store's version when the objects were listed, or None
     """
 
     def __init__(self, store: Store) -> None:
@@ -49,10 +41,7 @@ class KnownObjects:
     def law_of_newest(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame in this snapshot: the given one, or its objects' own.
 
-        Raises
-        ------
-        UsageError
-            If the law reads distances, and an object has none.
+        Raises `UsageError` if the law reads distances, and an object has none.
         """
         self.learn()
         if law is not None and not self.fits(law):
@@ -108,13 +97,7 @@ class KnownObjects:
         return felt.fixed_ids if felt.is_fixed else self._left_out_by(felt).ids
 
     def check_words(self, felt: Filter) -> None:
-        """Refuse a filter of which a word chooses no object.
-
-        Raises
-        ------
-        ObjectNotFoundError
-            It names the word.
-        """
+        """Raise `ObjectNotFoundError` for the first word of a filter that chooses no object."""
         if not self._left_out_by(felt).missing:
             return
         self._list(self._store.revision())  # frames without a query learn nothing

@@ -1,7 +1,4 @@
-"""The force law for users (the paper, section 3); its arithmetic is in `hapticdb.kernels.law`.
-
-A law of this module is checked and immutable, and makes the NamedTuple that kernels take.
-"""
+"""The force law for users (the paper, section 3); its arithmetic is in `hapticdb.kernels.law`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -35,26 +32,28 @@ class ForceLaw(Protocol):
 
 
 @dataclass(frozen=True)
-class TangentPlane:
+class _Stiff:
+    stiffness: float = 1000.0
+    """K, N/m, `MOST_STIFFNESS` at most."""
+
+    def __post_init__(self) -> None:
+        if not 0.0 <= self.stiffness <= MOST_STIFFNESS:
+            raise UsageError(
+                f"stiffness {self.stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}"
+            )
+        object.__setattr__(self, "stiffness", float(self.stiffness))
+
+
+class TangentPlane(_Stiff):
     """Tangent-plane law of VPS (McNeely, Puterbaugh and Troy, SIGGRAPH 1999).
 
     Through the centre c of the voxel that holds the shell point p goes a plane with the point's
     inward normal n: d = max(0, (c - p) . n), F = K d n, tau = (p - x_cm) x F. With N >= 10 hits
     force and torque are divided by N / 10. The force jumps where a point crosses a voxel's border:
     a property of the law.
-
-    Attributes
-    ----------
-    stiffness : float
-        K, N/m, `MOST_STIFFNESS` at most.
     """
 
-    stiffness: float = 1000.0
-
     name: ClassVar[str] = "plane"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "stiffness", _checked(self.stiffness))
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - kernels are loaded when they are first used
@@ -62,8 +61,7 @@ class TangentPlane:
         return kernels.TangentPlaneLaw(self.stiffness)
 
 
-@dataclass(frozen=True)
-class DistanceField:
+class DistanceField(_Stiff):
     """Penalty on the distance field: a point is felt by its distance u to the nearest surface.
 
     After Barbic and James 2008.
@@ -79,30 +77,14 @@ class DistanceField:
     and their distances almost equal.
 
     Only an environment in which every object has distances can be felt by this law.
-
-    Attributes
-    ----------
-    stiffness : float
-        K, N/m, `MOST_STIFFNESS` at most.
     """
 
-    stiffness: float = 1000.0
-
     name: ClassVar[str] = "distance"
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "stiffness", _checked(self.stiffness))
 
     @cached_property
     def for_kernels(self) -> Any:  # noqa: ANN401 - likewise
         """The law's NamedTuple for kernels."""
         return field.DistanceFieldLaw(self.stiffness)
-
-
-def _checked(stiffness: float) -> float:
-    if not 0.0 <= stiffness <= MOST_STIFFNESS:
-        raise UsageError(f"stiffness {stiffness} N/m: give a number from 0 to {MOST_STIFFNESS:g}")
-    return float(stiffness)
 
 
 PLANE, DISTANCE = TangentPlane(), DistanceField()
@@ -119,13 +101,7 @@ def as_law(law: "ForceLaw | LawName | None") -> ForceLaw | None:
 
 
 def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
-    """Law of that name and stiffness, N/m.
-
-    Raises
-    ------
-    UsageError
-        If there is no such law, or the stiffness is out of its range.
-    """
+    """Law of that name and stiffness, N/m; UsageError for others."""
     if name not in LAW_NAMES:
         raise UsageError(f"law {name!r}: this hapticdb has {', '.join(LAW_NAMES)}")
     return TangentPlane(stiffness) if name == PLANE.name else DistanceField(stiffness)

@@ -19,8 +19,7 @@ class Query(NamedTuple):
     """How a frame asked the database.
 
     strategy : the strategy used, never `auto`; statements : SQL statements run; ranges : index
-    ranges in these statements, each single key is one; rows : rows read, false hits included;
-    elapsed_us : time of the whole frame, microseconds.
+    ranges, single keys included; rows : rows read, false hits included; elapsed_us : of the frame.
     """
 
     strategy: str
@@ -41,8 +40,7 @@ class Touch:
     hits: NDArray[np.int64]
     """Indices (H,) of the shell's points inside a voxel, ascending."""
     depths: NDArray[np.float64]
-    """Depth (H,) of each hit in metres, 0 where the law does not feel it: above its tangent plane
-    or, under `DistanceField`, where the distance does not grow along the point's normal."""
+    """Depth (H,) of each hit in metres, 0 where the law does not feel it."""
     ids: list[int]
     """Ids of `objects`."""
     law: ForceLaw

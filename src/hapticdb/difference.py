@@ -50,14 +50,12 @@ class Difference:
     boxes: tuple[Pair, ...]
     voxels: tuple[Pair, ...]
     distances: tuple[Pair, ...]
-    """Other attributes; other bounding boxes, voxels and distances of the same surface in the same
-    place. Distances are compared where both environments have them, and rows on the same grid."""
+    """Other attributes; other boxes, voxels and distances of the same surface in the same place."""
     renumbered: tuple[Pair, ...]
     """The same part with another id, which is no difference."""
     compared: int
     n_voxels: int
-    """Objects with the same surface in the same place, whose rows were compared, and their
-    voxels."""
+    """Objects with the same surface in the same place, whose rows were compared; their voxels."""
     with_distances: tuple[int, int]
     """Compared objects that have distances in a, and in b."""
 
@@ -85,9 +83,8 @@ class Difference:
 def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = None) -> Difference:
     """Compare two environments: grids, objects, attributes, surfaces, and rows by their digests.
 
-    Each environment is read at one revision, surface by surface and in batches of rows, so memory
-    grows with the number of objects alone. `progress` is called with the number of rows read, and
-    of all. Raises `DatabaseError` when one of them cannot be opened or read.
+    Each is read at one revision, surface by surface and in batches of rows, so memory grows with
+    the number of objects alone. `progress` gets the number of rows read, and of all.
     """
     with (
         closing(open_store(a_url, read_only=True)) as a,

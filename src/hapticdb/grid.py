@@ -24,16 +24,15 @@ BRICK_BITS = 3
 CELL_BITS = 5
 """Bits on one axis of a voxel's place in its cell."""
 ROOM = 1.6
-"""Edge of a fitted grid, in longest sides of the first file's bounding box. A larger value leaves
-more room around the file, and makes voxels larger."""
+"""Edge of a fitted grid, in longest sides of the first file's bounding box."""
 
 
 @dataclass(frozen=True)
 class Grid:
     """A cube of ``2^bits`` voxels on each axis, and the order of its keys.
 
-    Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin. The interval is
-    half-open, so that each point has one voxel. Surfaces are voxelized with closed boxes.
+    Voxel (i, j, k) covers ``[i s, (i + 1) s)`` on each axis from the origin: each point has one
+    voxel. Surfaces are voxelized with closed boxes.
     """
 
     voxel_size: float

@@ -25,16 +25,14 @@ FARTHEST = 1e9
 """Largest coordinate of a position, metres. A larger value accepts less likely positions."""
 
 _UPRIGHT = 0.5
-"""Least scalar of a quaternion that is near the identity: turned by 120 degrees at most. A smaller
-value suspects more half turns."""
+"""Least scalar of a quaternion near the identity: turned by 120 degrees at most."""
 _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
 def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
     """Values as a C-contiguous array of float64. Such an array is returned itself.
 
-    Raises `UsageError` when the conversion would invent or lose something: complex numbers, masked
-    arrays, text, lists of unequal lengths.
+    Raises `UsageError` for complex numbers, masked arrays, text, lists of unequal lengths.
     """
     if type(values) is np.ndarray and values.dtype == np.float64:
         return values if values.flags.c_contiguous else np.ascontiguousarray(values)
@@ -85,10 +83,7 @@ def quaternion_of(rotations: ArrayLike) -> NDArray[np.float64]:
 
 
 def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
-    """Write poses (M, 4, 4), rigid transforms `world_from_tool` in metres, whole or not at all.
-
-    An existing file is replaced.
-    """
+    """Write poses (M, 4, 4), `world_from_tool` in metres, whole or not at all; replaces a file."""
     matrices = as_floats(poses, "poses")
     if matrices.ndim != 3 or matrices.shape[1:] != (4, 4):
         raise UsageError(f"poses must have the shape (M, 4, 4), not {matrices.shape}")
@@ -108,10 +103,7 @@ def write_poses(path: str | os.PathLike[str], poses: ArrayLike) -> None:
 
 
 def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool` of a file, in the file's order, in metres.
-
-    unit : of the file's positions, one of `hapticdb.mesh.UNITS`.
-    """
+    """Poses (M, 4, 4) `world_from_tool`, metres, of a file with positions in `unit`."""
     metres = metres_of(unit)
     poses = poses_of(_read_rows(Path(path)))
     poses[:, :3, 3] *= metres
@@ -119,10 +111,7 @@ def read_poses(path: str | os.PathLike[str], *, unit: str = "m") -> NDArray[np.f
 
 
 def map_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
-    """Poses (M, 4, 4) `world_from_tool`, metres, of a .npy file that is mapped into memory.
-
-    Raises `FileError` if the file cannot be read, or holds something else.
-    """
+    """Poses (M, 4, 4) `world_from_tool`, metres, of a mapped .npy file; raises `FileError`."""
     try:
         found = np.load(path, mmap_mode="r")
     except OSError as error:
@@ -139,11 +128,7 @@ def map_poses(path: str | os.PathLike[str]) -> NDArray[np.float64]:
 def read_timed_poses(
     path: str | os.PathLike[str],
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64]]:
-    """Times (M,) in seconds, or None, and poses (M, 4, 4) `world_from_tool` of a file.
-
-    Raises `FileError` if the file has a column ``t`` whose numbers do not increase, or cannot be
-    read.
-    """
+    """Times (M,), s, ascending, or None, and poses (M, 4, 4) `world_from_tool` of a file."""
     rows = _read_rows(Path(path), optional="t")
     if rows.shape[1] == len(COLUMNS):
         return None, poses_of(rows)
@@ -198,10 +183,7 @@ def _read_text(path: Path) -> str:
 
 
 def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
-    """Numbers (M, 7) in the order of `COLUMNS`, the quaternions normalised.
-
-    There is an eighth column if the header names the `optional` one.
-    """
+    """Numbers (M, 7) by `COLUMNS`, quaternions normalised; (M, 8) with the optional column."""
     text = _read_text(path)
     head = text.lstrip().split("\n", 1)[0]
     sign = next((sign for sign in ";\t" if sign in head and "," not in head), ",")

@@ -31,16 +31,10 @@ Url = str | os.PathLike[str]
 class CopyReport:
     """Result of a copy.
 
-    Attributes
-    ----------
-    source, target : str
-        The environments, as messages name them: without a password.
-    copied, voxels : int
-        Objects written now, and their voxels.
-    present : int
-        Objects that were there already.
-    renumbered : int
-        Objects written with another id, because their own was taken.
+    source, target : the environments, as messages name them: without a password
+    copied, voxels : objects written now, and their voxels
+    present : objects that were there already
+    renumbered : objects written with another id, because their own was taken
     """
 
     source: str
@@ -61,34 +55,19 @@ def copy_environment(
 ) -> CopyReport:
     """Copy an environment's objects into another, which is made if it does not exist.
 
-    Each object is copied in one transaction, with its id if that is free. Objects that are in the
-    target already are left alone: an interrupted copy goes on when it is started again. Everything
-    is read at one revision of the source, so later edits are not copied. The memory needed is
-    proportional to the largest object. Distances to surfaces are copied as they are, if the target
-    wants them; a new target of bricks wants them if the source does. Surfaces are copied with the
-    first object that has them.
+    Each object is copied in one transaction, with its id if that is free, its surface, and its
+    distances if the target wants them; a new target of bricks does if the source does. Objects that
+    are in the target already are left alone: an interrupted copy goes on when it is started again.
+    Everything is read at one revision. The memory needed is proportional to the largest object.
 
-    Parameters
-    ----------
-    source_url, target_url : str or path
-        The environments; engines, layouts and curves may differ.
-    layout : {"voxel", "brick"} or None
-        Layout of a new target; by default the source's. An existing target must have this layout.
-    curve : curve name or None
-        Curve of the target, by the same rule.
-    progress : callable or None
-        Called after each object that was written with the number of objects done, and of all.
+    layout : of a new target, by default the source's; an existing target must have it
+    curve : by the same rule
+    progress : called after each object that was written with the number of objects done, and of all
 
-    Raises
-    ------
-    UsageError, GridError
-        When both URLs lead to one environment, when bricks are requested in lexicographic order, or
-        when the target exists with another grid, layout or curve.
-    ConflictError
-        When the target has a part of the source with another geometry or in another place. Nothing
-        is written then.
-    DamagedError
-        When an object of the source does not have the voxels that its record counts.
+    Raises `UsageError` or `GridError` when both URLs lead to one environment, when bricks are
+    requested in lexicographic order, or when the target has another grid, layout or curve;
+    `ConflictError`, before any write, when the target has a part with another geometry or place;
+    `DamagedError` when an object of the source does not have the voxels that its record counts.
     """
     with closing(open_store(source_url, read_only=True)) as source:
         target, is_new = _target(target_url, source, layout, curve)
@@ -212,10 +191,7 @@ def part_of(obj: Object) -> tuple[str, str]:
 
 
 def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVector) -> Rows:
-    """All rows of an object of the source, in the layout and curve of the target.
-
-    With distances if the object has them and the target wants them.
-    """
+    """All rows of an object of the source, in the layout and curve of the target."""
     distances = obj.has_distances and target.wants_distances
     batches = list(rows_of_object(source, obj, quantiles, distances=distances))
     if distances:

@@ -20,14 +20,13 @@ AT_ONCE = 16
 MOST_BYTES = 1_000_000_000
 """Bytes of a packed surface that each engine can store in a row."""
 MOST_ROWS = 1 << 19
-"""Rows of the index that one statement may read, whatever objects they belong to. It takes far less
-than a second. A larger value needs fewer statements and more memory."""
+"""Rows of the index that one statement may read, far less than a second's work."""
 
 
 def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
     """Yield objects, in their order, with their geometry; DamagedError for an object without.
 
-    Reads each surface once, and keeps it as long as a later object has it.
+    A surface is read once, and kept as long as a later object has it.
     """
     uses = Counter(obj.digest for obj in objects)
     asked: set[str] = set()
@@ -49,10 +48,7 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
 
 
 def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
-    """Geometry of an object from its packed surface; DamagedError if it is not that of its digest.
-
-    The digest is a checksum of all that the part has, so nothing else is ever returned.
-    """
+    """Geometry of an object from its packed surface; DamagedError if its digest is another."""
     if surface is None:
         raise damaged(url, f"object {obj.id} ({obj.name}) has no surface")
     try:
@@ -107,14 +103,6 @@ def rows_of_object(
     """All rows of an object in batches, ascending by key; one statement reads one batch."""
     ranges = object_ranges(store.grid, store.layout, obj)
     return _batches(store, obj, ranges, quantiles, distances=distances)
-
-
-def bricks_of_object(
-    store: Store, obj: Object, quantiles: QuantileVector, *, distances: bool = False
-) -> Bricks:
-    """All bricks of an object, whatever its layout and curve."""
-    batches = rows_of_object(store, obj, quantiles, distances=distances)
-    return bricks_of_batches(store, list(batches), distances=distances)
 
 
 def bricks_of_batches(store: Store, batches: list[Rows], *, distances: bool) -> Bricks:

@@ -1,8 +1,4 @@
-"""Converts voxels to rows of the index table and back, in either layout and on any curve.
-
-Bricks in Z-order are the common form: the voxelizer makes them, and rows of any layout and curve
-are converted from and to them.
-"""
+"""Converts voxels to rows of the index table and back, by way of bricks in Z-order."""
 
 from typing import NamedTuple
 
@@ -92,10 +88,7 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
 
 
 def merged(pieces: list[Bricks]) -> Bricks:
-    """Merge bricks without distances; a brick in several pieces gets the bits of all.
-
-    Empties the list meanwhile, so no piece is stored twice.
-    """
+    """Merge bricks without distances, voxels united; empties the list to save memory."""
     if len(pieces) == 1:
         return pieces.pop()
     keys = np.unique(np.concatenate([piece.keys for piece in pieces]))

@@ -22,8 +22,7 @@ from hapticdb.store.base import Object, Rows, Store
 MOST_ATTEMPTS = 100
 """Attempts to add a part that other processes add and remove meanwhile; then an error is raised."""
 AT_BORDER = 1e-6
-"""Voxels by which a part may lie beyond the grid's border without an error, because of rounding. A
-larger value accepts parts that are cut off at the border."""
+"""Voxels by which a part may lie beyond the grid's border: rounding."""
 
 
 def check_names(mesh_file: MeshFile) -> None:
@@ -48,10 +47,7 @@ def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
 def bounds_inside(
     part: Part, link: str, grid: Grid, world_from_part: NDArray[np.float64] | None = None
 ) -> NDArray[np.float64]:
-    """`Part.bounds` at a given placement or at the file's.
-
-    Raises `OutsideGridError` if the part leaves the grid.
-    """
+    """`Part.bounds` at a given placement or at the file's; OutsideGridError beyond the grid."""
     placed = part if world_from_part is None else replace(part, world_from_part=world_from_part)
     points = placed.world_points()
     bounds = np.stack([points.min(axis=0), points.max(axis=0)])
@@ -74,10 +70,8 @@ def _box(bounds: NDArray[np.float64]) -> str:
 class KnownParts:
     """Parts of a file that an environment has, updated from the environment's log of changes.
 
-    by_name : the objects, by the names of the parts, in the order of their ids at first.
-
-    Measured with two imports of one file of 1,500 parts at once: the second took 4.6 s, but 33 s
-    if it listed all objects again for each part that the other had added.
+    by_name : the objects, by the names of the parts. Of two imports of one file of 1,500 parts at
+    once the second took 4.6 s, but 33 s with a new listing for each part that the other had added.
     """
 
     def __init__(self, store: Store, link: str) -> None:
@@ -115,7 +109,7 @@ def added_or_present(
 ) -> list[int]:
     """Add a part; returns its id, or nothing if another process has added the same part meanwhile.
 
-    Raises `EnvironmentExistsError` if there is a part of that name with another geometry.
+    Raises `EnvironmentExistsError` for a part of that name with another geometry.
     """
     for attempt in range(MOST_ATTEMPTS):
         try:
@@ -133,9 +127,9 @@ def added_or_present(
 class Plan(NamedTuple):
     """What an import writes, in this order.
 
-    replaced : parts that exchange an object, in the file's order, with the object's id; added :
-    parts that the environment lacks, in the file's order; dropped : ids of objects whose parts the
-    file lacks; removed : names of the file's parts that were removed from the environment before.
+    replaced : parts, in the file's order, with the ids of their objects; added : new parts, in the
+    file's order; dropped : ids of objects whose parts the file lacks; removed : names of the file's
+    parts that were removed from the environment before.
     """
 
     replaced: list[tuple[Part, int]]
@@ -156,25 +150,15 @@ def planned(
 ) -> Plan:
     """Compare a file with an environment; nothing is read or written.
 
-    Parameters
-    ----------
-    file, unit
-        The file's parts, and the unit in which it was read.
-    grid
-        The environment's.
-    known : mapping
-        The environment's objects of this file, by the names of their parts.
-    removed : set of str
-        Names of parts that were removed from the environment.
-    replace, keep_removed
-        As in `hapticdb.ingest.files.ImportOptions`.
+    file, unit : the file's parts, and the unit in which it was read
+    grid : the environment's
+    known : the environment's objects of this file, by the names of their parts
+    removed : names of parts that were removed from the environment
+    replace, keep_removed : as in `hapticdb.ingest.files.ImportOptions`
 
-    Raises
-    ------
-    OutsideGridError
-        If a part that is to be written leaves the grid.
-    GeometryChangedError
-        If a part has another geometry than the object of its name, which is not to be replaced.
+    Raises `OutsideGridError` if a part that is to be written leaves the grid;
+    `GeometryChangedError` if a part has another geometry than the object of its name, which is not
+    to be replaced.
     """
     missing = [part for part in file.parts if part.name not in known]
     there = [(part, known[part.name]) for part in file.parts if part.name in known]

@@ -26,8 +26,7 @@ from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, S
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 ShareCallback = Callable[[float], None]
-"""Called often with the share of a part that is done, 0 to 1. May raise an error, which ends the
-work."""
+"""Called often with the share of a part that is done, 0 to 1; its error ends the work."""
 SHARE_EVERY_S = 0.2
 """Seconds between two shares of a long part. A larger value tells of it less often."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
@@ -35,13 +34,11 @@ BYTES_A_BRICK = 8 + BRICK_BYTES
 _BYTES_A_ROW = 8 + 8 + BRICK_BYTES
 """Memory of a row with distances but for their packed bytes: its key, their end, its occupancy."""
 POINTS_AT_ONCE = 1 << 22
-"""Points of a cloud that one call marks: less than a second of work. A larger value reports
-progress less often."""
+"""Points of a cloud that one call marks: less than a second of work."""
 _VOXELS_SHARE = 0.1
 """Share of a part's time that its voxels take where distances are computed, too."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
-"""Number of bricks in all pieces at which the pieces are merged for the first time. A larger value
-merges less often and takes more memory."""
+"""Bricks in all pieces at which they are merged for the first time."""
 
 
 def rows_of_part(
@@ -89,11 +86,10 @@ def _with_distances(
     check_room: Callable[[int], None],
     progress: ShareCallback | None,
 ) -> Bricks:
-    """Bricks of a part with distances to its surface, and the bricks near it that it does not meet.
+    """Bricks near a part, with distances to its surface.
 
     bricks : those that the part meets; corners (T, 3, 3) of triangles, or (P, 1, 3) points of a
-    cloud, in voxels from the grid's origin; check_room : called with the bytes that the result
-    needs at least, raises if they are too many; progress : called with the share that is done.
+    cloud, in voxels from the grid's origin; check_room : called with the least bytes of the result.
     """
     keys: list[Keys] = []
     packed: list[NDArray[np.uint8]] = []
@@ -144,10 +140,9 @@ def bricks_of_pieces(
     what: str,
     progress: ShareCallback | None = None,
 ) -> Bricks:
-    """Bricks of a part from pieces with the share that is done, keys and occupancy.
+    """Bricks of a part from pieces: the share that is done, keys and occupancy.
 
-    Needs memory for twice the result and one piece. what : the name in the `FileError` that is
-    raised if the machine has less.
+    Takes the memory of twice the result and one piece; `what` is its name in a `FileError`.
     """
     pieces: list[Bricks] = []
     n_waiting, merge_from = 0, _MERGE_FROM
@@ -207,9 +202,8 @@ def voxelize_parts(
 ) -> Generator[tuple[Object, Rows, bytes] | float, None, None]:
     """Yield objects, rows and packed surfaces of parts, in order, a few of them made in advance.
 
-    Between them come shares of long parts, as from `in_threads`. Threads suffice because the
-    voxelizer runs without the interpreter lock. unit : in which the file was read, stored with the
-    objects; jobs : threads here, or workers elsewhere.
+    Between them come shares of long parts, as from `in_threads`: the voxelizer runs without the
+    interpreter lock. unit : of the file, stored with the objects; jobs : threads or workers.
     """
     given = {"unit": unit, "up": file.up}
     attributes: dict[str, object] = {name: value for name, value in given.items() if value}
@@ -244,8 +238,8 @@ def in_threads(
     """Yield the results of `work` on items, in order; `jobs` threads compute a few in advance.
 
     While the next result is not there, the share of it that is done comes instead, 0 to 1, five
-    times a second. `work` is called in a thread with an item, and with what it calls often with its
-    share. When this generator ends early, so does the work: the next such call raises an error.
+    times a second. `work` gets an item and a callback for its share, which raises an error after
+    this generator has ended.
     """
     shares: dict[int, float] = {}
     ended = Event()

@@ -44,6 +44,7 @@ class _Stiff:
         object.__setattr__(self, "stiffness", float(self.stiffness))
 
 
+@dataclass(frozen=True)
 class TangentPlane(_Stiff):
     """Tangent-plane law of VPS (McNeely, Puterbaugh and Troy, SIGGRAPH 1999).
 
@@ -61,6 +62,7 @@ class TangentPlane(_Stiff):
         return kernels.TangentPlaneLaw(self.stiffness)
 
 
+@dataclass(frozen=True)
 class DistanceField(_Stiff):
     """Penalty on the distance field: a point is felt by its distance u to the nearest surface.
 

@@ -128,11 +128,6 @@ def is_same_grid(a: Grid, b: Grid) -> bool:
     return (a.voxel_size, a.origin, a.bits) == (b.voxel_size, b.origin, b.bits)
 
 
-def is_same_kind(a: Store, b: Store) -> bool:
-    """Whether two stores have rows of the same form and keys."""
-    return (a.layout, a.grid.curve) == (b.layout, b.grid.curve)
-
-
 def _copy_objects(source: Store, target: Store, progress: Progress | None) -> CopyReport:
     copied = voxels = renumbered = 0
     # loading ends after the source's snapshot: an engine cannot vacuum tables that are being read
@@ -200,7 +195,7 @@ def _rows_for(target: Store, source: Store, obj: Object, quantiles: QuantileVect
             checksum.add(batch)
         if checksum.value() != obj.distances_crc:
             raise _damaged(source, obj, "distances other than those that were written")
-    if is_same_kind(source, target):
+    if (source.layout, source.grid.curve) == (target.layout, target.grid.curve):
         rows = joined(batches, distances=distances)
         n_voxels = len(rows) if source.layout == "voxel" else voxelize.count_voxels(rows.occupancy)
     else:

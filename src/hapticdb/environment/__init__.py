@@ -6,7 +6,6 @@ from hapticdb.environment.opened import Environment
 from hapticdb.grid import Grid
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import create_store, open_store
-from hapticdb.store.refusals import wants_distances
 
 __all__ = ["Environment", "create", "open"]
 
@@ -38,5 +37,4 @@ def create(
     Raises `EnvironmentExistsError` if something exists there already; `UsageError` for bricks in
     lexicographic order, or distances on the layout voxel.
     """
-    wish = wants_distances(layout, distances)
-    return Environment(create_store(url, grid, layout, distances=wish), url)
+    return Environment(create_store(url, grid, layout, distances=distances), url)

@@ -231,8 +231,8 @@ class _Target:
     def _create_or_join(self, grid: Grid) -> None:
         """Make the environment, or open the one that another process has made meanwhile."""
         try:
-            wanted = wants_distances(self._layout, self._options.distances)
-            self.store = create_store(self._url, grid, self._layout, distances=wanted)
+            wish = self._options.distances
+            self.store = create_store(self._url, grid, self._layout, distances=wish)
             self._is_new = True
         except EnvironmentExistsError:
             same = GridOptions(grid.bits, grid.voxel_size, None, grid.origin, grid.curve)

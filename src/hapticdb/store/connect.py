@@ -13,7 +13,7 @@ from hapticdb.store.engines import (
     Url,
     engine_of,
 )
-from hapticdb.store.refusals import check_distances
+from hapticdb.store.refusals import wants_distances
 from hapticdb.store.urls import redact
 
 
@@ -23,17 +23,17 @@ def open_store(url: Url, *, read_only: bool = False) -> Store:
 
 
 def create_store(
-    url: Url, grid: Grid, layout: Layout = "brick", *, distances: bool = False
+    url: Url, grid: Grid, layout: Layout = "brick", *, distances: bool | None = False
 ) -> Store:
     """Make a new environment; bricks need a hierarchical curve.
 
-    distances : whether imported parts get distances to their surfaces; the layout voxel has none.
+    distances : whether imported parts get distances to their surfaces; None for a layout's own.
     """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: choose one of {', '.join(LAYOUTS)}")
     check_curve(grid.curve, layout)
-    check_distances(layout, distances=distances)
-    return engine_of(url).create(os.fspath(url), grid, layout, distances=distances)
+    wish = wants_distances(layout, distances)
+    return engine_of(url).create(os.fspath(url), grid, layout, distances=wish)
 
 
 def exists(url: Url) -> bool:

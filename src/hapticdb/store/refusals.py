@@ -57,14 +57,8 @@ def check_unwritten(record: Object, known: Object, url: str) -> None:
         )
 
 
-def check_distances(layout: Layout, *, distances: bool) -> None:
-    """Refuse distances on the layout voxel: a row of distances belongs to a brick."""
-    if distances and layout == "voxel":
-        raise UsageError("the layout voxel has no distances: leave them out, or choose bricks")
-
-
 def wants_distances(layout: Layout, wish: bool | None) -> bool:  # noqa: FBT001 - a wish as given
     """Whether a new environment has distances: as wished, else bricks do; or UsageError."""
-    distances = layout == "brick" if wish is None else wish
-    check_distances(layout, distances=distances)
-    return distances
+    if wish and layout == "voxel":  # a row of distances belongs to a brick
+        raise UsageError("the layout voxel has no distances: leave them out, or choose bricks")
+    return layout == "brick" if wish is None else wish

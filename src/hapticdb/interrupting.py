@@ -17,8 +17,7 @@ from typing import Literal
 EXIT_CODE = 130
 MESSAGE = b"hapticdb: interrupted\n"
 AGAIN_S = 0.01
-"""Seconds until an interrupt that came where none may be raised is tried again. A larger value
-answers later."""
+"""Seconds until an interrupt that came where none may be raised is tried again."""
 
 LLVMLITE = f"{os.sep}llvmlite{os.sep}"
 """In the paths of llvmlite's modules."""

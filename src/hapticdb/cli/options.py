@@ -16,8 +16,6 @@ _TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as
 _LAYOUT = "Index table of a new environment."
 _CURVE = "Order of the keys of a new environment."
 
-# -- environments ---------------------------------------------------------------------------------
-
 UrlArgument = Annotated[
     str,
     typer.Argument(
@@ -40,8 +38,6 @@ ClusterOption = Annotated[
     ),
 ]
 
-# -- objects --------------------------------------------------------------------------------------
-
 _WORDS = "7 or 3,4, 'wheel*', attribute=value"
 
 ObjectsArgument = Annotated[
@@ -62,8 +58,6 @@ ExcludeOption = Annotated[
         help=f"Objects that are not felt: {_WORDS}. Give it again for more.",
     ),
 ]
-
-# -- tools and paths ------------------------------------------------------------------------------
 
 ToolOption = Annotated[str, _TOOL]
 OptionalToolOption = Annotated[str | None, _TOOL]
@@ -100,8 +94,6 @@ ConservativeOption = Annotated[
     ),
 ]
 BudgetOption = Annotated[float, typer.Option(metavar="MIB", help="Memory for resident cells.")]
-
-# -- results --------------------------------------------------------------------------------------
 
 CsvOption = Annotated[
     str | None,

@@ -184,8 +184,6 @@ class SessionHost(Closes):
         running = sorted(self._running.items())
         return [HostedSession(self._board, r.seat, number, self._call) for number, r in running]
 
-    # -- what sessions ask for ---------------------------------------------------------------
-
     def _call(self, word: str, session: int, /, *content: object) -> object:
         """Do what a session asks for; see `HostedSession`."""
         known: dict[str, Callable[..., object]] = {
@@ -225,8 +223,6 @@ class SessionHost(Closes):
                 recorded = running.stop_recording(self._board)
         return recorded
 
-    # -- other processes ---------------------------------------------------------------------
-
     def serve(self, sock: socket.socket) -> None:
         """Reply an `AttachedHost` at the other end of a pair of sockets, in a thread of its own.
 
@@ -240,8 +236,6 @@ class SessionHost(Closes):
             daemon=True,
             name="attached",
         ).start()
-
-    # -- looking after -----------------------------------------------------------------------
 
     def _tend(self, look: Callable[[], None]) -> None:
         """Look after something again and again; without `_changing`, which a slow begin holds."""

@@ -75,8 +75,6 @@ class Worker:
         self._stations = Stations(DISTANCE, board.seats, board.rings)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
-    # -- commands ----------------------------------------------------------------------------
-
     def obey(self) -> None:
         """Do what the host says until it ends; the work of the thread beside the loop's."""
         try:

@@ -14,8 +14,7 @@ START_PATIENCE = 120.0
 ANSWER_PATIENCE = 30.0
 """Seconds in which a worker must answer a command; normally milliseconds."""
 FILLED = 8
-"""Sessions of a worker from which another process is started, while the host may have more. Larger:
-fewer processes and less memory, and later frames."""
+"""Sessions of a worker from which another process is started, while the host may have more."""
 
 
 class WorkerProcess(Process):

@@ -37,13 +37,11 @@ Larger: the same depth on the screen gives more force."""
 CAP = 7.0
 """Greatest force of a hand in a browser, N: the longest arrow. As of scripted hands."""
 LEAST_SEEN = 1e-4
-"""Least motion that is drawn, as a share of the scene's diagonal, and of a turn. Larger: less is
-sent while a hand rests, and slow motions become steps."""
+"""Least motion that is drawn, as a share of the scene's diagonal, and of a turn."""
 PLUMB_EVERY = 0.1
 """Seconds from one line to what lies below the hand to the next. Larger: it follows more slowly."""
 LEAST_SHOWN = 0.01
-"""Least radius of what fills the view, as a share of the scene's diagonal. Smaller: more of it is
-seen, nearer than the eye can see."""
+"""Least radius of what fills the view, as a share of the scene's diagonal."""
 HISTORY = 300
 """Samples of the plot, ten seconds of them. Larger: a longer time is seen, and more is sent."""
 
@@ -85,8 +83,6 @@ class Browser:
         self.drawing = HandDrawing(client, site.facts.diagonal, middle, CAP)
         self.drawing.gizmo.on_update(self._moved)
 
-    # -- what a page with panels shows, too ------------------------------------------------------
-
     def hand_moved(self) -> None:
         """Show where the hand is now."""
 
@@ -101,8 +97,6 @@ class Browser:
 
     def frame_came(self, frame: np.void, wrench: Floats, touched: list[Object], now: float) -> None:
         """Show a frame of the session, its wrench (6,), and what it touches."""
-
-    # -- callbacks ---------------------------------------------------------------------------
 
     def guarded(self, role: str, act: Callable[[Event], None]) -> Callable[[Event], None]:
         """Return a callback that checks the role, and tells an error to the person alone."""
@@ -153,8 +147,6 @@ class Browser:
                 self.hand_moved()
 
         self.guarded("toucher", act)(event)
-
-    # -- the session -------------------------------------------------------------------------
 
     def move_hand(self, pose: Floats) -> None:
         """Put the hand at a pose (7,), metres, for the person."""
@@ -334,8 +326,6 @@ class Browser:
         shared, self._shared = self._shared, []
         for node in shared:
             node.remove()
-
-    # -- what the clock calls ----------------------------------------------------------------
 
     def tick(self, now: float) -> None:
         """Show the newest frame of the session; called `site.TICKS` times a second."""

@@ -12,8 +12,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 
 FARTHEST = 1e9
-"""Greatest coordinate that a browser may send, metres, as of poses in files. Larger: places at
-which a voxel is lost in rounding are let through."""
+"""Greatest coordinate that a browser may send, metres, as of poses in files."""
 
 
 def number_of(value: object, low: float, high: float, what: str) -> float:

@@ -29,8 +29,7 @@ FAMILIES: tuple[Colour, ...] = (
     (160, 194, 191), (211, 175, 187), (184, 190, 198), (200, 187, 165), (168, 181, 203),
     (187, 205, 177), (210, 188, 178),
 )  # fmt: skip
-"""Colours of sub-assemblies. More colours tell more sub-assemblies apart, and leave more nodes
-where parts are merged, because a node has one colour."""
+"""Colours of sub-assemblies."""
 SHADES = (1.0, 0.86)
 """Brightness of the objects of one sub-assembly, in turns by name. More shades: as `FAMILIES`."""
 MOST_COLOURS = 32
@@ -42,8 +41,7 @@ HEIGHTS: tuple[Colour, ...] = (
 MARKED: Colour = (255, 170, 0)
 """Colour of what is highlighted."""
 FADED: Rgba = (128, 138, 150, 20)
-"""Colour and opacity of everything beside a pair that is shown. More opaque: its place in the whole
-is seen better, and the pair worse."""
+"""Colour and opacity of everything beside a pair that is shown."""
 PAIR: tuple[Colour, Colour] = ((235, 104, 20), (36, 99, 160))
 """Colours of the two parts of a pair: orange and blue."""
 

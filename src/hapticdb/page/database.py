@@ -12,8 +12,7 @@ from hapticdb.errors import HapticDBError
 
 LOG = logging.getLogger("hapticdb.page")
 MOST_WAITING = 64
-"""Jobs that wait. Larger: more clicks of many people are kept while one job takes long, instead of
-being refused."""
+"""Jobs that wait."""
 ENDS_WITHIN = 0.2
 """Seconds in which a thread without a job ends. Larger: it wakes less often."""
 

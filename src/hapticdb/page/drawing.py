@@ -21,13 +21,11 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LONGEST_ARROW = 0.22
-"""Length of the longest arrow, as a share of the scene's diagonal: that of a force at the cap.
-Larger: small forces are seen better, and large ones leave the picture."""
+"""Length of the longest arrow, as a share of the scene's diagonal: that of a force at the cap."""
 ARROW_BEGINS = 1e-3
 """Share of its longest length below which an arrow is not drawn. Larger: fewer arrows."""
 LEAST_DRAWN = 2e-4
-"""Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap.
-Larger: less is sent while a hand rests."""
+"""Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap."""
 HAND_GIZMO = 110.0
 """Size of the hand's gizmo in every view, pixels. Larger: easier to grab, and more is behind it."""
 PLUMB: colours.Colour = (70, 80, 95)

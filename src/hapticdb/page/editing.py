@@ -121,8 +121,6 @@ class PersonsEdits:
         accept_clash(self._env, [a], [b], because)
         return "the pair is no longer accepted" if because is None else "the pair is accepted"
 
-    # -- transactions ------------------------------------------------------------------------
-
     def _move(self, obj: Object, place: Floats, revision: int) -> Object:
         with _conflicts_named(obj):
             moved = self._env.move(obj.id, place, revision=revision)

@@ -21,8 +21,7 @@ from hapticdb.query.law import inset_of
 Floats = NDArray[np.float64]
 
 PROBE_SHARE = 0.028
-"""Radius of the ball, as a share of the scene's diagonal. Larger: better seen, and it fits into
-fewer places."""
+"""Radius of the ball, as a share of the scene's diagonal."""
 LEAST_VOXELS = 3.0
 """Least radius of a probe, voxels. Larger: probes feel smooth in coarser environments, and are
 larger there."""

@@ -93,9 +93,6 @@ def _table(told: Sequence[Clash]) -> str:
     return f"<table>{head}{rows}</table>"
 
 
-# -- the matrix ------------------------------------------------------------------------------------
-
-
 def _matrix(told: Sequence[Clash]) -> str:
     """Numbers of pairs between sub-assemblies: those that overlap, of all."""
     there = [one for one in told if one.status != "gone" and one.a_name and one.b_name]
@@ -145,9 +142,6 @@ def _cell(deep: int, near: int) -> str:
         return "<td>"
     shade = f" style='background:rgb(235 104 20/{min(0.15 + deep / 10, 0.8):.2f})'" if deep else ""
     return f"<td{shade}>{deep:,}/{near:,}"
-
-
-# -- pictures --------------------------------------------------------------------------------------
 
 
 def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]) -> Iterator[str]:

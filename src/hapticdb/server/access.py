@@ -19,11 +19,9 @@ from hapticdb.errors import UsageError
 COOKIE = "hapticdb"
 """Name of the cookie. Browsers send a cookie to all ports of a machine, so the port is appended."""
 SIGNED_IN_SECONDS = 3600.0
-"""Seconds that a cookie is good for after it was last used. Larger: a stolen cookie works longer;
-smaller: a person who was away has to show the token again sooner."""
+"""Seconds that a cookie is good for after it was last used."""
 MOST_SIGNED_IN = 1024
-"""Greatest number of valid cookies. The one that was used longest ago makes room for a new one.
-Larger: more memory for a client that signs in again and again."""
+"""Greatest number of valid cookies. The one that was used longest ago makes room for a new one."""
 LEAST_TOKEN = 16
 """Fewest characters of a token that a person chooses. Smaller: it can be guessed."""
 LONGEST_TOKEN = 256

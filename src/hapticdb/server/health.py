@@ -21,8 +21,7 @@ from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.server")
 GOOD_FOR = 1.0
-"""Seconds that an answer is given again without asking the parts. Larger: a failure is seen later,
-and many who ask cost the database less."""
+"""Seconds that an answer is given again without asking the parts."""
 PATIENCE = 5.0
 """Seconds that the database has to answer."""
 

@@ -14,8 +14,7 @@ from msgspec import Meta
 from hapticdb.server.access import Role
 
 FARTHEST = 1e9
-"""Greatest absolute value of a coordinate, metres, and of any other number. Larger: numbers that
-overflow where they are multiplied."""
+"""Greatest absolute value of a coordinate, metres, and of any other number."""
 LARGEST = 16 << 10
 """Most bytes of a message; a long text field fits. Larger: more to decode for each."""
 

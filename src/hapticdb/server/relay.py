@@ -25,16 +25,13 @@ LOG = logging.getLogger("hapticdb.server")
 VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
 """The subprotocol by which viser's client names its version; the page compares it."""
 WAITING_MESSAGES = 4
-"""Messages of the page that wait for one browser. Larger: a browser that reads slowly holds more
-memory, before the page waits for it."""
+"""Messages of the page that wait for one browser."""
 CONNECT_PATIENCE = 5.0
 """Seconds for the connection to the page."""
 CLOSING_PATIENCE = 5.0
-"""Seconds that a browser has to take the close frame. Larger: one that does not read is served for
-longer."""
+"""Seconds that a browser has to take the close frame."""
 RENEW_EVERY = 60.0
-"""Seconds between two looks at a browser's cookie. Larger: a cookie that became invalid works
-longer."""
+"""Seconds between two looks at a browser's cookie."""
 
 GOING_AWAY, POLICY, TRY_LATER, SIGNED_OUT = 1001, 1008, 1013, 4401
 """WebSocket close codes; the last one is ours."""

@@ -33,8 +33,7 @@ LOG = logging.getLogger("hapticdb.server")
 PING_EVERY = 20.0
 """Seconds between two pings to a browser. Larger: a browser that vanished is noticed later."""
 PING_PATIENCE = 60.0
-"""Seconds for the answer to a ping, which waits behind the scene on a slow network. Larger: a
-browser that vanished holds its session longer."""
+"""Seconds for the answer to a ping, which waits behind the scene on a slow network."""
 HEADER_BYTES = 16 << 10
 """Most bytes of the headers of a request."""
 

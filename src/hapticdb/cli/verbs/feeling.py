@@ -46,8 +46,6 @@ LOOK_EVERY = 0.25
 """Seconds between two looks at the session: how late is told that its recording has ended, or that
 the tool lies in an object."""
 
-# -- options of this verb alone -------------------------------------------------------------------
-
 DeviceOption = Annotated[
     str,
     typer.Option(

@@ -57,10 +57,8 @@ if TYPE_CHECKING:
 MOST_TOUCHED = 8
 """Objects in the table of those that were touched in most frames."""
 FEW_POSES = 500
-"""Poses of a path below which it does not pay to measure the database's costs.
-
-Measuring takes most of a second, and `touch` opens the environment to read, so that it could not
-keep the figures. A larger value lets longer paths of large tools go without grouping."""
+"""Poses of a path below which it does not pay to measure the database's costs. Measuring takes most
+of a second, and `touch` opens the environment to read, so that it could not keep the figures."""
 
 StrategyOption = Annotated[StrategyName, typer.Option(help="How the database is asked.")]
 MaxgapOption = Annotated[

@@ -67,8 +67,6 @@ class ClashPanel:
             self._accept = gui.add_button_group("Pair", ("Accept", "Take back"))
             self._accept.on_click(guard("editor", self._accept_or_not))
 
-    # -- the search --------------------------------------------------------------------------
-
     def _look(self, _: object) -> None:
         within, contact = (
             1e-3 * checks.number_of(entry.value, 1e-6, 1e6, "a length")
@@ -96,8 +94,6 @@ class ClashPanel:
         """Say that the list may be out of date."""
         if self._found is not None:
             self._work.said.content = note_html("Parts have changed since: look again.")
-
-    # -- the list ----------------------------------------------------------------------------
 
     def _filter(self, event: "GuiEvent[Any]") -> None:
         if event.client is not None:
@@ -143,8 +139,6 @@ class ClashPanel:
         rows = [("Orange", names[0]), ("Blue", names[1]), ("Are", one.kind)]
         rows += [("By", one.length_text()), ("Status", one.status)]
         self._what.content = rows_html(rows + ([("Because", one.because)] if one.because else []))
-
-    # -- one pair ----------------------------------------------------------------------------
 
     def _show_or_end(self, event: "GuiEvent[Any]") -> None:
         if checks.choice_of(event.target.value, ("Show", "End"), "what to see") == "End":

@@ -74,8 +74,6 @@ class PartsPanel:
         self.moving = MovingControls(browser, gui)
         self.show_objects()
 
-    # -- the list ----------------------------------------------------------------------------
-
     def show_objects(self) -> None:
         """Show the list as the objects are now."""
         self._list()
@@ -114,8 +112,6 @@ class PartsPanel:
         if event.client is not None and event.target.value != NOTHING:
             label = checks.choice_of(event.target.value, tuple(self._lines), "a part")
             self.choose(self._lines[label])
-
-    # -- the chosen parts --------------------------------------------------------------------
 
     def clicked(self, origin: Floats, way: Floats) -> None:
         """Choose what a ray meets; or take it as an end of a distance."""
@@ -184,8 +180,6 @@ class PartsPanel:
         browser = self._browser
         browser.scene.colour(browser.chosen, (int(abs(red)), int(abs(green)), int(abs(blue))))
 
-    # -- voxels ------------------------------------------------------------------------------
-
     def _show_voxels(self, event: "GuiEvent[Any]") -> None:
         if checks.flag_of(event.target.value, "voxels"):
             self._browser.only_chosen()
@@ -226,8 +220,6 @@ class PartsPanel:
 
         self._browser.site.database.ask(centers, draw, self._browser.failed)
 
-    # -- a part in hand ----------------------------------------------------------------------
-
     def _take_out(self, _: object) -> None:
         browser = self._browser
         obj = self._browser.only_chosen()
@@ -250,8 +242,6 @@ class PartsPanel:
     def show_tool(self) -> None:
         """Show whether a part is in hand."""
         self._back.visible = self._browser.taken is not None
-
-    # -- distances ---------------------------------------------------------------------------
 
     def _start_measuring(self, event: "GuiEvent[Any]") -> None:
         checks.flag_of(event.target.value, "measuring")

@@ -68,8 +68,6 @@ class RecordPanel:
             self._play.on_click(guard("viewer", self._play_or_pause))
             self._said = gui.add_html("")
 
-    # -- recording ---------------------------------------------------------------------------
-
     def _names(self) -> list[str]:
         """Names of the recordings in the folder, the newest first."""
         folder = self._browser.site.recordings
@@ -106,8 +104,6 @@ class RecordPanel:
         self._record.label = "Record"
         self._state.content = note_html(said)
         self._list.options = (NOTHING, *self._names())
-
-    # -- replay ------------------------------------------------------------------------------
 
     def _choose(self, event: "GuiEvent[Any]") -> None:
         name = checks.choice_of(event.target.value, (NOTHING, *self._names()), "a recording")

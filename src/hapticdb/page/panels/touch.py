@@ -25,8 +25,7 @@ if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, GuiUplotHandle
 
 SHOWN_EVERY = 0.2
-"""Seconds from one update of numbers and plots to the next. Larger: less to send, and numbers that
-are easier to read."""
+"""Seconds from one update of numbers and plots to the next."""
 SECONDS = 10.0
 """Seconds that the plot shows."""
 HIGHEST = 8.0
@@ -87,8 +86,6 @@ class TouchPanel:
             self._scales = (browser.scale * SCALES[0] * 0.999, browser.scale * SCALES[1] * 1.001)
             scale.on_update(browser.guarded("toucher", self._rescale))
 
-    # -- callbacks ---------------------------------------------------------------------------
-
     def _choose_tool(self, event: "GuiEvent[Any]") -> None:
         browser = self._browser
         is_held = event.target.value == PART and not self._is_of_the_list
@@ -131,8 +128,6 @@ class TouchPanel:
         if scale != self._browser.scale:
             self._browser.scale = scale
             self._browser.begin_anew()
-
-    # -- what is shown -----------------------------------------------------------------------
 
     @property
     def _is_of_the_list(self) -> bool:

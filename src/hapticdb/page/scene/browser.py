@@ -66,8 +66,6 @@ class BrowserScene:
         self._look = _Look()
         contents.watch(self._key, Audience(client.scene), self._look.colour)
 
-    # -- what is seen ------------------------------------------------------------------------
-
     @property
     def hidden(self) -> set[int]:
         """Ids of the objects that this browser does not see."""
@@ -140,8 +138,6 @@ class BrowserScene:
     def _draw(self, ids: Iterable[int]) -> None:
         with self._client.atomic():
             self._contents.see(self._key, ids)
-
-    # -- clicks ------------------------------------------------------------------------------
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Struck | None:
         """The part that a ray, world frame, meets first, of those that this browser sees."""

@@ -18,8 +18,7 @@ from hapticdb.store.base import Object
 ALL = "all"
 """Key of the audience of all browsers."""
 MOST_LOOSE = 128
-"""Moved objects that get a node of their own, instead of being merged with others again. A larger
-value makes moves cheaper and leaves more nodes after many of them."""
+"""Moved objects that get a node of their own, instead of being merged with others again."""
 
 
 class Contents:
@@ -43,8 +42,6 @@ class Contents:
         self._numbers = count()
         self._loose: set[int] = set()
         self._preview: dict[int, NDArray[np.float64]] = {}
-
-    # -- objects -----------------------------------------------------------------------------
 
     def add(self, objects: Sequence[Object]) -> None:
         """Show objects as boxes, until `shape` gives them their shapes."""
@@ -148,8 +145,6 @@ class Contents:
     def _name(self) -> str:
         return f"/parts/{next(self._numbers)}"
 
-    # -- audiences ---------------------------------------------------------------------------
-
     def watch(self, key: Hashable, audience: Audience, sight: Sight) -> None:
         """Let one browser see objects in its own way, from now on."""
         with self.lock:
@@ -204,8 +199,6 @@ class Contents:
                 audience.blank(name)
             else:
                 audience.drop(name)
-
-    # -- what is where -----------------------------------------------------------------------
 
     def pick(
         self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]

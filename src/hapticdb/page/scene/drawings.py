@@ -20,8 +20,7 @@ if TYPE_CHECKING:
     from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
 LEAST_SIMPLIFIED = 64
-"""Vertices from which the browser makes coarser copies of a shape for a distant eye. A larger value
-saves time when the scene opens, and draws more triangles of distant shapes."""
+"""Vertices from which the browser makes coarser copies of a shape for a distant eye."""
 COARSER = ((14.0, 0.4), (45.0, 0.1))
 """Distances, in radii of a shape, from which the browser draws a share of its triangles. At 14
 radii a shape fills a fifth of the picture's height."""

@@ -9,8 +9,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 SHARP = np.cos(np.radians(30.0))
-"""Cosine of the angle between two faces above which their common edge is drawn sharp. A larger
-value (a smaller angle) makes more edges sharp, and more vertices to send."""
+"""Cosine of the angle between two faces above which their common edge is drawn sharp."""
 _MIX = np.array(
     [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93],
     dtype=np.uint64,

@@ -12,8 +12,7 @@ from hapticdb.resident.changes import writes_since
 from hapticdb.store.base import Object
 
 LOOK_EVERY_S = 0.02
-"""Seconds between two looks for commits of others. A larger value shows an edit later and asks the
-database less often."""
+"""Seconds between two looks for commits of others."""
 TRY_AGAIN_S = 1.0
 """Seconds after a failed statement until the next look."""
 
@@ -46,8 +45,6 @@ class Follower:
         """Close the connection, and wait until the thread has ended, at most so many seconds."""
         self._ended.set()
         self._thread.join(timeout)
-
-    # -- the thread --------------------------------------------------------------------------
 
     def _run(self) -> None:
         try:

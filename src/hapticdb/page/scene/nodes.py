@@ -15,11 +15,9 @@ from hapticdb.page.scene.shapes import Dots, PartShape, Piece
 from hapticdb.poses import quaternion_of
 
 LEAST_SAVED = 2_000
-"""Triangles that a batch must save, compared with merging its objects, to be a node of its own. A
-larger value makes fewer nodes and sends more bytes."""
+"""Triangles that a batch must save, compared with merging its objects, to be a node of its own."""
 MOST_MERGED = 24_000
-"""Triangles of a merged node, unless one object alone has more. A larger value makes fewer nodes,
-and sends more bytes when one object of the node is hidden, marked or moved."""
+"""Triangles of a merged node, unless one object alone has more."""
 BOX_OPACITY = 0.3
 """Opacity of the boxes of objects whose shape is being read."""
 _OPAQUE = 255

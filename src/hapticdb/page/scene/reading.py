@@ -23,8 +23,7 @@ from hapticdb.store.connect import open_store
 ShapedObject = tuple[Object, PartShape, NDArray[np.float64]]
 """An object, its shape, and the shape's pose (4, 4), world_from_shape."""
 SHOW_EVERY_S = 0.5
-"""Seconds after which the shapes read so far are shown. A larger value merges more of them, and
-shows them later."""
+"""Seconds after which the shapes read so far are shown."""
 SHOW_TRIANGLES = 1_000_000
 """Triangles after which the shapes read so far are shown."""
 

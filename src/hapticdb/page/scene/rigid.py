@@ -8,8 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME = 1e-7
-"""Greatest difference of two stretches that count as one, relative. A larger value shares more
-shapes between placements and shows them less exactly."""
+"""Greatest difference of two stretches that count as one, relative."""
 REMEMBERED = 1 << 14
 """Placements whose parts are kept, 1 kB each. A larger value saves time in larger scenes."""
 

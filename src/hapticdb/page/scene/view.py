@@ -66,8 +66,6 @@ class SceneView:
         self._follower.close(ENDS_WITHIN_S)
         self._reader.join(ENDS_WITHIN_S)
 
-    # -- what there is -----------------------------------------------------------------------
-
     @property
     def grid(self) -> Grid:
         """The environment's grid."""
@@ -78,8 +76,6 @@ class SceneView:
         """All objects by id, as of `revision`: a copy."""
         with self.contents.lock:
             return dict(self.contents.records)
-
-    # -- edits -------------------------------------------------------------------------------
 
     def move(self, object_id: int, transform: ArrayLike) -> bool:
         """Show an object at a new placement at once, in all browsers, before it is committed.

@@ -70,28 +70,12 @@ def animate(
 ) -> None:
     """Write a page that shows parts on their paths, one step after another, again and again.
 
-    The page needs no server: any browser opens the file.
+    The page needs no server: any browser opens the file, which is replaced. Raises
+    `MissingExtraError` without the extra `view`, `FileError` if the file cannot be written.
 
-    Parameters
-    ----------
-    path : path
-        The file; one that is there is replaced.
-    env : Environment
-        What the paths were found in.
-    steps : sequence of Extraction
-        Each with a path, in the order in which parts come out. What has come out is not shown in
-        later steps.
-    exclude : iterable of int
-        Ids of objects that are not shown at all, unless they come out.
-    up : {'x', 'y', 'z'} or None
-        Axis that points up; what most of the objects' files say unless given.
-
-    Raises
-    ------
-    MissingExtraError
-        Without the extra `view`.
-    FileError
-        If the file cannot be written.
+    steps : each with a path, in the order in which parts come out; exclude : ids of objects that
+    are not shown, unless they come out; up : axis 'x', 'y' or 'z' that points up, that of most of
+    the objects' files unless given.
     """
     check_view()
     from hapticdb.page.process import new_server, stop  # noqa: PLC0415 - the extra `view`

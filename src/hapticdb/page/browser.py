@@ -197,10 +197,7 @@ class Browser:
             self.begin_anew()
 
     def begin_anew(self, *, keeps_tool: bool = True) -> None:
-        """Begin the session again with the present tool, filter and scale, later, in a worker.
-
-        keeps_tool : whether the tool stays where it is now; else it begins in the hand.
-        """
+        """Begin the session again, in a worker: its tool stays, or begins in the hand."""
         if not self.visitor.may("toucher") or self._is_closed:
             return
         with self._swapping:

@@ -1,7 +1,4 @@
-"""Checks of values that a browser sent: a client may send anything in any field.
-
-Each raises `UsageError` for any other value than it asks for.
-"""
+"""Checks of values from a browser, which may send anything: UsageError for all others."""
 
 import math
 from collections.abc import Collection

@@ -62,10 +62,7 @@ def of_tool(number: int) -> Colour:
 
 
 def of_contacts(points: NDArray[np.float64], touched: list[Object]) -> NDArray[np.uint8]:
-    """Colours (n, 3) of contacts: each has that of the touched object whose box is nearest.
-
-    points : (n, 3), metres. Of boxes that are equally near, the smallest is taken.
-    """
+    """Colours (n, 3) of contacts (n, 3), metres: of the nearest, smallest touched box."""
     if not touched or not len(points):
         return np.full((len(points), 3), FORCE, dtype=np.uint8)
     ordered = sorted(touched, key=lambda obj: float(np.prod(obj.bounds[1] - obj.bounds[0])))

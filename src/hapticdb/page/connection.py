@@ -115,10 +115,7 @@ class PageConnection:
         inner.on_client_disconnect(leave)
 
     def visitor(self, client_id: int) -> Visitor:
-        """Return who a client of the guarded server is.
-
-        KeyError if it is not connected, or not by our server.
-        """
+        """Return who a client is; KeyError if it is not connected, or not by our server."""
         request = self._live[client_id].request
         assert request is not None  # noqa: S101 - the handshake is over
         shown = "".join(request.headers.get_all(SECRET)).encode(errors="replace")
@@ -127,10 +124,7 @@ class PageConnection:
         return Visitor(request.headers[NAME], request.headers[ROLE])
 
     def prepare(self, is_ending: Callable[[], bool]) -> None:
-        """Wait until the server has compiled what a hand calls; the first call asks for it.
-
-        HapticDBError if the page ends before.
-        """
+        """Wait until what a hand calls is compiled; HapticDBError if the page ends."""
         with self._asking:
             if not self._is_asked:
                 self._is_asked = True

@@ -20,11 +20,7 @@ Answer = TypeVar("Answer")
 
 
 class DatabaseThread:
-    """An environment in a thread of its own, which does the jobs of all browsers in turn.
-
-    It is opened for the first job, and for each later one again while it cannot be; such a job
-    fails.
-    """
+    """An environment in a thread of its own, opened for the first of all browsers' jobs."""
 
     def __init__(self, url: str, *, read_only: bool = True) -> None:
         self._url, self._read_only = url, read_only

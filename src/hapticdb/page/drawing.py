@@ -153,17 +153,16 @@ class HandDrawing:
         """Points as their nodes have them."""
         return np.asarray(np.asarray(points) - self.middle, np.float32)
 
-    def _arrow(self, arrow: "ArrowsHandle", start: Floats, way: Floats) -> None:
-        length, longest = float(np.linalg.norm(way)), LONGEST_ARROW * self._diagonal
+    def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
+        """Let an arrow, whose node is at `middle`, show a force (3,), N, at a place."""
+        longest = LONGEST_ARROW * self._diagonal
+        way = force * (longest / self.cap)
+        length = float(np.linalg.norm(way))
         is_seen = length > ARROW_BEGINS * longest
         if is_seen:
             way = way * (min(length, longest) / length)
             arrow.points = self._sent([[start, start + way]])
         arrow.visible = is_seen
-
-    def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
-        """Let an arrow, whose node is at `middle`, show a force (3,), N, at a place."""
-        self._arrow(arrow, start, force * (LONGEST_ARROW * self._diagonal / self.cap))
 
     def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:
         """Mark contacts (n, 3), each in its colour (n, 3)."""

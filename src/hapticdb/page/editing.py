@@ -70,10 +70,7 @@ class PersonsEdits:
         self._out: dict[int, Object] = {}
 
     def move(self, obj: Object, way: Floats) -> Object:
-        """Displace an object, as the person saw it, by (4, 4); returns it as it is now.
-
-        ConflictError if somebody has written the object since.
-        """
+        """Displace an object by (4, 4); ConflictError if another has written it since."""
         place = way @ obj.transform
         moved = self._move(obj, place, obj.revision)
         self._note(_Step("move", obj, place))
@@ -86,10 +83,7 @@ class PersonsEdits:
         return f"{short_name(obj.name)} is out"
 
     def put_back(self) -> str:
-        """Put back the object that this person took out last.
-
-        UsageError if there is none, ConflictError if somebody has imported it again.
-        """
+        """Put back the object taken out last; UsageError if none, or ConflictError."""
         if not self._out:
             raise UsageError("you have taken no part out")
         before = [*self._out.values()][-1]
@@ -185,10 +179,7 @@ class Edits:
         then: Callable[[Answer], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do an edit of a person later; then call `then` or `failed`. Waits for no database.
-
-        person : a number that nobody else ever gets.
-        """
+        """Do an edit of a person, a unique number, later; then call `then` or `failed`."""
 
         def refused(error: HapticDBError) -> None:
             if isinstance(error, AccessError):

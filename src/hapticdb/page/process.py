@@ -25,10 +25,7 @@ PANEL = 340
 
 
 def work(request: PageRequest, sender: MessageSender) -> None:
-    """Serve the page until the process that started this one ends.
-
-    Sends the message ``ready`` with viser's port once browsers can connect.
-    """
+    """Serve the page until the parent process ends; sends ``ready`` with viser's port."""
     server = new_server()
     connection = PageConnection(request.server, request.secret)
     connection.guard(server)
@@ -63,10 +60,7 @@ def new_server() -> "ViserServer":
 
 
 def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
-    """Show the scene, and make panels for each browser that connects.
-
-    visitor_of : who a client of viser is; a KeyError if it has gone again.
-    """
+    """Show the scene, and panels for each browser; `visitor_of`: KeyError if it has gone."""
     server = site.server
     server.gui.set_panel_label(site.title)
     server.gui.configure_theme(

@@ -58,10 +58,6 @@ class HeldTool:
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
-BUILT_IN = ("ball", "peg")
-"""Names of the probes that every environment has."""
-
-
 def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
     """Probes that fit a scene: a ball and a peg.
 
@@ -79,7 +75,7 @@ def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list
     )
     profiles = radius * np.column_stack([np.cos(ball), np.sin(ball)]), np.concatenate([tip, shaft])
     found = []
-    for name, profile in zip(BUILT_IN, profiles, strict=True):
+    for name, profile in zip(("ball", "peg"), profiles, strict=True):
         vertices, faces = _turned(profile)
         sample = partial(PointShell.from_mesh, vertices, faces, POINTS, inset=inset)
         found.append(HeldTool(name, sample, vertices, faces, is_round=name == "ball"))
@@ -135,8 +131,7 @@ def from_shell(name: str, shell: PointShell) -> HeldTool:
 def middle_of(shell: PointShell) -> Floats:
     """Middle (3,) of the box of a shell's surface, metres, the shell's frame."""
     outline = shell.outline
-    middle: Floats = 0.5 * (outline.min(axis=0) + outline.max(axis=0))
-    return middle
+    return np.asarray(0.5 * (outline.min(axis=0) + outline.max(axis=0)))
 
 
 def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
@@ -195,6 +190,5 @@ def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number
     )
     pose = np.eye(4)
     pose[:3, 3] = position
-    upright = np.column_stack([side, np.cross(up, side), up])
-    pose[:3, :3] = upright
+    pose[:3, :3] = np.column_stack([side, np.cross(up, side), up])
     return pose

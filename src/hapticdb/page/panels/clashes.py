@@ -31,10 +31,7 @@ LONGEST_TEXT = 200
 
 
 class ClashPanel:
-    """Looks for clashes, lists and shows them; editors accept them.
-
-    gui : where the panel is made, inside the present container.
-    """
+    """Looks for clashes, lists and shows them; editors accept them."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser

@@ -42,8 +42,7 @@ class _HeldPart:
 
     def way_to(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
         """Displacement (4, 4) of the part when the gizmo is at a pose."""
-        way: NDArray[np.float64] = pose @ np.linalg.inv(self.start)
-        return way
+        return np.asarray(pose @ np.linalg.inv(self.start))
 
 
 class MovingControls:
@@ -51,8 +50,6 @@ class MovingControls:
 
     Drags come on viser's event loop, answers in the thread of the edits, others' edits in the
     follower's, and choices in viser's pool: one lock is held around what changes the gizmo.
-
-    gui : where the panel is made, inside the present container.
     """
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
@@ -99,10 +96,7 @@ class MovingControls:
             self._gizmo.on_update(partial(self._dragged, self._held))
 
     def renew(self) -> None:
-        """Put the gizmo where the part is now, if somebody has moved it.
-
-        While the person drags it, or own moves wait to be written, the gizmo stays.
-        """
+        """Put the gizmo where another has moved the part; not during own moves."""
         with self._lock:
             held = self._held
             if held is None or self._is_dragged or held.n_waiting:

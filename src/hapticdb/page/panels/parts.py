@@ -33,10 +33,7 @@ MOST_VOXELS = 60_000
 
 
 class PartsPanel:
-    """Finds parts, says what they are, and sets what this browser shows and feels.
-
-    gui : where the panel is made, inside the present container.
-    """
+    """Finds parts, says what they are, and sets what this browser shows and feels."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser

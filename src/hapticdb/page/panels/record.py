@@ -40,10 +40,7 @@ class Replay(NamedTuple):
 
 
 class RecordPanel:
-    """Records this browser's session into the operator's folder, and replays what is there.
-
-    gui : where the panel is made, inside the present container.
-    """
+    """Records this browser's session into the operator's folder, and replays what is there."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser

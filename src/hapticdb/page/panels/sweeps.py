@@ -49,10 +49,7 @@ class _SweepAnswer(NamedTuple):
 
 
 class SweepPanel:
-    """Runs sweeps of this browser's tool or chosen part, and shows what they hit.
-
-    gui : where the panel is made, inside the present container.
-    """
+    """Runs sweeps of this browser's tool or chosen part, and shows what they hit."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -138,11 +135,7 @@ class SweepPanel:
 
 
 class _SweepJob:
-    """A sweep as it was asked for: later clicks do not change it.
-
-    part : id of the swept object; None: the tool; way : one of `WAYS`; length : of a way along an
-    axis, metres.
-    """
+    """A sweep as asked for; part : its id, None: the tool; way : one of `WAYS`; length : metres."""
 
     def __init__(self, browser: Browser, part: int | None, way: str, length: float) -> None:
         self._site = browser.site

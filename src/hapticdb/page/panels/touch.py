@@ -39,10 +39,7 @@ SCALES = (0.05, 20.0)
 
 
 class TouchPanel:
-    """Shows the session's newest frame, and sets the tool, its spring and its scale.
-
-    gui : where the panel is made, inside the present container.
-    """
+    """Shows the session's newest frame, and sets the tool, its spring and its scale."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -220,10 +217,7 @@ class TouchPanel:
 
 
 def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows (n, 2) of the last `SECONDS`, their times from now, and zeros where nothing was yet.
-
-    A plot always shows the range of its times, so that these are always the same.
-    """
+    """Rows (n, 2) of the last `SECONDS`, times from now; zeros before, for a fixed range."""
     rows = history.copy()
     rows[:, 0] -= history[-1, 0]
     rows = rows[rows[:, 0] >= -SECONDS]

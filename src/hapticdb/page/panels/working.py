@@ -20,10 +20,7 @@ Answer = TypeVar("Answer")
 
 
 class Work:
-    """One job of a browser's panel at a time: how far it is, and what came of it.
-
-    gui : where the bar and the words are made, inside the present container; what : names the job.
-    """
+    """One job of a browser's panel at a time, named `what`: how far it is, and what came of it."""
 
     def __init__(self, browser: Browser, gui: "GuiApi", what: str) -> None:
         self._browser, self._what = browser, what

@@ -113,10 +113,7 @@ class BrowserScene:
             self._draw(wanted)
 
     def spotlight(self, colours: Mapping[int, Colour]) -> None:
-        """See these objects, hidden ones too, in these colours, and through all others.
-
-        None: all as they were.
-        """
+        """See objects, hidden ones too, in these colours, and through all others."""
         with self._contents.lock:
             before, self._look.spotlit = self._look.spotlit, dict(colours)
             is_whole = bool(before) != bool(colours)

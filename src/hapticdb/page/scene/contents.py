@@ -180,7 +180,7 @@ class Contents:
 
     def _sync(self, node: Node, audience: Audience, sight: Sight) -> None:
         """Bring the nodes of one audience up to date with what it sees of a node's objects."""
-        wanted = node.drawings(sight) if node.members else {}
+        wanted: Mapping[str, Drawing | Sprinkle] = node.drawings(sight) if node.members else {}
         if audience is self._audiences[ALL][0]:
             before = self._shown.pop(node.name, {})
             for name in before.keys() - wanted.keys():

@@ -25,11 +25,7 @@ _SIDES = np.array([
 
 
 class Facets(NamedTuple):
-    """Triangles to show.
-
-    vertices (V, 3), metres, and faces (F, 3): float64 and int64; float32 and uint32 where they are
-    sent.
-    """
+    """Vertices (V, 3), metres, and faces (F, 3): float64 and int64; as sent, float32 and uint32."""
 
     vertices: NDArray[np.floating]
     faces: NDArray[np.integer]

@@ -18,11 +18,7 @@ TRY_AGAIN_S = 1.0
 
 
 class Follower:
-    """Opens an environment to read, and tells what is committed to it, in a thread of its own.
-
-    tell : called from that thread, first with all objects, then with each change: the objects that
-    were written, the ids of those that are gone, and the revision.
-    """
+    """Thread that calls `tell`: with all objects, then written, gone and revision."""
 
     grid: Grid
     """The environment's grid, from `start` on."""

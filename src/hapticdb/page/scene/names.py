@@ -4,10 +4,7 @@ from collections.abc import Mapping
 
 
 def assemblies_of(names: Mapping[int, str]) -> dict[str, list[int]]:
-    """Ids of the objects below each sub-assembly, by its path: elements joined by '/'.
-
-    In the order of the names, each sub-assembly before what it holds.
-    """
+    """Ids of the objects below each sub-assembly, by its path; outer ones first."""
     found: dict[str, list[int]] = {}
     for object_id, name in sorted(names.items(), key=lambda item: (item[1], item[0])):
         end = name.find("/", 1)

@@ -1,9 +1,8 @@
 """Objects gathered into few nodes: batches of one shape, and merged shapes of one colour."""
 
-from collections.abc import Callable, Hashable, Mapping, Sequence
+from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -44,25 +43,6 @@ Sight = Callable[[Member], Colour | Rgba | None]
 does not see it."""
 
 
-class Node(Protocol):
-    """Objects that are drawn together."""
-
-    @property
-    def name(self) -> str:
-        """Path of its node in the browser's scene."""
-
-    @property
-    def members(self) -> dict[int, Member]:
-        """Its objects by id; objects may leave it, none may join."""
-
-    @property
-    def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes."""
-
-    def drawings(self, sight: Sight) -> Mapping[str, Drawing | Sprinkle]:
-        """What an audience sees of it, by names of nodes; nodes without a drawing are gone."""
-
-
 class BatchNode:
     """One shape at one or more places; without a shape, the boxes of objects as cubes."""
 
@@ -85,10 +65,7 @@ class BatchNode:
 
     @property
     def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes: its node's places, 28 bytes each.
-
-        Boxes are there for a few seconds only.
-        """
+        """Whether a moved object sends few bytes: its node's places, 28 bytes each."""
         return self._is_boxes or len(self._slots) <= 256
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
@@ -207,6 +184,11 @@ class _MergedNode:
         )
 
 
+Node = BatchNode | _CloudNode | _MergedNode
+"""Objects that are drawn together: some may leave `members`, none may join. `drawings`: what an
+audience sees, by paths in the scene."""
+
+
 def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) -> Facets:
     """Pieces of members' shapes, by their numbers, at their places, metres from a centre (3,)."""
     vertices, faces, n_vertices = [], [], 0
@@ -222,10 +204,7 @@ def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) ->
 
 
 def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
-    """Nodes for members with shapes: batches where a shape repeats enough, the rest merged.
-
-    names : gives a new name for each node.
-    """
+    """Nodes of new names for members with shapes: batches of repeated shapes, the rest merged."""
     of_shape: dict[int, list[Member]] = {}
     for member in members:
         of_shape.setdefault(id(member.shape), []).append(member)

@@ -38,11 +38,7 @@ A larger value shows more detail, and sends about 100 bytes more for each cube."
 
 
 class ShapeReader:
-    """A thread that reads the shapes of objects which it is given, in order.
-
-    show : called from the thread with objects and their shapes, as they become known; lost : with
-    objects that have no triangles in the database.
-    """
+    """Thread that reads shapes: `show` gets them, `lost` objects without triangles."""
 
     def __init__(
         self,

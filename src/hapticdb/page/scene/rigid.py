@@ -33,10 +33,7 @@ class Placed(NamedTuple):
 
 
 def taken_apart(transform: NDArray[np.float64]) -> Placed:
-    """Polar decomposition of an affine placement (4, 4), which may mirror, scale or flatten.
-
-    Both matrices are read-only.
-    """
+    """Polar decomposition of an affine placement (4, 4), also a flat one; read-only."""
     return _taken_apart(np.asarray(transform, dtype=np.float64).tobytes())
 
 

@@ -26,11 +26,7 @@ class Piece(NamedTuple):
 
 
 class Dots(NamedTuple):
-    """Points of a cloud as they are drawn.
-
-    points (n, 3) float32, metres, about the shape's centre; colours (n, 3) uint8, sRGB; size : of a
-    point, metres.
-    """
+    """Points (n, 3) of a cloud about its centre, metres; colours (n, 3) sRGB; size, metres."""
 
     points: NDArray[np.float32]
     colours: NDArray[np.uint8]

@@ -182,10 +182,7 @@ def compare(scene: DemoScene) -> Comparison:
 def _race(
     env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
 ) -> dict[Strategy, list[Query]]:
-    """How every strategy asked. Each pose's answer is compared with `reference`.
-
-    The first layout's first strategy fills `reference`; differences are added to `disagreed`.
-    """
+    """Queries of each strategy; the first one's answers become the `reference` of all."""
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy, law="plane")

@@ -48,9 +48,8 @@ def leave() -> None:
     global _phase  # noqa: PLW0603
     if _phase != "not ours":
         _phase = "leaving"
-        signal.setitimer(
-            signal.ITIMER_REAL, 0.0
-        )  # without a handler the alarm would end the process
+        # without a handler the alarm would end the process
+        signal.setitimer(signal.ITIMER_REAL, 0.0)
 
 
 def tell() -> None:

@@ -74,13 +74,7 @@ for verb, summary in VERBS.items():
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run a command line and return its exit code.
-
-    Parameters
-    ----------
-    argv : sequence of str, optional
-        Arguments after the program's name; those of the process unless given.
-    """
+    """Run a command line, that of the process unless given, and return its exit code."""
     args = list(sys.argv[1:] if argv is None else argv)
     is_debugging = "--debug" in takewhile(lambda arg: arg.startswith("-"), args)
     _print_anything()

@@ -11,11 +11,7 @@ if TYPE_CHECKING:
 
 
 class Felt(NamedTuple):
-    """What the options --where and --exclude say.
-
-    where, exclude : their words, as Python takes them; left_out : ids of the objects that are not
-    felt now.
-    """
+    """Words of --where and --exclude, and ids of the objects that are left out now."""
 
     where: list[str]
     exclude: list[int | str]

@@ -121,10 +121,7 @@ def root(
 
 @contextmanager
 def ended_by_signals(stop: Callable[[], object]) -> Iterator[list[int]]:
-    """Let Ctrl-C or SIGTERM end a verb's work in order, and a second one the program.
-
-    stop : asks the work to end. Yields the signals that came.
-    """
+    """Let Ctrl-C or SIGTERM call `stop`, and a second one end all; yields the signals."""
     came: list[int] = []
     handlers = {number: signal.getsignal(number) for number in (signal.SIGINT, signal.SIGTERM)}
     before = {  # another's handler stays

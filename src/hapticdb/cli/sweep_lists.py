@@ -17,10 +17,7 @@ _HINT = "give a header with part or tool, and path; and if wanted where, exclude
 
 
 class Asked(NamedTuple):
-    """One sweep: files and words as they are given; contact : millimetres.
-
-    line : where it stands in a file of sweeps, or empty.
-    """
+    """One sweep, as given; contact : millimetres; line : in a file of sweeps, or empty."""
 
     tool: str | None
     part: list[str]

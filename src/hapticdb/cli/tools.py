@@ -1,5 +1,6 @@
 """The tool that a file holds."""
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -8,6 +9,7 @@ from hapticdb.errors import FileError, UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
+    from hapticdb.environment import Environment
     from hapticdb.pointshell.shell import PointShell
 
 
@@ -23,7 +25,6 @@ def shell_of(
     unit: str | None,
     points: int | None,
     seed: int | None,
-    spacing: float | None = None,
     inset: float = 0.0,
 ) -> "PointShell":
     """Shell of a tool's file, its defects told; --points and --seed as they were given.
@@ -35,9 +36,7 @@ def shell_of(
     with render.bar("sampling the tool", "points"):
         from hapticdb.pointshell.shell import PointShell
 
-        shell = PointShell.from_file(
-            tool, points, spacing=spacing, unit=unit, seed=seed or 0, inset=inset
-        )
+        shell = PointShell.from_file(tool, points, unit=unit, seed=seed or 0, inset=inset)
     if shell.defects:
         render.note(f"{tool}: found in the file: {shell.defects}")
     if not shell.is_closed:
@@ -49,6 +48,29 @@ def shell_of(
             f"{length_text(deepest - inset)} late; give the mesh it was made of, if that matters"
         )
     return shell
+
+
+def warn_of_size(env: "Environment", shell: "PointShell", left_out: Iterable[int]) -> None:
+    """Note a tool longer than the scene, or shorter than a voxel: its unit may be wrong.
+
+    Lengths are the longest sides of boxes. A unit that a person or the file gave is believed.
+    """
+    import numpy as np
+
+    from hapticdb.store.attributes import scene_bounds
+
+    gone = set(left_out)
+    scene = scene_bounds(obj for obj in env.objects() if obj.id not in gone)
+    if shell.has_unit or scene is None:
+        return
+    length, extent = float(np.ptp(shell.outline, axis=0).max()), float(np.ptp(scene, axis=0).max())
+    if length > extent:
+        compared = f"longer than the scene ({length_text(extent)})"
+    elif length < env.grid.voxel_size:
+        compared = f"shorter than a voxel ({length_text(env.grid.voxel_size)})"
+    else:
+        return
+    render.note(f"the tool is {length_text(length)} long, {compared}: is --tool-unit right?")
 
 
 def shell_text(shell: "PointShell") -> str:

@@ -22,10 +22,7 @@ AT_ONCE = 1 << 18
 
 
 def turned(direction: tuple[float, float, float], up: int) -> Floats:
-    """Unit vector (3,) ahead, left and up, in a world whose axis `up` points up.
-
-    None is mirrored: with y up, z is ahead and x is left, as in glTF.
-    """
+    """Unit vector (3,) ahead, left and up, axis `up` up; with y up, z is ahead, as in glTF."""
     return np.asarray(np.roll(direction, up - 2) / np.linalg.norm(direction))
 
 

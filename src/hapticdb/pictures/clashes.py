@@ -147,8 +147,7 @@ def _cell(deep: int, near: int) -> str:
 def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]) -> Iterator[str]:
     up, drawn = up_axis(objects.values()), 0
     for one in sorted(told, key=lambda one: not one.is_open):
-        pair = [objects.get(i) for i in (one.a, one.b)]
-        a, b = pair
+        a, b = objects.get(one.a), objects.get(one.b)
         if one.kind not in GRAVITY[:4] or one.place is None or a is None or b is None:
             continue
         surfaces = [part.surface() for _, part in parts_of(env.store, [a, b])]

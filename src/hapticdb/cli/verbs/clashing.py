@@ -127,7 +127,6 @@ there is none but not all pairs were looked at, and else 0.
 
 Example: hapticdb clashes car.db --of 'wheel*' --within 2
 """
-"""The verb's help text: longer than a function of this house may be."""
 
 
 def clashes(

@@ -129,7 +129,6 @@ not decided, 1 when no path is found.
 
 Example: hapticdb extract car.db body/hood --path out.csv
 """
-"""The verb's help text: longer than a function of this house may be."""
 
 
 def extract(

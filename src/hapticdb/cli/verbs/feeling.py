@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import hapticdb
-from hapticdb.cli import fitting, render, session_page
+from hapticdb.cli import render, session_page
 from hapticdb.cli.choosing import Felt, felt_objects
 from hapticdb.cli.forces import law_and_coupling
 from hapticdb.cli.hands import HandOptions
@@ -30,7 +30,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import compile_for, shell_of
+from hapticdb.cli.tools import compile_for, shell_of, warn_of_size
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
@@ -255,16 +255,13 @@ def _looked_at(
     law: LawName,
     is_inset: bool,  # noqa: FBT001 - of one call
 ) -> "tuple[Felt, PointShell]":
-    """Read what is felt, and make the shell, drawn in to where contact begins if it `is_inset`.
-
-    All of it is checked before a process is started.
-    """
+    """Filter and shell, before a process starts; `is_inset`: drawn in to the contact."""
     from hapticdb.query.law import inset_of
 
     with hapticdb.open(url, read_only=True) as env:
         felt = felt_objects(env, where, exclude)
         shell = drawn_in(inset_of(env.grid.voxel_size, law) if is_inset else 0.0)
-        fitting.warn_of_size(env, shell, felt.left_out)
+        warn_of_size(env, shell, felt.left_out)
     return felt, shell
 
 
@@ -284,10 +281,7 @@ def _begin_loop(
     processor: int | None,
     frames_on: FramesOn,
 ) -> "tuple[Rendering, list[str]]":
-    """Have what forks the processes load kernels while the tool is sampled here.
-
-    It also refuses what the loop cannot do. Returns rendering and purposes of the session.
-    """
+    """Load kernels in the fork server, check the loop; returns rendering and kernels' purposes."""
     from hapticdb.query.law import DISTANCE, as_law
     from hapticdb.ready import session_purposes
     from hapticdb.realtime.coupling import rendering_of

@@ -9,8 +9,6 @@ from hapticdb.cli.options import JsonOption, UrlArgument
 from hapticdb.cli.root import left_at
 
 if TYPE_CHECKING:
-    from collections.abc import Callable
-
     from hapticdb.check import CheckReport
 
 RightName = Literal["viewer", "toucher", "editor", "nobody"]
@@ -43,10 +41,10 @@ def check(
 
     Example: hapticdb check car.db
     """
-    from hapticdb.check import check_environment, repair_environment
+    from hapticdb.check import repair_environment
 
     render.compile_kernels("copy", *(["move"] if repair else []))
-    report = _read(url, check_environment)
+    report = _read(url)
     if repair and report.is_mendable:
         render.note(
             f"mending rows: of {render.counted(len(report.wrong), 'object')} made anew, of "
@@ -55,7 +53,7 @@ def check(
         )
         with render.bar("mending", "objects") as progress:
             repair_environment(url, report, progress=progress)
-        report = _read(url, check_environment)
+        report = _read(url)
     if json:
         render.say_json({"sound": report.is_sound} | vars(report))
     else:
@@ -69,7 +67,9 @@ def check(
         raise typer.Exit(1)
 
 
-def _read(url: str, check_environment: "Callable[..., CheckReport]") -> "CheckReport":
+def _read(url: str) -> "CheckReport":
+    from hapticdb.check import check_environment
+
     with render.bar("checking", "rows") as progress:
         return check_environment(url, progress=progress)
 

@@ -24,8 +24,7 @@ def sample(folder: FolderArgument, *, frames: FramesOption = 1000) -> None:
     """
     from hapticdb.sample import write_sample
 
-    written = write_sample(folder, frames)
-    for path in written:
+    for path in write_sample(folder, frames):
         render.say(str(path))
 
 

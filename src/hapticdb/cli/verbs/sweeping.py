@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
-from hapticdb.cli import fitting, render
+from hapticdb.cli import render
 from hapticdb.cli.choosing import felt_objects, ids_of
 from hapticdb.cli.csv_files import STDOUT, SWEPT, open_csv, rows_of_sweep
 from hapticdb.cli.options import (
@@ -21,7 +21,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
-from hapticdb.cli.tools import shell_of
+from hapticdb.cli.tools import shell_of, warn_of_size
 from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
@@ -118,7 +118,6 @@ The exit code is 0 when it is clear or slides, 4 when it overlaps, 1 when it hit
 
 Example: hapticdb sweep car.db --part 17 --path out.csv
 """
-"""The verb's help text: longer than a function of this house may be."""
 
 
 class _Options(NamedTuple):
@@ -238,7 +237,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
         else:
             is_saved = asked.tool.lower().endswith(".npz")
             shell = shell_of(asked.tool, options.tool_unit, None if is_saved else 1, None)
-            fitting.warn_of_size(env, shell, felt.left_out)
+            warn_of_size(env, shell, felt.left_out)
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude,

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Annotated
 
 import typer
 
-from hapticdb.cli import fitting, render
+from hapticdb.cli import render
 from hapticdb.cli.choosing import felt_objects
 from hapticdb.cli.csv_files import (
     CONTACTS,
@@ -39,7 +39,7 @@ from hapticdb.cli.options import (
     UrlArgument,
     WhereOption,
 )
-from hapticdb.cli.tools import shell_of, shell_record, shell_text
+from hapticdb.cli.tools import shell_of, shell_record, shell_text, warn_of_size
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -135,7 +135,7 @@ def touch(
         render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
-        fitting.warn_of_size(env, shell, felt.left_out)
+        warn_of_size(env, shell, felt.left_out)
         if out is not None:
             pieces = env.touch_pieces(
                 shell, path, where=felt.where, exclude=felt.exclude, law=chosen, on=on

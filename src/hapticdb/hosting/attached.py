@@ -24,12 +24,7 @@ class AttachedHost(Closes):
 
     Frames, contacts and hands are in memory that both processes share; all else goes over the
     socket, one request at a time. The sessions that this process has begun end when it dies or
-    closes. Also a context manager.
-
-    Raises
-    ------
-    HapticDBError
-        If the other process does not answer.
+    closes. Also a context manager. Raises `HapticDBError` if the other process does not answer.
     """
 
     def __init__(self, sock: socket.socket) -> None:

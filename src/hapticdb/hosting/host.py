@@ -77,7 +77,8 @@ class SessionHost(Closes):
         self._changing = threading.RLock()
         self._served: list[socket.socket] = []
         self._is_closed = threading.Event()
-        self._failure: HapticDBError | None = None
+        self.failure: HapticDBError | None = None
+        """Error that keeps the database from being read again; None while all is well."""
         self._pid = os.getpid()
         self._logged: set[str] = set()
         self._tending = [
@@ -97,30 +98,16 @@ class SessionHost(Closes):
         coupling: Coupling | None = None,
         scale: float = 1.0,
     ) -> HostedSession:
-        """Begin a session; its tool waits at `start` until the hand is moved.
+        """Begin a session; its tool waits at `start`, (4, 4), scene metres, until the hand moves.
 
-        Parameters
-        ----------
-        start : array_like
-            Pose (4, 4) of hand and tool, scene metres.
-        where, exclude : sequence of int or str
-            Words as of `Environment.find`. The tool feels the objects that `where` chooses (all if
-            it is empty) and `exclude` does not choose.
-        coupling : Coupling or None
-            Unless it has a profile, its hand counts as one that no force moves.
-        scale : float
-            S, metres of the scene for a metre of the device, for the coupling's numbers. Poses of
-            the hand are the scene's: whoever moves the hand scales them.
+        where, exclude : words as of `Environment.find`, of the objects in contact (all without
+        `where`) and of exceptions; coupling : without a profile no force moves its hand; scale :
+        metres of the scene for a metre of the device, for the coupling alone: poses of the hand are
+        the scene's.
 
-        Raises
-        ------
-        UsageError
-            If a number is out of its range, no seat is free, or something that is felt has no
-            distances to its surfaces.
-        ObjectNotFoundError
-            If a word chooses nothing.
-        DatabaseError
-            If the environment cannot be opened.
+        Raises `UsageError` if a number is out of its range, no seat is free, or an object has no
+        distances to its surfaces; `ObjectNotFoundError` if a word chooses nothing; `DatabaseError`
+        if the environment cannot be opened.
         """
         pose = pose_at(start)
         if not is_rigid(pose):
@@ -224,11 +211,7 @@ class SessionHost(Closes):
         return recorded
 
     def serve(self, sock: socket.socket) -> None:
-        """Reply an `AttachedHost` at the other end of a pair of sockets, in a thread of its own.
-
-        When the other end closes or its process dies, the sessions that it has begun end. The host
-        owns the socket from now on.
-        """
+        """Serve an `AttachedHost` in a thread; the host owns the socket from now on."""
         self._served.append(sock)
         threading.Thread(
             target=serve_attached,
@@ -258,7 +241,7 @@ class SessionHost(Closes):
                 try:
                     cells.supervise()
                 except HapticDBError as error:
-                    self._failure = error
+                    self.failure = error
 
     @contextmanager
     def _surviving(self, work: str) -> Iterator[None]:
@@ -270,11 +253,6 @@ class SessionHost(Closes):
             if said not in self._logged:
                 self._logged.add(said)
                 LOG.exception("%s failed; later errors of this kind are not logged", work)
-
-    @property
-    def failure(self) -> HapticDBError | None:
-        """Error that keeps the database from being read again; None while all is well."""
-        return self._failure
 
     @property
     def cells(self) -> list[ResidentCells]:

@@ -83,11 +83,7 @@ class HostedSession:
 
         The hand moves there from where it is, in about the time between two calls, so that calls at
         20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
-
-        Raises
-        ------
-        UsageError
-            If the pose is no rigid transform or is beyond 1e9 m, or the session is over.
+        UsageError if the pose is no rigid transform or is beyond 1e9 m, or the session is over.
         """
         row = np.asarray(pose, dtype=np.float64)
         if row.shape == (4, 4) and is_rigid(row):
@@ -113,10 +109,7 @@ class HostedSession:
         return tuple(sorted(set(ids.tolist())))
 
     def contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Points (n, 3) in contact now, m, and the forces (n, 3) on the tool there, N; world frame.
-
-        There are 64 at most, spread over all; they are written about 30 times a second.
-        """
+        """Points (n, 3) in contact, m, and forces there, N; world frame, n <= 64, 30 Hz."""
         found = self._board.contacts(self._open_seat())
         return found[:, :3], found[:, 3:]
 
@@ -127,12 +120,8 @@ class HostedSession:
     def record(self, path: str | os.PathLike[str], *, replace: bool = False) -> None:
         """Record the frames from now on into a file.
 
-        Raises
-        ------
-        UsageError
-            If the session is recorded already, or the file exists and `replace` is False.
-        FileError
-            If the file cannot be written.
+        UsageError if the session is recorded already, or the file exists and `replace` is False;
+        FileError if the file cannot be written.
         """
         self._call("record", self.id, os.path.abspath(path), replace)  # noqa: PTH100 - a text to send
 

@@ -38,10 +38,7 @@ class Preparation:
         self._is_ending = threading.Event()
 
     async def done(self) -> None:
-        """Wait until the kernels are compiled, or `close` is called.
-
-        HapticDBError or OSError if the process that compiles them cannot be started, or fails.
-        """
+        """Wait until kernels are compiled, or `close`; HapticDBError or OSError."""
         async with self._running:
             if not self._is_done and not self._is_ending.is_set():
                 await asyncio.to_thread(self._compile, asyncio.get_running_loop())

@@ -24,15 +24,7 @@ class Running:
         self._taking = threading.Lock()
 
     def record(self, path: str, rate: float, *, replace: bool) -> None:
-        """Begin a recording at the next frame.
-
-        Raises
-        ------
-        UsageError
-            If there is one already, or the file exists.
-        FileError
-            If the file cannot be written.
-        """
+        """Begin a recording at the next frame; errors as of `HostedSession.record`."""
         if self._recording is not None:
             raise UsageError(
                 f"the hosted session {self.session} is recorded already: stop it first"

@@ -12,10 +12,7 @@ Words = Sequence[int | str]
 
 
 class SharedTables:
-    """Tables of one environment, each with its fetching process, made when they are first needed.
-
-    budget_bytes : memory of each table.
-    """
+    """Tables of one environment, each of `budget_bytes`, made when first needed."""
 
     def __init__(self, url: str, budget_bytes: int) -> None:
         self.url, self._budget_bytes = url, budget_bytes
@@ -24,10 +21,7 @@ class SharedTables:
         self._making = threading.Lock()
 
     def checked(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; ObjectNotFoundError if one of them chooses nothing.
-
-        The table of a filter follows what others add and rename.
-        """
+        """Filter of the words; ObjectNotFoundError if one of them chooses nothing."""
         felt = Filter(where, exclude)
         if not felt.is_empty:
             with closing(open_store(self.url, read_only=True)) as store:

@@ -9,7 +9,7 @@ import hashlib
 import hmac
 import secrets
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from enum import IntEnum
 from http.cookies import CookieError, SimpleCookie
@@ -140,7 +140,7 @@ class Access:
         """Drop cookies whose time is over, and make room for one more."""
         now = self._clock()
         valid = {key: known for key, known in self._signed_in.items() if now < known.until}
-        oldest: Sequence[bytes] = sorted(valid, key=lambda key: valid[key].until)
+        oldest = sorted(valid, key=lambda key: valid[key].until)
         for key in oldest[: max(len(valid) - MOST_SIGNED_IN + 1, 0)]:
             del valid[key]
         self._signed_in = valid

@@ -1,7 +1,6 @@
 """The application: which path leads where."""
 
 import asyncio
-import logging
 
 from starlette.applications import Starlette
 from starlette.requests import Request
@@ -15,7 +14,6 @@ from hapticdb.server.health import Doctor
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 
-LOG = logging.getLogger("hapticdb.server")
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
 """Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
 FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")

@@ -61,11 +61,7 @@ class ClientPage(NamedTuple):
 
 
 def client_page(title: str) -> ClientPage:
-    """Read viser's client and give it a title of plain words.
-
-    Raises `MissingExtraError` if viser is not installed, or in a version whose client is of another
-    form.
-    """
+    """Read viser's client and give it a title; MissingExtraError without a known one."""
     spec = importlib.util.find_spec("viser")
     if spec is None or spec.origin is None:
         raise MissingExtraError(f"the browser view needs more packages: {pip_line('view')}")

@@ -1,7 +1,4 @@
-"""How much a client may ask for: rates, sizes, numbers and times.
-
-docs/serving.md has these figures in a table, and a test compares them.
-"""
+"""How much a client may ask for; docs/serving.md has a table, and a test compares them."""
 
 import time
 from collections.abc import Callable
@@ -10,10 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Limits:
-    """What one server allows, for a workshop of a dozen people on one machine.
-
-    docs/serving.md says what each is of. Rates are averages, with a burst beside them.
-    """
+    """What one server allows, for a dozen people on one machine: average rates, and bursts."""
 
     browsers: int = 32
     browsers_per_second: float = 10.0

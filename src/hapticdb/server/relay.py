@@ -38,11 +38,7 @@ GOING_AWAY, POLICY, TRY_LATER, SIGNED_OUT = 1001, 1008, 1013, 4401
 
 
 class Closing(Exception):  # noqa: N818 - an end, and not always an error
-    """Ends a browser's connection with a code and words for its console.
-
-    reason : str
-        The figure that counts it.
-    """
+    """Ends a browser's connection with code and words; `reason` is the figure that counts it."""
 
     def __init__(self, code: int, words: str, reason: str) -> None:
         super().__init__(words)

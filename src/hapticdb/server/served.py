@@ -57,11 +57,7 @@ class Serving:
 
 
 def check(serving: Serving) -> None:
-    """Refuse what must not be served, by a UsageError.
-
-    That is a server without a token that another machine could reach; a prefix, or files of TLS,
-    that cannot be used.
-    """
+    """Refuse, by UsageError, a server in reach without a token; a wrong prefix or TLS file."""
     if not is_near(serving.host) and serving.open_role is not None:
         raise UsageError(
             f"--host {serving.host}: other machines can reach that address, so clients need a "

@@ -46,12 +46,10 @@ def small_options(
     curve: CurveName | None = None,
     layout: Layout | None = None,
     jobs: int | None = None,
-    *,
-    distances: bool | None = None,
 ) -> ImportOptions:
     """Options that ask for `small_grid`."""
     grid = GridOptions(bits=BITS, voxel_size=SIZE, origin=ORIGIN, curve=curve)
-    return ImportOptions(grid=grid, layout=layout, jobs=jobs, distances=distances)
+    return ImportOptions(grid=grid, layout=layout, jobs=jobs)
 
 
 def placement(x: float, y: float, z: float, turn: float = 0.0) -> NDArray[np.float64]:
@@ -121,7 +119,6 @@ def oracle_voxels(part: Part, grid: Grid) -> set[Voxel]:
 
 
 def voxel_set(ijk: NDArray[np.int64]) -> set[Voxel]:
-    """The set of voxels (n, 3)."""
     found = {(i, j, k) for i, j, k in ijk.tolist()}
     assert len(found) == len(ijk)
     return found

@@ -13,7 +13,7 @@ import sys
 import tempfile
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from multiprocessing.connection import Connection
 from pathlib import Path
 from typing import IO, Any
@@ -88,28 +88,16 @@ def end_forked(pid: int) -> None:
 def child(
     command: Sequence[str],
     *,
-    stdin: int | None = subprocess.DEVNULL,
-    stdout: int | None = PIPE,
-    stderr: int | None = PIPE,
-    cwd: Path | None = None,
-    env: Mapping[str, str] | None = None,
     patience: float = PATIENCE,
+    **how: Any,  # noqa: ANN401 - as `subprocess.Popen` takes it; no input and pipes unless given
 ) -> Iterator["subprocess.Popen[str]"]:
     """A child process in a process group of its own. The end of the block waits for its end.
 
     The child is killed with its group when the block fails, and after `patience`. Then all its
     pipes close, so no read from them waits for ever.
     """
-    process = subprocess.Popen(
-        command,
-        stdin=stdin,
-        stdout=stdout,
-        stderr=stderr,
-        cwd=cwd,
-        env=env,
-        text=True,
-        process_group=0,
-    )
+    streams = {"stdin": subprocess.DEVNULL, "stdout": PIPE, "stderr": PIPE}
+    process = subprocess.Popen(command, text=True, process_group=0, **streams | how)
     late = threading.Event()
 
     def give_up() -> None:
@@ -141,17 +129,12 @@ def _kill(process: "subprocess.Popen[str]") -> None:
 def finished(
     command: Sequence[str],
     *,
-    stdin: int | None = subprocess.DEVNULL,
-    stdout: int | None = PIPE,
-    stderr: int | None = PIPE,
-    cwd: Path | None = None,
-    env: Mapping[str, str] | None = None,
     check: bool = False,
     patience: float = PATIENCE,
+    **how: Any,  # noqa: ANN401 - as `child` takes it
 ) -> "subprocess.CompletedProcess[str]":
     """Run a child process to its end; return its exit code and what it printed."""
-    keywords: dict[str, Any] = {"cwd": cwd, "env": env, "patience": patience}
-    with child(command, stdin=stdin, stdout=stdout, stderr=stderr, **keywords) as process:
+    with child(command, patience=patience, **how) as process:
         out, err = process.communicate(timeout=patience)
     if check:
         assert process.returncode == 0, err
@@ -174,7 +157,6 @@ def exit_code(pid: int) -> int:
 
 
 def until(claim: Callable[[], object], every: float = 0.01, patience: float = PATIENCE) -> None:
-    """Wait until a condition holds."""
     deadline = time.monotonic() + patience
     while not claim():
         assert time.monotonic() < deadline, f"it does not hold after {patience:g} s"
@@ -200,12 +182,10 @@ def named(pid: int) -> str:
 
 
 def joined(thread: threading.Thread) -> None:
-    """Wait for a thread's end."""
     thread.join(PATIENCE)
     assert not thread.is_alive(), f"it did not end within {PATIENCE:g} s"
 
 
 def received(connection: Connection) -> Any:  # noqa: ANN401 - whatever was sent
-    """Next message of another process."""
     assert connection.poll(PATIENCE), f"no word within {PATIENCE:g} s"
     return connection.recv()

@@ -83,7 +83,6 @@ def force_on(page: Page) -> float | None:
 
 
 def field(page: Page, label: str) -> Locator:
-    """Field beside a label."""
     return page.locator(f"xpath=//*[text()='{label}']/following::input[1]")
 
 

@@ -22,16 +22,12 @@ from hapticdb.sweeps.run import sweep
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
-Quad = tuple[Triple, Triple, Triple, Triple]
 
 MM = 1e-3
 CONTACT = 0.05
 """Default of the contact tolerance."""
 REACH = CONTACT + 0.02
 """Greatest motion that may free what is touched: the tolerance and the search's margin."""
-
-
-# --- surfaces -----------------------------------------------------------------------------------
 
 
 def moved(made: trimesh.Trimesh, at: Triple = (0.0, 0.0, 0.0)) -> Floats:
@@ -63,7 +59,6 @@ def quad(*corners: Triple) -> Floats:
 
 
 def sheet(side: float, height: float = 0.0) -> Floats:
-    """An open square about the z axis."""
     h = 0.5 * side
     return quad((-h, -h, height), (h, -h, height), (h, h, height), (-h, h, height))
 
@@ -112,16 +107,13 @@ def rotated(triangles: Floats, degrees: float, axis: str, at: Triple = (0.0, 0.0
     return np.asarray(triangles @ turn.T + np.array(at))
 
 
-# --- frames and paths ---------------------------------------------------------------------------
-
-
-def frame_of(seed: int, far: float = 300.0) -> Floats:
+def frame_of(seed: int) -> Floats:
     """A random rigid transform (4, 4); seed 0: none."""
     frame = np.eye(4)
     if seed:
         rng = np.random.default_rng(seed)
         frame[:3, :3] = Rotation.random(rng=rng).as_matrix()
-        frame[:3, 3] = rng.uniform(-far, far, 3)
+        frame[:3, 3] = rng.uniform(-300.0, 300.0, 3)
     return frame
 
 
@@ -149,9 +141,6 @@ def in_frame(poses: Floats, frame: Floats) -> Floats:
     found = frame @ poses @ back
     found[:, 3] = (0.0, 0.0, 0.0, 1.0)
     return np.asarray(found)
-
-
-# --- what is measured ---------------------------------------------------------------------------
 
 
 def imported(url: Path, surfaces: Mapping[str, Floats]) -> Environment:
@@ -194,14 +183,11 @@ def swept(
     )
 
 
-def judged(a: Floats, b: Floats, contact: float = CONTACT, within: float = 1.0) -> Judged:
+def judged(a: Floats, b: Floats, contact: float = CONTACT) -> Judged:
     """Judge two surfaces; lengths of the result in millimetres."""
     shapes = [CollisionShape(MM * triangles) for triangles in (a, b)]
-    found = judge(shapes[0], shapes[1], np.eye(4), MM * within, MM * contact)
+    found = judge(shapes[0], shapes[1], np.eye(4), MM, MM * contact)
     return found._replace(at_least=found.at_least / MM, at_most=found.at_most / MM)
-
-
-# --- sweeps -------------------------------------------------------------------------------------
 
 
 class Pull(NamedTuple):
@@ -293,9 +279,6 @@ PULLS = (
          start=6.0, by=0.0),
     Pull("sunk plate, rests", SUNK, BASE, pulls(), "free"),
 )  # fmt: skip
-
-
-# --- clashes ------------------------------------------------------------------------------------
 
 
 class Meeting(NamedTuple):

@@ -80,7 +80,6 @@ def running(
 
 @pytest.fixture
 def server(template: tuple[Path, Binaries]) -> Iterator[Server]:
-    """A running server for one test."""
     with running(template) as made:
         yield made
 
@@ -159,9 +158,8 @@ class After:
         patch.setattr(owner, name, called)
 
 
-def small(url: str, file: Path, layout: Layout = "brick") -> Environment:
-    """An environment of those balls, opened for writing."""
-    hapticdb.import_files(url, [file], options(layout))
+def small(url: str, file: Path) -> Environment:
+    hapticdb.import_files(url, [file], options("brick"))
     return hapticdb.open(url)
 
 

@@ -71,7 +71,6 @@ for. The lid has to go; the rod is in the way, but taking it off does not help."
 
 
 def made(folder: Path, scene: Scene) -> Path:
-    """An environment of a scene's parts."""
     parts = {name: joined(*(box(*each) for each in boxes)) for name, boxes in scene.items()}
     return imported(folder, 2.0 * SIZE, **parts)
 

@@ -44,7 +44,6 @@ def tell(workerinput: dict[str, object]) -> None:
 
 
 def is_every() -> bool:
-    """Whether the run tries everything."""
     return _chosen["seed"] is None
 
 
@@ -57,7 +56,6 @@ def drawn(cases: Sequence[T], most: int = 12) -> list[T]:
 
 
 def header() -> str:
-    """Line of the run's header."""
     if is_every():
         return "every step is tried"
     return f"some steps of each long loop: the same again with --draw={_chosen['seed']}"

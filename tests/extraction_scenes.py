@@ -39,7 +39,6 @@ def imported(folder: Path, size: float = SIZE, **parts: trimesh.Trimesh) -> Path
 
 
 def found_in(url: Path, part: str, **options: Any) -> Extraction:  # noqa: ANN401
-    """The way out of a part."""
     with hapticdb.open(url, read_only=True) as env:
         return extract(env, part, **{"seconds": 500.0, **options})
 
@@ -205,19 +204,19 @@ def pocket(folder: Path) -> Path:
     )
 
 
-def ledge(folder: Path, room: float = 0.035) -> Path:
+def ledge(folder: Path) -> Path:
     """A plate between a floor and a ledge, touching both: it slides along +x, and then it lifts.
 
-    The ledge covers 0.02 m of the plate; a stop ends the slide after `room` metres, in contact with
+    The ledge covers 0.02 m of the plate; a stop ends the slide after 0.035 m, in contact with
     the floor. So no straight pull gets free.
     """
     base = [
-        box((-0.02, -0.06, -0.02), (0.08 + room + 0.02, 0.06, 0.0)),  # the floor
+        box((-0.02, -0.06, -0.02), (0.135, 0.06, 0.0)),  # the floor
         box((-0.02, -0.06, -0.02), (0.0, 0.06, 0.03)),  # behind
         box((-0.02, -0.06, 0.015), (0.02, 0.06, 0.03)),  # the ledge
-        box((0.08 + room, -0.06, -0.02), (0.08 + room + 0.02, 0.06, 0.03)),  # the stop
-        box((-0.02, -0.06, -0.02), (0.08 + room + 0.02, -0.045, 0.03)),
-        box((-0.02, 0.045, -0.02), (0.08 + room + 0.02, 0.06, 0.03)),
+        box((0.115, -0.06, -0.02), (0.135, 0.06, 0.03)),  # the stop
+        box((-0.02, -0.06, -0.02), (0.135, -0.045, 0.03)),
+        box((-0.02, 0.045, -0.02), (0.135, 0.06, 0.03)),
     ]
     return imported(folder, base=joined(*base), plate=box((0.0, -0.03, 0.0), (0.08, 0.03, 0.015)))
 

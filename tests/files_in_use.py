@@ -5,7 +5,6 @@ import signal
 from contextlib import closing
 from pathlib import Path
 
-import hapticdb
 from children import exit_code
 from hapticdb import Grid
 from hapticdb.store.sqlite.store import SQLiteStore
@@ -23,7 +22,6 @@ def make(path: Path, *numbers: int) -> Path:
 
 
 def write(store: SQLiteStore, *numbers: int) -> None:
-    """Write blobs of those numbers."""
     for n in numbers:
         write_voxels(store, blob(n, (30, 30, 30)), f"blob {n}")
 
@@ -38,9 +36,3 @@ def killed(path: Path, *numbers: int) -> None:
         finally:
             os.kill(os.getpid(), signal.SIGKILL)
     assert exit_code(pid) == -signal.SIGKILL
-
-
-def names(path: Path, *, read_only: bool = True) -> list[str]:
-    """Names of the objects in a file."""
-    with hapticdb.open(path, read_only=read_only) as env:
-        return [obj.name for obj in env.objects()]

@@ -129,7 +129,6 @@ def run(suffix: str, numbers: Sequence[int], folder: Path) -> int:
 
 
 def main() -> int:
-    """Run from the command line."""
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("files", type=int, nargs="?", default=1000)
     parser.add_argument("--only", type=int, help="number of one file to make and read again")

@@ -13,8 +13,6 @@ Voxel = tuple[int, int, int]
 Vector = tuple[int, int, int]
 Triangle = Sequence[Sequence[float]]
 
-# --- bricks -------------------------------------------------------------------------------------
-
 
 def z_order(i: int, j: int, k: int) -> int:
     """Key of a voxel on the Z-order curve, bit by bit, i the most significant axis."""
@@ -35,13 +33,10 @@ def bricks_of_voxels(voxels: Iterable[Voxel]) -> dict[int, bytes]:
     return {key: occupancy[key].to_bytes(64, "little") for key in sorted(occupancy)}
 
 
-# --- voxelizing ---------------------------------------------------------------------------------
-
 TOUCH = Fraction(1, 10**9)
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    """Cross product."""
     return (
         a[1] * b[2] - a[2] * b[1],
         a[2] * b[0] - a[0] * b[2],
@@ -50,12 +45,10 @@ def cross(a: Vector, b: Vector) -> Vector:
 
 
 def dot(a: Vector, b: Vector) -> int:
-    """Scalar product."""
     return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
 
 
 def difference(a: Vector, b: Vector) -> Vector:
-    """Vector from b to a."""
     return (a[0] - b[0], a[1] - b[1], a[2] - b[2])
 
 
@@ -119,7 +112,6 @@ def voxels_of_triangle(triangle: Triangle, bits: int, touch: Fraction = TOUCH) -
 def voxels_of_triangles(
     triangles: Iterable[Triangle], bits: int, touch: Fraction = TOUCH
 ) -> set[Voxel]:
-    """Voxels that at least one of the triangles meets."""
     return set().union(*(voxels_of_triangle(triangle, bits, touch) for triangle in triangles))
 
 

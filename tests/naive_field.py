@@ -19,7 +19,6 @@ def bump(t: float) -> float:
 
 
 def slope_of_bump(t: float) -> float:
-    """Derivative of `bump`."""
     if abs(t) <= 0.5:
         return -2.0 * t
     return -float(np.sign(t)) * (1.5 - abs(t)) if abs(t) <= 1.5 else 0.0

@@ -156,8 +156,6 @@ class Total:
         return (fx, fy, fz), (tx, ty, tz)
 
 
-# --- the distance law ----------------------------------------------------------------------------
-
 HALF_WIDTH, STEPS, ONSET, BLENDING = 2.75, 254, 1.5, 1.0
 Steps = Mapping[Voxel, int]
 """Stored distances of one object at voxel centres; 254 and more, or nothing: far away."""
@@ -203,7 +201,6 @@ def touch_distances(
     origin: Triple,
     size: float,
     side: int,
-    stiffness: float = 1000.0,
     exclude: Collection[int] = (),
 ) -> NaiveTouch:
     """Sum the distance law; fields has the stored distances of each object."""
@@ -239,6 +236,6 @@ def touch_distances(
             }
             near = near or {min(i for i in own if own[i] == min(own.values()))}
             found.near += [(n, i) for i in sorted(near | set(ids))]
-            total.add(p, nrm, cm, stiffness, depth)
+            total.add(p, nrm, cm, 1000.0, depth)
     found.force, found.torque = total.averaged(weight)
     return found

@@ -45,7 +45,6 @@ class PagePerson:
             self.told.append(str(message))
 
     def wait_for(self, words: str) -> None:
-        """Wait until the page has shown these words."""
         until(lambda: (self.look(0.05), any(words in text for text in self.received))[1])
 
     def find(self, label: str) -> str:
@@ -61,7 +60,6 @@ class PagePerson:
         return found[0]
 
     def press(self, label: str) -> None:
-        """Press a button."""
         self.put(self.find(label), value=True)
 
     def choose(self, label: str, value: object) -> None:

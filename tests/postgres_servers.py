@@ -31,7 +31,6 @@ class Binaries(NamedTuple):
     major: int
 
     def path(self, program: str) -> str:
-        """Path of one of its programs."""
         return str(self.bindir / program)
 
     def run(self, program: str, *words: str) -> str:
@@ -87,7 +86,6 @@ class Server:
         self.binaries.run("pg_ctl", "start", "-w", "-t", str(LONG_S), *words)
 
     def stop(self) -> None:
-        """End the server, and wait for it."""
         self.binaries.run("pg_ctl", "stop", "-w", "-m", "fast", "-D", str(self.data))
 
     @property
@@ -103,7 +101,6 @@ class Server:
 
 @contextlib.contextmanager
 def serving(folder: Path, binaries: Binaries, settings: Mapping[str, str]) -> Iterator[Server]:
-    """A server that runs inside the block."""
     server = Server(folder, binaries, settings)
     server.start()
     try:

@@ -70,8 +70,6 @@ class RandomPull(NamedTuple):
     middle: Floats = np.zeros(3)
 
 
-# --- shapes -------------------------------------------------------------------------------------
-
 NONE = np.zeros((0, 3, 3))
 
 
@@ -172,9 +170,6 @@ def _shape(rng: Random, shapes: tuple[Callable[[Random], Body], ...], *, tilted:
     return made
 
 
-# --- paths --------------------------------------------------------------------------------------
-
-
 def _direction(rng: Random) -> tuple[Floats, str]:
     """Unit vector of a pull, and how it leads: off the plane, along it, into it."""
     kind = str(rng.choice(["off", "along", "into", "straight in", "straight off"]))
@@ -212,9 +207,6 @@ def _start(rng: Random) -> float:
     if kind == 2:
         return _log(rng, 0.001, 0.045)
     return _log(rng, 0.1, 3.0) if kind == 3 else -0.002
-
-
-# --- scenes -------------------------------------------------------------------------------------
 
 
 def _rests(rng: Random) -> RandomPull:
@@ -308,5 +300,4 @@ KINDS = (_rests, _rests, _rests, _rests, _rests, _rests, _fits, _fits, _in_tin, 
 
 
 def random_pull(seed: int) -> RandomPull:
-    """The pull of a seed."""
     return KINDS[seed % len(KINDS)](np.random.default_rng([46, seed]))

@@ -52,7 +52,6 @@ def begun(path: Path, head: Header = HEADER, **options: Any) -> Recorder:  # noq
 
 
 def write(path: Path, frames: Frames, head: Header = HEADER) -> Path:
-    """Write a recording."""
     with begun(path, head) as recorder:
         recorder.append(frames)
     return path

@@ -98,7 +98,6 @@ def database(request: pytest.FixtureRequest) -> str:
 
 @contextlib.contextmanager
 def places(database: str) -> Iterator[Place]:
-    """Places of a database."""
     given: list[str] = []
 
     def new() -> str:

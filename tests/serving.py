@@ -40,12 +40,10 @@ class Running:
 
     @property
     def place(self) -> str:
-        """Host and port."""
         return f"127.0.0.1:{self.port}"
 
     @property
     def address(self) -> str:
-        """Address of the page."""
         return f"http://{self.place}{self.prefix}/"
 
     def ask(
@@ -83,7 +81,6 @@ def urls(url: str | Path) -> dict[Role, str]:
 
 @contextlib.contextmanager
 def running(serving: Serving) -> Iterator[Running]:
-    """Run a server while the block runs."""
     ready = threading.Event()
     ports: list[int] = []
     errors: list[BaseException] = []

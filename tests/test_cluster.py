@@ -184,9 +184,6 @@ def test_ctrl_c_leaves_a_state_that_the_same_command_goes_on_from(
     assert rows_of(there) == rows_of(here)
 
 
-# -- what cannot be --------------------------------------------------------------------------------
-
-
 def test_a_scheduler_that_is_not_there_is_told_in_a_line(
     run: Run, scene: Path, made: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
@@ -224,9 +221,7 @@ def test_workers_that_cannot_do_it_are_told(
 
 
 @pytest.mark.long
-def test_a_scheduler_that_goes_away_or_has_no_worker_is_told(
-    scene: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_scheduler_without_a_worker_is_told(scene: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(cluster, "LONGEST_S", 3.0)
     with (
         scheduling(0) as address,
@@ -234,32 +229,24 @@ def test_a_scheduler_that_goes_away_or_has_no_worker_is_told(
         pytest.raises(ClusterError, match="has no worker: start some"),
     ):
         find_clashes(env, within=0.2, on=address)
-    file = balls(tmp_path, 24)
+
+
+@pytest.mark.long
+@pytest.mark.parametrize("is_stopped", [False, True])
+def test_a_scheduler_that_goes_away_or_stands_still_is_told(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, is_stopped: bool
+) -> None:
+    monkeypatch.setattr(cluster, "LONGEST_S", 2.0)
+    file, there = balls(tmp_path, 24), tmp_path / "there.db"
     with contextlib.ExitStack() as running:
         address = running.enter_context(scheduling())
 
         def leave(now: ImportProgress) -> None:
             if now.parts_done == 3:
-                running.close()
+                stop_scheduler(address) if is_stopped else running.close()
 
         with pytest.raises(ClusterError, match="the scheduler went away"):
-            hapticdb.import_files(tmp_path / "there.db", [file], on(address), leave)
-
-
-@pytest.mark.long
-def test_a_scheduler_that_stands_still_is_told(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(cluster, "LONGEST_S", 2.0)
-    file, there = balls(tmp_path, 24), tmp_path / "there.db"
-    with scheduling() as address:
-
-        def stop(now: ImportProgress) -> None:
-            if now.parts_done == 3:
-                stop_scheduler(address)
-
-        with pytest.raises(ClusterError, match="the scheduler went away"):
-            hapticdb.import_files(there, [file], on(address), stop)
+            hapticdb.import_files(there, [file], on(address), leave)
     with hapticdb.open(there, read_only=True) as env:
         assert len(env.objects()) >= 3
 

@@ -117,7 +117,6 @@ def test_ids_alone_make_no_difference(tmp_path: Path) -> None:
 
 
 def test_how_far_a_part_has_moved_is_told(tmp_path: Path) -> None:
-    """The way of its bounding box in metres."""
     ijk = blob(1, PLACE)
     shift = np.array([3, 0, -2])
     for name, voxels, transform in (

@@ -72,9 +72,6 @@ def without_child(monkeypatch: pytest.MonkeyPatch) -> None:
         monkeypatch.setattr(module, "read_file", parse_in_process)
 
 
-# --- moving -------------------------------------------------------------------------------------
-
-
 def test_objects_are_those_of_the_newest_revision(env: Environment, tmp_path: Path) -> None:
     ids = [obj.id for obj in env.objects()]
     with hapticdb.open(tmp_path / "e.db") as other:
@@ -248,9 +245,6 @@ def test_a_move_by_another_while_the_file_is_read_leaves_no_stray_rows(
     assert not index_rows(env)
 
 
-# --- opening and closing ------------------------------------------------------------------------
-
-
 def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> None:
     before, file = rows_of(Path(env.url)), Path(env.url).with_name("more.obj")
     write_obj(file, assembly(1))
@@ -264,8 +258,6 @@ def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> 
             write()
     assert rows_of(Path(env.url)) == before
 
-
-# --- other readers ------------------------------------------------------------------------------
 
 EDIT = """
 import sys
@@ -315,9 +307,6 @@ def test_edits_of_another_process_are_felt_by_the_next_touch(
         assert [o.id for o in env.objects()] == [1]
         with pytest.raises(hapticdb.errors.ObjectNotFoundError):
             env.touch(sphere, pose, exclude=[2])
-
-
-# --- statistics ---------------------------------------------------------------------------------
 
 
 def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointShell) -> None:

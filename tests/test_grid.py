@@ -24,9 +24,6 @@ def center_of(grid: Grid) -> NDArray[np.float64]:
     return middle
 
 
-# --- the grid -----------------------------------------------------------------------------------
-
-
 @given(
     ijk=st.lists(st.integers(0, 2**12 - 1), min_size=3, max_size=3),
     corner=st.lists(st.integers(-(2**12), 2**12), min_size=3, max_size=3),
@@ -88,8 +85,6 @@ def test_a_grid_that_cannot_be_is_refused(arguments: tuple[Any, ...], message: s
         Grid(*arguments)
     assert isinstance(caught.value, UsageError)
 
-
-# --- options ------------------------------------------------------------------------------------
 
 EACH: dict[str, list[Any]] = {
     "bits": [None, 1, 11, 21],
@@ -166,8 +161,6 @@ def test_bounds_that_overflow_are_refused() -> None:
     with pytest.raises(GridError), np.errstate(all="ignore"):
         GridOptions().fit(np.array([[-1e308] * 3, [1e308] * 3]))
 
-
-# --- options against an existing grid -----------------------------------------------------------
 
 KNOWN = Grid(0.01, (-1.0, 0.0, 2.0), 9, "hilbert")
 

@@ -47,7 +47,6 @@ def add(env: Environment, ijk: NDArray[np.int64], name: str, **fields: Any) -> i
 
 
 def change(path: Path, *statements: str) -> None:
-    """Change the database with plain SQL, without the library."""
     with closing(apsw.Connection(str(path))) as connection:
         for sql in statements:
             connection.execute(sql)
@@ -59,9 +58,6 @@ def scattered(draw: st.DrawFn, bits: int) -> NDArray[np.int64]:
     coordinate = st.integers(0, 2**bits - 1)
     found = draw(st.sets(st.tuples(coordinate, coordinate, coordinate), min_size=1, max_size=60))
     return np.array(sorted(found), dtype=np.int64)
-
-
-# --- what a copy holds --------------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("most_rows", [1, 1 << 19])
@@ -113,7 +109,6 @@ def test_an_object_keeps_everything_but_its_revision(tmp_path: Path) -> None:
 def test_no_statement_brings_more_than_a_batch(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    """No statement returns more rows than a batch, however large an object is."""
     source = make_blobs(tmp_path / "a.db")
     monkeypatch.setattr(geometry, "MOST_ROWS", 8)
     brought: list[int] = []
@@ -129,9 +124,6 @@ def test_no_statement_brings_more_than_a_batch(
     assert max(brought) <= 8
     assert len(brought) > 12
     assert diff_environments(source, tmp_path / "b.db").is_equal
-
-
-# --- a target that is not empty -----------------------------------------------------------------
 
 
 def test_an_id_that_is_taken_is_exchanged(tmp_path: Path) -> None:
@@ -171,9 +163,6 @@ def test_the_same_part_otherwise_is_a_conflict_before_anything_is_written(
     with pytest.raises(hapticdb.errors.ConflictError, match=rf"object 5 \(blob 2\) of .* {word}"):
         copy_environment(source, tmp_path / "b.db")
     assert rows_of(tmp_path / "b.db") == before
-
-
-# --- copies that are refused --------------------------------------------------------------------
 
 
 @pytest.mark.parametrize("spelling", ["{0}", "sqlite:///{0}", "{1}/x/../a.db", "{1}/link.db"])
@@ -240,9 +229,6 @@ def test_a_damaged_object_is_told_and_an_empty_target_discarded(tmp_path: Path) 
     assert not (tmp_path / "b.db").exists()
 
 
-# --- while others work --------------------------------------------------------------------------
-
-
 def test_edits_made_meanwhile_are_not_copied(tmp_path: Path) -> None:
     """A copy has the revision at which it began; started again, it reports the conflict."""
     source = make_blobs(tmp_path / "a.db")
@@ -281,8 +267,6 @@ def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
     assert (report.copied, report.present) == (1, 3)
     assert diff_environments(source, tmp_path / "b.db").is_equal
 
-
-# --- interrupted --------------------------------------------------------------------------------
 
 COPY = """
 import sys, time
@@ -336,9 +320,6 @@ def test_an_interrupted_copy_started_again_ends_as_an_undisturbed_one(
     assert (found.compared, found.renumbered) == (N_OBJECTS, ())
     copy_environment(many, tmp_path / "whole.db", layout=layout)
     assert rows_of(target) == rows_of(tmp_path / "whole.db")
-
-
-# --- distances ----------------------------------------------------------------------------------
 
 
 def with_packed(ijk: NDArray[np.int64], grid: Grid, seed: int) -> Rows:

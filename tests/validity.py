@@ -48,7 +48,6 @@ def contents(env: Environment) -> Contents:
 
 
 def valid_contents(url: str) -> Contents:
-    """Open an environment for writing, check it, and return its contents."""
     with hapticdb.open(url) as env:
         assert_valid(env)
         return contents(env)

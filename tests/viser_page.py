@@ -10,7 +10,6 @@ from hapticdb.realtime.processes import MessageSender, parent_is_gone
 
 
 def work(request: PageRequest, sender: MessageSender) -> None:
-    """Serve the page until the server ends."""
     server = viser.ViserServer("127.0.0.1", 0, verbose=False)
     connection = PageConnection(request.server, request.secret)
     connection.guard(server)
@@ -44,5 +43,4 @@ def work(request: PageRequest, sender: MessageSender) -> None:
 
 
 def fail(_request: PageRequest, _sender: MessageSender) -> None:
-    """Cannot start."""
     raise OSError("no such scene")

@@ -99,7 +99,6 @@ def kind(store: Store) -> tuple[Grid, Layout]:
 
 
 def everything(store: Store) -> Rows:
-    """All rows of a store."""
     return store.scan(*EVERYWHERE)
 
 

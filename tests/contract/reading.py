@@ -11,8 +11,6 @@ from voxels import EVERYWHERE, blob, kind
 
 
 class ReadingContract(StoreCase):
-    """Tests of the reads that a frame needs, and of the statistics that grouping by cost needs."""
-
     def test_lookup_finds_every_row_of_a_key_and_no_other(
         self, store: Store, plain: dict[int, set[int]]
     ) -> None:

@@ -15,8 +15,6 @@ from voxels import EVERYWHERE, blob, is_noticed, kind, write_voxels
 
 
 class SharingContract(StoreCase):
-    """Tests of a store's owner thread, and of the commits of others that it reads and notices."""
-
     def test_a_snapshot_sees_one_revision(self, store: Store) -> None:
         reader = self.reopen(store)
         before = reader.size().rows

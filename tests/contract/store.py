@@ -16,8 +16,6 @@ GRID = Grid(0.01, (0, 0, 0), 6)
 
 
 class UrlContract(Case):
-    """Tests of an engine's URLs: opening, making, naming, refusing."""
-
     def test_what_was_made_is_opened(self) -> None:
         url = self.new_url()
         assert not exists(url)

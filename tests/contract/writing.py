@@ -28,13 +28,10 @@ SECOND = PairRow(1, 3, "overlapping", 1e-3, None, PLACE, "new", 2, "a setting")
 
 
 def made_up(store: Store) -> set[str]:
-    """Digests of the surfaces that are made up."""
     return {digest for digest in store.surface_digests() if len(digest) < 64}
 
 
 class WritingContract(StoreCase):
-    """Tests of the effect of a write, and of the state after a refused one."""
-
     def test_objects_return_as_written(self, store: Store) -> None:
         first, second = store.objects()
         assert (first.id, second.id) == (1, 2)

@@ -72,9 +72,6 @@ def refusal(report: FileReport, kind: type[hapticdb.errors.HapticDBError]) -> st
     return str(report.error)
 
 
-# --- voxels -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_every_layout_and_curve_holds_the_voxels_of_the_oracle(
     tmp_path: Path,
@@ -173,9 +170,6 @@ def test_a_unit_scales_files_that_carry_none(tmp_path: Path, unit: str) -> None:
         assert env.grid.edge == pytest.approx(ROOM * 6 * length)
 
 
-# --- the grid -----------------------------------------------------------------------------------
-
-
 def test_equal_grid_options_are_accepted_and_differing_ones_refused(
     tmp_path: Path, file: Path
 ) -> None:
@@ -225,21 +219,22 @@ def test_a_surface_on_the_border_of_the_grid_is_inside(tmp_path: Path) -> None:
     assert obj.voxels == 32**3 - 30**3
 
 
-def test_a_point_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """It is marked or refused, never dropped without an error."""
-    points = np.array([[0.0, 0, 0], [ORIGIN[0] - 1e-7 * SIZE, 0.05, 0.05]])
-    cloud = write_ply(tmp_path / "scan.ply", points)
-    report = import_one(tmp_path / "e.db", cloud, small_options())
-    assert report.status == "failed" or report.added[0].voxels == 2
-
-
-def test_a_plate_that_rounding_carries_over_the_border_does_not_vanish(tmp_path: Path) -> None:
-    """A file in single precision may be off by 2e-7 of a voxel."""
-    corners = np.array([[-0.1, -0.1, 0], [0.1, -0.1, 0], [0, 0.1, 0]])
-    corners[:, 2] = ORIGIN[2] - 2e-9
-    plate = write_obj(tmp_path / "plate.obj", {"plate": (corners, np.array([[0, 1, 2]]))})
-    report = import_one(tmp_path / "e.db", plate, small_options())
-    assert report.status == "failed" or report.added[0].voxels > 200
+@pytest.mark.parametrize("is_cloud", [True, False])
+def test_what_rounding_carries_over_the_border_does_not_vanish(
+    tmp_path: Path, is_cloud: bool
+) -> None:
+    """It is marked or refused. A file in single precision may be off by 2e-7 of a voxel."""
+    if is_cloud:
+        points = np.array([[0.0, 0, 0], [ORIGIN[0] - 1e-7 * SIZE, 0.05, 0.05]])
+        file, least = write_ply(tmp_path / "scan.ply", points), 2
+    else:
+        corners = np.array([[-0.1, -0.1, ORIGIN[2] - 2e-9]] * 3)
+        corners[1, 0] = corners[2, 1] = 0.1
+        corners[2, 0] = 0.0
+        plate = {"plate": (corners, np.array([[0, 1, 2]]))}
+        file, least = write_obj(tmp_path / "plate.obj", plate), 201
+    report = import_one(tmp_path / "e.db", file, small_options())
+    assert report.status == "failed" or report.added[0].voxels >= least
 
 
 MEMORY = """
@@ -276,9 +271,6 @@ def test_a_cube_of_two_million_voxels_an_axis_takes_no_more_memory(tmp_path: Pat
                 sorted(env.voxels(obj.id).tolist()),
                 sorted(brick_voxels(*voxelize(scaled, 21)).tolist()),
             )
-
-
-# --- several files, and again -------------------------------------------------------------------
 
 
 def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) -> None:

@@ -67,9 +67,6 @@ def test_what_was_never_there_is_not_held_for_removed(run: Run, tmp_path: Path) 
     assert (found["objects"], found["kept_removed"]) == (1, 0)
 
 
-# -- replacing -------------------------------------------------------------------------------------
-
-
 def changed_file(folder: Path) -> Path:
     """A changed file: box0 as before, box1 larger, no box2, and a new box3."""
     file = boxes(folder / "boxes.glb", 4)

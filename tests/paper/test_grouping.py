@@ -30,9 +30,6 @@ def key_lists(values: st.SearchStrategy[int], most: int) -> st.SearchStrategy[li
     return st.lists(values, min_size=1, max_size=most, unique=True).map(sorted)
 
 
-# --- MaxGap -------------------------------------------------------------------------------------
-
-
 def definition_of_maxgap(keys: list[int], gap: int) -> list[tuple[int, int]]:
     """Neighbours p < q share a range if and only if q - p <= gap."""
     ranges = [(keys[0], keys[0])]
@@ -76,9 +73,6 @@ def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
             wanted.append((first, brick))
             first = None
     assert as_pairs(found) == wanted
-
-
-# --- CBGroup ------------------------------------------------------------------------------------
 
 
 def costs_of(descent: float, row: float) -> CostModel:

@@ -38,9 +38,6 @@ def vector_of(keys: list[int], resolution: int) -> QuantileVector:
     return QuantileVector(np.array([rows[r - 1] for r in ranks], dtype=np.int64), len(rows))
 
 
-# --- the quantile vector ------------------------------------------------------------------------
-
-
 @few
 @given(keys=KEYS, resolution=st.integers(1, 250), unit=st.tuples(st.floats(0, 1), st.floats(0, 1)))
 def test_expected_rows_are_off_by_two_buckets_at_most(
@@ -60,8 +57,6 @@ def test_a_resolution_out_of_range_is_refused(scene: Environment, resolution: in
         scene.quantiles(resolution)
 
 
-# --- the cost model -----------------------------------------------------------------------------
-
 MODEL = CostModel(2.0, 3.0, 50.0, 0.5, 100.0)
 
 
@@ -70,9 +65,6 @@ def test_cautious_grouping_closes_fewer_gaps() -> None:
     quantiles = QuantileVector(np.arange(0, 4001, 100, dtype=np.int64), 40 * 4)  # 1.56 rows a gap
     assert len(cbgroup(keys, keys, quantiles, replace(MODEL, caution=1.0)).lows) == 1
     assert len(cbgroup(keys, keys, quantiles, replace(MODEL, caution=3.0)).lows) == len(keys)
-
-
-# --- calibration --------------------------------------------------------------------------------
 
 
 def make_scene(path: Path, layout: Layout = "brick") -> Environment:
@@ -137,8 +129,6 @@ def test_a_grid_smaller_than_a_tool_can_be_calibrated(
     figures = calibrate(env.store, repeats=1, budget=0.0).figures()
     assert all(math.isfinite(value) and value >= 0 for value in figures.values())
 
-
-# --- grouping by kept figures -------------------------------------------------------------------
 
 DEAR = CostModel(1e6, 1e6, 1e6, 1e6, 1.0)
 

@@ -110,9 +110,6 @@ def test_a_damaged_page_ends_a_copy(path: Path, tmp_path: Path) -> None:
     assert sorted(files(tmp_path)) == ["q.db"]
 
 
-# --- putting back --------------------------------------------------------------------------------
-
-
 def test_a_copy_takes_the_place_of_a_file_and_its_log(path: Path, copy: Path) -> None:
     killed(path, 3, 4)
     assert Path(f"{path}-wal").stat().st_size
@@ -226,9 +223,6 @@ def test_a_replacement_that_is_killed_leaves_the_former_file_or_the_copy(
     assert not Path(f"{path}-wal").exists()
     backup_environment(copy, path, replace=True)
     assert names(path) == ["floor", "blob 1"]
-
-
-# --- the command line -----------------------------------------------------------------------------
 
 
 def test_the_verbs_say_what_they_have_copied(run: Run, path: Path) -> None:

@@ -182,9 +182,6 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
         assert_valid(env)
 
 
-# --- one connection -----------------------------------------------------------------------------
-
-
 @pytest.fixture
 def cut_off(admin: psycopg.Connection) -> Callable[[Environment], None]:
     """End the server process of an environment's connection, and wait until it is gone."""
@@ -250,9 +247,6 @@ def test_a_snapshot_does_not_go_on_over_another_connection(
             found = env.objects()
             cut_off(env)
         assert len(found) == len(env.objects()) == N_PARTS
-
-
-# --- Ctrl-C -------------------------------------------------------------------------------------
 
 
 def test_an_interrupted_touch_leaves_nothing_behind(

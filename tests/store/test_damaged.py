@@ -65,7 +65,6 @@ def answers(path: Path) -> str:
 
 
 def made(path: Path, layout: Layout, curve: CurveName, *, distances: bool) -> Sample:
-    """An environment of three objects."""
     log = Path(f"{path}-wal")
     grid = Grid(0.001, (0, 0, 0), 6, curve)
     hapticdb.create(path, grid, layout=layout, distances=distances).close()

@@ -18,7 +18,6 @@ def attempt(host: str, port: int, reason: str, address: str = "127.0.0.1") -> st
 
 
 def told(*attempts: str) -> HapticDBError:
-    """Error for a connection after these attempts."""
     last = attempts[-1].partition("': connection failed: ")[2]
     text = f"connection failed: {last}{MANY}" + "\n".join(attempts)
     return failures.refused(psycopg.OperationalError(text), "postgresql://many/x")

@@ -278,9 +278,6 @@ def import_once(url: str, file: Path) -> None:
     hapticdb.import_files(url, [file])
 
 
-# --- clients and servers that hang ----------------------------------------------------------------
-
-
 def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
     shell, expected = two_tools(), hits_at(url)
     name = parse(url).environment

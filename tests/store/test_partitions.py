@@ -73,7 +73,6 @@ def spread(template: tuple[Path, Binaries]) -> Iterator[Spread]:
 
 
 def dropped(url: str) -> None:
-    """Drop an environment and its partitions."""
     with schema_of.connected(url) as connection:
         schema_of.drop(connection)
 

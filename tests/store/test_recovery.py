@@ -46,8 +46,6 @@ from postgres_servers import Server
 from servers import kill
 from validity import Contents, assert_valid, contents, valid_contents
 
-# --- imports ------------------------------------------------------------------------------------
-
 
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
@@ -95,9 +93,6 @@ def test_an_import_goes_on_by_itself_when_the_server_comes_back(
     assert valid_contents(url) == undisturbed[layout]
 
 
-# --- single writes ------------------------------------------------------------------------------
-
-
 @pytest.mark.long
 @pytest.mark.usefixtures("_impatient")
 def test_an_edit_cut_off_by_a_crash_has_done_nothing_and_can_be_done_again(
@@ -138,9 +133,6 @@ def test_an_edit_goes_on_by_itself_when_the_server_comes_back(
     *_, change = env.store.changes()
     assert (change.action, change.id) == (name, first)
     assert_valid(env)
-
-
-# --- frames -------------------------------------------------------------------------------------
 
 
 @pytest.fixture

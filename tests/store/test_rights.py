@@ -173,9 +173,6 @@ def test_an_editor_cannot_pass_its_right_on(url: str, roles: dict[Right, str]) -
     assert allowed(url_as(url, roles["nobody"])) == set()
 
 
-# -- who may grant, and to whom ------------------------------------------------------------------
-
-
 def test_only_the_owner_grants(granted: dict[Right, str], roles: dict[Right, str]) -> None:
     for right, url in granted.items():
         for role in (roles["nobody"], roles[right]):
@@ -196,9 +193,6 @@ def test_a_role_that_no_right_can_hold_back_is_refused(
         grant(url, member, "viewer")
     admin.execute(sql.SQL("REVOKE {} FROM {}").format(*map(sql.Identifier, (owner, member))))
     assert allowed(url) == EVERYTHING
-
-
-# -- through hapticdb ----------------------------------------------------------------------------
 
 
 def test_a_viewer_touches_by_every_strategy_and_writes_nothing(
@@ -312,8 +306,6 @@ def test_grant_speaks_one_line(run: Run, url: str, roles: dict[Right, str]) -> N
     refused(run("grant", url, roles["viewer"], "--as", "owner"), "viewer")
     refused(run("grant", "a.db", "anna", "--as", "viewer"), "file system")
 
-
-# -- passwords are never shown -------------------------------------------------------------------
 
 MARK = "Zq7"
 # no server listens on port 1

@@ -57,7 +57,6 @@ def pair(request: pytest.FixtureRequest, made: Path) -> Iterator[Pair]:
 
 
 def copy_server(primary: Server, data: Path) -> None:
-    """Copy a server's data into a folder, for a standby that follows it."""
     words = ["--write-recovery-conf", "--checkpoint=fast", "--no-sync", f"--pgdata={data}"]
     primary.binaries.run("pg_basebackup", *words, f"--dbname={primary.conninfo()}")
 

@@ -54,9 +54,6 @@ def write(where: str) -> None:
         write_voxels(env.store, VOXEL, f"{next(numbers)}")
 
 
-# --- SQLite -------------------------------------------------------------------------------------
-
-
 @pytest.mark.parametrize("is_replaced", [False, True])
 def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
     file: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, *, is_replaced: bool
@@ -80,12 +77,8 @@ def test_a_file_that_is_gone_or_another_is_told_until_it_is_back(
     reader.close()
 
 
-# --- PostgreSQL ---------------------------------------------------------------------------------
-
-
 @pytest.fixture
 def reader(url: str) -> Iterator[PostgresStore]:
-    """A reader that watches."""
     store = PostgresStore.open(url, read_only=True)
     store.watch()
     yield store
@@ -190,8 +183,6 @@ def test_long_names_have_channels_of_their_own_that_the_server_takes() -> None:
     assert len(channels) == len(names)
     assert all(len(channel.encode()) <= LONGEST_NAME for channel in channels)
 
-
-# --- notifications from roles without rights -----------------------------------------------------
 
 FORGED = [
     "", "nonsense", "-1", "0", "²", "9" * 5000, "9223372036854775807", "1e300",

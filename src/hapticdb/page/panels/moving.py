@@ -23,7 +23,8 @@ if TYPE_CHECKING:
 MOVING_GIZMO = 0.13
 """Size of a part's gizmo, as a share of the scene's diagonal. Larger: easier to grab."""
 LEAST_WAY = 1e-9
-"""Least change of a part's placement, metres or radians, that is written."""
+"""Least change of a part's placement, metres or radians, that is written. At 0 a click on the gizmo
+would be an edit."""
 
 
 @dataclass(eq=False)

@@ -7,7 +7,7 @@ from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,8 +25,6 @@ from hapticdb.page.wording import error_text
 if TYPE_CHECKING:
     from viser import ViserServer
 
-    from hapticdb.page.browser import Browser
-
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
@@ -35,6 +33,19 @@ TICKS = 30.0
 browser."""
 WORKERS = 4
 """Threads that begin sessions, so that a slow one delays no other browser much."""
+
+
+class _Updated(Protocol):
+    """What a site asks of each browser, which imports this module."""
+
+    def tick(self, now: float) -> None:
+        """Show what is new; called `TICKS` times a second, with seconds of a clock."""
+
+    def objects_changed(self) -> None:
+        """Show the objects as they are now."""
+
+    def close(self) -> None:
+        """End what the browser shows and does."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +95,7 @@ class Site:
     host: AttachedHost
     request: PageRequest
     connection: PageConnection
-    browsers: "dict[int, Browser]" = field(default_factory=dict)
+    browsers: dict[int, _Updated] = field(default_factory=dict)
 
     def __post_init__(self) -> None:
         self._lock = threading.Lock()
@@ -154,7 +165,7 @@ class Site:
             except Exception:
                 LOG.exception("a browser did not end well")
 
-    def everyone(self, act: "Callable[[Browser], None]") -> None:
+    def everyone(self, act: Callable[[_Updated], None]) -> None:
         """Do something for each browser; one that fails does not stop the others."""
         for browser in list(self.browsers.values()):
             try:

@@ -19,7 +19,7 @@ from hapticdb.errors import UsageError
 COOKIE = "hapticdb"
 """Name of the cookie. Browsers send a cookie to all ports of a machine, so the port is appended."""
 SIGNED_IN_SECONDS = 3600.0
-"""Seconds that a cookie is good for after it was last used. Larger: a stolen cookie works longer."""
+"""Seconds that a cookie is good for after it was last used. Larger: so is a stolen one."""
 MOST_SIGNED_IN = 1024
 """Greatest number of valid cookies. The one that was used longest ago makes room for a new one."""
 LEAST_TOKEN = 16

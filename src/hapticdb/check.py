@@ -25,6 +25,7 @@ from hapticdb.store.base import (
     Progress,
     Rows,
     Store,
+    all_rows,
     is_ascending,
     row_shift,
 )
@@ -228,7 +229,7 @@ class _Sums:
     def batches(self, at_once: int, *, distances: bool = False) -> Iterator[Rows]:
         """All rows, added to the sums; ends where they are in `disorder`."""
         key, object_id = -1, 0
-        while len(rows := self._store.rows_after(key, object_id, at_once, distances=distances)):
+        for rows in all_rows(self._store, at_once, distances=distances):
             if not is_ascending(np.append(key, rows.keys), np.append(object_id, rows.ids)):
                 self.disorder = f"after key {key} are not in order"
                 return

@@ -1,7 +1,7 @@
 """Compares what two environments hold, whatever their engines, layouts and curves."""
 
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
 
@@ -12,7 +12,7 @@ from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.ingest.geometry import unpacked_part
 from hapticdb.kernels import curves
-from hapticdb.store.base import BRICK_BYTES, Object, Progress, Rows, Store
+from hapticdb.store.base import BRICK_BYTES, Object, Progress, Rows, Store, all_rows
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import Url, is_same_grid, part_of
 
@@ -154,7 +154,7 @@ def _other_rows(
     for distances, some in ((False, pairs), (True, measured)):
         sums: tuple[dict[int, int], dict[int, int]] = {}, {}
         for store, of in zip((a, b), sums, strict=True) if some else ():
-            for rows in _batches(store, distances=distances):
+            for rows in all_rows(store, ROWS_AT_ONCE, distances=distances):
                 hashes = _hashes_of_bands(rows, store) if distances else _hashes_of(rows, store)
                 _add(of, rows, hashes)
                 done += 0 if distances else len(rows)
@@ -162,13 +162,6 @@ def _other_rows(
                     progress(min(done, total), total)
         found.append([(x, y) for x, y in some if sums[0].get(x.id, 0) != sums[1].get(y.id, 0)])
     return found[0], found[1]
-
-
-def _batches(store: Store, *, distances: bool) -> Iterator[Rows]:
-    key, object_id = -1, 0
-    while len(rows := store.rows_after(key, object_id, ROWS_AT_ONCE, distances=distances)):
-        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
-        yield rows
 
 
 def _add(sums: dict[int, int], rows: Rows, hashes: Hashes) -> None:

@@ -255,6 +255,14 @@ class LocatedShell(NamedTuple):
     exclude: Keys
 
 
+def all_rows(store: "Store", limit: int, *, distances: bool = False) -> Iterator[Rows]:
+    """All rows in ascending order of key and id, at most `limit` at a time."""
+    key, object_id = -1, 0
+    while len(rows := store.rows_after(key, object_id, limit, distances=distances)):
+        key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
+        yield rows
+
+
 class Store(Protocol):
     """An opened environment. Methods take and return whole batches.
 

@@ -212,7 +212,7 @@ class _Comparison:
         self._header, self._residency = recording.header, residency
         self._n_frames = self._n_differing = 0
         self._parting: Parting | None = None
-        self._last: Frames | None = None
+        self._last: float | None = None  # time of the last frame
         self._reasons: dict[str, tuple[int, str]] = {}  # first frame and words of each kind
 
     def add(self, recorded: Frames, present: Frames) -> None:
@@ -239,11 +239,10 @@ class _Comparison:
     def _look_for_reasons(self, frames: Frames) -> None:
         """Find the first frames after which a replay may differ."""
         now, times = self._residency.revision, frames["time"]
-        begins = times - frames["dt"] if self._last is None else np.append(self._last, times[:-1])
-        if self._last is None:
-            begins[1:] = times[:-1]
+        begun = times[0] - frames["dt"][0] if self._last is None else self._last
+        begins = np.append(begun, times[:-1])
         gaps = np.abs(times - begins - frames["dt"]) > 1e-7
-        self._last = times[-1:]
+        self._last = float(times[-1])
         for kind, found, words in (
             ("unknown", frames["unknown"] > 0, "since frame {0} met cells not in memory"),
             ("lost", gaps, "since frames before frame {0} were lost"),

@@ -19,7 +19,7 @@ from hapticdb.closing import Closes
 from hapticdb.errors import FileError, UsageError
 from hapticdb.poses import poses_of
 from hapticdb.recording.frame import FRAME, Frames, State
-from hapticdb.recording.header import OLDER, Header
+from hapticdb.recording.header import MAGIC, OLDER, Header
 
 __all__ = ["FRAME", "Frames", "Header", "Recorder", "Recording", "State"]
 
@@ -257,8 +257,8 @@ class Recorder(Closes):
     def _check_old(self) -> None:
         """Refuse to replace what is no recording."""
         with self._as_file_errors("replace"), io.FileIO(self.path, "rb") as old:
-            start = old.read(19)
-            if start and start[: len(OLDER)] != OLDER and start != b"hapticdb recording ":
+            start = old.read(len(MAGIC))
+            if start and start[: len(OLDER)] != OLDER and start != MAGIC:
                 raise FileError(f"{self.path} is no recording of hapticdb: give another name")
 
     def _keep_old(self) -> None:

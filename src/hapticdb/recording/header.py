@@ -27,7 +27,9 @@ from hapticdb.store.urls import redact
 
 FORMAT_VERSION = 1
 """Version of the format; files of other versions are refused."""
-FIRST_LINE = re.compile(rb"hapticdb recording (\d{1,9}) (\d{12}) ([0-9a-f]{8})\n")
+MAGIC = b"hapticdb recording "
+"""First bytes of a recording."""
+FIRST_LINE = re.compile(MAGIC + rb"(\d{1,9}) (\d{12}) ([0-9a-f]{8})\n")
 """First line of a recording: format, offset of the rows in bytes, CRC-32 of the header's rest."""
 LINE_BYTES = 43
 """Bytes of the first line, while the format has one digit."""
@@ -144,9 +146,7 @@ class Header:
         spaces = -(LINE_BYTES + len(text) + 1 + len(blobs)) % ROWS_AT
         body = text + b" " * spaces + b"\n" + blobs
         end = LINE_BYTES + len(body)
-        return b"hapticdb recording %d %012d %08x\n" % (
-            FORMAT_VERSION, end, zlib.crc32(body)
-        ) + body  # fmt: skip
+        return MAGIC + b"%d %012d %08x\n" % (FORMAT_VERSION, end, zlib.crc32(body)) + body
 
     @classmethod
     def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
@@ -161,7 +161,7 @@ class Header:
         if line.startswith(OLDER):
             raise FileError(f"{where} was made before 0.1: record it again")
         found = FIRST_LINE.fullmatch(line)
-        if found is None and line and not b"hapticdb recording ".startswith(line[:19]):
+        if found is None and line and not MAGIC.startswith(line[: len(MAGIC)]):
             raise FileError(f"{where} is no recording of hapticdb")
         if len(line) == LINE_BYTES and found is None:
             raise FileError(f"{where}: its header is damaged; nothing of it can be read")

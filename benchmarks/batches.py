@@ -212,7 +212,6 @@ def measure(folder: Path, model: Path | None, bits: int, settings: Settings) -> 
     car = model or sample.car
     options = ImportOptions(grid=GridOptions(bits=bits, extent=EXTENT), distances=False)
     hapticdb.import_files(folder / "car.db", [car], options)
-    hapticdb.warm_up()
     load = os.getloadavg()
     parts = [part.triangles() for part in read_file(car).parts]
     cells: list[dict[str, Any]] = []

@@ -28,7 +28,7 @@ from hapticdb.clashes import run
 from hapticdb.clashes.judge import Judged, PlacedPair
 from hapticdb.clashes.shapes import Shapes
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.compiling import entries_for, load
+from hapticdb.kernels._jit import load_entries
 from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.store.base import NO_ROWS
 from hapticdb.store.pairs import Kind
@@ -63,7 +63,7 @@ def measured(what: str, url: str) -> dict[str, Any]:
 
     list_cpu_s : of making the list of all pairs, which a search leaves to who asks for it.
     """
-    load(entries_for("clashes"))
+    load_entries()
     is_alone = what == "distances alone"
     if is_alone:
         vars(run)["judge_placed"] = distance
@@ -109,7 +109,6 @@ def main() -> None:
     if asked.measure:
         print(json.dumps(measured(*asked.measure)))
         return
-    hapticdb.warm_up()
     with tempfile.TemporaryDirectory() as folder:
         url = Path(folder, "scene.db")
         make(url, asked.copies)

@@ -7,6 +7,7 @@ import argparse
 import json
 import os
 import re
+import shutil
 import subprocess
 import sys
 import time
@@ -15,12 +16,14 @@ from typing import Any, NamedTuple
 
 import hapticdb
 from hapticdb import GridOptions, ImportOptions
+from hapticdb.kernels._sets import fitting_set
 from hapticdb.mesh import read_file
 from hapticdb.sample import SampleFiles
 
 PEAK = re.compile(r"VmHWM:\s+(\d+) kB")
 LONGEST_S = 1800.0
 """Seconds after which a command counts as hung."""
+PACKAGE = Path(hapticdb.__file__).parent
 FIRST = {
     "import": ("import", "{turn}.db", "{car}", "--bits", "8", "--extent", "1.6"),
     "touch": ("touch", "{turn}.db", "--tool", "{tool}", "--poses", "{path}"),
@@ -83,9 +86,13 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
 
 
 def first_start(folder: Path, sample: SampleFiles) -> list[dict[str, Any]]:
-    """Seconds of first commands, with nothing compiled, and of the same commands again."""
+    """Seconds of first commands of a new copy as a wheel has it, and of the same commands again."""
     places = {"car": sample.car, "tool": sample.wrench, "path": sample.path}
-    variables = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache")}
+    shutil.copytree(PACKAGE, folder / "hapticdb", ignore=shutil.ignore_patterns("__pycache__"))
+    fitting = fitting_set()
+    assert fitting is not None
+    shutil.copytree(fitting[0], folder / "hapticdb/kernels/_machine", dirs_exist_ok=True)
+    variables = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": str(folder)}
     cells = []
     for name, words in FIRST.items():
         cell: dict[str, Any] = {"command": name}

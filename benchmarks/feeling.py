@@ -157,7 +157,6 @@ def main() -> None:
     given = parser.parse_args()
     out = Path("results-quick" if given.quick else "results")
     effort = QUICK if given.quick else Effort()
-    hapticdb.warm_up()
     with awake(), tempfile.TemporaryDirectory(prefix="hapticdb-feel-") as folder:
         model = Path(os.environ.get("HAPTICDB_TEST_DATA", ""), CAR)
         if not model.is_file():

@@ -170,7 +170,6 @@ def evaluate(
     sample = write_sample(folder / "sample")
     models = costs.models(sample.car, real=real)
     evaluation = Evaluation(folder, models[0], bits, budget)
-    hapticdb.warm_up()
     with awake():
         on_sqlite(evaluation)
         for binaries in find_binaries():

@@ -30,7 +30,6 @@ from hapticdb.batches.feeler import Feeler
 from hapticdb.batches.on_gpu import GpuFrames
 from hapticdb.devices.scripted import Player
 from hapticdb.ingest.geometry import parts_of
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.kernels.resident.cells import RESULTS
 from hapticdb.poses import read_poses
 from hapticdb.sample import write_sample
@@ -52,10 +51,6 @@ TABLE = 2 << 30
 PACKAGES = ("numpy", "numba", "numba-cuda")
 REPEATS = 1000
 """Frames whose times are sorted."""
-SEARCHES = tuple(
-    f"resident.{one}"
-    for one in ("first_hits.find_first_hits", "nearest.find_nearest", "cell_table.cells_met")
-)
 PATIENCE = 5.0
 """Seconds of the frames of one shell on one side, at most about."""
 
@@ -238,7 +233,6 @@ def measure(
     folder: Path, sizes: tuple[int, ...], batch: int, repeats: int, *, quick: bool = False
 ) -> dict[str, Any]:
     """Measure all; results as records for JSON."""
-    compile_missing([*entries_for("frames", "frames by distance"), *SEARCHES])
     few, many = PointShell.load(folder / "few.npz"), PointShell.load(folder / "many.npz")
     situations = dict(np.load(folder / "poses.npz"))
     frames, batches, hands = [], [], []

@@ -14,7 +14,7 @@ import pytest
 import children
 import draws
 from hapticdb import PointShell
-from hapticdb.kernels.compiling import NAMES, compile_missing
+from hapticdb.kernels import _sets
 from hapticdb.pointshell.shell import fibonacci_sphere
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 from voxels import KINDS
@@ -36,7 +36,7 @@ def pytest_configure(config: pytest.Config) -> None:
     of_a_worker: dict[str, str] | None = getattr(config, "workerinput", None)
     if of_a_worker is None:  # once, before the processes that run tests start
         children.begin_run()
-        compile_missing(NAMES)
+        _sets.fitting_set()
     else:
         children.begin_run(Path(of_a_worker["shared"]))
 

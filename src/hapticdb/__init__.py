@@ -56,7 +56,6 @@ if TYPE_CHECKING:
     from hapticdb.query.law import TangentPlane as TangentPlane
     from hapticdb.query.touches import Query as Query
     from hapticdb.query.touches import Touch as Touch
-    from hapticdb.ready import warm_up as warm_up
     from hapticdb.realtime.coupling import Coupling as Coupling
     from hapticdb.realtime.replay import Replayed as Replayed
     from hapticdb.realtime.replay import replay as replay

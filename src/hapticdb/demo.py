@@ -23,7 +23,6 @@ from hapticdb.paper.strategies import Strategy
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
 from hapticdb.query.touches import Query, Touch
-from hapticdb.ready import make_ready
 from hapticdb.sample import SampleFiles, write_sample
 from hapticdb.store.base import Layout
 
@@ -128,7 +127,6 @@ def prepare(
     options = GridOptions(bits=bits)
     home = Path(folder)
     files = write_sample(home, frames)
-    make_ready("demo")
     shell = PointShell.from_file(files.wrench, points)
     layouts: tuple[tuple[Layout, str], ...] = (("brick", "car.db"), ("voxel", "car_voxel.db"))
     imported = [

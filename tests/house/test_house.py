@@ -14,12 +14,9 @@ from collections.abc import Iterator
 from importlib.metadata import version
 from pathlib import Path
 
-import numba
-import pytest
-
 import hapticdb
 from children import finished
-from hapticdb.kernels._cache import cache_folder, sources_digest
+from hapticdb.kernels._machine_code import sources_digest
 from sources import PACKAGE, ROOT, modules, named, python_files
 
 # domains that may import less than their floor allows -> what they may import
@@ -254,13 +251,12 @@ def test_the_version_is_one() -> None:
 # --- the kernels' cache -------------------------------------------------------------------------
 
 
-def test_any_edit_of_a_kernel_moves_the_cache(tmp_path: Path) -> None:
+def test_any_edit_of_a_kernel_asks_for_another_set(tmp_path: Path) -> None:
     """Also an edit of a leaf in another file than its entry's, with equal size and time stamp."""
     folder = tmp_path / "kernels"
     shutil.copytree(PACKAGE / "kernels", folder, ignore=shutil.ignore_patterns("__pycache__"))
     first = sources_digest(folder)
     assert first == sources_digest(PACKAGE / "kernels")
-    assert first in cache_folder()
     for source in sorted(folder.rglob("*.py")):
         content, status = source.read_bytes(), source.stat()
         source.write_bytes(content[:-1] + b" ")
@@ -270,37 +266,3 @@ def test_any_edit_of_a_kernel_moves_the_cache(tmp_path: Path) -> None:
         assert sources_digest(folder) == first
     (folder / "curves.py").rename(folder / "bends.py")
     assert sources_digest(folder) != first
-
-
-CACHES = """
-import sys
-from numba import config, njit
-before = config.CACHE_DIR
-import hapticdb, hapticdb.environment
-import hapticdb.kernels.curves
-from hapticdb.kernels._jit import ENTRIES, CACHE_FOLDER
-assert config.CACHE_DIR == before, (before, config.CACHE_DIR)
-sys.path.insert(0, sys.argv[1])
-import theirs
-theirs.twice(21)
-print(theirs.twice._cache.cache_path)
-print(CACHE_FOLDER)
-print(*{entry._cache.cache_path for entry in ENTRIES})
-"""
-
-
-@pytest.mark.skipif(bool(numba.config.DISABLE_JIT), reason="without the JIT there is no cache")
-@pytest.mark.parametrize("is_configured", [False, True])
-def test_users_kernels_keep_their_own_cache(tmp_path: Path, is_configured: bool) -> None:
-    (tmp_path / "theirs.py").write_text(
-        "from numba import njit\n@njit(cache=True)\ndef twice(x):\n    return 2 * x\n"
-    )
-    variables = {"NUMBA_CACHE_DIR": str(tmp_path / "cache")} if is_configured else {}
-    theirs, folder, ours = run_python(CACHES, str(tmp_path), **variables).splitlines()
-    wanted = tmp_path / ("cache" if is_configured else "__pycache__")
-    assert wanted in (Path(theirs), *Path(theirs).parents)
-    assert Path(folder).name == f"kernels-{sources_digest(PACKAGE / 'kernels')}"
-    assert all(Path(folder) in Path(path).parents for path in ours.split(" "))
-    assert not Path(theirs).is_relative_to(folder)
-    if is_configured:
-        assert Path(folder).is_relative_to(tmp_path / "cache")

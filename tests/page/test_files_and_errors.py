@@ -15,7 +15,7 @@ import hapticdb
 from assemblies import drop_surfaces
 from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
-from hapticdb.page.connection import PageConnection, PageRequest, Visitor, line
+from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.panels.touch import PART
 from hapticdb.page.process import new_server, open_page
 from hapticdb.page.site import Site
@@ -66,7 +66,6 @@ def page_of(
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     ours, theirs = socket.socketpair()
-    ours.sendall(line("prepared"))
     request = PageRequest(
         dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0, "",
         None if recordings is None else str(recordings),

@@ -24,7 +24,6 @@ from chromium import (
     picture,
     until,
 )
-from hapticdb.kernels.compiling import compile_missing, entries_for
 from hapticdb.page import tools
 from hapticdb.page.process import new_server
 from hapticdb.page.scene.picking import Struck
@@ -51,7 +50,6 @@ def imported(test_data: Path | None, tmp_path_factory: pytest.TempPathFactory) -
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=9, extent=1.8))
     reports = hapticdb.import_files(folder / "car.db", [folder / "vintage_car.glb"], options)
     assert [report.status for report in reports] == ["imported"]
-    compile_missing(entries_for("host", "sweep"))
     return folder / "car.db"
 
 

@@ -62,7 +62,6 @@ class Person(Browser):
         self.client, self.site = MagicMock(client_id=0), MagicMock(host=host, workers=workers)
         self.client.add_notification = lambda *words, **_: self.told.append(": ".join(words))
         self.site.objects, self.site.edits, self.site.error_text = {}, None, str
-        self.site.connection.preparing = ""
         self.site.facts = SimpleNamespace(has_distances=False, diagonal=1.0)
         self.scene = SimpleNamespace(hidden=())  # type: ignore[assignment]
         self.tool, self.scale = SimpleNamespace(shell=None), 1.0  # type: ignore[assignment]

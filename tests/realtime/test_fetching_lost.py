@@ -172,8 +172,8 @@ def test_threads_that_supervise_together_start_one_process(
     started: list[Process] = []
     barrier = threading.Barrier(4)
 
-    def noted(*given: Any) -> Process:  # noqa: ANN401 - what a `Process` takes
-        started.append(Process(*given))
+    def noted(*given: Any, **named: Any) -> Process:  # noqa: ANN401 - what a `Process` takes
+        started.append(Process(*given, **named))
         return started[-1]
 
     def supervise(_: int) -> None:

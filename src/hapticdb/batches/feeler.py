@@ -20,8 +20,7 @@ from hapticdb.kernels.resident.cells import CONTACTS, DEEPEST, HITS, RESULTS, UN
 from hapticdb.kernels.resident.feeling import feel_kernel
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import HapticQuery, as_poses
-from hapticdb.query.law import ForceLaw, frames_by
-from hapticdb.ready import make_ready
+from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
@@ -68,7 +67,6 @@ class Feeler(Closes):
         if device not in get_args(BatchDevice):
             raise UsageError(f"device {device!r}: choose 'cpu' or 'cuda'")
         n_jobs = available_jobs(jobs)
-        make_ready(frames_by(law))
         self.shell = shell
         self.law = law
         self._store = store

@@ -8,7 +8,6 @@ from typing import NamedTuple
 import numpy as np
 
 from hapticdb.clashes.run import BUDGET, PairQuery, PairSearch, is_same
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Store
 from hapticdb.store.pairs import PairRow
 
@@ -92,7 +91,6 @@ def _misfit(row: PairRow, known: set[int], bare: set[int], revision: int) -> str
 def _judged_again(
     search: PairSearch, rows: Sequence[PairRow], objects: Mapping[int, Object], revision: int
 ) -> Iterator[PairFault]:
-    make_ready("clashes")
     old = {(row.a, row.b): row for row in rows}
     pairs = [(objects[row.a], objects[row.b]) for row in rows]
     for row in search.measured(pairs, {}, revision):

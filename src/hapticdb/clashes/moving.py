@@ -20,7 +20,6 @@ from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.poses import rotation_of
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Progress
 from hapticdb.store.finding import Words
 from hapticdb.store.pairs import Kind
@@ -88,7 +87,6 @@ def find_meetings(
     """
     if not 0.0 < contact < np.inf:
         raise UsageError(f"contact {contact} m: give a length above 0")
-    make_ready("sweep", "clashes")
     with env.store.snapshot():
         tool = MovingSurface(env.shell(*of, points=1, inset=0.0))
         way = Way.of(poses, tool.corners, center_of(tool, about))

@@ -23,7 +23,6 @@ from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Progress, Store
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
@@ -100,8 +99,6 @@ def find_clashes(
     until = np.inf if seconds is None else began + seconds
     asked = PairQuery(within, contact, tuple(of), tuple(against), until, budget, progress)
     with connected(on) as workers:
-        if workers is None:
-            make_ready("clashes")
         return PairSearch(env.store, asked, env.address, workers).found(began)
 
 
@@ -366,7 +363,6 @@ def _piece(
     placed: Sequence[PlacedPair],
 ) -> list[Judged | None]:
     """Judge pairs: the task of a worker."""
-    make_ready("clashes")
     with closing(there.open()) as store:
         shapes = Shapes(store, budget)
         return [work(shapes, one) for one in placed]

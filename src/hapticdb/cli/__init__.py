@@ -25,7 +25,7 @@ from hapticdb.cli.verbs.keeping import backup, check, grant
 from hapticdb.cli.verbs.listing import info, objects
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
-from hapticdb.cli.verbs.sampling import demo, sample, warm
+from hapticdb.cli.verbs.sampling import demo, sample
 from hapticdb.cli.verbs.serving import serve, view
 from hapticdb.cli.verbs.sweeping import HELP as SWEEP_HELP
 from hapticdb.cli.verbs.sweeping import sweep
@@ -60,10 +60,9 @@ VERBS: dict[Callable[..., None], str] = {
     grant: "Say what a role may do, on PostgreSQL.",
     demo: "Make, import, touch and draw the sample.",
     sample: "Write a sample: a car, a wrench and its path.",
-    warm: "Compile every kernel now, so that no verb has to.",
 }
 """The verbs, and the line about each in the list of verbs."""
-HIDDEN = {sample, warm}
+HIDDEN = {sample}
 """Verbs that the list leaves out: what they do, others do by themselves."""
 HELP = {clashes: CLASHES_HELP, sweep: SWEEP_HELP, extract: EXTRACT_HELP}
 """Help texts that are too long for a docstring, so that no function is over 60 lines."""

@@ -1,7 +1,6 @@
 """What people see: tables and notes; bars on a terminal only."""
 
 import json
-import os
 import re
 import shlex
 import shutil
@@ -156,24 +155,6 @@ def shares(counts: Mapping[str, int]) -> str:
     total = sum(counts.values()) or 1
     ranked = sorted(counts.items(), key=lambda item: (-item[1], item[0]))
     return ", ".join(f"{name} {100 * n / total:.3g} %" for name, n in ranked)
-
-
-def compile_kernels(*purposes: str, files: Sequence[str] = ()) -> int:
-    """Compile the kernels of those purposes that this machine has not compiled yet, with a bar.
-
-    purposes: as `hapticdb.kernels.compiling.PURPOSES` names them; files: what the verb is going to
-    read: if none of them exists, nothing is compiled, so that the error about them comes at once.
-    Returns how many kernels were compiled.
-    """
-    if files and not any(map(os.path.exists, files)):
-        return 0
-    from hapticdb.kernels.compiling import entries_for, missing
-    from hapticdb.ready import make_ready
-
-    if not missing(entries_for(*purposes)):
-        return 0
-    with bar("compiling, once", "kernels") as tell:
-        return make_ready(*purposes, progress=tell and (lambda now: tell(now.done, now.total)))
 
 
 @contextmanager

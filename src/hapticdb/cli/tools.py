@@ -13,11 +13,10 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
 
-def compile_for(tool: str, *purposes: str) -> None:
-    """Compile the kernels of purposes; refuse a tool whose file is missing before that."""
+def check_there(tool: str) -> None:
+    """Refuse a tool whose file is missing."""
     if not Path(tool).exists():
         raise FileError(f"cannot read {tool}: there is no such file")
-    render.compile_kernels(*purposes)
 
 
 def shell_of(

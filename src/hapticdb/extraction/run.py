@@ -23,7 +23,6 @@ from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Exit, Problem, problem_of
 from hapticdb.extraction.pulls import Pulls
 from hapticdb.extraction.result import Blocker, Extraction, WayOut, ids_of
-from hapticdb.ready import make_ready
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
@@ -150,7 +149,6 @@ def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
 
 def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Extraction:
     """Pull, plan if no pull is proved, and collect the result, without its time."""
-    make_ready("extract")
     leaving = Exit(
         problem.box[0],
         problem.box[1],

@@ -27,7 +27,6 @@ from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
-from hapticdb.ready import make_ready
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
@@ -113,7 +112,6 @@ class SessionHost(Closes):
         if not is_rigid(pose):
             raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
         Handle(scale=scale)  # checks it
-        make_ready("host")  # here, so that no worker compiles
         felt = self._tables.checked(where, exclude)
         with self._changing:
             if self._is_closed.is_set():

@@ -14,7 +14,7 @@ import numpy as np
 
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.kernels.compiling import load
+from hapticdb.kernels._jit import load_entries
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.board import Board
@@ -27,8 +27,6 @@ from hapticdb.recording.header import Start
 from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 
-ENTRIES = tuple(f"period.loop.{name}" for name in ("run", "move_by_coupling"))
-"""Kernels that a worker calls, and those that they call."""
 LOOK_EVERY = 0.25
 """Seconds between two checks whether the host still lives."""
 LEAVE_PATIENCE = 5.0
@@ -155,7 +153,7 @@ class Worker:
 
 def work(request: WorkerRequest, sender: MessageSender) -> None:
     """Run a worker; the work of the process."""
-    load(ENTRIES)
+    load_entries("period.loop")
     worker = Worker(request)
     looping = threading.Thread(target=worker.run, daemon=True)
     looping.start()

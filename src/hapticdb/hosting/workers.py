@@ -23,7 +23,8 @@ class WorkerProcess(Process):
     def __init__(self, number: int, board: Board, rate: float) -> None:
         self.number = number
         request = WorkerRequest(board, rate)
-        super().__init__("hapticdb.hosting.worker:work", request, [board.descriptor], ["host"])
+        work = "hapticdb.hosting.worker:work"
+        super().__init__(work, request, [board.descriptor], with_kernels=True)
         self.await_ready("worker's", START_PATIENCE)
         self._channel.sock.settimeout(ANSWER_PATIENCE)
 

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import voxelize
-from hapticdb.ready import make_ready
 from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Band, Keys, Layout, Rows
 
 BRICKS_AT_ONCE = 1 << 15
@@ -70,7 +69,6 @@ def bricks_of_rows(rows: Rows, grid: Grid, layout: Layout) -> Bricks:
 
 def bricks_of_voxels(ijk: NDArray[np.int64], grid: Grid) -> Bricks:
     """Bricks of voxels (n, 3) inside the grid, in any order."""
-    make_ready("points")
     return Bricks(*voxelize.mark_points(ijk.astype(np.float64) + 0.5, grid.bits))
 
 

@@ -13,7 +13,6 @@ from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.mesh import Part
 from hapticdb.poses import as_floats
 from hapticdb.query.frame import as_ids
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Rows, Store
 
 Floats = NDArray[np.float64]
@@ -63,7 +62,6 @@ def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Obje
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
     chosen = as_ids(ids).tolist()
-    make_ready("move")  # not inside the transaction, for which other writers wait
 
     def moved() -> Iterator[tuple[Object, Rows]]:
         objects = [store.object(i) for i in chosen]

@@ -20,7 +20,6 @@ from hapticdb.kernels.surfaces import distances as kernels
 from hapticdb.kernels.surfaces import voxelize
 from hapticdb.mesh import MeshFile, Part
 from hapticdb.mesh.child import bytes_available
-from hapticdb.ready import make_ready
 from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, Store
 
 Item = TypeVar("Item")
@@ -60,7 +59,6 @@ def rows_of_part(
 
     Raises `FileError` if this would take more memory than the machine has left.
     """
-    make_ready("import")
     what = f"part {part.name!r}"
     voxels_alone = _VOXELS_SHARE if distances else 1.0
     if part.is_cloud:
@@ -128,7 +126,6 @@ def pieces_of_points(
     points: NDArray[np.float64], bits: int
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
     """Bricks of the voxels that hold points, as `voxelize.voxelize_pieces` yields them."""
-    make_ready("points")
     end = max(len(points), 1)
     for first in range(0, end, POINTS_AT_ONCE):
         some = points[first : first + POINTS_AT_ONCE]

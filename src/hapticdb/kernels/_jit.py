@@ -1,27 +1,30 @@
 """How kernels are compiled: the numba options of this package, here and nowhere else.
 
-An entry is called from Python and declares the types of its arguments, so that `compiling` can
-compile it before its first call, in another process. A leaf is called by kernels only.
-
-Machine code goes into a folder of its own (`_cache`); users' own kernels keep the folder that they
-configured.
+An entry is called from Python and declares the types of its arguments, for which its machine code
+is in a set (`_sets`). A leaf is called by kernels only. An entry that is called with other
+types, as those of a user's law, is compiled in place for them, once a process.
 """
 
 import os
+import pickle
 from collections.abc import Callable, Mapping
+from pathlib import Path
 from types import MappingProxyType
-from typing import Any
+from typing import Any, NamedTuple
 
 import numba
 from numba import config, types
-from numba.core.caching import FunctionCache
+from numba.core.caching import NullCache
+from numba.core.compiler import CompileResult
 from numba.core.runtime import rtsys
+from numba.core.serialize import dumps
 from numba.core.sigutils import normalize_signature
 from numba.extending import overload
 from numba.np.numpy_support import from_dtype
 
-from hapticdb.kernels._cache import CACHE_FOLDER, IN_WORKER
-from hapticdb.kernels._linking import EntryCompiler, ask_once, compile_once, note_nothing
+from hapticdb.kernels._linking import EntryCompiler, link_leaves_into_entries
+from hapticdb.kernels._machine_code import BUILDING
+from hapticdb.kernels._sets import code_of
 
 INT, FLOAT, NONE = types.int64, types.float64, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
@@ -37,16 +40,21 @@ READ_FLOATS2 = types.Array(FLOAT, 2, "C", readonly=True)
 A read-only array has another type than a writable one.
 """
 
-ENTRIES: list[Any] = []
-"""Every compiled entry, in order of definition."""
-SIGNATURES: dict[str, tuple[Any, ...]] = {}
-"""Types of the arguments of every entry, by its module and name: ``query.grouping.gap_rows``.
+
+class Declared(NamedTuple):
+    """An entry, compiled by numba, and the types of its arguments."""
+
+    compiled: Any
+    signature: tuple[Any, ...]
+
+
+ENTRIES: dict[str, Declared] = {}
+"""Entries of the modules that are loaded, by module and name: ``query.grouping.gap_rows``.
 
 An entry that is compiled for the distance law, too, has a second name for that, which ends in
 `BY_DISTANCE`.
 """
 BY_DISTANCE = "@distances"
-
 
 _ENTRY_OPTIONS: dict[str, Any] = {
     "nogil": True, "error_model": "numpy", "no_cfunc_wrapper": True, "_nrt": True,
@@ -54,12 +62,11 @@ _ENTRY_OPTIONS: dict[str, Any] = {
 """Options of entries. `_nrt` is numba's counting of references to arrays."""
 _LEAF_OPTIONS: dict[str, Any] = _ENTRY_OPTIONS | {"_nrt": False}
 _BY_ADDRESS: dict[str, Any] = {"_nrt": False, "no_cpython_wrapper": True}
-if IN_WORKER in os.environ:
+_BUILDING = os.environ.get(BUILDING, "")
+if _BUILDING:
     _ENTRY_OPTIONS |= {"pipeline_class": EntryCompiler}
     _LEAF_OPTIONS |= {"no_cpython_wrapper": True}
-    compile_once()
-    ask_once()
-    note_nothing()
+    link_leaves_into_entries()
 
 
 def fields_of(kind: type, *fields: Any) -> Any:  # noqa: ANN401 - numba's types are untyped
@@ -72,30 +79,39 @@ def record_of(layout: Any, axes: int = 0) -> Any:  # noqa: ANN401 - likewise
     return types.Array(from_dtype(layout), axes, "C")
 
 
-class _Cache(FunctionCache):  # type: ignore[misc]
-    """Machine code on disk of one entry.
+class _Kept(NullCache):  # type: ignore[misc]
+    """Machine code of one entry in a set.
 
-    What is loaded needs none of what numba compiles with, half a second of imports: a process that
-    has all its kernels on disk goes without.
-
-    Machine code for a NamedTuple from outside this package stays in memory. The file that
-    lists an entry's machine code names such types by their module, and a process that cannot
-    import one of them could read nothing of that file.
+    What is loaded needs none of what numba compiles with, half a second of imports: a process whose
+    kernels are all in a set goes without.
     """
 
-    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401 - numba's types
-        """Load the machine code of a signature; None if it is not on disk."""
-        rtsys.initialize(target_context)
-        with self._guard_against_spurious_io_errors():
-            return self._load_overload(sig, target_context)
+    def __init__(self, name: str) -> None:
+        self._name = name
 
-    def save_overload(self, sig: Any, data: Any) -> None:  # noqa: ANN401 - likewise
-        """Store the machine code, unless it is for types from outside this package."""
+    def _name_of(self, sig: Any) -> str:  # noqa: ANN401 - numba's types
+        """Name of the declared signature; empty for another one."""
         given, _ = normalize_signature(sig)
-        kinds = [kind.dtype if isinstance(kind, types.CPointer) else kind for kind in given]
-        classes = [getattr(kind, "instance_class", None) for kind in kinds]
-        if all(c is None or c.__module__.startswith("hapticdb.") for c in classes):
-            super().save_overload(sig, data)
+        for name in (self._name, self._name + BY_DISTANCE):
+            if name in ENTRIES and ENTRIES[name].signature == given:
+                return name
+        return ""
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:  # noqa: ANN401 - likewise
+        """Load the machine code of a signature; None if no set has it."""
+        name = "" if _BUILDING else self._name_of(sig)
+        code = code_of(name) if name else None
+        if code is None:
+            return None
+        rtsys.initialize(target_context)
+        return CompileResult._rebuild(target_context, *pickle.loads(code))  # noqa: S301, SLF001
+
+    def save_overload(self, sig: Any, cres: Any) -> None:  # noqa: ANN401 - likewise
+        """Add the machine code of a declared signature to the set that is built."""
+        if _BUILDING and (name := self._name_of(sig)):
+            part = Path(_BUILDING, f"{name}.{os.getpid()}")
+            part.write_bytes(dumps(cres._reduce()))  # noqa: SLF001 - as numba's own cache
+            part.rename(Path(_BUILDING, name))
 
 
 def entry(
@@ -103,39 +119,40 @@ def entry(
     also: Mapping[Any, Any] = MappingProxyType({}),
     by_address: bool = False,
 ) -> Callable[[Callable[..., Any]], Callable[..., Any]]:
-    """Compile a kernel that Python calls with arguments of those types, when it is first called.
+    """Compile a kernel that Python calls with arguments of those types.
 
-    `also` declares the signature for the distance law: some types exchanged. The kernel is
-    cached on disk and runs without the interpreter lock. A call with other types is correct, but
-    slow the first time, because the kernel is compiled for them then. by_address: only kernels call
-    it (`hand.calling`), and it makes no arrays.
+    `also` declares the signature for the distance law: some types exchanged. The kernel runs
+    without the interpreter lock. by_address: only kernels call it (`hand.calling`), and it makes no
+    arrays.
     """
 
     def decorate(function: Callable[..., Any]) -> Callable[..., Any]:
-        before = config.CACHE_DIR
-        config.CACHE_DIR = CACHE_FOLDER
-        try:
-            compiled = numba.njit(**_ENTRY_OPTIONS | (_BY_ADDRESS if by_address else {}))(function)
-            if not config.DISABLE_JIT:
-                compiled._cache = _Cache(function)  # noqa: SLF001 - as cache=True sets numba's own
-        finally:
-            config.CACHE_DIR = before
-        ENTRIES.append(compiled)
+        compiled = numba.njit(**_ENTRY_OPTIONS | (_BY_ADDRESS if by_address else {}))(function)
         module = function.__module__.removeprefix("hapticdb.kernels.")
         name = f"{module}.{function.__name__}"
-        SIGNATURES[name] = signature
+        if not config.DISABLE_JIT:
+            compiled._cache = _Kept(name)  # noqa: SLF001 - as cache=True sets numba's own
+        ENTRIES[name] = Declared(compiled, signature)
         if also:
-            SIGNATURES[name + BY_DISTANCE] = tuple(also.get(kind, kind) for kind in signature)
+            by_distance = tuple(also.get(kind, kind) for kind in signature)
+            ENTRIES[name + BY_DISTANCE] = Declared(compiled, by_distance)
         return compiled  # type: ignore[no-any-return]
 
     return decorate
+
+
+def load_entries(module: str = "") -> None:
+    """Load the machine code of every entry of a module, or of all modules that are loaded."""
+    for name, (compiled, signature) in list(ENTRIES.items()):
+        if not config.DISABLE_JIT and module in {"", name.rpartition(".")[0]}:
+            compiled.compile(signature)
 
 
 def leaf(function: Callable[..., Any], **more: Any) -> Callable[..., Any]:  # noqa: ANN401
     """Compile a function that only kernels call; LLVM inlines it if it is small.
 
     It counts no references, so arrays cost nothing, but it can make none (`maker`). A process that
-    only compiles makes no machine code of a leaf alone (`_linking`). Elsewhere a leaf can be called
+    builds a set makes no machine code of a leaf alone (`_linking`). Elsewhere a leaf can be called
     from Python, as tests do. numba gives a literal a type of its own; a leaf is compiled without.
     """
     compiled = numba.njit(**_LEAF_OPTIONS | more)(function)

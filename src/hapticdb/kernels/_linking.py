@@ -1,27 +1,15 @@
-"""How a process that only compiles does so: each thing once.
+"""How a process that builds a set compiles: each thing once.
 
 There nothing but entries is called from Python. numba would optimize each function together with
 all that it calls, and emit machine code for it: a leaf five calls below an entry six times. Instead
-an entry links each leaf below it, once, and its own passes inline and optimize them. Most of the
-time is numba's own, before LLVM begins; what it notes there for nobody is left out, too.
+an entry links each leaf below it, once, and its own passes inline and optimize them: 50 s of
+processor time for all entries instead of 86.
 """
 
-from contextlib import nullcontext
-from functools import cache
-from inspect import iscode
 from typing import Any
 
-from numba.core import event, transforms
-from numba.core.base import BaseContext
 from numba.core.codegen import JITCodeLibrary, JITCPUCodegen
 from numba.core.compiler import Compiler
-from numba.core.compiler_machinery import PassManager, _pass_registry
-from numba.core.cpu import CPUContext
-from numba.core.postproc import PostProcessor, VariableLifetime
-from numba.core.typed_passes import NopythonRewrites
-from numba.core.types.functions import BaseFunction
-from numba.core.typing import Context
-from numba.core.untyped_passes import InlineClosureLikes
 
 
 class _Library(JITCodeLibrary):  # type: ignore[misc]  # numba is untyped
@@ -72,8 +60,8 @@ class EntryCompiler(Compiler):  # type: ignore[misc]  # likewise
         super().__init__(typing_context, target, library, *others)
 
 
-def compile_once() -> None:
-    """Let numba make no machine code but of entries, and search for what a call means once.
+def link_leaves_into_entries() -> None:
+    """Let numba make no machine code but of entries.
 
     Leaves are all else that it compiles: ours, and its own functions that they call.
     """
@@ -87,60 +75,3 @@ def compile_once() -> None:
 
     Compiler.__init__ = __init__
     JITCPUCodegen.set_env = lambda *_: None  # constants of functions that are called
-    search, known = BaseFunction.get_call_type, {}
-
-    def get_call_type(self: Any, context: Any, args: Any, kws: Any) -> Any:  # noqa: ANN401
-        asked = self, tuple(args), tuple(kws.items())
-        if asked not in known:
-            known[asked] = search(self, context, args, kws)
-        return known[asked]
-
-    BaseFunction.get_call_type = get_call_type  # type: ignore[method-assign]
-
-
-def ask_once() -> None:
-    """Let numba load its registries once, and not for each function, and ask for a size once."""
-    for kind in CPUContext, Context:
-        kind.load_additional_registries = cache(kind.load_additional_registries)
-    for size in "get_abi_sizeof", "get_abi_alignment":
-        setattr(BaseContext, size, cache(getattr(BaseContext, size)))
-
-
-def note_nothing() -> None:
-    """Let numba tell no listeners, take no times, and compute no lives of variables in between.
-
-    Nor does it rewrite array expressions, which no kernel has, or search for closures where the
-    Python code has none. A fifth of the time of compiling; what is compiled stays the same.
-    """
-    event.start_event = event.end_event = lambda *_, **__: None
-    event.trigger_event = lambda *_, **__: nullcontext()
-
-    def run_pass(self: Any, _: int, done: Any, state: Any) -> None:  # noqa: ANN401
-        constants = state.func_id.code.co_consts
-        if isinstance(done, NopythonRewrites) or (
-            isinstance(done, InlineClosureLikes) and not any(map(iscode, constants))
-        ):
-            return
-        done.analysis = self._analysis
-        has_changed = done.run_initialization(state)
-        has_changed |= done.run_pass(state)
-        has_changed |= done.run_finalizer(state)
-        if _pass_registry.get(type(done)).mutates_CFG:
-            if has_changed:
-                PostProcessor(state.func_ir).run()
-            else:
-                state.func_ir.blocks = transforms.canonicalize_cfg(state.func_ir.blocks)
-
-    PassManager._runPass = run_pass  # noqa: SLF001
-    complete = PostProcessor.run
-
-    def run(self: Any, emit_dels: bool = False, *others: Any, **named: Any) -> None:  # noqa: ANN401
-        code = self.func_ir
-        if emit_dels or code.is_generator:
-            complete(self, emit_dels, *others, **named)
-            return
-        code.blocks = transforms.canonicalize_cfg(code.blocks)
-        code.variable_lifetime = VariableLifetime(code.blocks)
-        code.generator_info = None
-
-    PostProcessor.run = run

@@ -92,9 +92,6 @@ class Browser:
     def session_ended(self) -> None:
         """Show that the session is over, and with it a recording."""
 
-    def waits(self, text: str) -> None:
-        """Show what the session waits for; nothing new if the text is empty."""
-
     def frame_came(self, frame: np.void, wrench: Floats, touched: list[Object], now: float) -> None:
         """Show a frame of the session, its wrench (6,), and what it touches."""
 
@@ -208,7 +205,6 @@ class Browser:
         """Begin sessions while one is wanted; does nothing if another worker does so already."""
         while self._keeps_tool is not None and self._beginning.acquire(blocking=False):
             try:
-                self.site.prepare()
                 self._begin()
             except HapticDBError as error:
                 self.failed(error)
@@ -338,8 +334,6 @@ class Browser:
             self._tell_lost_frames(session)
         frame = None if session is None else session.latest()
         if session is None or frame is None:
-            if self.visitor.may("toucher"):
-                self.waits(self.site.connection.preparing)
             return
         one = frame[0]
         tool, wrench = np.array(one["tool"]), np.array(one["applied"])

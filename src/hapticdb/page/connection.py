@@ -15,10 +15,8 @@ import json
 import logging
 import socket
 import threading
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from typing import TYPE_CHECKING, Any, NamedTuple
-
-from hapticdb.errors import HapticDBError
 
 if TYPE_CHECKING:
     import viser
@@ -38,8 +36,6 @@ LATE = 1013
 """WebSocket close code "try again later", for a connection without the secret."""
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
-PREPARED_EVERY = 0.2
-"""Seconds from one look for the page's end to the next while the server compiles."""
 MOST_FAILED = 20
 """Messages of one connection that viser cannot take in, such as a text for a slider, before it is
 closed. Larger: such a client fills the log longer."""
@@ -81,11 +77,6 @@ class PageConnection:
         self._socket = socket.socket(fileno=descriptor)
         self._secret = secret.encode()
         self._live: Mapping[int, ServerConnection] = {}
-        self._asking = threading.Lock()
-        self._is_asked = False
-        self._is_prepared = threading.Event()
-        self.preparing = ""
-        """How far the server is with what a hand calls, in words; empty while it does nothing."""
         self._thread = threading.Thread(target=self._listen, name="server", daemon=True)
         self._thread.start()
 
@@ -123,16 +114,6 @@ class PageConnection:
             raise KeyError(client_id)
         return Visitor(request.headers[NAME], request.headers[ROLE])
 
-    def prepare(self, is_ending: Callable[[], bool]) -> None:
-        """Wait until what a hand calls is compiled; HapticDBError if the page ends."""
-        with self._asking:
-            if not self._is_asked:
-                self._is_asked = True
-                self.tell("prepare")
-        while not self._is_prepared.wait(PREPARED_EVERY):
-            if is_ending():
-                raise HapticDBError("the page ends")
-
     def tell(self, word: str) -> None:
         """Send a message to the server; does nothing if it has ended."""
         with contextlib.suppress(OSError):
@@ -143,10 +124,6 @@ class PageConnection:
             while received := stream.readline(LONGEST_LINE):
                 message = json.loads(received)
                 match message["word"]:
-                    case "preparing":
-                        self.preparing = message["text"]
-                    case "prepared":
-                        self._is_prepared.set()
                     case "ping":
                         self.tell("pong")
 

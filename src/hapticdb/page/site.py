@@ -140,10 +140,6 @@ class Site:
         if self.edits is not None:
             self.edits.close()
 
-    def prepare(self) -> None:
-        """Wait until what a hand calls is compiled; HapticDBError if the page ends before."""
-        self.connection.prepare(self._is_ending.is_set)
-
     def take_number(self) -> int:
         """Return the smallest number that no browser has: it decides a tool's colour and place."""
         with self._lock:

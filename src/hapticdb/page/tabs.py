@@ -55,10 +55,6 @@ class TabbedBrowser(Browser):
         """Show that the session is over, and with it a recording."""
         self.record.session_ended()
 
-    def waits(self, text: str) -> None:
-        """Show what the session waits for; nothing new if the text is empty."""
-        self.touch.show_wait(text)
-
     def frame_came(
         self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
     ) -> None:

@@ -15,7 +15,7 @@ from hapticdb.paper.cost_model import CostModel
 from hapticdb.paper.grouping import DEFAULT_MAXGAP, cbgroup, maxgap
 from hapticdb.paper.quantiles import QuantileVector
 from hapticdb.query.frame import NOTHING_EXCLUDED, Asked, HapticQuery
-from hapticdb.query.law import ForceLaw, TangentPlane, frames_by
+from hapticdb.query.law import ForceLaw, TangentPlane
 from hapticdb.query.touches import Query, Touch
 from hapticdb.store.base import Keys, LocatedShell, Rows, Store
 from hapticdb.store.covering import Ranges
@@ -74,13 +74,6 @@ class _Form:
     frames: Strategies
     strategy: Strategy
     gap: int
-
-    def purposes(self, law: ForceLaw) -> list[str]:
-        """Purposes (`kernels.compiling.PURPOSES`) of its kernels."""
-        if self.strategy == "statement":
-            return ["statement"]
-        grouping = ["calibrate"] if self.strategy in {"maxgap", "cbgroup"} else []
-        return [frames_by(law, "touch"), *grouping]
 
     def touch(self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int) -> Touch:
         """Touch of a located shell; started : when the frame began, ns."""

@@ -24,7 +24,6 @@ from hapticdb.pointshell.coverage import Ball, covering_radius, points_for
 from hapticdb.pointshell.inset import draw_inward
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
-from hapticdb.ready import make_ready
 
 MAX_POINTS = 10_000_000
 """Greatest number of points of a shell."""
@@ -241,7 +240,6 @@ class PointShell:
         inset: float,
         link: str,
     ) -> "PointShell":
-        make_ready("shell")
         surface = orient(triangles)
         n_points = DEFAULT_POINTS if points is None else points
         if spacing is not None:

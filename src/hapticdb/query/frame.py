@@ -12,14 +12,12 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
-from hapticdb.kernels.compiling import entries_for, load
 from hapticdb.kernels.field import lattice, packing
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
 from hapticdb.query.known_objects import KnownObjects
-from hapticdb.query.law import PLANE, ForceLaw, frames_by
+from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.query.touches import Query, Touch
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Keys, Rows, Store, row_shift
 from hapticdb.store.covering import Ranges
 from hapticdb.store.filtering import ALL, Filter
@@ -49,9 +47,6 @@ Group = Callable[[Keys, bool], Ranges]
 class Form(Protocol):
     """Another form of a frame's query: a strategy of `hapticdb.paper.strategies`."""
 
-    def purposes(self, law: ForceLaw) -> list[str]:
-        """Purposes (`kernels.compiling.PURPOSES`) of its kernels."""
-
     def touch(
         self, located: "contact.Located", exclude: Keys, law: ForceLaw, started: int
     ) -> Touch:
@@ -71,7 +66,6 @@ class HapticQuery:
         self.known = KnownObjects(store)
         least = getattr(store, "grouping_threshold", LEAST_GROUPED)
         self._least_grouped = math.inf if least is None else least
-        self._ready: dict[tuple[Form | None, type], bool] = {}
         self.grid = store.grid.for_kernels(row_shift(store.layout))
 
     def touch(
@@ -109,8 +103,6 @@ class HapticQuery:
     ) -> Touch:
         """Look a shell up in a snapshot, whose objects are loaded first."""
         known = self.known
-        if known.version is None:  # the first frame: kernels may have to be compiled
-            self._get_ready(form, self.law_now(law))
         with self._store.snapshot():
             chosen = known.law_of_newest(law)
             return self._frame(shell, pose, form, known.left_out(felt), chosen)
@@ -128,16 +120,13 @@ class HapticQuery:
         self, shell: "PointShell", pose: ArrayLike, form: Form | None, exclude: Keys, law: ForceLaw
     ) -> Touch:
         """Look a shell up; the result names the objects that are known."""
-        reads = self._ready.get((form, type(law.for_kernels)))
-        if reads is None:
-            reads = self._get_ready(form, law)
+        reads = laws.reads_distances(law.for_kernels)
         started = time.perf_counter_ns()
         located = locate(shell, pose, self.grid)
         if form is not None:
             return form.touch(located, exclude, law, started)
         keys, ranges = located.keys, None
         if len(keys) >= self._least_grouped and self._group is not None:
-            make_ready("calibrate")
             ranges = self._group(keys, reads)  # by this frame alone, not by frames before it
         if ranges is None or KEYS_PER_RANGE * len(ranges.lows) > len(keys):
             rows = self._store.lookup(keys, distances=reads)
@@ -147,15 +136,6 @@ class HapticQuery:
             asked = ("cbgroup", 1, len(ranges.lows), len(rows.keys))
         payload = self.distances_of(rows, keys) if reads else None
         return self.refined(located, rows, payload, exclude, law, asked, started)
-
-    def _get_ready(self, form: Form | None, law: ForceLaw) -> bool:
-        """Compile and load what frames of a form and a law call; whether they read distances."""
-        purposes = [frames_by(law, "touch")] if form is None else form.purposes(law)
-        make_ready(*purposes)
-        load(entries_for(*purposes))
-        numbers = law.for_kernels
-        reads = self._ready[form, type(numbers)] = laws.reads_distances(numbers)
-        return reads
 
     def distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
         """Distances (R, 1000) of rows, unset beyond `keys`; UsageError without distances."""
@@ -212,7 +192,6 @@ class HapticQuery:
         """Every (point, object) pair (P, 2) of points of a frame that a law has felt."""
         reads = laws.reads_distances(law.for_kernels)
         law = law if reads else PLANE  # every law that reads none feels the objects of hits
-        make_ready(frames_by(law, "pairs"))
         payload = self.distances_of(rows, located.keys) if reads else None
         keys, ids, occupancy, _ = rows
         return refining.pairs_of_points(  # type: ignore[no-any-return]
@@ -223,7 +202,6 @@ class HapticQuery:
         self, shell: "PointShell", poses: NDArray[np.float64], exclude: Keys, law: ForceLaw
     ) -> Iterator[Touch]:
         """Touches at rigid poses (n, 4, 4); a statement for several counts at the first."""
-        make_ready(frames_by(law, "touch"))
         batch: list[contact.Located] = []
         n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
         for pose in poses:

@@ -112,8 +112,3 @@ def law_named(name: str, stiffness: float) -> TangentPlane | DistanceField:
 def reads_distances(law: ForceLaw | LawName) -> bool:
     """Whether a law, or the law of that name, reads distances to surfaces."""
     return law == DISTANCE.name or isinstance(law, DistanceField)
-
-
-def frames_by(law: ForceLaw | LawName, what: str = "frames") -> str:
-    """Purpose (`kernels.compiling.PURPOSES`) of what a law does: frames over resident cells."""
-    return f"{what} by distance" if reads_distances(law) else what

@@ -35,25 +35,25 @@ longer for a server that hangs."""
 class Order(NamedTuple):
     """What a process shall do, and in which surroundings.
 
-    work : function, as ``package.module:function``; purposes : of the kernels that are loaded
-    before the fork (`kernels.compiling.PURPOSES`), with the function's module; with none, `prepare`
-    alone loads the module; numbers : of the descriptors that it gets, or None where no process is
-    wanted yet; path, environment, most_files : as the process that gives the order has them.
+    work : function, as ``package.module:function``; with_kernels : whether the server loads
+    its module and that module's kernels before the fork; numbers : of the descriptors that it gets,
+    or None where no process is wanted yet; path, environment, most_files : as the process that
+    gives the order has them.
     """
 
     work: str
-    purposes: tuple[str, ...]
+    with_kernels: bool
     numbers: tuple[int, ...] | None
     path: list[str]
     environment: dict[str, str]
     most_files: tuple[int, int]
 
 
-def _order(work: str, purposes: Sequence[str], numbers: Sequence[int] | None) -> Order:
+def _order(work: str, numbers: Sequence[int] | None, *, with_kernels: bool) -> Order:
     """An order for a process with the surroundings of this one."""
     return Order(
         work,
-        tuple(purposes),
+        with_kernels,
         None if numbers is None else tuple(numbers),
         sys.path,
         dict(os.environ),
@@ -117,26 +117,25 @@ def _end() -> None:
     _server = None
 
 
-def prepare(work: str, purposes: Sequence[str]) -> None:
-    """Have the server load a function's module and the kernels of purposes, and go on here.
+def prepare(work: str, *, with_kernels: bool) -> None:
+    """Have the server load a function's module, or its kernels, too, and go on here.
 
-    Kernels that are not compiled yet are left out. To be called as soon as it is known that a
-    process will be started.
+    To be called as soon as it is known that a process will be started.
     """
     with _lock:
         try:
-            _known().channel.send(_order(work, purposes, None))
+            _known().channel.send(_order(work, None, with_kernels=with_kernels))
         except OSError:  # `start` tries again, and tells what is wrong
             _end()
 
 
 def start(
-    work: str, purposes: Sequence[str], streams: Sequence[int], numbers: Sequence[int]
+    work: str, streams: Sequence[int], numbers: Sequence[int], *, with_kernels: bool
 ) -> tuple[int, int]:
     """Start a process that runs a function.
 
-    work, purposes : as for `Order`; streams : descriptors of its standard input, output and errors;
-    numbers : more descriptors, which it has under the same numbers.
+    work, with_kernels : as for `Order`; streams : descriptors of its standard input, output and
+    errors; numbers : more descriptors, which it has under the same numbers.
 
     Returns its process id, and a descriptor that stands for it.
 
@@ -147,7 +146,7 @@ def start(
     HapticDBError
         If the server does not answer.
     """
-    wanted = _order(work, purposes, numbers)
+    wanted = _order(work, numbers, with_kernels=with_kernels)
     folder = os.open(".", os.O_PATH)
     try:
         number, standing = _answered(wanted, [*streams, folder, *numbers])
@@ -213,8 +212,8 @@ def _serve(channel: Channel, owning: int) -> None:
                 wanted, descriptors = channel.receive()
             except (EOFError, OSError):
                 return
-            if wanted.purposes or wanted.numbers is None:
-                _load(wanted.work, wanted.purposes, compiles=wanted.numbers is not None)
+            if wanted.with_kernels or wanted.numbers is None:
+                _load(wanted.work, with_kernels=wanted.with_kernels)
             if wanted.numbers is None:
                 continue
             try:
@@ -229,15 +228,13 @@ def _serve(channel: Channel, owning: int) -> None:
                 os.close(received)
 
 
-def _load(work: str, purposes: Sequence[str], *, compiles: bool) -> None:
-    """Load a function's module and kernels; the process itself tells what cannot be loaded."""
+def _load(work: str, *, with_kernels: bool) -> None:
+    """Load a function's module, and kernels; the process itself tells what cannot be loaded."""
     with contextlib.suppress(Exception):
         import_module(work.partition(":")[0])
-        compiling = import_module("hapticdb.kernels.compiling")
-        names = compiling.entries_for(*purposes)
-        if compiles or not compiling.missing(names):
-            compiling.load(names)
-            gc.freeze()  # collections in copies leave these pages shared
+        if with_kernels:
+            import_module("hapticdb.kernels._jit").load_entries()
+        gc.freeze()  # collections in copies leave these pages shared
 
 
 def _forked(wanted: Order, descriptors: list[int], owning: int) -> tuple[int, int]:

@@ -293,7 +293,7 @@ def empty_loop(
 
 def n_compiled() -> int:
     """Number of signatures of all kernels that have been compiled or loaded."""
-    return sum(len(entry.signatures) for entry in ENTRIES if hasattr(entry, "signatures"))
+    return sum(len(getattr(e.compiled, "signatures", ())) for e in ENTRIES.values())
 
 
 def work(request: LoopRequest, sender: MessageSender) -> None:

@@ -41,19 +41,19 @@ class Process:
         Argument of that function; picklable.
     descriptors : sequence of int
         File descriptors that the process inherits, under the same numbers.
-    purposes : sequence of str
-        What it calls kernels for (`kernels.compiling.PURPOSES`). It begins with them loaded, and
-        with the function's module; by default with neither.
+    with_kernels : bool
+        Whether it begins with the function's module and its kernels loaded.
     """
 
     def __init__(
-        self, work: str, request: object, descriptors: Sequence[int], purposes: Sequence[str] = ()
+        self, work: str, request: object, descriptors: Sequence[int], *, with_kernels: bool = False
     ) -> None:
         content = pickle.dumps(request)
         sock, theirs = socket.socketpair()
         channel = self._channel = Channel(sock)
         try:
-            self.pid, self._standing = start(work, purposes, [theirs.fileno(), 2, 2], descriptors)
+            streams = [theirs.fileno(), 2, 2]
+            self.pid, self._standing = start(work, streams, descriptors, with_kernels=with_kernels)
         except BaseException:
             channel.close()
             raise

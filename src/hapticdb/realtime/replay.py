@@ -8,13 +8,12 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import GridError, HapticDBError, UsageError
-from hapticdb.kernels.compiling import build
+from hapticdb.kernels._machine_code import build
 from hapticdb.kernels.hand.near_points import FAR, LONGEST_REST
 from hapticdb.kernels.records import FRAME, SEAT, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import LISTED, VERSION
 from hapticdb.poses import poses_of
 from hapticdb.query.law import reads_distances
-from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.coupling import radius_of
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.tracking import Wish
@@ -84,13 +83,6 @@ class Replayed:
         )
 
 
-def purposes_of(recording: Recording) -> list[str]:
-    """What a replay calls kernels for."""
-    header = recording.header
-    by_law = session_purposes(header.rendering, reads_distances=reads_distances(header.law))
-    return ["resident", by_law[-1]]
-
-
 def replay(recording: Recording, environment: Environment) -> Replayed:
     """Run the session's kernel over the recorded hand, all cells in memory, and compare outputs.
 
@@ -118,7 +110,6 @@ def replay(recording: Recording, environment: Environment) -> Replayed:
             f"{recording.path} was recorded on {header.grid.describe()}, and {environment.url} "
             f"has {environment.grid.describe()}: give the environment of {header.environment}"
         )
-    make_ready(*purposes_of(recording))
     with CellTable.create(distances=reads_distances(header.law)) as table:
         residency = Residency(environment.store, table, header.exclude, where=header.where)
         again = _Again(recording, residency, table)

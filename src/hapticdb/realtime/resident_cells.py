@@ -14,7 +14,6 @@ from hapticdb.grid import Grid
 from hapticdb.kernels.records import FIGURES
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw
-from hapticdb.ready import make_ready
 from hapticdb.realtime.coupling import DirectRendering, SettledCoupling
 from hapticdb.realtime.fetching import FetchRequest, Wrap
 from hapticdb.realtime.fork_server import prepare
@@ -27,7 +26,7 @@ from hapticdb.store.filtering import Filter
 from hapticdb.store.finding import Words
 from hapticdb.store.urls import redact
 
-FETCH, PURPOSES = "hapticdb.realtime.fetching:fetch", ("resident",)
+FETCH = "hapticdb.realtime.fetching:fetch"
 """What a fetching process runs, and what it calls kernels for."""
 START_PATIENCE = 60.0
 """Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
@@ -128,9 +127,8 @@ class ResidentCells(Closes):
     ) -> None:
         self.url = url
         self.filter = Filter(where, exclude)
-        prepare(FETCH, PURPOSES)  # while the environment is read
+        prepare(FETCH, with_kernels=True)  # while the environment is read
         self.grid, has_distances = self._read_environment(distances)
-        make_ready(*PURPOSES)  # now: two processes would each compile them
         self.table = CellTable.create(budget_bytes, distances=has_distances)
         self.restarts = 0
         self._request = FetchRequest(url, self.table, self.grid, self.filter, wrap)
@@ -174,7 +172,7 @@ class ResidentCells(Closes):
             store.close()
 
     def _begun(self) -> Process:
-        return Process(FETCH, self._request, [self.table.descriptor], PURPOSES)
+        return Process(FETCH, self._request, [self.table.descriptor], with_kernels=True)
 
     def __del__(self) -> None:
         with suppress(Exception):

@@ -14,7 +14,6 @@ from hapticdb.devices.protocol import Device, check_device
 from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
-from hapticdb.ready import make_ready, session_purposes
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import (
     Coupling,
@@ -195,8 +194,6 @@ class Session(Closes):
         staleness: float,
         seconds: float | None,
     ) -> None:
-        purposes = session_purposes(self.rendering, reads_distances=reads_distances(self.law))
-        make_ready(*purposes)  # here, so that the loop does not compile
         table = self.cells.table
         if self._recording is not None:
             self._recording.open()
@@ -224,7 +221,7 @@ class Session(Closes):
             "hapticdb.realtime.loop:work",
             request,
             [table.descriptor, board.descriptor],
-            purposes,
+            with_kernels=True,
         )
         table.desk.pids[self._row] = self._process.pid
         start = self._process.await_ready("loop's", START_PATIENCE)

@@ -6,7 +6,7 @@ import json
 import logging
 import secrets
 import socket
-from collections.abc import Awaitable, Callable
+from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError
 from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, line
@@ -31,8 +31,7 @@ class PageKeeper:
     work : function of the process, as `Process` takes it; it sends ``ready`` with its port.
     request : makes the request of a process, of its sockets to the server and to the host, and of
     the secret that the server's connections show. serve_host : takes the socket at whose other end
-    the page begins its sessions. prepare : compiles what hands call; the page asks for it when
-    somebody first takes a tool in hand.
+    the page begins its sessions.
     """
 
     def __init__(
@@ -40,11 +39,8 @@ class PageKeeper:
         work: str,
         request: Callable[[int, int, str], object],
         serve_host: Callable[[socket.socket], None],
-        prepare: Callable[[], Awaitable[None]],
     ) -> None:
         self._work, self._request, self._serve_host = work, request, serve_host
-        self._prepare = prepare
-        self._preparing: asyncio.Task[None] | None = None
         self._process: Process | None = None
         self._writer: asyncio.StreamWriter | None = None
         self._reader: asyncio.StreamReader | None = None
@@ -128,18 +124,6 @@ class PageKeeper:
         if self._writer is not None:
             self._writer.write(line(word, text))
 
-    def prepare(self) -> None:
-        """Compile what hands call, and tell the page when they may begin."""
-        self._preparing = asyncio.create_task(self._prepared())
-
-    async def _prepared(self) -> None:
-        try:
-            await self._prepare()
-        except (HapticDBError, OSError) as error:
-            # then each session compiles what it needs
-            LOG.error("kernels cannot be compiled ahead: %s", error)  # noqa: TRY400 - says all
-        self.tell("prepared")
-
     async def answers(self) -> bool:
         """Whether the page answers now."""
         if not self.is_ready:
@@ -167,8 +151,6 @@ class PageKeeper:
                 match json.loads(received)["word"]:
                     case "pong":
                         self._has_answered.set()
-                    case "prepare":
-                        self.prepare()
                     case "refused":
                         LOG.warning("a connection to the page went round the server: closed")
 

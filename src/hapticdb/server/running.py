@@ -13,7 +13,6 @@ import uvicorn
 
 from hapticdb.errors import UsageError
 from hapticdb.hosting.host import SessionHost
-from hapticdb.hosting.preparing import Preparation
 from hapticdb.page.connection import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
@@ -64,15 +63,13 @@ async def run(
     serving: Serving,
     ready: Callable[[int], None],
     stop: asyncio.Event,
-    note: Callable[[str], None] = lambda _: None,
 ) -> None:
     """Serve until `stop` is set; then end in order, so that no recording is lost.
 
     First no connection is taken any more and browsers are told to go; then the page ends its
     sessions; then the host ends those that are left and finishes their recordings.
 
-    ready : called with the port when browsers can come; stop : set when the server shall end;
-    note : called with a line of words on how far the compiling of what hands call is.
+    ready : called with the port when browsers can come; stop : set when the server shall end.
     """
     check(serving)
     page = await asyncio.to_thread(client_page, serving.title)
@@ -83,17 +80,11 @@ async def run(
         host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
         ends.push_async_callback(asyncio.to_thread, host.close)
 
-        preparation = Preparation(
-            ("host", "shell"), note, lambda text: keeper.tell("preparing", text)
-        )
         served = Served(access, serving.limits, Figures(), host)
         served.figures.add(HostCollector(host))
-        keeper = PageKeeper(
-            serving.page, partial(_page_request, serving), host.serve, preparation.done
-        )
+        keeper = PageKeeper(serving.page, partial(_page_request, serving), host.serve)
         served.figures.page_starts.set_function(lambda: keeper.n_starts)
         ends.push_async_callback(keeper.stop)
-        ends.callback(preparation.close)
         if not await _unless(stop, keeper.start()):
             return
         keeping = asyncio.create_task(keeper.keep())

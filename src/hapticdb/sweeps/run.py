@@ -18,7 +18,6 @@ from hapticdb.mesh import Part
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.ready import make_ready
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 from hapticdb.sweeps.contact import Contact
@@ -88,7 +87,6 @@ def sweep(
         If a word chooses no object; if an object's surface is not in the database.
     """
     asked = _Asked(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
-    make_ready("sweep")
     tool = MovingSurface(shell)
     way = Way.of(poses, tool.corners, center_of(tool, about))
     with suppress(ConnectionLostError):

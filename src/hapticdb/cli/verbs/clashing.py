@@ -162,7 +162,6 @@ def clashes(
             raise UsageError("--poses and --turn take --of, and no --html, --seconds, --on")
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
-    render.compile_kernels(*(["clashes"] if on is None else []))
     from hapticdb.clashes.run import find_clashes
 
     with (
@@ -228,7 +227,6 @@ def _meetings(
     center = None
     if about is not None:
         center = [MM * x for x in numbers_of(about, 3, "--about", "X,Y,Z in millimetres")]
-    render.compile_kernels("sweep", "clashes")
     with (
         hapticdb.open(url, read_only=True) as env,
         render.bar("moving", "objects") as progress,

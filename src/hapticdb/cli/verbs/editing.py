@@ -54,7 +54,6 @@ def move(
             raise UsageError(
                 f"--matrix places one object, and {len(found)} are chosen: give one, or --translate"
             )
-        render.compile_kernels("move")
         with left_at(
             f"all that was chosen has moved, or nothing: see 'hapticdb objects {env.url}'"
         ):

@@ -176,7 +176,6 @@ def extract(
         ids = ids_of(env, parts, "PART")
         felt = felt_objects(env, where, exclude, ids)
         kept = ids_of(env, keep, "--keep") if keep else []
-        render.compile_kernels("extract")
         with render.bar("pulling", "searches" if on else "pulls") as progress:
             options |= {"where": felt.where, "progress": progress}
             if disassemble:

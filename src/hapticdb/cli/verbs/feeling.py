@@ -30,7 +30,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import compile_for, shell_of, warn_of_size
+from hapticdb.cli.tools import check_there, shell_of, warn_of_size
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
@@ -197,13 +197,13 @@ def feel(
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
-    chosen_rendering, kernels = _begin_loop(law, rendering, processor, frames_on)
+    chosen_rendering = _begin_loop(law, rendering, processor, frames_on)
     profile = None if device_profile is None else profile_named(device_profile)
     chosen, coupling = law_and_coupling(law, chosen_rendering, stiffness, cap, delay, profile)
     limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
-    compile_for(tool, *kernels)
+    check_there(tool)
     drawn_in = partial(_shell, tool, tool_unit, points, seed, device)
     felt, shell = _looked_at(url, where, exclude, drawn_in, law or "distance", not conservative)
     session_page.tell_cost(len(shell), rate, law or "distance", frames_on)
@@ -280,10 +280,9 @@ def _begin_loop(
     rendering: RenderingName | None,
     processor: int | None,
     frames_on: FramesOn,
-) -> "tuple[Rendering, list[str]]":
-    """Load kernels in the fork server, check the loop; returns rendering and kernels' purposes."""
+) -> "Rendering":
+    """Load kernels in the fork server, check the loop; returns the rendering."""
     from hapticdb.query.law import DISTANCE, as_law
-    from hapticdb.ready import session_purposes
     from hapticdb.realtime.coupling import rendering_of
 
     chosen = rendering_of(rendering, as_law(law) or DISTANCE)
@@ -291,14 +290,13 @@ def _begin_loop(
         from hapticdb.realtime.on_gpu import check_frames
 
         check_frames(frames_on, chosen)
-    purposes = session_purposes(chosen, reads_distances=law != "plane")
-    prepare("hapticdb.realtime.loop:work", ["resident", *purposes])
+    prepare("hapticdb.realtime.loop:work", with_kernels=True)
 
     with render.bar("loading", ""):
         from hapticdb.realtime.timing import Timing
 
     Timing(processor=processor)
-    return chosen, purposes
+    return chosen
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:

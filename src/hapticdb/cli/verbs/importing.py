@@ -196,7 +196,6 @@ def _imported(
             "--chord changes nothing: it is for STEP files, and the triangles of others are kept"
         )
     with left_at("what went in is whole, and the same command goes on from there"):
-        render.compile_kernels("import", files=files)
         started = time.perf_counter()
         with render.import_bar() as progress:
             reports = import_files(url, files, options, progress)

@@ -43,7 +43,6 @@ def check(
     """
     from hapticdb.check import repair_environment
 
-    render.compile_kernels("copy", *(["move"] if repair else []))
     report = _read(url)
     if repair and report.is_mendable:
         render.note(

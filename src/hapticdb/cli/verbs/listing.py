@@ -243,7 +243,6 @@ def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
 
     with opened_to_keep(url) as env:
         is_kept = not env.store.is_read_only
-        render.compile_kernels("calibrate")
         if is_kept:
             with suppress(AccessError):  # a role may keep costs only
                 env.analyze()

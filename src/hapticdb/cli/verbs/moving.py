@@ -44,10 +44,11 @@ def copy(
     """
     from hapticdb.transfer import copy_environment
 
-    with left_at("what went over is whole, and the same command goes on from there"):
-        render.compile_kernels("copy")
-        with render.bar("copying", "objects") as progress:
-            report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
+    with (
+        left_at("what went over is whole, and the same command goes on from there"),
+        render.bar("copying", "objects") as progress,
+    ):
+        report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
     if json:
         render.say_json(vars(report))
     else:
@@ -88,7 +89,6 @@ def diff(
     """
     from hapticdb.difference import diff_environments
 
-    render.compile_kernels("copy")
     with render.bar("comparing", "rows") as progress:
         difference = diff_environments(a, b, progress=progress)
     record = _record(difference)

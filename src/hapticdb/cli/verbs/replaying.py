@@ -76,7 +76,6 @@ def replay(
 def _replayed(session: "Recording", url: str | None) -> "Replayed":
     """Run a recording's frames again."""
     import hapticdb
-    from hapticdb.realtime.replay import purposes_of
 
     place: str | Path
     if url is None:
@@ -85,7 +84,6 @@ def _replayed(session: "Recording", url: str | None) -> "Replayed":
     else:
         place = url
     with hapticdb.open(place, read_only=True) as env:
-        render.compile_kernels(*purposes_of(session))
         return hapticdb.replay(session, env)
 
 

@@ -28,27 +28,6 @@ def sample(folder: FolderArgument, *, frames: FramesOption = 1000) -> None:
         render.say(str(path))
 
 
-def warm() -> None:
-    """Compile every kernel that this machine has not compiled yet, so that no verb has to.
-
-    Half a minute on two processors; kept in the user's cache folder until
-    another version of hapticdb or numba is installed.
-
-    Example: hapticdb warm
-    """
-    from time import perf_counter
-
-    from hapticdb.kernels.compiling import entries_for
-
-    started = perf_counter()
-    n_compiled = render.compile_kernels("everything")
-    total = len(entries_for("everything"))
-    elapsed = perf_counter() - started
-    render.say(
-        f"{render.counted(total, 'kernel')} ready: {n_compiled} compiled now, in {elapsed:.1f} s"
-    )
-
-
 def demo(
     folder: FolderArgument = Path("demo"),
     *,
@@ -67,7 +46,6 @@ def demo(
     from hapticdb.demo import compare, prepare
     from hapticdb.pictures.demo import draw
 
-    render.compile_kernels("demo")
     render.note(f"writing the sample into {folder}, importing it in both layouts ...")
     with render.import_bar() as progress:
         scene = prepare(folder, bits=bits, frames=frames, points=points, progress=progress)

@@ -247,7 +247,7 @@ def _run(
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")
     served.check(serving)
-    prepare(served.PAGE, [])  # loads while the server does here
+    prepare(served.PAGE, with_kernels=False)  # loads while the server does here
     from hapticdb.server import logs, running
 
     if not served.is_near(serving.host) and serving.certificate is None:
@@ -268,7 +268,7 @@ def _run(
                 loop.call_later(seconds, stop.set)
 
         with ended_by_signals(lambda: loop.call_soon_threadsafe(stop.set)) as signals:
-            await running.run(serving, begun, stop, render.note)
+            await running.run(serving, begun, stop)
         return signals
 
     level = logging.WARNING if is_quiet else logging.INFO

@@ -183,8 +183,6 @@ def sweep(
     asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
         jobs = [_job(env, each, path_unit) for each in asked]
-        tools = [each.tool for each in asked if each.tool]
-        render.compile_kernels("sweep", files=tools if len(tools) == len(asked) else [])
         if batch is not None:
             raise typer.Exit(_run_batch(env, jobs, options, json=json))
         told = _swept(env, jobs[0], options)

@@ -124,7 +124,7 @@ def touch(
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
-    from hapticdb.query.law import frames_by, inset_of
+    from hapticdb.query.law import inset_of
 
     plane, distance = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
     path, opened = _path_of(poses, path_unit, out, on), partial(hapticdb.open, url, read_only=True)
@@ -132,7 +132,6 @@ def touch(
         name: LawName = law or ("distance" if env.has_distances else "plane")
         chosen: ForceLaw = distance if name == "distance" else plane
         felt = felt_objects(env, where, exclude)
-        render.compile_kernels("shell", frames_by(name, "frames" if out else "touch"), files=[tool])
         reach = inset_of(env.grid.voxel_size, name)
         shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
         warn_of_size(env, shell, felt.left_out)

@@ -44,7 +44,6 @@ class TouchPanel:
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._shown_at = 0.0
-        self._waits_for = ""
         may_touch = browser.visitor.may("toucher")
         self._reading = gui.add_html(
             self._reading_html(0.0, 0.0, [], "The tool is being made ready.", is_held=may_touch)
@@ -145,12 +144,6 @@ class TouchPanel:
         if hasattr(self, "_place"):
             for field, value in zip(self._place, self._browser.hand[:3].tolist(), strict=True):
                 put(field, round(value, field.precision))
-
-    def show_wait(self, text: str) -> None:
-        """Show what the session waits for, instead of a force."""
-        if text and text != self._waits_for:
-            self._waits_for = text
-            self._reading.content = self._reading_html(0.0, 0.0, [], text, is_held=True)
 
     def show_parts(self, n_waiting: int, n_parts: int) -> None:
         """Show how many parts have come, until all have."""

@@ -1,0 +1,122 @@
+"""All entries compiled side by side into a set (`_machine_code`): the build hook's work.
+
+numba compiles one function at a time in a process, with any number of threads. Each process takes
+whole modules, whose entries share leaves.
+"""
+
+import fcntl
+import importlib
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+
+from hapticdb.kernels._machine_code import (
+    BUILDING,
+    built_for,
+    digest_of,
+    level,
+    manifest_of,
+)
+
+LONGEST = (
+    *("period.loop", "query.refining", "resident.feeling"),
+    *("triangles.nearest", "surfaces.distances", "triangles.sweeping"),
+)
+"""Modules whose entries take longest to compile, which come first: 13 s to 2 s of 50."""
+PATIENCE = 1200.0
+"""Seconds after which processes that compile are ended. Larger: a slower machine may compile."""
+MOST_SETS = 10
+"""Sets that are kept in a folder, the newest ones: 6 MB each."""
+SERVE = "from hapticdb.kernels._building import serve; serve()"
+"""Python code that a compiling process runs."""
+
+
+def build_set(folder: Path) -> None:
+    """Compile all entries into a folder, which is there when it is complete, or not at all.
+
+    Raises OSError if that cannot be done here. A second process waits for the first one.
+    """
+    folder.parent.mkdir(parents=True, exist_ok=True)
+    with folder.with_name(f"{folder.name}.lock").open("w") as lock:
+        fcntl.flock(lock, fcntl.LOCK_EX)
+        if manifest_of(folder).get("for") == built_for():
+            return
+        made = Path(tempfile.mkdtemp(prefix=folder.name, dir=folder.parent))
+        try:
+            _compile_into(made)
+            entries = {file.name: digest_of(file.read_bytes()) for file in made.iterdir()}
+            manifest = json.dumps({"for": built_for(), "entries": entries}, indent=1)
+            (made / "manifest.json").write_text(manifest)
+            shutil.rmtree(folder, ignore_errors=True)
+            made.rename(folder)
+        finally:
+            shutil.rmtree(made, ignore_errors=True)
+        sets = sorted(folder.parent.glob("kernels-*[!k]"), key=lambda one: one.stat().st_mtime)
+        for old in sets[:-MOST_SETS]:
+            shutil.rmtree(old, ignore_errors=True)
+
+
+def _modules() -> list[str]:
+    """Modules that define entries, those of `LONGEST` first."""
+    folder = Path(__file__).parent
+    found = {
+        ".".join(source.relative_to(folder).with_suffix("").parts)
+        for source in folder.rglob("[a-z]*.py")
+        if re.search(r"^@entry\(", source.read_text(), re.MULTILINE)
+    }
+    return [*LONGEST, *sorted(found.difference(LONGEST))]
+
+
+def _compile_into(folder: Path) -> None:
+    """Compile all entries in a process for each processor; OSError if one fails.
+
+    They take the numbers of modules, a byte each, from one pipe.
+    """
+    modules, known = _modules(), level()
+    asked, ask = os.pipe()
+    os.write(ask, bytes(range(len(modules))))
+    os.close(ask)
+    env = {name: value for name, value in os.environ.items() if not name.startswith("NUMBA_")}
+    env |= {
+        BUILDING: str(folder),
+        "NUMBA_CPU_NAME": known.cpu,
+        "NUMBA_CPU_FEATURES": known.features,
+    }
+    # the package is found in the same place as here, in any working folder
+    env["PYTHONPATH"] = os.pathsep.join([str(Path(__file__).parents[2]), *sys.path])
+    workers: list[subprocess.Popen[bytes]] = []
+    until = time.monotonic() + PATIENCE
+    try:
+        for _ in range(os.cpu_count() or 1):
+            worker = subprocess.Popen(  # noqa: S603 - this interpreter, this package
+                [sys.executable, "-c", SERVE, str(os.getpid()), *modules],
+                stdin=asked,
+                stdout=subprocess.DEVNULL,
+                env=env,
+                start_new_session=True,  # the parent handles Ctrl-C and ends this process
+            )
+            workers.append(worker)
+        if any(worker.wait(until - time.monotonic()) for worker in workers):
+            raise OSError("a process that compiles has failed: its errors are above")
+    except subprocess.TimeoutExpired as error:
+        raise OSError(f"compiling was not done after {PATIENCE:g} s") from error
+    finally:
+        for worker in workers:
+            worker.kill()
+            worker.wait()
+        os.close(asked)
+
+
+def serve() -> None:
+    """Run a compiling process; its arguments are its parent and the modules."""
+    parent = int(sys.argv[1])
+    while (number := os.read(0, 1)) and os.getppid() == parent:
+        module = sys.argv[2 + number[0]]
+        importlib.import_module(f"hapticdb.kernels.{module}")
+        importlib.import_module("hapticdb.kernels._jit").load_entries(module)

@@ -1,0 +1,72 @@
+"""Occupancies of bricks packed without loss: only bytes that are not 0, behind a mask of them.
+
+Bit n of a mask of 64 bits, 8 bytes, the lowest of each byte first, is 1 where byte n of the
+occupancy is not 0; then come these bytes in order. Byte n is a cube of 2 x 2 x 2 voxels, so a
+surface through a brick meets about 16 of the 64, which takes 24 bytes. An SQL expression finds the
+bit of a voxel by counting the bits of the mask before it.
+
+Bricks follow one another without lengths: a mask says how many bytes follow it. A mask of zeros
+alone is a brick without a voxel, of which nothing is stored.
+"""
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels._jit import BYTES, READ_BYTES, entry
+from hapticdb.kernels.bits import lowest_bit
+
+BYTES_OF_BRICK = 64
+"""Bytes of an occupancy: a bit for each voxel."""
+MASK_BYTES = BYTES_OF_BRICK // 8
+"""Bytes of a mask."""
+
+
+@entry(READ_BYTES, BYTES)
+def unpack_kernel(data, out):
+    """Unpack bricks, one after the other, into out (64 R,), which is zero -> bytes read, or -1.
+
+    -1 where data (n,) ends before the last brick does.
+    """
+    at, end = np.int64(0), data.shape[0]
+    for first in range(0, out.shape[0], BYTES_OF_BRICK):
+        follow = at + MASK_BYTES
+        if follow > end:
+            return np.int64(-1)
+        for n in range(MASK_BYTES):
+            mask = np.int64(data[at + n])
+            while mask:
+                if follow == end:
+                    return np.int64(-1)
+                out[first + 8 * n + lowest_bit(mask)] = data[follow]
+                follow += 1
+                mask &= mask - 1
+        at = follow
+    return at
+
+
+def pack(occupancy: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
+    """Pack occupancies (64 R,) -> packed bytes (n,), and where each brick ends in them (R,).
+
+    A brick without a voxel has no bytes.
+    """
+    bricks = occupancy.reshape(-1, BYTES_OF_BRICK)
+    is_held = bricks != 0
+    masks = np.packbits(is_held, axis=1, bitorder="little")
+    is_stored = np.hstack([np.repeat(is_held.any(axis=1)[:, None], MASK_BYTES, axis=1), is_held])
+    ends = np.cumsum(is_stored.sum(axis=1, dtype=np.int64))
+    return np.hstack([masks, bricks])[is_stored], ends
+
+
+def unpack(data: bytes, n_bricks: int) -> NDArray[np.uint8]:
+    """Unpack bricks, each with its mask: occupancies (64 R,), read-only.
+
+    Raises
+    ------
+    ValueError
+        If these are not the bytes of so many bricks.
+    """
+    out = np.zeros(BYTES_OF_BRICK * n_bricks, np.uint8)
+    if unpack_kernel(np.frombuffer(data, np.uint8), out) != len(data):
+        raise ValueError(f"{len(data)} bytes are not {n_bricks} bricks")
+    out.flags.writeable = False
+    return out

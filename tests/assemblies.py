@@ -124,7 +124,7 @@ def voxel_set(ijk: NDArray[np.int64]) -> set[Voxel]:
     return found
 
 
-TABLES = ("environment", "object", "voxel", "brick", "band", "surface", "change", "quantile")
+TABLES = ("environment", "object", "voxel", "brick", "surface", "change", "quantile")
 
 
 def rows_of(database: Path, *tables: str) -> Rows:

@@ -75,8 +75,8 @@ CRAFTED = {
     ),
 }
 OF_BRICKS = {
-    "an empty brick": "UPDATE brick SET occupancy = zeroblob(64) WHERE id = 2",
-    "other bricks": f"UPDATE brick SET occupancy = x'{'0f' * 64}' WHERE id = 2",
+    "an empty brick": "UPDATE brick SET occupancy = zeroblob(8) WHERE id = 2",
+    "other bricks": f"UPDATE brick SET occupancy = x'{'ff' * 8}{'0f' * 64}' WHERE id = 2",
     "a brick cut short": "UPDATE brick SET occupancy = zeroblob(3) WHERE id = 2",
     "a brick of text": "UPDATE brick SET occupancy = 'x' WHERE id = 2",
 }

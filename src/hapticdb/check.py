@@ -1,6 +1,7 @@
 """Checks whether an environment is sound: what is stored against what it derives from."""
 
 import os
+from collections import defaultdict
 from collections.abc import Iterator
 from contextlib import closing
 from dataclasses import dataclass, field, replace
@@ -17,8 +18,10 @@ from hapticdb.ingest.moving import rewrite_object
 from hapticdb.ingest.placement import OTHER_BOUNDS, placement_faults
 from hapticdb.kernels import curves
 from hapticdb.kernels.field import packing
+from hapticdb.kernels.surfaces import voxelize
 from hapticdb.store.base import (
     BRICK_BYTES,
+    Band,
     Change,
     Keys,
     Object,
@@ -34,14 +37,10 @@ from hapticdb.store.engines import DropsRows
 from hapticdb.store.pairs import PairRow
 from hapticdb.store.parsing import Checksum
 
-ROWS_AT_ONCE = 1 << 17
-"""Rows that are read at a time. A larger value takes more memory and hardly less time."""
-BAND_ROWS_AT_ONCE = 1 << 14
-"""Rows of distances that are read at a time; 1,000 bytes each when they are unpacked."""
+ROWS_AT_ONCE = 1 << 14
+"""Rows that are read at a time; 1,000 bytes each when their distances are unpacked."""
 MOST_FINDINGS = 1000
 """Most findings that a report keeps. The report counts all findings."""
-BITS = np.array([byte.bit_count() for byte in range(256)], dtype=np.uint8)
-"""Number of set bits of each byte."""
 
 
 @dataclass
@@ -169,7 +168,6 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
         for finding in chain(
             _log_findings(store, objects),
             _row_findings(store, objects, report, progress),
-            _band_findings(store, objects, report),
             _surface_findings(store, objects, report),
         ):
             report.add(finding)
@@ -217,19 +215,39 @@ def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
 # -- rows ----------------------------------------------------------------------------------------
 
 
+class _Sum:
+    """Voxels and checksums of an object, from the rows read so far."""
+
+    def __init__(self) -> None:
+        self.voxels = self.voxels_measured = self.rows_measured = 0
+        self.rows, self.distances = Checksum(), Checksum()
+
+    def add(self, rows: Rows) -> None:
+        """Add rows of the object: voxels, or bricks with distances."""
+        held, measured = rows.occupied(), rows.measured()
+        self.voxels += _voxels_of(held)
+        self.voxels_measured += _voxels_of(measured)
+        self.rows_measured += len(measured)
+        self.rows.add(held)
+        self.distances.add(measured)
+
+
+def _voxels_of(rows: Rows) -> int:
+    return voxelize.count_voxels(rows.occupancy) if rows.occupancy.size else len(rows)
+
+
 class _Sums:
-    """Voxels and checksum of each object, from the rows read so far."""
+    """Sums of each object, from the rows read so far."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
-        self.voxels: dict[int, int] = {}
-        self.checksums: dict[int, Checksum] = {}
+        self.of: defaultdict[int, _Sum] = defaultdict(_Sum)
         self.disorder: str | None = None
 
-    def batches(self, at_once: int, *, distances: bool = False) -> Iterator[Rows]:
+    def batches(self) -> Iterator[Rows]:
         """All rows, added to the sums; ends where they are in `disorder`."""
         key, object_id = -1, 0
-        for rows in all_rows(self._store, at_once, distances=distances):
+        for rows in all_rows(self._store, ROWS_AT_ONCE):
             if not is_ascending(np.append(key, rows.keys), np.append(object_id, rows.ids)):
                 self.disorder = f"after key {key} are not in order"
                 return
@@ -237,22 +255,12 @@ class _Sums:
             self._add(rows)
             yield rows
 
-    def value(self, obj: Object) -> int:
-        """Checksum of an object's rows."""
-        return self.checksums.get(obj.id, Checksum()).value()
-
     def _add(self, rows: Rows) -> None:
-        if rows.occupancy.size:
-            counts = BITS[rows.occupancy].reshape(-1, BRICK_BYTES).sum(axis=1, dtype=np.int64)
-        else:
-            counts = np.ones(len(rows), np.int64)
         order = np.argsort(rows.ids, kind="stable")
         ids = rows.ids[order]
         starts = np.flatnonzero(np.diff(ids, prepend=ids[0] - 1))
         for own in np.split(order, starts[1:]):
-            object_id = int(rows.ids[own[0]])
-            self.voxels[object_id] = self.voxels.get(object_id, 0) + int(counts[own].sum())
-            self.checksums.setdefault(object_id, Checksum()).add(rows.picked(own))
+            self.of[int(rows.ids[own[0]])].add(rows.picked(own))
 
 
 def _row_findings(
@@ -262,67 +270,52 @@ def _row_findings(
     progress: Progress | None,
 ) -> Iterator[str]:
     sums, places, total = _Sums(store), _Places(store, objects), store.size().rows
-    for rows in sums.batches(ROWS_AT_ONCE):
+    for rows in sums.batches():
         report.rows += len(rows)
         yield from places.findings(rows)
+        yield from _band_findings(rows.measured())
         if progress is not None:
             progress(min(report.rows, total), total)
     if sums.disorder:
         yield f"rows {sums.disorder}"
         return
-    report.voxels = sum(sums.voxels.values())
+    report.voxels = sum(one.voxels for one in sums.of.values())
     if report.rows != total:
         yield f"{report.rows:,} rows were read, and {total:,} counted"
-    report.strays = sorted(sums.voxels.keys() - objects.keys())
+    report.strays = sorted(sums.of.keys() - objects.keys())
     for missing in report.strays:
         yield f"rows of object {missing}, which is not there"
     for obj in objects.values():
-        found = sums.voxels.get(obj.id, 0)
-        is_other = sums.value(obj) != obj.rows_crc
-        if found != obj.voxels:
-            yield f"object {obj.id} ({obj.name}) has {found:,} voxels instead of {obj.voxels:,}"
-        if is_other:
-            yield f"object {obj.id} ({obj.name}): its rows are not those that were written"
-        if is_other or found != obj.voxels:
+        faults = list(_faults_of(obj, sums.of[obj.id]))
+        yield from (f"object {obj.id} ({obj.name}){fault}" for fault in faults)
+        if faults:
             report.wrong.append(obj.id)
 
 
-# -- distances ------------------------------------------------------------------------------------
+def _band_findings(rows: Rows) -> Iterator[str]:
+    """Distances that are no packed rows."""
+    assert rows.distances is not None  # noqa: S101 - of measured rows
+    try:
+        packing.unpack(*rows.distances)
+    except ValueError as error:
+        first, last = rows.keys[[0, -1]].tolist()
+        yield f"distances between keys {first} and {last}: {error}"
 
 
-def _band_findings(store: Store, objects: dict[int, Object], report: CheckReport) -> Iterator[str]:
-    """Distances that are damaged, missing, or of no object."""
-    sums = _Sums(store)
-    key_end = 1 << max(3 * store.grid.bits - row_shift(store.layout), 0)
-    for rows in sums.batches(BAND_ROWS_AT_ONCE, distances=True):
-        first, last = int(rows.keys[0]), int(rows.keys[-1])
-        if first < 0 or last >= key_end:
-            yield "distances of bricks outside the grid"
-        assert rows.distances is not None  # noqa: S101 - read with distances
-        try:
-            packing.unpack(*rows.distances)
-        except ValueError as error:
-            yield f"distances between keys {first} and {last}: {error}"
-    if sums.disorder:
-        yield f"distances {sums.disorder}"
+def _faults_of(obj: Object, found: _Sum) -> Iterator[str]:
+    """Faults of an object's rows."""
+    if found.voxels != obj.voxels:
+        yield f" has {found.voxels:,} voxels instead of {obj.voxels:,}"
+    if found.rows.value() != obj.rows_crc:
+        yield ": its rows are not those that were written"
+    if not obj.has_distances:
+        if found.rows_measured:
+            yield " has distances, and its record has none"
         return
-    for found in sorted(sums.checksums):
-        if found not in objects:
-            report.strays = sorted({*report.strays, found})
-            yield f"distances of object {found}, which is not there"
-        elif not objects[found].has_distances:
-            yield f"object {found} ({objects[found].name}) has distances, and its record has none"
-    for obj in objects.values():
-        if not obj.has_distances:
-            continue
-        lacks = sums.voxels.get(obj.id, 0) != obj.voxels
-        is_other = sums.value(obj) != obj.distances_crc
-        if lacks:
-            yield f"object {obj.id} ({obj.name}) has voxels in bricks without distances"
-        if is_other:
-            yield f"object {obj.id} ({obj.name}): its distances are not those that were written"
-        if (lacks or is_other) and obj.id not in report.wrong:
-            report.wrong.append(obj.id)
+    if found.voxels_measured != obj.voxels:
+        yield " has voxels in bricks without distances"
+    if found.distances.value() != obj.distances_crc:
+        yield ": its distances are not those that were written"
 
 
 # -- surfaces -------------------------------------------------------------------------------------
@@ -373,20 +366,19 @@ class _Places:
         outside = (rows.keys < 0) | (rows.keys >= self._key_end)
         if outside.any():
             yield f"key {int(rows.keys[outside][0])} lies outside the grid"
-        if self._is_brick:
-            yield from self._brick_findings(rows)
-        at = np.searchsorted(self._ids, rows.ids).clip(max=max(len(self._ids) - 1, 0))
-        known = ~outside & (self._ids[at] == rows.ids) if len(self._ids) else outside & False
-        low = self._voxels(rows.keys[known])
-        box = self._boxes[at[known]]
+        if rows.distances is not None:
+            yield from self._brick_findings(rows, rows.distances)
+        rows = rows.picked(np.flatnonzero(~outside & np.isin(rows.ids, self._ids))).occupied()
+        low = self._voxels(rows.keys)
+        box = self._boxes[np.searchsorted(self._ids, rows.ids)]
         size = (1 << BRICK_BITS) - 1 if self._is_brick else 0
         beside = ((low > box[:, 1]) | (low + size < box[:, 0])).any(axis=1)
-        for object_id in np.unique(rows.ids[known][beside]).tolist():
+        for object_id in np.unique(rows.ids[beside]).tolist():
             yield f"object {object_id}: rows of it lie outside its bounds"
 
-    def _brick_findings(self, rows: Rows) -> Iterator[str]:
+    def _brick_findings(self, rows: Rows, distances: Band) -> Iterator[str]:
         bricks = rows.occupancy.reshape(-1, BRICK_BYTES)
-        empty = ~bricks.any(axis=1)
+        empty = ~bricks.any(axis=1) & (distances.lengths == 0)
         if empty.any():
             yield f"brick {int(rows.keys[empty][0])} holds no voxel"
         if self._grid.bits < BRICK_BITS:  # the grid is smaller than a brick: its first voxels

@@ -12,12 +12,14 @@ from hapticdb.errors import DamagedError
 from hapticdb.grid import BRICK_BITS, Grid
 from hapticdb.ingest.geometry import unpacked_part
 from hapticdb.kernels import curves
-from hapticdb.store.base import BRICK_BYTES, Object, Progress, Rows, Store, all_rows
+from hapticdb.store.base import BRICK_BYTES, Band, Object, Progress, Rows, Store, all_rows
 from hapticdb.store.connect import open_store
 from hapticdb.transfer import Url, is_same_grid, part_of
 
 Pair = tuple[Object, Object]
 Hashes = NDArray[np.uint64]
+Sums = tuple[dict[int, int], dict[int, int]]
+"""Sums of hashes by object, of both environments."""
 ROWS_AT_ONCE = 1 << 14
 """Rows that are read at a time, 512 bytes each when they are unpacked."""
 
@@ -150,18 +152,22 @@ def _other_rows(
     """Pairs whose voxels differ, and whose distances do."""
     measured = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
     done, total = 0, sum(store.size().rows for store in (a, b))
-    found = []
-    for distances, some in ((False, pairs), (True, measured)):
-        sums: tuple[dict[int, int], dict[int, int]] = {}, {}
-        for store, of in zip((a, b), sums, strict=True) if some else ():
-            for rows in all_rows(store, ROWS_AT_ONCE, distances=distances):
-                hashes = _hashes_of_bands(rows, store) if distances else _hashes_of(rows, store)
-                _add(of, rows, hashes)
-                done += 0 if distances else len(rows)
-                if progress is not None:
-                    progress(min(done, total), total)
-        found.append([(x, y) for x, y in some if sums[0].get(x.id, 0) != sums[1].get(y.id, 0)])
-    return found[0], found[1]
+    voxels: Sums = {}, {}
+    bands: Sums = {}, {}
+    for n, store in enumerate((a, b) if pairs else ()):
+        for rows in all_rows(store, ROWS_AT_ONCE):
+            _add(voxels[n], rows, _hashes_of(rows, store))
+            if rows.distances is not None:
+                _add(bands[n], rows, _hashes_of_bands(rows, rows.distances, store))
+            done += len(rows)
+            if progress is not None:
+                progress(min(done, total), total)
+    return _apart(pairs, voxels), _apart(measured, bands)
+
+
+def _apart(pairs: Sequence[Pair], sums: Sums) -> list[Pair]:
+    """Pairs of which the sums differ."""
+    return [(x, y) for x, y in pairs if sums[0].get(x.id, 0) != sums[1].get(y.id, 0)]
 
 
 def _add(sums: dict[int, int], rows: Rows, hashes: Hashes) -> None:
@@ -186,10 +192,9 @@ def _hashes_of(rows: Rows, store: Store) -> Hashes:
     return sums
 
 
-def _hashes_of_bands(rows: Rows, store: Store) -> Hashes:
+def _hashes_of_bands(rows: Rows, distances: Band, store: Store) -> Hashes:
     """Hashes (R,) of the packed distances of bricks."""
-    assert rows.distances is not None  # noqa: S101 - read with distances
-    data, ends = rows.distances.data.tobytes(), rows.distances.ends.tolist()
+    data, ends = distances.data.tobytes(), distances.ends.tolist()
     crcs = [zlib.crc32(data[at:end]) for at, end in zip([0, *ends], ends, strict=False)]
     return _mixed(_mixed(_z_keys(rows, store)).view(np.int64) ^ np.array(crcs, np.int64))
 

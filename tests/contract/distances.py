@@ -10,7 +10,17 @@ from hapticdb.errors import EnvironmentExistsError
 from hapticdb.grid import CurveName, Grid
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store import parsing
-from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Change, Keys, Rows, Store, row_shift
+from hapticdb.store.base import (
+    BRICK_BYTES,
+    NO_KEYS,
+    Change,
+    Keys,
+    LocatedShell,
+    Rows,
+    Store,
+    all_rows,
+    row_shift,
+)
 from voxels import EVERYWHERE, blob, voxel_object, with_distances
 
 GRID = Grid(0.01, (-0.3, 0.1, 0.2), 6)
@@ -103,15 +113,27 @@ class DistancesContract(StoreCase):
         own = band.rows_of(1, *EVERYWHERE)
         np.testing.assert_array_equal(own.occupancy, parts[0].occupancy)
         assert band.lookup(np.unique(keys)).distances is None
-        assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == len(keys)
 
-    def test_the_size_tells_of_distances_apart(self, band: Store) -> None:
-        n_rows = len(self.expected(band, 1, 3))
-        assert band.size().band_rows == n_rows > 0
-        assert 0 < band.size().band_bytes <= band.size().bytes
+    def test_rows_are_counted_whether_their_bricks_hold_voxels_or_not(self, band: Store) -> None:
+        n_rows = sum(len(self.rows(band, object_id)) for object_id in PLACES)
+        assert band.count(*EVERYWHERE) == band.size().rows == band.quantiles(7).n_rows == n_rows
+        assert n_rows > len(band.scan(*EVERYWHERE))
         band.remove(1)
         band.remove(3)
-        assert band.size().band_rows == 0
+        assert band.count(*EVERYWHERE) == len(band.scan(*EVERYWHERE)) == len(self.rows(band, 2))
+
+    def test_figure_3_finds_the_voxels_alone(self, band: Store) -> None:
+        """At each voxel of a box around the objects, where most bricks of an object hold none."""
+        voxels = np.argwhere(np.ones((36, 32, 32))) + np.array([4, 8, 8])
+        order = Grid(1.0, (0, 0, 0), 3).encode(voxels & 7)
+        addresses = (band.grid.encode(voxels) >> 9 << 9) | order
+        frame = LocatedShell(np.zeros((len(voxels) + 1, 6)), addresses, 1.0, NO_KEYS)
+        ordinals, ids = band.statement_hits(frame)
+        found = {(*voxels[n].tolist(), i) for n, i in zip(ordinals, ids.tolist(), strict=True)}
+        assert len(found) == len(ids)
+        assert found == {
+            (*voxel, i) for i, place in PLACES.items() for voxel in blob(i, place).tolist()
+        }
 
     def test_nothing_asked_has_no_distances(self, band: Store) -> None:
         for empty in (
@@ -160,10 +182,14 @@ class DistancesContract(StoreCase):
             assert _is_touched(list(band.changes())[-1], rows.keys)
 
     def test_all_rows_are_read_in_pieces_for_check(self, band: Store) -> None:
-        found = {}
-        key, object_id = -1, 0
-        while len(rows := band.rows_after(key, object_id, 7, distances=True)):
+        found, measured = {}, {}
+        for rows in all_rows(band, 7):
             assert len(rows) <= 7
-            key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
             found.update(_content_of(rows))
-        assert found == self.expected(band, 1, 3)
+            measured.update(_content_of(rows.measured()))
+        voxels = self.rows(band, 2)
+        bricks = voxels.occupancy.reshape(-1, BRICK_BYTES)
+        without = zip(voxels.keys.tolist(), bricks, strict=True)
+        everything = self.expected(band, 1, 3)
+        assert measured == everything
+        assert found == everything | {(key, 2): (brick.tobytes(), b"") for key, brick in without}

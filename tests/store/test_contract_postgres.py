@@ -60,7 +60,12 @@ def test_a_foreign_schema_is_told_apart_and_left_alone(
 
 
 def test_another_format_is_refused_in_one_line(url: str, admin: psycopg.Connection) -> None:
-    table = f"{parse(url).environment}.environment"
+    name = parse(url).environment
+    admin.execute(f"CREATE TABLE {name}.band (z_val bigint)")
+    with pytest.raises(hapticdb.errors.NotAnEnvironmentError, match=r"made before 0\.1; import"):
+        hapticdb.open(url)
+    admin.execute(f"DROP TABLE {name}.band")
+    table = f"{name}.environment"
     admin.execute(f"UPDATE {table} SET version = 99")
     with pytest.raises(hapticdb.errors.NewerVersionError, match="install a newer"):
         hapticdb.open(url)

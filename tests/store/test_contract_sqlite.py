@@ -22,7 +22,7 @@ from hapticdb.store.refusals import FORMAT
 from hapticdb.store.sqlite import place
 from hapticdb.store.sqlite.file import BEFORE_FORMAT_1, named_errors
 from hapticdb.store.sqlite.store import SQLiteStore
-from voxels import blob, write_voxels
+from voxels import blob, with_distances, write_voxels
 
 ALL_KEYS = np.array([0]), np.array([1 << 9])
 
@@ -59,6 +59,12 @@ def write_former_mark(path: Path) -> None:
         plain.execute("PRAGMA user_version = 7")
 
 
+def add_former_table(path: Path) -> None:
+    """Distances had a table of their own."""
+    with closing(sqlite3.connect(path)) as plain, plain:
+        plain.execute("CREATE TABLE band (z_val INTEGER)")
+
+
 def cut_off(path: Path) -> None:
     path.write_bytes(path.read_bytes()[: path.stat().st_size // 2])
 
@@ -73,6 +79,7 @@ def empty(path: Path) -> None:
         (write_text, hapticdb.errors.NotAnEnvironmentError, "no hapticdb environment"),
         (empty, hapticdb.errors.NotAnEnvironmentError, "is empty"),
         (write_former_mark, hapticdb.errors.NotAnEnvironmentError, r"was made before 0\.1; import"),
+        (add_former_table, hapticdb.errors.NotAnEnvironmentError, r"was made before 0\.1; import"),
         (write_newer_version, hapticdb.errors.NewerVersionError, "install a newer"),
         (cut_off, hapticdb.errors.DamagedError, "is damaged"),
         (Path.unlink, hapticdb.errors.EnvironmentNotFoundError, "no environment at"),
@@ -231,7 +238,7 @@ def test_loading_fills_the_pages_and_readers_go_on(
 ) -> None:
     monkeypatch.setattr(place, "LOOK_SECONDS", 0.0)
     rng = np.random.default_rng(1)
-    parts = [np.unique(rng.integers(0, 64, (2000, 3)), axis=0) for _ in range(30)]
+    parts = [np.unique(rng.integers(0, 64, (200, 3)), axis=0) for _ in range(30)]
     fold = "PRAGMA wal_checkpoint(TRUNCATE)"
     with (
         closing(SQLiteStore.create(tmp_path / "q.db", GRID)) as store,
@@ -239,7 +246,7 @@ def test_loading_fills_the_pages_and_readers_go_on(
     ):
         with store.loading():
             for n, voxels in enumerate(parts):
-                write_voxels(store, voxels, f"part {n}")
+                write_voxels(store, voxels, f"part {n}", with_distances(voxels, GRID, "brick"))
             store._connection.driver.execute(fold)
             rows, before = reader.scan(*ALL_KEYS), store.path.stat().st_size
             assert reader.revision() == len(parts)

@@ -30,7 +30,7 @@ PLACES: tuple[tuple[tuple[float, float, float], tuple[Strategy, ...]], ...] = (
     ((0.02, 0.04, 0.045), ("maxgap",)),
 )
 """Positions of the tool in metres, and the strategies that are asked there."""
-OF_ROWS = "SELECT pageno - 1 FROM dbstat WHERE name IN ('brick', 'voxel', 'band')"
+OF_ROWS = "SELECT pageno - 1 FROM dbstat WHERE name IN ('brick', 'voxel')"
 
 
 class Sample(NamedTuple):

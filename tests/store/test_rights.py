@@ -88,7 +88,6 @@ A_COLUMN = {
     "object": "name",
     "voxel": "z_val",
     "brick": "occupancy",
-    "band": "distances",
     "surface": "geometry",
     "pair": "kind",
     "change": "action",
@@ -119,8 +118,9 @@ OWNING = {
     "DROP FUNCTION @refresh_statistics",
     "DROP TYPE @hit CASCADE",
 }
+HAS_VOXEL = "SELECT @has_voxel(occupancy, 0) FROM @brick"
 FORCE = "SELECT @force(ROW(0, 0, 0, 0, 0, 0, 0, 0, 0, 1, 0)::@hit)"
-VIEWING = {*SELECT.values(), FORCE}
+VIEWING = {*SELECT.values(), FORCE, HAS_VOXEL}
 ALLOWED: dict[Right, set[str]] = {
     "nobody": set(),
     "viewer": VIEWING,
@@ -129,7 +129,7 @@ ALLOWED: dict[Right, set[str]] = {
         *VIEWING,
         *(INSERT[t] for t in A_COLUMN if t != "environment"),
         *(UPDATE[t] for t in A_COLUMN if t != "change"),
-        *(DELETE[t] for t in ("object", "voxel", "brick", "band", "surface", "pair")),
+        *(DELETE[t] for t in ("object", "voxel", "brick", "surface", "pair")),
         "SELECT @refresh_statistics()",
         "SELECT nextval('@object_id_seq')",
         "SELECT setval('@object_id_seq', 1000)",

@@ -65,8 +65,7 @@ def calibrate(
         before = store.drop_caches
     rows_per_block = size.rows / max(size.leaf_blocks, 1)
     quantiles = QuantileVector.of(store)
-    has_distances = size.band_rows > 0
-    trials = _Trials(store, quantiles, 1 if cold else repeats, before, has_distances=has_distances)
+    trials = _Trials(store, quantiles, 1 if cold else repeats, before)
     started = time.perf_counter()
     for n, probe in enumerate(_probes(store, quantiles)):
         trials.measure(probe)
@@ -85,11 +84,8 @@ class _Trials:
         quantiles: QuantileVector,
         repeats: int,
         before: Callable[[], None] | None,
-        *,
-        has_distances: bool,
     ) -> None:
         self._store = store
-        self._has_distances = has_distances
         self._before = before
         self._quantiles = quantiles
         self._repeats = repeats
@@ -103,14 +99,14 @@ class _Trials:
         store = self._store
         for gap in (0, 1 << 9, 1 << 13, 1 << 16):
             lows, highs = grouping.group_by_gap(probe.keys, probe.first, probe.last, gap)
-            rows = len(store.scan(lows, highs))
+            rows = store.count(lows, highs)
             if rows > TOO_MANY_ROWS:
                 continue
             scan = self._time(lambda lo=lows, hi=highs: store.scan(lo, hi))  # type: ignore[misc]
             count = self._time(lambda lo=lows, hi=highs: store.count(lo, hi))  # type: ignore[misc]
             self._scans.append((1, len(lows), rows, scan))
             self._counts.append((1, len(lows), rows, count))
-            if self._has_distances:
+            if store.wants_distances:
                 more = self._time(lambda lo=lows, hi=highs: store.scan(lo, hi, distances=True))  # type: ignore[misc]
                 self._with_distances += np.array([more - scan, rows])
         self._keys.append(probe.keys)

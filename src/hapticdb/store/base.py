@@ -13,8 +13,8 @@ from hapticdb.store.pairs import Ids, KeptPairs, MaybeMark, Outlines, PairRow
 from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
-Table = Literal["voxel", "brick", "band"]
-"""Tables that hold rows: the index table of a layout, and the distances beside `brick`."""
+Columns = Literal["voxel", "brick", "distances"]
+"""What a read returns: rows of a layout, or bricks with their distances."""
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 BRICK_SHIFT = 3 * BRICK_BITS
 """Bits of a voxel's key below its brick's."""
@@ -61,7 +61,7 @@ class Band(NamedTuple):
 
 
 class Rows(NamedTuple):
-    """A batch of rows of the index table, and of the table of distances beside it.
+    """A batch of rows of the index table.
 
     keys : (R,) int64, ascending: voxel keys, or brick keys.
     ids : (R,) int64, ids of objects.
@@ -99,11 +99,17 @@ class Rows(NamedTuple):
         return Rows(self.keys[which], self.ids[which], bits, distances)
 
     def occupied(self) -> "Rows":
-        """The rows of the index table: those whose brick holds a voxel, without distances."""
+        """Rows whose brick holds a voxel, without distances."""
         rows = self.having(None)
         if self.distances is None:
             return rows
         return rows.picked(np.flatnonzero(self.occupancy.reshape(-1, BRICK_BYTES).any(axis=1)))
+
+    def measured(self) -> "Rows":
+        """Rows with distances, of those that `Store.rows_after` returns."""
+        if self.distances is None:
+            return NO_DISTANCES
+        return self.picked(np.flatnonzero(self.distances.lengths))
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)
@@ -235,8 +241,6 @@ class Size(NamedTuple):
     rows: int
     bytes: int
     leaf_blocks: int
-    band_rows: int = 0
-    band_bytes: int = 0
     surfaces: int = 0
     surface_bytes: int = 0
 
@@ -255,10 +259,10 @@ class LocatedShell(NamedTuple):
     exclude: Keys
 
 
-def all_rows(store: "Store", limit: int, *, distances: bool = False) -> Iterator[Rows]:
+def all_rows(store: "Store", limit: int) -> Iterator[Rows]:
     """All rows in ascending order of key and id, at most `limit` at a time."""
     key, object_id = -1, 0
-    while len(rows := store.rows_after(key, object_id, limit, distances=distances)):
+    while len(rows := store.rows_after(key, object_id, limit)):
         key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
         yield rows
 
@@ -313,9 +317,9 @@ class Store(Protocol):
 
     # -- rows: arrays of keys and of bounds are ascending, distinct and contiguous -----------------
     #
-    # Rows come in ascending order of key and id, by one statement, but for `lookup_each`. With
-    # `distances` they come from the table of distances, with their occupancy, zero where a brick
-    # holds no voxel; objects without distances have no rows then.
+    # Rows come in ascending order of key and id, by one statement, but for `lookup_each`: those of
+    # bricks that hold a voxel. With `distances` all rows that have some, whose occupancy is zero
+    # where a brick holds no voxel; objects without distances have no rows then.
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
@@ -327,13 +331,16 @@ class Store(Protocol):
         """Rows with a key in any closed range, ascending and disjoint."""
 
     def count(self, lows: Keys, highs: Keys) -> int:
-        """Number of rows that `scan` would return, counted inside the engine."""
+        """Number of rows in the ranges, of bricks without a voxel, too, counted in the engine."""
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any closed range, ascending and disjoint."""
 
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        """At most `limit` rows after (key, id); (-1, 0) starts at the first."""
+    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
+        """At most `limit` of all rows after (key, id); (-1, 0) starts at the first.
+
+        Bricks come with their distances, which have no bytes where the row has none.
+        """
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
         """Wrench (6,) of the frame, N and N m about its centre, by one statement: Figure 3."""
@@ -385,8 +392,8 @@ class Store(Protocol):
     #
     # A given surface, packed, is stored under the record's digest, unless there is one already. The
     # last object of a digest takes the surface along when it is removed or gets another digest.
-    # Rows with distances are written into both tables; rows without into the index table alone,
-    # and the object has no distances then. All raise ReadOnlyError where writes are refused.
+    # An object has distances if its rows have them. All raise ReadOnlyError where writes are
+    # refused.
 
     def loading(self) -> AbstractContextManager[None]:
         """A context in which many objects are written. May be nested.

@@ -9,6 +9,7 @@ import json
 import math
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from itertools import chain, pairwise, repeat
 from typing import Any, NoReturn, cast
 
 import numpy as np
@@ -16,6 +17,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import DamagedError, GridError
 from hapticdb.grid import CurveName, Grid
+from hapticdb.kernels.field import occupancy
 from hapticdb.store.base import (
     LAYOUTS,
     LONGEST_BAND,
@@ -28,6 +30,7 @@ from hapticdb.store.base import (
     Rows,
 )
 from hapticdb.store.pairs import KINDS, STATUSES, Outlines, PairRow
+from hapticdb.store.refusals import made_before
 
 KEY_END = 1 << 63
 """One above the largest count or key that an int64 holds."""
@@ -39,10 +42,12 @@ CHECKSUMS = (ROWS_CRC, DISTANCES_CRC)
 ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
 TABLES = (
-    "band", "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed",
+    "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed",
     "surface", "voxel",
 )  # fmt: skip
 """Tables that every environment has."""
+NO_VOXEL = bytes(8)
+"""Packed occupancy of a brick that holds no voxel of the object, which the tables leave out."""
 Floats = NDArray[np.float64]
 
 
@@ -99,20 +104,41 @@ def attributes_text(record: Object, rows: Rows) -> str:
     return json.dumps(kept, sort_keys=True)
 
 
-def check_lengths(url: str, least: int, most: int) -> None:
-    """Refuse rows of distances if the least or the most bytes of a row cannot be."""
-    if least < 1 or most > LONGEST_BAND:
+def check_lengths(url: str, most: int) -> None:
+    """Refuse rows of distances if the most bytes of a row cannot be."""
+    if most > LONGEST_BAND:
         raise damaged(url, "distances of the wrong length")
 
 
 def band_of(url: str, packed: bytes, lengths: NDArray[np.int64]) -> Band:
     """Packed distances that were read, and the bytes of each row."""
-    if len(lengths):
-        check_lengths(url, lengths.min(), lengths.max())
+    check_lengths(url, lengths.max(initial=0))
     ends = np.cumsum(lengths)
     if len(packed) != (int(ends[-1]) if len(ends) else 0):
         raise damaged(url, "distances of the wrong length")
     return Band(np.frombuffer(packed, np.uint8), ends)
+
+
+def bricks_of(url: str, packed: bytes, count: int) -> NDArray[np.uint8]:
+    """Occupancy of bricks that were read, packed one after the other."""
+    try:
+        return occupancy.unpack(packed, count)
+    except ValueError as error:
+        raise damaged(url, "a brick of the wrong length") from error
+
+
+def fields_of(rows: Rows) -> Iterator[tuple[bytes | None, bytes | None]]:
+    """Occupancy and distances of bricks as tables hold them: packed, None where there are none."""
+    bricks = occupancy.pack(rows.occupancy)
+    if rows.distances is None:
+        return zip(_pieces(*bricks), repeat(None))
+    return zip(_pieces(*bricks), _pieces(*rows.distances), strict=True)
+
+
+def _pieces(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> Iterator[bytes | None]:
+    joined = data.tobytes()
+    for start, end in pairwise(chain([0], ends.tolist())):
+        yield joined[start:end] or None
 
 
 def wish_of(url: str, stored: object) -> bool:
@@ -144,6 +170,8 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
 
     kinds : ``table``, or another kind of object, by name.
     """
+    if "band" in kinds:  # distances had a table of their own
+        raise made_before(url)
     for name in TABLES:
         kind = kinds.get(name)
         if kind is None:

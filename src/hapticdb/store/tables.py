@@ -197,8 +197,8 @@ class Tables(ABC):
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         return self._read("rows_of", lows, highs, object_id, distances=distances)
 
-    def rows_after(self, key: int, object_id: int, limit: int, *, distances: bool = False) -> Rows:
-        return self._read("after", key, object_id, limit, distances=distances)
+    def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
+        return self._read("after", key, object_id, limit, distances=self.layout == "brick")
 
     # -- reads -----------------------------------------------------------------------------------
 

@@ -121,13 +121,13 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         "voxels": voxels,
         "rows": size.rows,
         "bytes": size.bytes,
-        "distances": {"objects": n_banded, "rows": size.band_rows, "bytes": size.band_bytes},
+        "distances": {"objects": n_banded},
         "surfaces": {"shapes": size.surfaces, "bytes": size.surface_bytes},
         "standby": None if lag is None else lag._asdict(),
         "statistics": {"source": source, **freshness._asdict()},
     }
     a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
-    distances = f"of {render.counted(n_banded, 'object')}, {render.bytes_text(size.band_bytes)}"
+    distances = f"of {render.counted(n_banded, 'object')}" if n_banded else "none"
     n_shapes = render.counted(size.surfaces, "shape")
     surfaces = f"{n_shapes}, {render.bytes_text(size.surface_bytes)}" if size.surfaces else "none"
     words = [
@@ -145,7 +145,7 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         ("voxels", f"{voxels:,}"),
         ("rows", f"{size.rows:,}"),
         ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
-        ("distances", distances if n_banded else "none"),
+        ("distances", distances),
         ("surfaces", surfaces),
         ("statistics", f"{SOURCES[source]}; {_age(freshness)}"),
     ]

@@ -4,10 +4,10 @@ A distance u is in voxels, from a voxel's centre to the nearest triangle of an o
 nearest point of a point cloud. It is stored in 8 bits: q = min(round(254 u / h), 254), and 255
 where u is above h, the half width of the band.
 
-A row of the table `band` belongs to one brick and one object. It has the distances at 10^3 centres:
-the brick's own 8^3 and one more on each side. So each point in the brick finds in this one row the
-8 centres around it that trilinear interpolation needs, and the 27 that a quadratic B-spline needs.
-A resident cell has 34^3 distances for the same reason. In both, k runs fastest.
+A row of the table `brick` belongs to one brick and one object. It has the distances at 10^3
+centres: the brick's own 8^3 and one more on each side. So each point in the brick finds in this one
+row the 8 centres around it that trilinear interpolation needs, and the 27 that a quadratic B-spline
+needs. A resident cell has 34^3 distances for the same reason. In both, k runs fastest.
 """
 
 from hapticdb.kernels._jit import leaf

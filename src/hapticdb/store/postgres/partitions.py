@@ -1,6 +1,6 @@
 """Rows on other servers: the tables of rows, partitioned by ranges of their keys.
 
-The tables of a layout's rows are declared partitioned; each partition is a foreign table of
+The table of a layout's rows is declared partitioned; each partition is a foreign table of
 `postgres_fdw` in a schema of the environment's name on another server. Objects, surfaces and the
 log of changes stay where the environment is.
 
@@ -17,7 +17,7 @@ from psycopg import errors, sql
 
 from hapticdb.errors import AccessError, EnvironmentExistsError, UsageError
 from hapticdb.grid import Grid
-from hapticdb.store.base import Layout, Table, row_shift
+from hapticdb.store.base import Layout, row_shift
 from hapticdb.store.postgres.address import Address, partition_addresses
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
@@ -25,17 +25,14 @@ CELL_BITS = 15
 """Bits of a key that name a voxel within its cell."""
 SCHEMA = Path(__file__).with_name("schema.sql").read_text(encoding="utf-8")
 """Makes all tables and functions of an environment, in its schema."""
-TABLES: dict[Layout, tuple[Table, ...]] = {"voxel": ("voxel",), "brick": ("brick", "band")}
-"""Tables of a layout whose rows lie on the partitions, or in a layout's own tables."""
 SIZE = """
 CREATE VIEW size AS
 SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0)::bigint AS bytes,
        coalesce(sum(pg_relation_size(oid)) FILTER (WHERE relname = {index}), 0)::bigint
-         / current_setting('block_size')::int AS pages,
-       coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relname = 'band'), 0)::bigint AS band
+         / current_setting('block_size')::int AS pages
   FROM pg_class
  WHERE relnamespace = quote_ident({name})::regnamespace"""
-"""On a partition: bytes of tables and indexes, pages of the rows' index, bytes of distances."""
+"""On a partition: bytes of tables and indexes, pages of the rows' index."""
 SERVER = """
 CREATE SERVER {server} FOREIGN DATA WRAPPER postgres_fdw
 OPTIONS (host {host}, port {port}, dbname {database}, async_capable 'true', fetch_size '10000',
@@ -51,20 +48,20 @@ SELECT DISTINCT srvname::text
 """Servers that `spread` made for an environment."""
 
 
-def ends(grid: Grid, layout: Layout, table: Table, n: int) -> list[int]:
+def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
     """Keys (n - 1,) at which all but the first of n partitions begin: cells if possible."""
     shift = row_shift(layout)
     within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
     cells = 1 << max(3 * grid.bits - within, 0)
     if cells < n:
         raise UsageError(
-            f"a grid of {grid.bits} bits has {cells} rows of the table {table}, too few for {n} "
+            f"a grid of {grid.bits} bits has {cells} rows of the table {layout}, too few for {n} "
             "partitions: give fewer partitions, or more bits"
         )
     return [(cells * i // n) << (within - shift) for i in range(1, n)]
 
 
-def _statements(table: Table) -> list[str]:
+def _statements(table: Layout) -> list[str]:
     """Statements of a table's section of `SCHEMA`."""
     found = re.search(rf"^-- ## {table}$(.*?)(?=^-- ## )", SCHEMA, re.MULTILINE | re.DOTALL)
     assert found is not None  # noqa: S101 - the file has a section for each table
@@ -81,8 +78,7 @@ def spread(
     partitions = partition_addresses(address)
     if not partitions:
         return lambda _: None
-    for table in TABLES[layout]:
-        ends(grid, layout, table, len(partitions))
+    ends(grid, layout, len(partitions))
     made: list[ServerConnection] = []
     try:
         for partition in partitions:
@@ -135,9 +131,8 @@ def _make_partition(connection: ServerConnection, layout: Layout) -> None:
             f"{connection.shown}: schema {name!r} exists already on this partition; name another "
             "environment with ?environment=NAME, or drop it there"
         ) from error
-    for table in TABLES[layout]:
-        for statement in _statements(table):
-            connection.execute(statement)
+    for statement in _statements(layout):
+        connection.execute(statement)
     index = sql.Literal(f"{layout}_key")
     connection.execute(sql.SQL(SIZE).format(name=sql.Literal(name), index=index))
 
@@ -145,7 +140,7 @@ def _make_partition(connection: ServerConnection, layout: Layout) -> None:
 def _join(
     connection: ServerConnection, made: Sequence[ServerConnection], grid: Grid, layout: Layout
 ) -> None:
-    """Exchange the tables of rows for partitioned ones, inside the environment's transaction."""
+    """Exchange the table of rows for a partitioned one, inside the environment's transaction."""
     schema = connection.address.environment
     try:
         if not connection.execute(
@@ -159,7 +154,7 @@ def _join(
             "with 'CREATE EXTENSION postgres_fdw' and 'GRANT USAGE ON FOREIGN DATA WRAPPER "
             "postgres_fdw TO ...'"
         ) from error
-    connection.execute("CREATE TABLE size (bytes bigint, pages bigint, band bigint)")
+    connection.execute("CREATE TABLE size (bytes bigint, pages bigint)")
     for n, server in enumerate(servers):
         inherits = sql.SQL(
             "CREATE FOREIGN TABLE {} () INHERITS (size) SERVER {}"
@@ -167,27 +162,25 @@ def _join(
         )
         place = sql.Identifier(f"size_{n}"), server, sql.Literal(schema)
         connection.execute(inherits.format(*place))
-    for table in TABLES[layout]:
-        connection.execute(f"DROP TABLE {table}")
-        for statement in _statements(table):
-            if "CREATE UNIQUE INDEX" not in statement:
-                by_range = re.sub(r"WITH \(.*\)", "PARTITION BY RANGE (z_val)", statement)
-                connection.execute(by_range)
-        inner = map(str, ends(grid, layout, table, len(made)))
-        limits = ["MINVALUE", *inner, "MAXVALUE"]
-        for n, server in enumerate(servers):
-            connection.execute(
-                sql.SQL(PARTITION).format(
-                    partition=sql.Identifier(f"{table}_{n}"),
-                    table=sql.Identifier(table),
-                    low=sql.SQL(limits[n]),
-                    high=sql.SQL(limits[n + 1]),
-                    server=server,
-                    schema=sql.Literal(schema),
-                    name=sql.Literal(table),
-                )
+    connection.execute(f"DROP TABLE {layout}")
+    for statement in _statements(layout):
+        if "CREATE UNIQUE INDEX" not in statement:
+            by_range = re.sub(r"WITH \(.*\)", "PARTITION BY RANGE (z_val)", statement)
+            connection.execute(by_range)
+    limits = ["MINVALUE", *map(str, ends(grid, layout, len(made))), "MAXVALUE"]
+    for n, server in enumerate(servers):
+        connection.execute(
+            sql.SQL(PARTITION).format(
+                partition=sql.Identifier(f"{layout}_{n}"),
+                table=sql.Identifier(layout),
+                low=sql.SQL(limits[n]),
+                high=sql.SQL(limits[n + 1]),
+                server=server,
+                schema=sql.Literal(schema),
+                name=sql.Literal(layout),
             )
-        connection.execute(f"SELECT count(*) FROM {table}")  # reaches each of them, or fails now
+        )
+    connection.execute(f"SELECT count(*) FROM {layout}")  # reaches each of them, or fails now
 
 
 def _make_server(

@@ -24,8 +24,9 @@ VIEWER = (
     # everybody has it by default, but the owner may have revoked it
     "GRANT USAGE ON TYPE {schema}.hit TO {role}",
     (
-        "GRANT EXECUTE ON FUNCTION {schema}.add_up(double precision),"
-        " {schema}.wrench_of_hits({schema}.hit[]), {schema}.force({schema}.hit) TO {role}"
+        "GRANT EXECUTE ON FUNCTION {schema}.has_voxel(bytea, bigint),"
+        " {schema}.add_up(double precision), {schema}.wrench_of_hits({schema}.hit[]),"
+        " {schema}.force({schema}.hit) TO {role}"
     ),
 )
 TOUCHER = (*VIEWER, "GRANT INSERT, UPDATE ON {schema}.cost TO {role}")
@@ -33,7 +34,7 @@ EDITOR = (
     *TOUCHER,
     (
         "GRANT INSERT, UPDATE, DELETE ON {schema}.object, {schema}.voxel, {schema}.brick,"
-        " {schema}.band, {schema}.surface, {schema}.pair TO {role}"
+        " {schema}.surface, {schema}.pair TO {role}"
     ),
     "GRANT INSERT ON {schema}.change TO {role}",  # no UPDATE: rows of the log stay
     "GRANT INSERT, DELETE ON {schema}.removed TO {role}",

@@ -5,10 +5,10 @@
 -- which explains each column); only differences are explained here.
 -- All tables are there in each schema; the layout says which of `voxel` and `brick` has rows.
 --
--- An environment with partitions has `voxel`, or `brick` and `band`, as partitioned tables, with
--- foreign tables on other servers (store/postgres/partitions.py). The sections of the same names
--- below are run there as they stand. Here they are run again without their indexes, with
--- PARTITION BY RANGE (z_val) instead of their storage parameters.
+-- An environment with partitions has `voxel` or `brick` as a partitioned table, with foreign tables
+-- on other servers (store/postgres/partitions.py). The section of the same name below is run there
+-- as it stands. Here it is run again without its index, with PARTITION BY RANGE (z_val) instead of
+-- its storage parameters.
 
 -- ## environment: one row
 
@@ -56,30 +56,19 @@ ALTER TABLE voxel ALTER z_val SET STATISTICS 10000, ALTER id SET STATISTICS 0;
 CREATE UNIQUE INDEX voxel_key ON voxel (z_val, id);
 
 -- ## brick
--- 64 bytes are too few to compress or to store in a table of their own: PLAIN.
+-- A row has 30 to 1,000 bytes, packed already: EXTERNAL compresses nothing, and spares the three
+-- bytes of padding and length that PLAIN takes.
 
 CREATE TABLE brick (
   z_val     bigint NOT NULL,
   id        bigint NOT NULL,
-  occupancy bytea NOT NULL CHECK (octet_length(occupancy) = 64)
+  occupancy bytea CHECK (octet_length(occupancy) BETWEEN 9 AND 72),
+  distances bytea
 ) WITH (autovacuum_vacuum_insert_scale_factor = 0.02, autovacuum_analyze_scale_factor = 0.05);
-ALTER TABLE brick ALTER occupancy SET STORAGE PLAIN;
+ALTER TABLE brick ALTER occupancy SET STORAGE EXTERNAL, ALTER distances SET STORAGE EXTERNAL;
 ALTER TABLE brick ALTER z_val SET STATISTICS 10000, ALTER id SET STATISTICS 0;
-ALTER TABLE brick ALTER occupancy SET STATISTICS 0;
+ALTER TABLE brick ALTER occupancy SET STATISTICS 0, ALTER distances SET STATISTICS 0;
 CREATE UNIQUE INDEX brick_key ON brick (z_val, id);
-
--- ## band
--- A row has 30 to 1,000 bytes, packed already: EXTERNAL compresses nothing, and spares the three
--- bytes of padding and length that PLAIN takes.
-
-CREATE TABLE band (
-  z_val     bigint NOT NULL,
-  id        bigint NOT NULL,
-  distances bytea NOT NULL
-) WITH (autovacuum_vacuum_insert_scale_factor = 0.02, autovacuum_analyze_scale_factor = 0.05);
-ALTER TABLE band ALTER distances SET STORAGE EXTERNAL;
-ALTER TABLE band ALTER id SET STATISTICS 0, ALTER distances SET STATISTICS 0;
-CREATE UNIQUE INDEX band_key ON band (z_val, id);
 
 -- ## surface
 
@@ -161,6 +150,19 @@ REVOKE ALL ON FUNCTION refresh_statistics() FROM PUBLIC;
 -- ## cost
 
 CREATE TABLE cost (machine text PRIMARY KEY, figures json NOT NULL);
+
+-- ## has_voxel: whether a brick holds a voxel, by the last nine bits of its key in Z-order
+-- An expression, which the planner puts in its place.
+
+CREATE FUNCTION has_voxel(occupancy bytea, voxel bigint) RETURNS boolean
+LANGUAGE sql IMMUTABLE AS $$
+  SELECT CASE WHEN get_bit(occupancy, voxel >> 3) = 1 THEN
+           get_bit(occupancy, (voxel & 7) + 8 * (8 +
+             bit_count(substring(occupancy, 1, (voxel >> 6)::int)) + bit_count((
+               get_byte(occupancy, (voxel >> 6)::int) & ((1 << (voxel >> 3 & 7)::int) - 1)
+             )::bit(8)))) = 1
+         END
+$$;
 
 -- ## force: the paper's force(point, z_val)
 -- A hit carries what the tangent-plane law needs, so that one statement serves any shell, pose and

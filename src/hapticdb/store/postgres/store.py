@@ -12,12 +12,12 @@ from hapticdb.store import parsing
 from hapticdb.store.base import (
     NO_KEYS,
     NO_OCCUPANCY,
+    Columns,
     Keys,
     Layout,
     LocatedShell,
     Rows,
     Store,
-    Table,
     is_ascending,
     joined,
     no_rows,
@@ -114,7 +114,9 @@ class PostgresStore(ServerTables):
         if found[0] is None:
             return no_rows(distances=distances)
         keys, ids = wire.read_int8s(found[0]), wire.read_int8s(found[1])
-        occupancy = np.frombuffer(found[2] or b"", np.uint8) if self._shift else NO_OCCUPANCY
+        occupancy = NO_OCCUPANCY
+        if self._shift:
+            occupancy = parsing.bricks_of(self.url, found[2] or b"", len(keys))
         rows = Rows(keys, ids, occupancy)
         if distances:
             lengths = wire.read_int8s(found[4])
@@ -123,10 +125,10 @@ class PostgresStore(ServerTables):
         return rows if is_ascending(keys, ids) else rows.picked(np.lexsort((ids, keys)))
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
-        table: Table = "band" if distances else self.layout
+        columns: Columns = "distances" if distances else self.layout
         if form != "after" and not asked[0].size:
             return no_rows(distances=distances)
-        text = getattr(self._sql, form)[table]
+        text = getattr(self._sql, form)[columns]
         if form == "lookup_one":
             each = (self._connection.fetch(text, wire.int8(key)) for key in asked[0].tolist())
             parts = [self._unpacked(found, distances=distances) for found in each]

@@ -22,7 +22,7 @@ CREATE TABLE environment (
   bits            INTEGER NOT NULL,  -- for each axis, 1 to 21: 2^bits voxels
   curve           TEXT NOT NULL,     -- order of the keys: z, hilbert or lexicographic
   layout          TEXT NOT NULL,     -- voxel or brick: the table of rows
-  wants_distances INTEGER NOT NULL CHECK (wants_distances IN (0, 1))  -- rows in `band`, too
+  wants_distances INTEGER NOT NULL CHECK (wants_distances IN (0, 1))  -- of new objects
 ) STRICT;
 
 -- ## object: a part at its place
@@ -51,21 +51,14 @@ CREATE TABLE voxel (
 ) STRICT, WITHOUT ROWID;
 
 -- ## brick: 8 x 8 x 8 voxels a row, for the layout `brick`
+-- A row for each brick that an object touches; if the object has distances, for each within 2.75
+-- voxels of its surface.
 
 CREATE TABLE brick (
   z_val     INTEGER NOT NULL,  -- key of the brick: a voxel's without the last 9 bits
-  id        INTEGER NOT NULL,  -- of an object that touches it
-  occupancy BLOB NOT NULL CHECK (length(occupancy) = 64),  -- a bit for each voxel
-  PRIMARY KEY (z_val, id)
-) STRICT, WITHOUT ROWID;
-
--- ## band: distances to surfaces, for the layout `brick` with wants_distances = 1
--- A row for each brick that lies within 2.75 voxels of an object's surface.
-
-CREATE TABLE band (
-  z_val     INTEGER NOT NULL,  -- key of the brick
   id        INTEGER NOT NULL,  -- of the object
-  distances BLOB NOT NULL,     -- of 10 x 10 x 10 voxel centres, packed, up to 2,048 bytes
+  occupancy BLOB CHECK (length(occupancy) BETWEEN 9 AND 72),  -- voxels touched; NULL: none
+  distances BLOB,  -- of 10 x 10 x 10 voxel centres to the surface, packed, up to 2,048 bytes
   PRIMARY KEY (z_val, id)
 ) STRICT, WITHOUT ROWID;
 

@@ -21,17 +21,15 @@ from hapticdb.errors import UsageError
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import (
-    BRICK_BYTES,
-    LAYOUTS,
     NO_OCCUPANCY,
     Band,
+    Columns,
     Keys,
     Layout,
     LocatedShell,
     Progress,
     Rows,
     Store,
-    Table,
     no_rows,
 )
 from hapticdb.store.engines import BackupReport, unknown_scheme
@@ -40,32 +38,26 @@ from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.connection import FileConnection
 from hapticdb.store.sqlite.tables import force as sqlite_force
 from hapticdb.store.sqlite.tables.file_tables import FileTables
-from hapticdb.store.sqlite.tables.ranges import COLUMNS, TABLES, RangeStatements
+from hapticdb.store.sqlite.tables.ranges import HELD, LISTS, TABLES, RangeStatements
 from hapticdb.store.tables import Form
 
-LOOKUP: dict[Table, str] = {
-    table: f"""
-SELECT {columns}
-  FROM carray(?1) AS asked CROSS JOIN {TABLES[table]}
- WHERE {table}.z_val = asked.value"""
-    for table, columns in COLUMNS.items()
+LOOKUP: dict[Columns, str] = {
+    columns: f"""
+SELECT {LISTS[columns]}
+  FROM carray(?1) AS asked CROSS JOIN {table}
+ WHERE z_val = asked.value AND {HELD[columns]}"""
+    for columns, table in TABLES.items()
 }
-LOOKUP_ONE: dict[Table, str] = {
-    table: f"SELECT {COLUMNS[table]} FROM {table} WHERE z_val = ?1" for table in LAYOUTS
-} | {  # a statement of one key takes 5 us more with a LEFT JOIN, even if it finds nothing
-    "band": """
-SELECT z_val, id, (SELECT occupancy FROM brick WHERE brick.z_val = ?1 AND brick.id = band.id),
-       distances
-  FROM band WHERE z_val = ?1""",
+LOOKUP_ONE: dict[Columns, str] = {
+    columns: f"SELECT {LISTS[columns]} FROM {table} WHERE z_val = ?1 AND {HELD[columns]}"
+    for columns, table in TABLES.items()
 }
-AFTER: dict[Table, str] = {
-    table: f"""
-SELECT {columns} FROM {TABLES[table]}
- WHERE ({table}.z_val, {table}.id) > (?1, ?2) ORDER BY {table}.z_val, {table}.id LIMIT ?3"""
-    for table, columns in COLUMNS.items()
+AFTER: dict[Columns, str] = {
+    columns: f"""
+SELECT {LISTS[columns].replace(" distances", " coalesce(distances, x'')")} FROM {table}
+ WHERE (z_val, id) > (?1, ?2) ORDER BY z_val, id LIMIT ?3"""
+    for columns, table in TABLES.items()
 }
-NO_VOXEL = bytes(BRICK_BYTES)
-"""Occupancy of a brick that holds no voxel of the object."""
 PREFIX = "sqlite:///"
 # libpq's other form of an address, and a URL without its slashes: either may hold a password
 KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
@@ -130,23 +122,23 @@ class SQLiteStore(FileTables):
     # -- reads -----------------------------------------------------------------------------------
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
-        table: Table = "band" if distances else self.layout
+        columns: Columns = "distances" if distances else self.layout
         if form != "after" and not asked[0].size:
             return no_rows(distances=distances)
         fetch = self._connection.fetch
         if form == "lookup_one":
-            one = LOOKUP_ONE[table]
+            one = LOOKUP_ONE[columns]
             found = [row for key in asked[0].tolist() for row in fetch(one, (key,))]
         elif form == "lookup":
-            found = fetch(LOOKUP[table], (apsw.carray(asked[0]),))
+            found = fetch(LOOKUP[columns], (apsw.carray(asked[0]),))
         elif form == "after":
-            found = fetch(AFTER[table], asked)
+            found = fetch(AFTER[columns], asked)
         else:
-            sql, bindings = self._ranges.scan(table, *asked[:2])
+            sql, bindings = self._ranges.scan(columns, *asked[:2])
             if form == "rows_of":
-                sql, bindings = f"{sql} AND {table}.id = ?4", (*bindings, asked[2])
+                sql, bindings = f"{sql} AND id = ?4", (*bindings, asked[2])
             found = fetch(sql, bindings)
-        return _rows_of(self.url, found, table)
+        return _rows_of(self.url, found, columns)
 
     def count(self, lows: Keys, highs: Keys) -> int:
         if not lows.size:
@@ -163,32 +155,29 @@ class SQLiteStore(FileTables):
         return pairs[:, 0] - 1, pairs[:, 1].copy()
 
 
-def _rows_of(url: str, found: list[Any], table: Table) -> Rows:
-    """Rows from the tuples of a statement: the columns `ranges.COLUMNS` of a table."""
+def _rows_of(url: str, found: list[Any], columns: Columns) -> Rows:
+    """Rows from the tuples of a statement, which lists `ranges.LISTS`."""
     if not found:
-        return no_rows(distances=table == "band")
+        return no_rows(distances=columns == "distances")
     keys, ids, *more = zip(*found, strict=True)
     count = len(keys)
-    bits, distances = b"", None
+    occupancy, distances = NO_OCCUPANCY, None
     try:
         # by Python's own functions: a frame has few rows, and each call of NumPy takes 2 us
-        if table == "band":
+        if columns == "distances":
             lengths = list(map(len, more[1]))
             ends = np.fromiter(accumulate(lengths), np.int64, count)
             distances = Band(np.frombuffer(b"".join(more[1]), np.uint8), ends)
-            parsing.check_lengths(url, min(lengths), max(lengths))
-            bits = b"".join([NO_VOXEL if brick is None else brick for brick in more[0]])
-        elif table == "brick":
-            bits = b"".join(more[0])
-        occupancy = np.frombuffer(bits, np.uint8) if more else NO_OCCUPANCY
+            parsing.check_lengths(url, max(lengths))
+            more[0] = tuple([parsing.NO_VOXEL if brick is None else brick for brick in more[0]])
+        if more:
+            occupancy = parsing.bricks_of(url, b"".join(more[0]), count)
         rows = Rows(
             np.fromiter(keys, np.int64, count), np.fromiter(ids, np.int64, count), occupancy,
             distances,
         )  # fmt: skip
     except (TypeError, ValueError, OverflowError) as error:
         raise parsing.damaged(url, f"a row of another kind: {error}") from error
-    if more and len(bits) != BRICK_BYTES * count:
-        raise parsing.damaged(url, "a brick of the wrong length")
     return rows
 
 

@@ -10,7 +10,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.store.base import BRICK_BYTES, Band, LocatedShell, Rows
+from hapticdb.store.base import LocatedShell, Rows
+from hapticdb.store.parsing import fields_of
 
 BYTEA, INT8, TEXT, FLOAT8 = 17, 20, 25, 701
 INT8_ARRAY, FLOAT8_ARRAY = 1016, 1022
@@ -21,6 +22,8 @@ _STRIDE = _INT8S.itemsize
 
 COPY_HEADER = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 COPY_TRAILER = b"\xff\xff"
+NULL = b"\xff\xff\xff\xff"
+"""Length of a field that is NULL."""
 
 
 class Parameter(NamedTuple):
@@ -90,39 +93,18 @@ def read_float8s(value: bytes) -> NDArray[np.float64]:
 
 
 def copy_rows(rows: Rows, object_id: int) -> bytes:
-    """Rows of an object, of `band` if they have distances, for COPY without header and trailer."""
-    if rows.distances is not None:
-        return _copy_band(rows.keys, rows.distances, object_id)
-    has_bits = rows.occupancy.size > 0
-    bits = (("bits_length", ">i4"), ("bits", f"V{BRICK_BYTES}")) if has_bits else ()
-    packed = _begun(rows.keys, object_id, *bits)
-    if has_bits:
-        packed["bits_length"] = BRICK_BYTES
-        packed["bits"] = np.ascontiguousarray(rows.occupancy).view(f"V{BRICK_BYTES}").reshape(-1)
-    return packed.tobytes()
-
-
-def _begun(keys: NDArray[np.int64], object_id: int, *last: tuple[str, str]) -> NDArray[np.void]:
-    """Rows of COPY with key and id, but without the fields that follow."""
+    """Rows of an object for COPY, without header and trailer; bricks with both their fields."""
     first = [("fields", ">i2"), ("z_length", ">i4"), ("z_val", ">i8")]
-    packed = np.empty(len(keys), [*first, ("id_length", ">i4"), ("id", ">i8"), *last])
-    packed["fields"] = 2 + bool(last)
+    packed = np.empty(len(rows), [*first, ("id_length", ">i4"), ("id", ">i8")])
+    packed["fields"] = 4 if rows.occupancy.size else 2
     packed["z_length"] = packed["id_length"] = 8
-    packed["z_val"] = keys
+    packed["z_val"] = rows.keys
     packed["id"] = object_id
-    return packed
-
-
-def _copy_band(keys: NDArray[np.int64], distances: Band, object_id: int) -> bytes:
-    """Rows of the table `band`: what stands before each row's bytes, then these bytes."""
-    lengths = distances.lengths
-    heads = _begun(keys, object_id, ("distances_length", ">i4"))
-    heads["distances_length"] = lengths
-    size = heads.itemsize
-    starts = distances.ends - lengths + size * np.arange(len(keys))
-    is_data = np.ones(len(distances.data) + size * len(keys), dtype=np.bool_)
-    is_data[starts[:, None] + np.arange(size)] = False
-    packed = np.empty(len(is_data), np.uint8)
-    packed[is_data] = distances.data
-    packed[~is_data] = heads.view(np.uint8)
-    return packed.tobytes()
+    if not rows.occupancy.size:
+        return packed.tobytes()
+    pieces: list[bytes] = []
+    for row, fields in zip(packed, fields_of(rows), strict=True):
+        pieces.append(row.tobytes())
+        for one in fields:
+            pieces += [NULL] if one is None else [len(one).to_bytes(4), one]
+    return b"".join(pieces)

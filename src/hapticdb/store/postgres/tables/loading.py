@@ -13,11 +13,10 @@ from types import TracebackType
 import psycopg
 
 from hapticdb.errors import ConnectionLostError
-from hapticdb.store.base import Layout, Table
+from hapticdb.store.base import Layout
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.partitions import TABLES
 
 # Advisory locks of an environment: one for its loaders, one for the maker of the index.
 # The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
@@ -26,36 +25,30 @@ LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
-class _Indexes:
-    """The indexes of an environment's rows, and the tables that they belong to."""
+class _Index:
+    """The index of an environment's rows, and its table; None where partitions have them."""
 
-    def __init__(self, connection: ServerConnection, tables: tuple[Table, ...]) -> None:
+    def __init__(self, connection: ServerConnection, table: Layout | None) -> None:
         self._connection = connection
-        self._tables = tables
+        self.table = table
 
-    def are_there(self) -> bool:
-        """Whether no index is missing."""
-        if not self._tables:
-            return True
-        found = self._connection.rows(
-            "SELECT bool_and(to_regclass(name) IS NOT NULL) FROM unnest(%s::text[]) AS name",
-            ([f"{table}_key" for table in self._tables],),
-        )
-        return bool(found[0][0])
+    def is_there(self) -> bool:
+        """Whether the index is not missing."""
+        text = "SELECT to_regclass(%s) IS NOT NULL"
+        return self.table is None or self._connection.rows(text, (f"{self.table}_key",))[0][0]
 
-    def have_no_rows(self) -> bool:
-        """Whether there are tables, and all are empty."""
-        held = " OR ".join(f"EXISTS (SELECT 1 FROM {table})" for table in self._tables)
-        return self._connection.rows(f"SELECT {held or True}") == [(False,)]
+    def has_no_rows(self) -> bool:
+        """Whether there is a table, and it is empty."""
+        text = f"SELECT EXISTS (SELECT 1 FROM {self.table})"
+        return self.table is not None and self._connection.rows(text) == [(False,)]
 
     def drop(self) -> None:
-        """Drop the indexes. If somebody is reading, they stay, and nobody waits."""
+        """Drop the index. If somebody is reading, it stays, and nobody waits."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
             try:
                 connection.begin("lock_timeout = '50ms'")
-                keys = ", ".join(f"{table}_key" for table in self._tables)
-                connection.command(f"DROP INDEX IF EXISTS {keys}")
+                connection.command(f"DROP INDEX IF EXISTS {self.table}_key")
                 connection.command("COMMIT")
             except BaseException:
                 if not connection.driver.closed:
@@ -63,27 +56,25 @@ class _Indexes:
                 raise
 
     def make(self) -> None:
-        """Make the missing indexes, while readers go on and writers wait."""
+        """Make the missing index, while readers go on and writers wait."""
         connection = self._connection
         connection.command("SET maintenance_work_mem = '256MB'")
-        for table in self._tables:
-            connection.command(
-                f"CREATE UNIQUE INDEX IF NOT EXISTS {table}_key ON {table} (z_val, id)"
-            )
+        connection.command(
+            f"CREATE UNIQUE INDEX IF NOT EXISTS {self.table}_key ON {self.table} (z_val, id)"
+        )
         connection.command("RESET maintenance_work_mem")
 
     def vacuum(self) -> None:
         """Let frames read the index only."""
-        if self._tables:
-            self._connection.command(f"VACUUM {', '.join(self._tables)}")
+        self._connection.command(f"VACUUM {self.table}")
 
 
 class Loading:
-    """The context in which a connection writes many objects; indexes on partitions stay."""
+    """The context in which a connection writes many objects; those of partitions stay."""
 
     def __init__(self, connection: ServerConnection, layout: Layout, *, is_spread: bool) -> None:
         self._connection = connection
-        self._indexes = _Indexes(connection, () if is_spread else TABLES[layout])
+        self._index = _Index(connection, None if is_spread else layout)
         self._depth = 0
         self._is_owner = False
         self._has_written = False
@@ -103,8 +94,8 @@ class Loading:
             connection.execute(f"SELECT pg_advisory_lock_shared({KEY})", (LOADERS,))
             try:
                 self._is_owner = connection.is_owner()
-                if self._is_owner and self._indexes.have_no_rows():
-                    self._indexes.drop()
+                if self._is_owner and self._index.has_no_rows():
+                    self._index.drop()
             except BaseException:
                 self._unlock("_shared", LOADERS)
                 raise
@@ -127,10 +118,10 @@ class Loading:
                 return
         with connection.without_limit("statement_timeout", "lock_timeout"):
             try:
-                if self._is_owner:
+                if self._is_owner and self._index.table is not None:
                     self._make_index()
                     if self._has_written:  # so that frames read the index only
-                        self._indexes.vacuum()
+                        self._index.vacuum()
             finally:
                 self._unlock("_shared", LOADERS)
 
@@ -149,7 +140,7 @@ class Loading:
     def mend(self) -> None:
         """Make the index that a killed loader left out, unless somebody is loading now."""
         connection = self._connection
-        if not connection.is_owner() or self._indexes.are_there():
+        if not connection.is_owner() or self._index.is_there():
             return
         with (
             connection.without_limit("statement_timeout", "lock_timeout"),
@@ -182,10 +173,10 @@ class Loading:
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
     def _make_index(self) -> None:
-        """Make the indexes, one connection at a time: IF NOT EXISTS alone would let two begin."""
+        """Make the index, one connection at a time: IF NOT EXISTS alone would let two begin."""
         connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:
-            self._indexes.make()
+            self._index.make()
         finally:
             self._unlock("", MAKERS)

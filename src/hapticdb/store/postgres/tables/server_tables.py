@@ -7,13 +7,12 @@ import numpy as np
 from numpy.typing import NDArray
 from psycopg import errors
 
-from hapticdb.store.base import LAYOUTS, NO_KEYS, Histogram, Keys, Object, Rows, Size, Table
+from hapticdb.store.base import LAYOUTS, NO_KEYS, Histogram, Keys, Layout, Object, Rows, Size
 from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures, wire
 from hapticdb.store.postgres.connecting.connection import ServerConnection
-from hapticdb.store.postgres.partitions import TABLES
 from hapticdb.store.postgres.tables import statements
 from hapticdb.store.postgres.tables.loading import Loading
 from hapticdb.store.postgres.watching import channel_of
@@ -24,12 +23,11 @@ Result = TypeVar("Result")
 WRITE_LOCK = "SELECT 1 FROM environment WHERE id = 1 FOR UPDATE"
 # writers take revisions one after the other, and no reader waits for this lock
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
-COPY_CHUNK = 1 << 17
+COPY_CHUNK = 1 << 14
 """Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
-COLUMNS: dict[Table, str] = {
+COLUMNS: dict[Layout, str] = {
     "voxel": "z_val, id",
-    "brick": "z_val, id, occupancy",
-    "band": "z_val, id, distances",
+    "brick": "z_val, id, occupancy, distances",
 }
 # not from a sequence, which also counts rolled-back writes: an import that is run again would
 # give other ids
@@ -45,8 +43,7 @@ PUT_PAIRS = PUT.format(
 DELETE_PAIRS = """
 DELETE FROM pair USING unnest(%s::bigint[], %s::bigint[]) AS gone (a, b)
  WHERE (pair.a, pair.b) = (gone.a, gone.b)"""
-SIZE_OF_BAND = "SELECT count(*), pg_total_relation_size('band') FROM band"
-SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages), sum(band) FROM size"
+SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages) FROM size"
 SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 SERVER_RESOLUTION = 10_000
 """Buckets of the server's histogram: the most that it keeps, and the paper's best resolution."""
@@ -139,8 +136,7 @@ class ServerTables(Tables):
 
         def work() -> None:
             if not self._do("SELECT 1 FROM object WHERE id = %s", (object_id,)):
-                for table in TABLES[self.layout]:
-                    self._do(f"DELETE FROM {table} WHERE id = %s", (object_id,))
+                self._do(f"DELETE FROM {self.layout} WHERE id = %s", (object_id,))
 
         self._alone(work)
 
@@ -179,30 +175,7 @@ class ServerTables(Tables):
 
     def _put(self, rows: Rows, object_id: int) -> None:
         """Write the rows of an object that has none."""
-        self._copy_into(self.layout, rows.occupied(), object_id)
-        if rows.distances is not None:
-            self._copy_into("band", rows, object_id)
-
-    def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
-        """Delete the rows of an object as it is now, from both tables; returns their keys.
-
-        keys : of its new rows; on partitions a try that failed may have left such rows.
-        """
-        lows, highs = ranges
-        if self._is_spread and keys.size:
-            lows, highs = np.append(lows, keys.min()), np.append(highs, keys.max())
-        chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(known.id)
-        tables: list[Table] = [self.layout]
-        if known.has_distances:
-            tables.append("band")
-        gone = []
-        for table in tables:
-            (found,) = self._connection.fetch(statements.DELETE_ROWS[table], *chosen)
-            gone.append(wire.read_int8s(found))
-        return np.concatenate(gone)
-
-    def _copy_into(self, table: Table, rows: Rows, object_id: int) -> None:
-        target = f"{table} ({COLUMNS[table]})"
+        target = f"{self.layout} ({COLUMNS[self.layout]})"
         with self._connection.driver.cursor().copy(
             f"COPY {target} FROM STDIN (FORMAT binary)"
         ) as copy:
@@ -210,6 +183,18 @@ class ServerTables(Tables):
             for at in range(0, len(rows), COPY_CHUNK):
                 copy.write(wire.copy_rows(rows.part(at, at + COPY_CHUNK), object_id))
             copy.write(wire.COPY_TRAILER)
+
+    def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
+        """Delete the rows of an object as it is now; returns their keys.
+
+        keys : of its new rows; on partitions a try that failed may have left such rows.
+        """
+        lows, highs = ranges
+        if self._is_spread and keys.size:
+            lows, highs = np.append(lows, keys.min()), np.append(highs, keys.max())
+        chosen = wire.int8s(lows), wire.int8s(highs), wire.int8(known.id)
+        (found,) = self._connection.fetch(statements.DELETE_ROWS[self.layout], *chosen)
+        return wire.read_int8s(found)
 
     # -- statistics ------------------------------------------------------------------------------
 
@@ -223,12 +208,11 @@ class ServerTables(Tables):
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
-            (band,) = self._connection.execute(SIZE_OF_BAND).fetchall()
             if self._is_spread:
-                ((more, index, of_band),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
-                total, index, band = total + int(more), int(index), (band[0], of_band)
+                ((more, index),) = self._connection.execute(SIZE_OF_PARTITIONS).fetchall()
+                total, index = total + int(more), int(index)
             (surfaces,) = self._connection.execute(SIZE_OF_SURFACES).fetchall()
-            return Size(int(rows), total, max(index, 1), *map(int, (*band, *surfaces)))
+            return Size(int(rows), total, max(index, 1), *map(int, surfaces))
 
     def quantiles(self, resolution: int) -> Histogram:
         """At 10,000 from the server's statistics once there are enough rows."""

@@ -4,50 +4,53 @@ Every statement also returns its revision, so a reader notices an edit without a
 Rows come in the order of the index; `PostgresStore` checks that.
 """
 
-from typing import NamedTuple, get_args
+from typing import NamedTuple
 
-from hapticdb.store.base import BRICK_BYTES, LAYOUTS, Layout, Table
+from hapticdb.store.base import LAYOUTS, Columns, Layout
+from hapticdb.store.parsing import NO_VOXEL
 
-TABLES: tuple[Table, ...] = get_args(Table)
-# the LEFT JOIN of `band` and `brick` as a subquery in the list of columns: so the planner can only
-# look up each brick by its key, and the rows keep the order of `band`
-OCCUPANCY = f"""
-       string_agg(coalesce((SELECT occupancy FROM brick
-                             WHERE brick.z_val = band.z_val AND brick.id = band.id),
-                           decode(repeat('00', {BRICK_BYTES}), 'hex')), '')"""
-PACKED: dict[Table, str] = {
+TABLES: dict[Columns, Layout] = {"voxel": "voxel", "brick": "brick", "distances": "brick"}
+PACKED: dict[Columns, str] = {
     "voxel": "array_agg(z_val), array_agg(id)",
     "brick": "array_agg(z_val), array_agg(id), string_agg(occupancy, '')",
-    "band": f"array_agg(z_val), array_agg(id), {OCCUPANCY}, string_agg(distances, ''),"
-    " array_agg(octet_length(distances)::bigint)",
+    "distances": f"""array_agg(z_val), array_agg(id),
+       string_agg(coalesce(occupancy, '\\x{NO_VOXEL.hex()}'), ''), string_agg(distances, ''),
+       array_agg(coalesce(octet_length(distances), 0)::bigint)""",
 }
+HELD: dict[Columns, str] = {
+    "voxel": "true",
+    "brick": "occupancy IS NOT NULL",
+    "distances": "distances IS NOT NULL",
+}
+"""Condition on a row that a read returns."""
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
 
-def _by_table(source: str) -> dict[Table, str]:
-    """Packed rows of each table, and the revision."""
+def _packed(source: str) -> dict[Columns, str]:
+    """Packed rows with each choice of columns, and the revision."""
     return {
-        table: f"\nSELECT {PACKED[table]}, {SEEN}\n{source.replace('TABLE', table)}"
-        for table in TABLES
+        columns: f"\nSELECT {PACKED[columns]}, {SEEN}\n"
+        + source.replace("TABLE", table).replace("HELD", HELD[columns])
+        for columns, table in TABLES.items()
     }
 
 
 # PostgreSQL 17 and later read each leaf page once for all of the sorted keys on it
-LOOKUP = _by_table("  FROM TABLE\n WHERE z_val = ANY ($1)")
-LOOKUP_ONE = _by_table("  FROM TABLE\n WHERE z_val = $1")
-SCAN = _by_table("""  FROM unnest($1, $2) AS range(low, high) JOIN TABLE
-    ON z_val BETWEEN range.low AND range.high""")
-AFTER = _by_table("""  FROM (SELECT * FROM TABLE
+LOOKUP = _packed("  FROM TABLE\n WHERE z_val = ANY ($1) AND HELD")
+LOOKUP_ONE = _packed("  FROM TABLE\n WHERE z_val = $1 AND HELD")
+SCAN = _packed("""  FROM unnest($1, $2) AS range(low, high) JOIN TABLE
+    ON z_val BETWEEN range.low AND range.high AND HELD""")
+AFTER = _packed("""  FROM (SELECT * FROM TABLE
          WHERE z_val >= $1 AND (z_val, id) > ($1, $2)
          ORDER BY z_val, id LIMIT $3) AS TABLE""")
 # LATERAL and OFFSET 0 force a scan of each range: the planner expects wide ranges, and would read
 # the whole index to find the id
-ROWS_OF = _by_table("""  FROM unnest($1, $2) AS range(low, high),
+ROWS_OF = _packed("""  FROM unnest($1, $2) AS range(low, high),
        LATERAL (SELECT *
                   FROM TABLE
-                 WHERE z_val BETWEEN range.low AND range.high AND id = $3
+                 WHERE z_val BETWEEN range.low AND range.high AND id = $3 AND HELD
                  ORDER BY z_val OFFSET 0) AS TABLE""")
-DELETE_ROWS: dict[Table, str] = {
+DELETE_ROWS: dict[Layout, str] = {
     table: f"""
 WITH gone AS (
   DELETE FROM {table}
@@ -60,7 +63,7 @@ WITH gone AS (
                            OFFSET 0) AS found))
   RETURNING z_val)
 SELECT array_agg(z_val) FROM gone"""
-    for table in TABLES
+    for table in LAYOUTS
 }
 COUNT: dict[Layout, str] = {
     layout: f"""
@@ -74,7 +77,7 @@ SELECT count(*)
 KEY_TEST: dict[Layout, str] = {"voxel": "z_val = shell.key", "brick": "z_val = shell.key >> 9"}
 BIT_TEST: dict[Layout, str] = {
     "voxel": "",
-    "brick": " AND get_bit(occupancy, shell.key & 511) = 1",
+    "brick": " AND has_voxel(occupancy, shell.key & 511)",
 }
 # Only hits fetch their point, by its ordinal: unnesting all seven arrays of the shell takes half as
 # long again.
@@ -115,13 +118,13 @@ def without_few(sql: str, layout: Layout, number: int) -> str:
 
 
 class Texts(NamedTuple):
-    """Statements by table or layout, as the constants above have them."""
+    """Statements by columns or layout, as the constants above have them."""
 
-    lookup: dict[Table, str]
-    lookup_one: dict[Table, str]
-    scan: dict[Table, str]
-    after: dict[Table, str]
-    rows_of: dict[Table, str]
+    lookup: dict[Columns, str]
+    lookup_one: dict[Columns, str]
+    scan: dict[Columns, str]
+    after: dict[Columns, str]
+    rows_of: dict[Columns, str]
     counts: dict[Layout, str]
     wrench: dict[Layout, str]
     hits: dict[Layout, str]
@@ -133,59 +136,29 @@ ONE_SERVER = Texts(LOOKUP, LOOKUP_ONE, SCAN, AFTER, ROWS_OF, COUNT, WRENCH, HITS
 # Rows on partitions (docs/postgresql.md): the same questions, so that a condition on keys reaches
 # the partitions. OFFSET 0 makes the planner ask them for each range or key, by its value; a join
 # would fetch all of their rows. Rows of no object, which a crash has left, are passed over.
-HELD = "EXISTS (SELECT 1 FROM object WHERE object.id = {0}.id)"
+KNOWN = "EXISTS (SELECT 1 FROM object WHERE object.id = {0}.id)"
 
 
-def _spread(table: Table, where: str) -> str:
-    """Rows of a table with a condition on `z_val`, as a subquery; those of `band` with bricks."""
-    if table != "band":
-        return f"(SELECT * FROM {table} WHERE {where} AND {HELD.format(table)} OFFSET 0) AS {table}"
-    return f"""(
-       SELECT z_val, id, occupancy, distances
-         FROM (SELECT * FROM band WHERE {where} AND {HELD.format(table)} OFFSET 0) AS near
-         LEFT JOIN (SELECT * FROM brick WHERE {where} OFFSET 0) AS held USING (z_val, id)
-        ORDER BY z_val, id OFFSET 0) AS band"""
+def _known(table: str, where: str) -> str:
+    """Rows of a table with a condition on `z_val`, as a subquery; only those of objects."""
+    return f"(SELECT * FROM {table} WHERE {where} AND {KNOWN.format(table)} OFFSET 0) AS {table}"
 
 
-SPREAD_PACKED = PACKED | {
-    "band": f"""array_agg(z_val), array_agg(id),
-       string_agg(coalesce(occupancy, decode(repeat('00', {BRICK_BYTES}), 'hex')), ''),
-       string_agg(distances, ''), array_agg(octet_length(distances)::bigint)"""
-}
+def _spread(source: str, where: str) -> dict[Columns, str]:
+    return _packed(f"  FROM {source}" + _known("TABLE", f"{where} AND HELD"))
+
+
 _RANGES = "unnest($1, $2) AS range(low, high), LATERAL "
 _IN_RANGE = "z_val BETWEEN range.low AND range.high"
-_NEXT = "SELECT * FROM {0} WHERE z_val >= $1 AND (z_val, id) > ($1, $2) ORDER BY z_val, id LIMIT $3"
-
-
-def _spread_after(table: Table) -> str:
-    if table != "band":
-        return f"SELECT {SPREAD_PACKED[table]}, {SEEN} FROM ({_NEXT.format(table)}) AS {table}"
-    return f"""
-  WITH near AS MATERIALIZED ({_NEXT.format("band")})
-SELECT {SPREAD_PACKED["band"]}, {SEEN}
-  FROM (SELECT z_val, id, occupancy, distances
-          FROM near LEFT JOIN (SELECT * FROM brick
-                                WHERE z_val BETWEEN $1 AND (SELECT max(z_val) FROM near)
-                               OFFSET 0) AS held USING (z_val, id)
-         ORDER BY z_val, id) AS band"""
-
-
-def _spread_rows(source: str, where: str) -> dict[Table, str]:
-    return {
-        table: f"SELECT {SPREAD_PACKED[table]}, {SEEN} FROM {source}{_spread(table, where)}"
-        for table in TABLES
-    }
-
-
 SPREAD = Texts(
-    _spread_rows("", "z_val = ANY ($1)"),
-    _spread_rows("", "z_val = $1"),
-    _spread_rows(_RANGES, _IN_RANGE),
-    {table: _spread_after(table) for table in TABLES},
-    _spread_rows(_RANGES, f"{_IN_RANGE} AND id = $3"),
-    {layout: f"SELECT count(*) FROM {_RANGES}{_spread(layout, _IN_RANGE)}" for layout in LAYOUTS},
+    _spread("", "z_val = ANY ($1)"),
+    _spread("", "z_val = $1"),
+    _spread(_RANGES, _IN_RANGE),
+    AFTER,
+    _spread(_RANGES, f"{_IN_RANGE} AND id = $3"),
+    {layout: f"SELECT count(*) FROM {_RANGES}{_known(layout, _IN_RANGE)}" for layout in LAYOUTS},
     {
-        layout: text.removesuffix(")") + f" AND {HELD.format(layout)} OFFSET 0)"
+        layout: text.removesuffix(")") + f" AND {KNOWN.format(layout)} OFFSET 0)"
         for layout, text in WRENCH.items()
     },
     {
@@ -193,7 +166,7 @@ SPREAD = Texts(
 SELECT array_agg(n), array_agg(id), {SEEN}
   FROM unnest($1) WITH ORDINALITY AS shell(key, n),
        LATERAL (SELECT id FROM {layout}
-                 WHERE {KEY_TEST[layout]}{bit} AND {HELD.format(layout)} OFFSET 0) AS found"""
+                 WHERE {KEY_TEST[layout]}{bit} AND {KNOWN.format(layout)} OFFSET 0) AS found"""
         for layout, bit in BIT_TEST.items()
     },
 )

@@ -2,7 +2,7 @@
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any, TypeVar, get_args
+from typing import Any, TypeVar
 
 import apsw
 import numpy as np
@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
-from hapticdb.store.base import BRICK_BYTES, NO_KEYS, Keys, Layout, Object, Rows, Size, Table
+from hapticdb.store.base import LAYOUTS, NO_KEYS, Keys, Layout, Object, Rows, Size
 from hapticdb.store.covering import Ranges
 from hapticdb.store.pairs import PUT, Ids, PairRow
 from hapticdb.store.sqlite.connection import FileConnection
@@ -24,23 +24,17 @@ SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type
 # whole arrays are bound at once: 8 times faster than executemany, without the interpreter lock
 INSERT = {
     "voxel": "INSERT INTO voxel SELECT value, ?2 FROM carray(?1)",
-    "brick": f"""INSERT INTO brick SELECT value, ?2,
-                        substr(?3, {BRICK_BYTES} * rowid - {BRICK_BYTES - 1}, {BRICK_BYTES})
-                   FROM carray(?1)""",
+    "brick": """INSERT INTO brick SELECT value, ?2, nth(?3, rowid, 0), nth(?4, rowid, 0)
+                  FROM carray(?1)""",
 }
-INSERT_BAND = """
-INSERT INTO band SELECT value, ?2, substr(?3, nth(?4, rowid, 0), nth(?5, rowid, 0))
-  FROM carray(?1)"""
 CHUNK = 1 << 14
 """Rows that one statement inserts; to undo it takes up to a page of memory for each."""
 PUT_PAIR = PUT.format(values=f"VALUES ({', '.join('?' * 14)})")
 DELETE_PAIR = "DELETE FROM pair WHERE (a, b) = (?, ?)"
-DELETE: dict[Table, str] = {
-    table: f"DELETE FROM {table} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
-    for table in get_args(Table)
+DELETE: dict[Layout, str] = {
+    layout: f"DELETE FROM {layout} WHERE z_val BETWEEN ? AND ? AND id = ? RETURNING z_val"
+    for layout in LAYOUTS
 }
-SIZE_OF_BAND = "SELECT ncell, pgsize FROM dbstat WHERE name = 'band' AND aggregate = TRUE"
-"""Rows and bytes by one pass: in a table WITHOUT ROWID each cell is a row."""
 SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(length(geometry)), 0) FROM surface"
 
 
@@ -115,34 +109,18 @@ class FileTables(Tables):
         self._connection.driver.executemany(DELETE_PAIR, gone)
         self._connection.driver.executemany(PUT_PAIR, [row.columns for row in rows])
 
-    def _put(self, union: Rows, object_id: int) -> None:
-        """Insert rows, ascending by key, and their distances: a statement for each chunk."""
-        rows = union.occupied()
+    def _put(self, rows: Rows, object_id: int) -> None:
+        """Insert rows, ascending by key: a statement for each chunk."""
         for at in range(0, len(rows), CHUNK):
-            keys = apsw.carray(rows.keys[at : at + CHUNK])
-            if self.layout == "voxel":
-                self._do(INSERT["voxel"], (keys, object_id))
-            else:
-                part = rows.occupancy[BRICK_BYTES * at : BRICK_BYTES * (at + CHUNK)]
-                self._do(INSERT["brick"], (keys, object_id, part.tobytes()))
-        for at in range(0, len(union) if union.distances is not None else 0, CHUNK):
-            band = union.part(at, at + CHUNK)
-            assert band.distances is not None  # noqa: S101 - a part of what has some
-            data, ends = band.distances
-            lengths = band.distances.lengths
-            places = (apsw.pyobject((ends - lengths + 1).tolist()), apsw.pyobject(lengths.tolist()))
-            keys = apsw.carray(np.ascontiguousarray(band.keys))
-            self._do(INSERT_BAND, (keys, object_id, data.tobytes(), *places))
+            part = rows.part(at, at + CHUNK)
+            fields = zip(*parsing.fields_of(part), strict=True) if self.layout == "brick" else ()
+            keys = apsw.carray(np.ascontiguousarray(part.keys))
+            self._do(INSERT[self.layout], (keys, object_id, *map(apsw.pyobject, fields)))
 
     def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:  # noqa: ARG002
-        tables: list[Table] = [self.layout]
-        if known.has_distances:
-            tables.append("band")
         gone: list[int] = []
         for low, high in zip(ranges.lows.tolist(), ranges.highs.tolist(), strict=True):
-            for table in tables:
-                deleted = self._do(DELETE[table], (low, high, known.id))
-                gone += [row[0] for row in deleted]
+            gone += [row[0] for row in self._do(DELETE[self.layout], (low, high, known.id))]
         return np.array(gone, dtype=np.int64)
 
     # -- statistics ------------------------------------------------------------------------------
@@ -153,12 +131,11 @@ class FileTables(Tables):
             blocks = self._connection.fetch(
                 "SELECT pageno FROM dbstat WHERE name = ?1 AND aggregate = TRUE", (self.layout,)
             )
-            (band,) = self._connection.fetch(SIZE_OF_BAND)  # a row for an empty table, too
             (surfaces,) = self._connection.fetch(SIZE_OF_SURFACES)
         wal = Path(f"{self._connection.path}-wal")
         total = self._connection.path.stat().st_size + (wal.stat().st_size if wal.exists() else 0)
         n_blocks = int(blocks[0][0]) if blocks else 1
-        return Size(int(rows), total, n_blocks, *map(int, (*band, *surfaces)))
+        return Size(int(rows), total, n_blocks, *map(int, surfaces))
 
     def findings(self) -> Iterator[str]:
         for (line,) in self._connection.fetch("PRAGMA integrity_check(100)"):

@@ -15,11 +15,11 @@ from hapticdb.grid import Grid
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.query import refining
 from hapticdb.store import parsing
-from hapticdb.store.base import BRICK_BYTES, Keys, Layout, LocatedShell, row_shift
+from hapticdb.store.base import Keys, Layout, LocatedShell, row_shift
 
 TEST: dict[Layout, str] = {
     "voxel": "z_val = shell.value",
-    "brick": "z_val = shell.value >> 9 AND get_bit(occupancy, shell.value & 511)",
+    "brick": "z_val = shell.value >> 9 AND has_voxel(occupancy, shell.value & 511)",
 }
 """The condition of the statements on a row."""
 WRENCH: dict[Layout, str] = {
@@ -55,15 +55,21 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
     def force() -> _Force:
         return _Force(grid, layout)
 
-    def get_bit(occupancy: bytes, bit: int) -> int:
-        if not isinstance(occupancy, bytes) or len(occupancy) != BRICK_BYTES:
-            raise parsing.damaged(connection.filename, "a brick of the wrong length")
-        return occupancy[bit >> 3] >> (bit & 7) & 1  # as PostgreSQL's function of that name
+    def has_voxel(occupancy: bytes | None, voxel: int) -> int:
+        if occupancy is None:
+            return 0
+        try:
+            mask, byte = int.from_bytes(occupancy[:8], "little"), voxel >> 3
+            at = 8 + (mask & ((1 << byte) - 1)).bit_count()
+            return occupancy[at] >> (voxel & 7) & 1 if mask >> byte & 1 else 0
+        except (TypeError, IndexError) as error:
+            cause = "a brick of the wrong length"
+            raise parsing.damaged(connection.filename, cause) from error
 
     is_felt = _LastExcluded().is_felt
     connection.create_aggregate_function("force", cast("Any", force), 3)
     connection.create_scalar_function("is_felt", cast("Any", is_felt), 2)
-    connection.create_scalar_function("get_bit", cast("Any", get_bit), 2, deterministic=True)
+    connection.create_scalar_function("has_voxel", cast("Any", has_voxel), 2, deterministic=True)
 
 
 class _Force:

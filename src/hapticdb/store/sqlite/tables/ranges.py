@@ -9,36 +9,35 @@ from typing import Any, cast
 import apsw
 import numpy as np
 
-from hapticdb.store.base import Keys, Layout, Table, row_shift
+from hapticdb.store.base import Columns, Keys, Layout, row_shift
 
 KEY_BITS = 63
 """Value bits of a non-negative int64."""
 
-COLUMNS: dict[Table, str] = {
+LISTS: dict[Columns, str] = {
     "voxel": "z_val, id",
     "brick": "z_val, id, occupancy",
-    "band": "band.z_val, band.id, occupancy, distances",
+    "distances": "z_val, id, occupancy, distances",
 }
-TABLES: dict[Table, str] = {
-    "voxel": "voxel",
-    "brick": "brick",
-    # the occupancy is NULL if the brick holds no voxel: a coalesce to zeros takes 1 us a row
-    "band": "band LEFT JOIN brick ON brick.z_val = band.z_val AND brick.id = band.id",
+TABLES: dict[Columns, str] = {"voxel": "voxel", "brick": "brick", "distances": "brick"}
+HELD: dict[Columns, str] = {
+    "voxel": "TRUE",
+    "brick": "occupancy IS NOT NULL",
+    "distances": "distances IS NOT NULL",
 }
+"""Condition on a row that a read returns."""
 # SQLite never reorders a CROSS JOIN, so the rows keep the order of the keys asked for
-NARROW: dict[Table, str] = {
-    table: f"""
-SELECT {columns}
-  FROM carray(?1) AS range CROSS JOIN {TABLES[table]}
- WHERE {table}.z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)"""
-    for table, columns in COLUMNS.items()
+NARROW: dict[Columns, str] = {
+    columns: f"""
+  FROM carray(?1) AS range CROSS JOIN {table}
+ WHERE z_val BETWEEN range.value >> ?2 AND (range.value >> ?2) + (range.value & ?3)"""
+    for columns, table in TABLES.items()
 }
-WIDE: dict[Table, str] = {
-    table: f"""
-SELECT {columns}
-  FROM carray(?1) AS low CROSS JOIN {TABLES[table]}
- WHERE {table}.z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)"""
-    for table, columns in COLUMNS.items()
+WIDE: dict[Columns, str] = {
+    columns: f"""
+  FROM carray(?1) AS low CROSS JOIN {table}
+ WHERE z_val BETWEEN low.value AND nth(?2, low.rowid, ?3)"""
+    for columns, table in TABLES.items()
 }
 
 
@@ -53,27 +52,31 @@ class RangeStatements:
         self._layout = layout
         connection.create_scalar_function("nth", cast("Any", _nth), 3, deterministic=True)
 
-    def scan(self, table: Table, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
-        """Rows of a table with a key in closed ranges, ascending and disjoint, at least one."""
+    def scan(self, columns: Columns, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
+        """Rows with a key in closed ranges, ascending and disjoint, at least one."""
+        source, bindings = self._source(columns, lows, highs)
+        return f"SELECT {LISTS[columns]}{source} AND {HELD[columns]}", bindings
+
+    def count(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
+        """Count the rows of the index table in the ranges."""
+        source, bindings = self._source(self._layout, lows, highs)
+        return f"SELECT count(*){source}", bindings
+
+    def _source(self, columns: Columns, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
         widths = highs - lows
         is_narrow = (
             int(widths.max()) <= self._mask and int(lows[-1]) < self._key_end and int(lows[0]) >= 0
         )
         if is_narrow:
             packed = apsw.carray((lows << self._width_bits) | widths)
-            return NARROW[table], (packed, self._width_bits, self._mask)
-        return WIDE[table], (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
-
-    def count(self, lows: Keys, highs: Keys) -> tuple[str, tuple[Any, ...]]:
-        """Count the rows of the index table in the ranges."""
-        sql, bindings = self.scan(self._layout, lows, highs)
-        return f"SELECT count(*) FROM ({sql})", bindings
+            return NARROW[columns], (packed, self._width_bits, self._mask)
+        return WIDE[columns], (apsw.carray(np.ascontiguousarray(lows)), _ends(highs), 0)
 
 
 def _ends(highs: Keys) -> object:
     return apsw.pyobject(highs.tolist())
 
 
-def _nth(values: list[int], ordinal: int, _: int) -> int:
-    """Value of a bound list by ordinal, from 1: the other end of a range."""
+def _nth(values: list[Any], ordinal: int, _: int) -> Any:  # noqa: ANN401 - what SQLite holds
+    """Value of a bound list by ordinal, from 1: the other end of a range, or a row's bytes."""
     return values[ordinal - 1]

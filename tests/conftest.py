@@ -13,15 +13,19 @@ import pytest
 
 import children
 import draws
-from hapticdb import PointShell
+from banded import write_points
+from command_line import made, run, scene  # noqa: F401 - fixtures
+from hapticdb import Environment, PointShell
 from hapticdb.kernels import _sets
 from hapticdb.pointshell.shell import fibonacci_sphere
+from realtime.sessions import floor_points, floored
+from realtime.worlds import make
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
 from voxels import KINDS
 
 NEWEST = {"cli", "house"}
 """Rooms tested on the newest PostgreSQL alone: what is said, not what a server is asked."""
-OLDER = {"test_contract_postgres.py", "test_partitions.py", "test_session_edits.py"}
+OLDER = {"test_contract_postgres.py", "test_partitions.py"}
 """Modules tested on every PostgreSQL that is found; the others only with --every-step."""
 QUICK_KINDS = {"brick-z", "voxel-lexicographic"}
 """Layout and curve of the contract's quick tests on other engines than SQLite, which has all."""
@@ -117,3 +121,18 @@ def sphere() -> PointShell:
     """300 points on a sphere of 12 mm about the tool's origin, normals inward."""
     out = fibonacci_sphere(300)
     return PointShell(points=out * 0.012, normals=-out, center=np.zeros(3), is_closed=True)
+
+
+@pytest.fixture(scope="module")
+def voxel_floor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor of voxels with its top at z = 0, on SQLite."""
+    with floored(make(tmp_path_factory.mktemp("voxels"), bits=6)) as env:
+        yield env
+
+
+@pytest.fixture(scope="module")
+def distance_floor(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
+    """A floor with distances, 1 mm below z = 0, on SQLite."""
+    with make(tmp_path_factory.mktemp("distances"), bits=6) as env:
+        write_points(env.store, floor_points(31.5), "floor")
+        yield env

@@ -1,18 +1,15 @@
 """The verbs view and serve, with mistakes and signals."""
 
-import os
-import signal
-import sys
 from pathlib import Path
-from urllib.request import urlopen
 
 import pytest
 
 import hapticdb
-from children import PATIENCE, child
 from hapticdb.cli import main
-from hapticdb.cli.root import TERMINATED
+from hapticdb.cli.options import RenderingName
+from hapticdb.cli.verbs.serving import _serving
 from hapticdb.realtime import fork_server
+from hapticdb.server.running import _page_request
 
 
 @pytest.fixture
@@ -53,19 +50,8 @@ def test_a_mistake_is_one_line_and_starts_nothing(
     assert words in told.err
 
 
-@pytest.mark.long
-def test_sigterm_ends_the_server_in_order(scene: Path) -> None:
-    command = [sys.executable, "-m", "hapticdb", "serve", str(scene), "--token", "--log-json"]
-    with child(command, env=dict(os.environ)) as server:
-        assert server.stdout is not None
-        assert server.stderr is not None
-        lines = [server.stdout.readline().split() for _ in range(3)]
-        assert [role for role, _ in lines] == ["viewer", "toucher", "editor"]
-        place = lines[0][1].partition("?")[0]
-        with urlopen(f"{place}healthz", timeout=PATIENCE) as answer:  # noqa: S310 - our own
-            assert b'"status":"ok"' in answer.read()
-        server.send_signal(signal.SIGTERM)
-        told = server.stderr.read()
-        assert server.wait(PATIENCE) == TERMINATED
-    assert '"event": "stopped"' in told
-    assert "?token=" not in told
+@pytest.mark.parametrize("rendering", [None, "coupled", "direct"])
+def test_a_rendering_reaches_host_and_page(scene: Path, rendering: RenderingName | None) -> None:
+    serving = _serving(str(scene), None, {}, None, None, rendering)
+    assert serving.rendering == rendering
+    assert _page_request(serving, 0, 0, "").is_direct == (rendering == "direct")

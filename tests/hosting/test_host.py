@@ -22,14 +22,13 @@ from hapticdb.hosting.attached import AttachedHost
 from hapticdb.hosting.host import SessionHost
 from hapticdb.hosting.hosted import HostedSession
 from hapticdb.poses import row_of_pose
-from hapticdb.realtime.coupling import Coupling
+from hapticdb.realtime.coupling import Coupling, Rendering
 from hapticdb.realtime.replay import replay
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
 from hapticdb.resident.table import is_alive
 from realtime.hands import at
-from realtime.sessions import floored, recorded, standing_plate
-from realtime.worlds import make
+from realtime.sessions import recorded, standing_plate
 
 Floats = NDArray[np.float64]
 RATE = 500.0
@@ -39,8 +38,8 @@ ABOVE, PRESSED = at(0.0, 0.0, 0.02), at(0.0, 0.0, 0.004)
 
 
 @pytest.fixture(scope="module")
-def host(env: Environment) -> Iterator[SessionHost]:
-    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20, processes=2) as made:
+def host(distance_floor: Environment) -> Iterator[SessionHost]:
+    with SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20, processes=2) as made:
         yield made
 
 
@@ -56,6 +55,12 @@ def pushed(session: HostedSession) -> float:
     """Force along z that the hand feels now, N."""
     last = session.latest()
     return 0.0 if last is None else float(last["applied"][0, 2])
+
+
+def force_of(session: HostedSession) -> float:
+    """Size of the force that the hand feels now, N."""
+    last = session.latest()
+    return 0.0 if last is None else float(np.linalg.norm(last["applied"][0, :3]))
 
 
 def press(
@@ -78,30 +83,12 @@ def run_frames(session: HostedSession, count: int) -> None:
 
 
 def test_the_floor_pushes_the_hand_up_and_is_named_while_it_is_touched(
-    session: HostedSession, env: Environment
+    session: HostedSession, distance_floor: Environment
 ) -> None:
-    (floor,) = env.find("floor")
+    (floor,) = distance_floor.find("floor")
     assert (pushed(session), session.touched()) == (0.0, ())
     press([session], lambda: pushed(session) > 0.5 and session.touched() == (floor.id,))
     press([session], lambda: pushed(session) == 0.0 and session.touched() == (), ABOVE)
-
-
-def test_the_hand_moves_in_steps_of_the_loop_between_arrivals(
-    session: HostedSession, tmp_path: Path
-) -> None:
-    session.record(tmp_path / "way.hdbrec")
-    poses = [at(0.0, 0.0, z) for z in np.linspace(0.02, 0.05, 16)]
-    for pose in poses:  # 2 mm each time, at 33 Hz if the machine is not busy: 0.07 m/s
-        session.move(pose)
-        run_frames(session, 15)
-    until(lambda: _height(session) == pytest.approx(0.05, abs=1e-9))
-    assert session.stop_recording() > 0
-    frames = recorded(tmp_path / "way.hdbrec")
-    heights = frames["hand"][:, 2]
-    steps = np.diff(heights)
-    assert (steps >= -1e-12).all()
-    assert heights.max() <= 0.05 + 1e-12  # never beyond what was said
-    assert (steps <= 0.1 * np.diff(frames["time"])).all()  # in between, too: it never jumps
 
 
 def _height(session: HostedSession) -> float:
@@ -119,7 +106,7 @@ def test_contacts_lie_on_the_floor_and_their_forces_lift_the_tool(session: Hoste
 
 
 def test_a_recording_replays_bit_for_bit(
-    session: HostedSession, env: Environment, tmp_path: Path
+    session: HostedSession, distance_floor: Environment, tmp_path: Path
 ) -> None:
     press([session], lambda: pushed(session) > 0.5)
     path = tmp_path / "hosted.hdbrec"
@@ -138,7 +125,7 @@ def test_a_recording_replays_bit_for_bit(
     assert frames["contacts"].max() > 0
     assert sorted(set(frames["spring"][:, 0])) == [300.0, 1000.0]
     assert not frames["state"][0] & State.ANEW  # the state of the running session was taken over
-    result = replay(Recording(path), env)
+    result = replay(Recording(path), distance_floor)
     assert result.is_equal, result.describe()
 
 
@@ -156,7 +143,7 @@ def test_objects_that_a_session_leaves_out_are_not_felt(
 
 
 def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
-    host: SessionHost, env: Environment
+    host: SessionHost, distance_floor: Environment
 ) -> None:
     """The tool rests above the floor, and something is put where it is."""
     session = host.begin(standing_plate(), ABOVE)
@@ -165,21 +152,12 @@ def test_a_cell_that_changes_beside_a_resting_tool_is_felt(
     assert last is not None
     assert last["hits"][0] == 0
     points = np.array([(x, 32.0, 47.0) for x in np.arange(30.0, 34.0, 0.25)])
-    added = write_points(env.store, points, "put")
+    added = write_points(distance_floor.store, points, "put")
     try:
         until(lambda: (f := session.latest()) is not None and f["state"][0] & State.IN_OBJECT)
     finally:
         session.end()
-        env.remove(added)
-
-
-def test_a_new_coupling_is_felt(session: HostedSession) -> None:
-    press([session], lambda: _height(session) == pytest.approx(PRESSED[2, 3], abs=1e-9))
-    run_frames(session, 100)  # the tool follows
-    press([session], lambda: pushed(session) > 0.5)
-    before = pushed(session)
-    session.set_coupling(Coupling(stiffness=100.0))
-    press([session], lambda: 0.0 < pushed(session) < 0.5 * before)
+        distance_floor.remove(added)
 
 
 @pytest.mark.parametrize(
@@ -214,22 +192,42 @@ def test_a_session_that_has_ended_says_so(host: SessionHost, sphere: PointShell)
             use()
 
 
-def test_what_has_no_distances_is_not_felt_and_the_line_names_what_may_be_done(
-    tmp_path: Path, sphere: PointShell
-) -> None:
+@pytest.mark.parametrize(
+    ("floor", "rendering"), [("voxel_floor", None), ("distance_floor", "direct")]
+)
+def test_a_hand_rendered_directly_gets_each_frames_wrench(
+    floor: str, rendering: Rendering | None, request: pytest.FixtureRequest, sphere: PointShell,
+    tmp_path: Path,
+) -> None:  # fmt: skip
+    env: Environment = request.getfixturevalue(floor)
+    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20, rendering=rendering) as host:
+        session = host.begin(sphere, ABOVE)
+        press([session], lambda: pushed(session) > 0.5 and session.touched() == (1,))
+        session.record(tmp_path / "direct.hdbrec")
+        session.set_coupling(Coupling(cap=0.25))
+        press([session], lambda: force_of(session) == pytest.approx(0.25))
+        with pytest.raises(UsageError, match="stiffness does not go with the rendering direct"):
+            session.set_coupling(Coupling(stiffness=100.0))
+        session.end()
+    frames = recorded(tmp_path / "direct.hdbrec")
+    assert (frames["tool"] == frames["hand"]).all()
+    result = replay(Recording(tmp_path / "direct.hdbrec"), env)
+    assert result.is_equal, result.describe()
+
+
+def test_a_coupled_hand_needs_distances(voxel_floor: Environment, sphere: PointShell) -> None:
     with (
-        floored(make(tmp_path, bits=6)) as flat,
-        SessionHost(flat.url, rate=RATE, budget_bytes=8 << 20) as host,
-        pytest.raises(UsageError, match=r"import with distances .* --law plane$"),
+        SessionHost(voxel_floor.url, rate=RATE, rendering="coupled") as host,
+        pytest.raises(UsageError, match=r"import with distances .* leave out --rendering coupled"),
     ):
         host.begin(sphere, ABOVE)
 
 
 def test_a_host_takes_no_more_sessions_than_its_board_has_seats(
-    env: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
+    distance_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setattr(hosting, "MOST_SESSIONS", 1)
-    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20) as host:
+    with SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20) as host:
         first = host.begin(sphere, ABOVE)
         with pytest.raises(UsageError, match="end one first"):
             host.begin(sphere, ABOVE)
@@ -277,9 +275,9 @@ def test_the_sessions_of_a_process_that_dies_end(host: SessionHost) -> None:
 
 
 def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
-    env: Environment, sphere: PointShell
+    distance_floor: Environment, sphere: PointShell
 ) -> None:
-    with SessionHost(env.url, rate=RATE, budget_bytes=8 << 20) as host:
+    with SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20) as host:
         session = host.begin(sphere, ABOVE)
         os.kill(host.pids[0], signal.SIGKILL)
         until(lambda: session.is_over)
@@ -291,9 +289,9 @@ def test_sessions_of_a_worker_that_dies_are_over_and_others_can_begin(
 
 
 def test_a_closed_host_leaves_no_process_and_refuses_sessions(
-    env: Environment, sphere: PointShell
+    distance_floor: Environment, sphere: PointShell
 ) -> None:
-    host = SessionHost(env.url, rate=RATE, budget_bytes=8 << 20)
+    host = SessionHost(distance_floor.url, rate=RATE, budget_bytes=8 << 20)
     host.begin(sphere, ABOVE)
     pids = [*host.pids, *(cells.pid for cells in host.cells)]
     host.close()
@@ -303,11 +301,11 @@ def test_a_closed_host_leaves_no_process_and_refuses_sessions(
         host.begin(sphere, ABOVE)
 
 
-def test_numbers_out_of_range_are_refused(env: Environment) -> None:
+def test_numbers_out_of_range_are_refused(distance_floor: Environment) -> None:
     with pytest.raises(UsageError, match="give 10 to"):
-        SessionHost(env.url, rate=5.0)
+        SessionHost(distance_floor.url, rate=5.0)
     with pytest.raises(UsageError, match="give 1 or more"):
-        SessionHost(env.url, processes=0)
+        SessionHost(distance_floor.url, processes=0)
 
 
 def test_the_other_end_of_a_closed_socket_is_an_error() -> None:
@@ -318,9 +316,9 @@ def test_the_other_end_of_a_closed_socket_is_an_error() -> None:
 
 
 def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
-    env: Environment, sphere: PointShell
+    distance_floor: Environment, sphere: PointShell
 ) -> None:
-    with SessionHost(env.url, rate=250.0, budget_bytes=16 << 20, processes=1) as host:
+    with SessionHost(distance_floor.url, rate=250.0, budget_bytes=16 << 20, processes=1) as host:
         sessions = [host.begin(sphere, ABOVE) for _ in range(64)]
         assert len(host.cells) == len(host.pids) == 1
         press(sessions, lambda: all(pushed(session) > 0.5 for session in sessions))
@@ -333,9 +331,9 @@ def test_sixty_four_sessions_share_a_table_and_all_feel_the_floor(
 
 
 def test_an_overloaded_worker_runs_all_sessions_at_the_same_lower_rate(
-    env: Environment, sphere: PointShell
+    distance_floor: Environment, sphere: PointShell
 ) -> None:
-    with SessionHost(env.url, rate=20_000.0, budget_bytes=16 << 20, processes=1) as host:
+    with SessionHost(distance_floor.url, rate=20_000.0, budget_bytes=16 << 20, processes=1) as host:
         sessions = [host.begin(sphere, PRESSED) for _ in range(24)]
 
         def share_alike() -> bool:
@@ -351,9 +349,9 @@ def test_an_overloaded_worker_runs_all_sessions_at_the_same_lower_rate(
 
 
 def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
-    env: Environment, sphere: PointShell
+    distance_floor: Environment, sphere: PointShell
 ) -> None:
-    with SessionHost(env.url, rate=250.0, budget_bytes=16 << 20) as host:
+    with SessionHost(distance_floor.url, rate=250.0, budget_bytes=16 << 20) as host:
         session = host.begin(sphere, ABOVE)
         press([session], lambda: pushed(session) > 0.5)
         fetching = host.cells[0].pid
@@ -367,18 +365,3 @@ def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
         finally:
             os.kill(fetching, signal.SIGCONT)
         until(lambda: pushed(session) > 0.5)
-
-
-def test_a_tool_in_cells_that_are_not_resident_is_not_pushed(
-    env: Environment, sphere: PointShell
-) -> None:
-    with SessionHost(env.url, rate=250.0, budget_bytes=16 << 20) as host:
-        near = host.begin(sphere, ABOVE)
-        until(lambda: near.latest() is not None)
-        os.kill(host.cells[0].pid, signal.SIGSTOP)  # nothing is fetched any more
-        try:
-            far = host.begin(sphere, at(5.0, 5.0, 5.0))
-            until(lambda: far.latest() is not None)
-            assert not far.latest()["applied"].any()  # type: ignore[index]
-        finally:
-            os.kill(host.cells[0].pid, signal.SIGCONT)

@@ -61,14 +61,14 @@ def two_parts(folder: Path) -> Path:
 
 @contextmanager
 def page_of(
-    url: Path, *, recordings: Path | None = None
+    url: Path, *, recordings: Path | None = None, is_direct: bool = False
 ) -> Iterator[tuple[Site, PagePerson, TabbedBrowser]]:
     """Open the page of an environment, with one editor at it."""
     server = new_server()
     ours, theirs = socket.socketpair()
     request = PageRequest(
         dict.fromkeys(("viewer", "toucher", "editor"), str(url)), (), 0, 0, "",
-        None if recordings is None else str(recordings),
+        None if recordings is None else str(recordings), is_direct=is_direct,
     )  # fmt: skip
     with ExitStack() as ending:
         ending.callback(ours.close)
@@ -166,6 +166,14 @@ def test_no_error_in_a_browser_names_a_folder_or_the_environment(scene: Path) ->
         for text in person.received:
             for secret in (str(folder), str(folder.parent), folder.name, "scene.db", "Traceback"):
                 assert secret not in text, text
+
+
+@pytest.mark.parametrize("is_direct", [False, True])
+def test_a_hand_without_a_spring_has_no_stiffness(scene: Path, *, is_direct: bool) -> None:
+    with page_of(scene, is_direct=is_direct) as (site, person, browser):
+        labels = [widget.get("label") for widget in person.widgets.values()]
+        assert ("Stiffness, N/m" in labels) == site.is_coupled == (not is_direct)
+        assert (browser._coupling() is None) == is_direct
 
 
 URL = "postgresql://ada:s3cret@db.example:5432/cars?environment=beetle&password=s3cret"

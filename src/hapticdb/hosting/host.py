@@ -27,8 +27,15 @@ from hapticdb.hosting.workers import Workers
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
+from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import Coupling, SettledCoupling, radius_of
+from hapticdb.realtime.coupling import (
+    Coupling,
+    DirectRendering,
+    Rendering,
+    radius_of,
+    rendering_of,
+)
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
 from hapticdb.realtime.timing import Timing
@@ -50,7 +57,9 @@ class SessionHost(Closes):
     one table of resident cells and its fetching process. Also a context manager.
 
     url : the environment; rate : frames a second of each session; budget_bytes : memory of each
-    table of cells; processes : most worker processes, one for each processor unless given.
+    table of cells; processes : most worker processes, one for each processor unless given, and one
+    for each rendering; rendering : of all sessions. Without it sessions whose objects have
+    distances to surfaces are coupled, and the others feel tangent planes directly.
     """
 
     _pid = 0
@@ -63,11 +72,13 @@ class SessionHost(Closes):
         rate: float = 1000.0,
         budget_bytes: int = DEFAULT_BUDGET,
         processes: int | None = None,
+        rendering: Rendering | None = None,
     ) -> None:
         Timing(rate)  # checks it
+        rendering_of(rendering, DISTANCE)  # likewise
         if processes is not None and processes < 1:
             raise UsageError(f"{processes} worker processes: give 1 or more")
-        self.url, self.rate = url, rate
+        self.url, self.rate, self._rendering = url, rate, rendering
         self._tables = SharedTables(url, budget_bytes)
         self._board = Board.create(MOST_SESSIONS)
         self._workers = Workers(self._board, rate, processes or os.cpu_count() or 1)
@@ -100,13 +111,14 @@ class SessionHost(Closes):
         """Begin a session; its tool waits at `start`, (4, 4), scene metres, until the hand moves.
 
         where, exclude : words as of `Environment.find`, of the objects in contact (all without
-        `where`) and of exceptions; coupling : without a profile no force moves its hand; scale :
+        `where`) and of exceptions; coupling : without a profile no force moves its hand; rendered
+        directly, it gives caps alone; scale :
         metres of the scene for a metre of the device, for the coupling alone: poses of the hand are
         the scene's.
 
-        Raises `UsageError` if a number is out of its range, no seat is free, or an object has no
-        distances to its surfaces; `ObjectNotFoundError` if a word chooses nothing; `DatabaseError`
-        if the environment cannot be opened.
+        Raises `UsageError` if a number is out of its range, no seat is free, or a hand is to be
+        coupled where an object has no distances to its surfaces; `ObjectNotFoundError` if a word
+        chooses nothing; `DatabaseError` if the environment cannot be opened.
         """
         pose = pose_at(start)
         if not is_rigid(pose):
@@ -129,14 +141,16 @@ class SessionHost(Closes):
         """Take seat, cells and worker for a session; all are given back if one is not to be had."""
         session = next(self._ids)
         with ExitStack() as undo:
-            worker = self._workers.least_busy()
-            seat = self._board.take(session, worker.number)
-            undo.callback(self._board.release, seat)
             cells = self._tables.take(felt)
             undo.callback(self._tables.release, cells)
-            if not cells.has_distances:
-                raise UsageError(without_distances(self.url))
-            settled = self._settled(coupling, cells, shell, scale)
+            law = DISTANCE if cells.has_distances else PLANE
+            if self._rendering == "coupled" and law is PLANE:
+                raise UsageError(without_distances(self.url, "leave out --rendering coupled"))
+            rendering = rendering_of(self._rendering, law)
+            settled = self._settled(coupling, cells, shell, scale, rendering)
+            worker = self._workers.least_busy(law, rendering)
+            seat = self._board.take(session, worker.number)
+            undo.callback(self._board.release, seat)
             reader = cells.table.join()
             undo.callback(cells.table.leave, reader)
             cells.table.desk.pids[reader] = worker.pid
@@ -159,10 +173,13 @@ class SessionHost(Closes):
         cells: ResidentCells,
         shell: PointShell,
         scale: float,
-    ) -> SettledCoupling:
-        """Coupling of a session, with all its numbers."""
-        radius = radius_of(shell, cells.grid.voxel_size)
-        return (coupling or Coupling()).settled(SCRIPTED, self.rate, scale, radius)
+        rendering: Rendering,
+    ) -> DirectRendering:
+        """Coupling or caps of a session, with all numbers."""
+        radius, coupling = radius_of(shell, cells.grid.voxel_size), coupling or Coupling()
+        if rendering == "direct":
+            return coupling.direct(SCRIPTED, scale, radius)
+        return coupling.settled(SCRIPTED, self.rate, scale, radius)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions that run now, by their ids."""
@@ -187,7 +204,10 @@ class SessionHost(Closes):
 
     def _set_coupling(self, running: Running, coupling: Coupling | None) -> None:
         asked = running.request
-        settled = self._settled(coupling, running.cells, asked.shell, asked.coupling.scale)
+        settled = self._settled(
+            coupling, running.cells, asked.shell, asked.coupling.scale,
+            running.worker.request.rendering,
+        )  # fmt: skip
         running.worker.ask("set_coupling", asked.seat, settled)
         running.request = replace(asked, coupling=settled)
 

@@ -6,7 +6,6 @@ from hapticdb.errors import UsageError
 from hapticdb.hosting.hosted import Recorded
 from hapticdb.hosting.worker import SeatRequest
 from hapticdb.hosting.workers import WorkerProcess
-from hapticdb.query.law import DISTANCE
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.recording.file import Recorder
@@ -33,7 +32,9 @@ class Running:
         try:
             recording.open()
             first, start = self.worker.ask("state", self.seat)
-            header = self.cells.header(asked.shell, rate, DISTANCE, asked.coupling, start)
+            header = self.cells.header(
+                asked.shell, rate, self.worker.request.law, asked.coupling, start
+            )
             recording.begin(header, first)
         except BaseException:
             recording.discard()

@@ -16,10 +16,10 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.kernels._jit import load_entries
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import DISTANCE
+from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.channel import Message
-from hapticdb.realtime.coupling import SettledCoupling
+from hapticdb.realtime.coupling import DirectRendering, Rendering
 from hapticdb.realtime.processes import MessageSender, parent_is_gone, reply_to_parent
 from hapticdb.realtime.stations import Station, Stations
 from hapticdb.realtime.timing import undisturbed
@@ -35,10 +35,12 @@ LEAVE_PATIENCE = 5.0
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """board : of the host; rate : frames/s."""
+    """board : of the host; rate : frames/s; law, rendering : of all its sessions."""
 
     board: Board
     rate: float
+    law: ForceLaw
+    rendering: Rendering
 
 
 @dataclass(frozen=True)
@@ -55,7 +57,7 @@ class SeatRequest:
     reader: int
     grid: Grid
     shell: PointShell
-    coupling: SettledCoupling
+    coupling: DirectRendering
     pose: tuple[float, ...]
 
 
@@ -67,10 +69,10 @@ class Worker:
     """
 
     def __init__(self, request: WorkerRequest) -> None:
-        self._rate = request.rate
+        self._rate, self._law = request.rate, request.law
         self._tables: dict[int, CellTable] = {}
         self._board = board = request.board
-        self._stations = Stations(DISTANCE, board.seats, board.rings)
+        self._stations = Stations(request.law, board.seats, board.rings, request.rendering)
         self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
 
     def obey(self) -> None:
@@ -102,10 +104,11 @@ class Worker:
         if request.table not in self._tables:
             self._tables[request.table] = CellTable(os.dup(descriptor), request.n_slots)
         table, rows = self._tables[request.table], self._stations.rows
+        cells = table.cells if reads_distances(self._law) else table.cells.without_distances()
         n = int(np.flatnonzero(rows["is_running"] == 0)[0])
         row = rows[n : n + 1]
         station = Station(
-            row, table.cells, request.reader, table.desk.sessions[request.reader, ...],
+            row, cells, request.reader, table.desk.sessions[request.reader, ...],
             request.grid, clusters_of(request.shell, request.grid.voxel_size),
         )  # fmt: skip
         pose = np.array(request.pose)

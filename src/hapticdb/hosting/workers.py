@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 
 from hapticdb.hosting.worker import WorkerRequest
+from hapticdb.query.law import ForceLaw
 from hapticdb.realtime.board import TAKEN, Board
+from hapticdb.realtime.coupling import Rendering
 from hapticdb.realtime.processes import Process
 
 START_PATIENCE = 120.0
@@ -18,13 +20,12 @@ FILLED = 8
 
 
 class WorkerProcess(Process):
-    """A worker process, from the host; `number` counts from 0, `rate` is in frames a second."""
+    """A worker process, from the host; `number` counts from 0, `request` says what it runs."""
 
-    def __init__(self, number: int, board: Board, rate: float) -> None:
-        self.number = number
-        request = WorkerRequest(board, rate)
+    def __init__(self, number: int, request: WorkerRequest) -> None:
+        self.number, self.request = number, request
         work = "hapticdb.hosting.worker:work"
-        super().__init__(work, request, [board.descriptor], with_kernels=True)
+        super().__init__(work, request, [request.board.descriptor], with_kernels=True)
         self.await_ready("worker's", START_PATIENCE)
         self._channel.sock.settimeout(ANSWER_PATIENCE)
 
@@ -46,21 +47,22 @@ class Workers:
         """Process ids of those that run."""
         return [process.pid for process in self._processes if process.is_alive]
 
-    def least_busy(self) -> WorkerProcess:
-        """Worker for one more session: the one with the fewest, or a new one if all are filled."""
+    def least_busy(self, law: ForceLaw, rendering: Rendering) -> WorkerProcess:
+        """Worker for one more such session: with the fewest, or a new one if all are filled."""
         for process in [process for process in self._processes if not process.is_alive]:
             self._processes.remove(process)
             process.end()
-        seats = self._board.seats
+        seats, request = self._board.seats, WorkerRequest(self._board, self._rate, law, rendering)
+        alike = [process for process in self._processes if process.request == request]
         counts = [
             int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == process.number)))
-            for process in self._processes
+            for process in alike
         ]
-        if not counts or (min(counts) >= FILLED and len(counts) < self._most):
-            self._processes.append(WorkerProcess(self._next, self._board, self._rate))
+        if not counts or (min(counts) >= FILLED and len(self._processes) < self._most):
+            self._processes.append(WorkerProcess(self._next, request))
             self._next += 1
             return self._processes[-1]
-        return self._processes[int(np.argmin(counts))]
+        return alike[int(np.argmin(counts))]
 
     def close(self) -> None:
         """End all workers."""

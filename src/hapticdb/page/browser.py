@@ -229,7 +229,7 @@ class Browser:
             undo.callback(self._unshare)
             session = self.site.host.begin(
                 self.tool.shell, pose_of_row(start[:3], start[3:]), exclude=self._unfelt,
-                coupling=Coupling(stiffness=self.stiffness), scale=self.scale,
+                coupling=self._coupling(), scale=self.scale,
             )  # fmt: skip
             undo.callback(session.end)
             session.move(self.hand)
@@ -295,7 +295,10 @@ class Browser:
         self.stiffness = stiffness
         session = self.session
         if session is not None and not session.is_over:
-            session.set_coupling(Coupling(stiffness=self.stiffness))
+            session.set_coupling(self._coupling())
+
+    def _coupling(self) -> Coupling | None:
+        return Coupling(stiffness=self.stiffness) if self.site.is_coupled else None
 
     def _start(self) -> Floats:
         return row_of_pose(self.site.facts.start(self.tool.radius, self.number))

@@ -47,7 +47,7 @@ class PageRequest(NamedTuple):
     urls : the environment's address for each role: the database decides what each may do; tools :
     files, the first is chosen at the start; server, host : descriptors of the sockets to the server
     (this module) and to the `SessionHost`; secret : of the server's connections; recordings : a
-    folder, or None.
+    folder, or None; is_direct : whether hands are coupled nowhere.
     """
 
     urls: Mapping[str, str]
@@ -57,6 +57,7 @@ class PageRequest(NamedTuple):
     secret: str
     recordings: str | None = None
     title: str = ""
+    is_direct: bool = False
 
 
 class Visitor(NamedTuple):

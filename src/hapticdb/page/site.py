@@ -114,6 +114,9 @@ class Site:
         self.objects = self.view.objects
         self.facts = facts = SceneFacts.of(self.view)
         self.database = DatabaseThread(self.url)
+        self.is_coupled = not request.is_direct and all(
+            obj.has_distances for obj in self.objects.values()
+        )
         self.tools = [
             *tools.from_files(request.tools, facts.voxel_size, has_distances=facts.has_distances),
             *tools.built_in(facts.diagonal, facts.voxel_size, has_distances=facts.has_distances),

@@ -64,12 +64,11 @@ class CacheFigures(NamedTuple):
     lag: float | None = None
 
 
-def without_distances(url: str) -> str:
-    """Words for a coupling in an environment without distances: what may be done."""
+def without_distances(url: str, instead: str) -> str:
+    """Words for a coupling in an environment without distances: what may be done `instead`."""
     return (
         f"{redact(url)} has no distances to surfaces, which the coupling of hand and tool needs: "
-        "import with distances into another environment, or feel tangent planes directly with "
-        "--law plane"
+        f"import with distances into another environment, or {instead}"
     )
 
 

@@ -174,7 +174,8 @@ class Session(Closes):
         if not reads_distances(self.law) or self.cells.has_distances:
             return
         if asked is None:
-            raise UsageError(without_distances(self.cells.url))
+            instead = "feel tangent planes directly with --law plane"
+            raise UsageError(without_distances(self.cells.url, instead))
         raise UsageError(
             "the law distance needs cells with distances to surfaces, and these have none: make "
             "ResidentCells(..., distances=True), or give law='plane'"

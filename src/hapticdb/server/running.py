@@ -77,7 +77,8 @@ async def run(
         sock = ends.enter_context(listening(serving))
         port = int(sock.getsockname()[1])
         access = Access(serving.tokens, open_role=serving.open_role, port=port)
-        host = await asyncio.to_thread(SessionHost, serving.urls[Role.VIEWER])
+        url, rendering = serving.urls[Role.VIEWER], serving.rendering
+        host = await asyncio.to_thread(SessionHost, url, rendering=rendering)
         ends.push_async_callback(asyncio.to_thread, host.close)
 
         served = Served(access, serving.limits, Figures(), host)
@@ -108,7 +109,10 @@ async def run(
 
 def _page_request(serving: Serving, server: int, host: int, secret: str) -> PageRequest:
     urls = {role.word: url for role, url in serving.urls.items()}
-    return PageRequest(urls, serving.tools, server, host, secret, serving.recordings, serving.title)
+    return PageRequest(
+        urls, serving.tools, server, host, secret, serving.recordings, serving.title,
+        is_direct=serving.rendering == "direct",
+    )  # fmt: skip
 
 
 async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:

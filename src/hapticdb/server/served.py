@@ -13,6 +13,7 @@ from hapticdb.server.limits import Limits
 
 if TYPE_CHECKING:
     from hapticdb.hosting.host import SessionHost
+    from hapticdb.realtime.coupling import Rendering
     from hapticdb.server.figures import Figures
 
 PAGE = "hapticdb.page.process:work"
@@ -28,7 +29,8 @@ class Serving:
     urls : the environment's address for each role; tools : files; tokens : the role that each
     gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
     it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
-    recordings of sessions, None: nobody records; page : function of the page's process.
+    recordings of sessions, None: nobody records; rendering : as of `SessionHost`; page : function
+    of the page's process.
     """
 
     urls: Mapping[Role, str]
@@ -43,6 +45,7 @@ class Serving:
     key: str | None = None
     title: str = "hapticdb"
     recordings: str | None = None
+    rendering: "Rendering | None" = None
     limits: Limits = field(default_factory=Limits)
     page: str = PAGE
 

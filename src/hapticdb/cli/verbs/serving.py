@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import UrlArgument
+from hapticdb.cli.options import RenderingName, UrlArgument
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
@@ -24,6 +24,14 @@ ToolsOption = Annotated[
         "--tool",
         metavar="FILE",
         help="Mesh of a tool to choose from, beside a ball and a peg. Give it again for more.",
+    ),
+]
+RenderingOption = Annotated[
+    RenderingName | None,
+    typer.Option(
+        help="coupled: a spring between hand and tool, which stays outside of surfaces; needs "
+        "distances. direct: the wrench of each frame, capped.",
+        show_default="coupled where there are distances",
     ),
 ]
 RecordingsOption = Annotated[
@@ -84,6 +92,7 @@ def view(
     url: UrlArgument,
     *,
     tool: ToolsOption = None,
+    rendering: RenderingOption = None,
     recordings: RecordingsOption = None,
     seconds: SecondsOption = None,
     no_browser: NoBrowserOption = False,
@@ -96,7 +105,7 @@ def view(
     from hapticdb.server.access import Role, make_token
 
     token = make_token()
-    serving = _serving(url, tool, {token: Role.EDITOR}, None, recordings)
+    serving = _serving(url, tool, {token: Role.EDITOR}, None, recordings, rendering)
 
     def ready(port: int) -> None:
         address = serving.address(port, token)
@@ -118,6 +127,7 @@ def serve(
     port: PortOption = 0,
     prefix: PrefixOption = "",
     host_name: HostNameOption = None,
+    rendering: RenderingOption = None,
     recordings: RecordingsOption = None,
     tls_cert: CertificateOption = None,
     tls_key: KeyOption = None,
@@ -133,7 +143,7 @@ def serve(
 
     tokens = _tokens(token_file, are_made=token)
     serving = replace(
-        _serving(url, tool, tokens, role_url, recordings),
+        _serving(url, tool, tokens, role_url, recordings, rendering),
         host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
         certificate=tls_cert, key=tls_key,
     )  # fmt: skip
@@ -169,6 +179,7 @@ def _serving(
     tokens: "dict[str, Role]",
     role_urls: Sequence[str] | None,
     recordings: str | None,
+    rendering: RenderingName | None,
 ) -> "Serving":
     """What to serve; refuses an environment, a tool or a folder that is not there."""
     from contextlib import closing
@@ -192,7 +203,7 @@ def _serving(
     return Serving(
         urls=urls, tools=tuple(tools or ()), tokens=tokens,
         open_role=None if tokens else Role.EDITOR,
-        title=_title(url),
+        title=_title(url), rendering=rendering,
         recordings=None if recordings is None else str(Path(recordings).resolve()),
     )  # fmt: skip
 

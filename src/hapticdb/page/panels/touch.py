@@ -69,11 +69,12 @@ class TouchPanel:
                 field.precision = max(2 - round(np.log10(step)), 2)
                 field.on_update(browser.guarded("toucher", self._type_place))
         with gui.add_folder("How it feels", expand_by_default=False):
-            stiffness = gui.add_slider(
-                "Stiffness, N/m", SOFTEST, STIFFEST, 10.0, browser.stiffness,
-                hint="Of the spring between hand and tool: force for a metre of the hand.",
-            )  # fmt: skip
-            stiffness.on_update(browser.guarded("toucher", self._stiffen))
+            if browser.site.is_coupled:
+                stiffness = gui.add_slider(
+                    "Stiffness, N/m", SOFTEST, STIFFEST, 10.0, browser.stiffness,
+                    hint="Of the spring between hand and tool: force for a metre of the hand.",
+                )  # fmt: skip
+                stiffness.on_update(browser.guarded("toucher", self._stiffen))
             scale = gui.add_number(
                 "Scale", round(browser.scale, 3), step=0.001,
                 min=round(browser.scale * SCALES[0], 4), max=round(browser.scale * SCALES[1], 3),

@@ -14,7 +14,7 @@ from distributed import LocalCluster
 import hapticdb
 from assemblies import Mesh, ball, row_of_boxes, rows_of, small_options, write_obj
 from children import finished
-from command_line import Run, command, made, poses, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, command, poses, refused
 from disassembly_scenes import STACK
 from disassembly_scenes import made as made_of
 from hapticdb import ImportOptions, disassemble, find_clashes
@@ -26,8 +26,6 @@ from hapticdb.ingest.files import ImportProgress
 from hapticdb.transfer import copy_environment
 from scheduling import bare_worker, kill_a_worker, scheduling, stop_scheduler
 from servers import Place
-
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 
 @pytest.fixture(scope="module")

@@ -1,7 +1,5 @@
 """One tool at one place feels one force by command, library and page; results say what they are."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, poses, run, scene  # noqa: F401 - fixtures
+from command_line import Run, poses
 from hapticdb.page.tools import from_files, middle_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.realtime.coupling import limit_text

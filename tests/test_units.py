@@ -1,7 +1,5 @@
 """Lengths are read in the given unit, and a user sees that unit and the scene's size."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,7 +11,7 @@ import trimesh
 from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinateSystemVlr
 
 import hapticdb
-from command_line import Run, boxes, refused, run  # noqa: F401 - fixtures
+from command_line import Run, boxes, refused
 from command_line import tool as stl
 from hapticdb.mesh import parse_in_process, read_file
 from hapticdb.units import place_text

@@ -1,14 +1,12 @@
 """Every option that names objects accepts several, by id, name and pattern."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
 import pytest
 
 import hapticdb
-from command_line import Run, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, poses, refused, succeeded
 
 TOUCH = ("--tool", "tool.npz", "--poses", "path.csv")
 

@@ -1,7 +1,5 @@
 """The verb clashes."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import base64
 import csv
 import html
@@ -15,7 +13,7 @@ import pytest
 
 import hapticdb
 from assemblies import row_of_boxes
-from command_line import Run, boxes, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, refused
 from hapticdb.cli.verbs.clashing import COLUMNS
 
 

@@ -1,7 +1,5 @@
 """The command line for a user: help and verbs, import, and its process."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import inspect
 import json
 import os
@@ -14,17 +12,7 @@ import pytest
 import hapticdb
 import step_files
 from children import child, finished
-from command_line import (  # noqa: F401 - fixtures among them
-    Run,
-    boxes,
-    command,
-    made,
-    poses,
-    refused,
-    run,
-    scene,
-    succeeded,
-)
+from command_line import Run, boxes, command, poses, refused, succeeded
 from hapticdb import cli
 from hapticdb.cli.values import length_of
 from hapticdb.store import connect

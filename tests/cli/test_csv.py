@@ -1,7 +1,5 @@
 """Results as CSV: all digits, stable headers, no partial files, nothing else on stdout."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import csv
 import errno
 import io
@@ -11,7 +9,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, refused, succeeded
 from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, CsvWriter, text_cell
 from hapticdb.recording.file import Header, Recording
 from hapticdb.recording.frame import FRAME

@@ -1,7 +1,5 @@
 """The verb extract, with right and wrong arguments."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
@@ -9,7 +7,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, refused, succeeded
 from disassembly_scenes import CHAIN, STACK
 from disassembly_scenes import made as made_of
 from extraction_scenes import enclosed, lid

@@ -1,7 +1,5 @@
 """The verbs feel and replay as a newcomer uses them, with mistakes and Ctrl-C."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 import os
 import re
@@ -14,16 +12,7 @@ import pytest
 
 import hapticdb
 from children import PATIENCE, child, descendants, named, until
-from command_line import (  # noqa: F401 - fixtures
-    Run,
-    command,
-    made,
-    on_terminal,
-    refused,
-    run,
-    scene,
-    succeeded,
-)
+from command_line import Run, command, on_terminal, refused, succeeded
 from hapticdb.cli.session_page import tell_cost
 from hapticdb.cli.values import size_bytes
 from hapticdb.query.law import LawName
@@ -115,14 +104,6 @@ def test_what_a_large_tool_costs_is_said_in_a_line(
     said = capsys.readouterr().err
     assert told in said
     assert len(said.splitlines()) == bool(told)
-
-
-@pytest.mark.usefixtures("scene")
-def test_without_a_baseline_no_empty_loop_is_run(run: Run) -> None:
-    wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.2)
-    out = succeeded(run(*wish, "--no-baseline"))
-    assert out.splitlines()[0].split() == ["session"]
-    assert re.search(r"^ *empty loop +not measured", out, re.MULTILINE)
 
 
 @pytest.mark.usefixtures("scene")

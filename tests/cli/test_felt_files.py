@@ -1,7 +1,5 @@
 """`touch --out`: a table of all poses, whole or not at all."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import importlib.util
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import pytest
 from numba import cuda
 
 import hapticdb
-from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, refused
 from hapticdb.batches import feeler
 from hapticdb.cli.csv_files import WRENCH
 

@@ -1,7 +1,5 @@
 """Fit under the distance law: tools drawn inward, and the clearance that is told from contact."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
@@ -10,7 +8,7 @@ import pytest
 
 import hapticdb
 from bands import band_rows
-from command_line import Run, poses, run, succeeded, tool  # noqa: F401 - fixtures
+from command_line import Run, poses, succeeded, tool
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
 from voxels import voxel_object

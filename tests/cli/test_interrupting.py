@@ -1,17 +1,11 @@
 """Ctrl-C at any moment of the command line gives one line and exit code 130."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
-import contextlib
-import signal
 import sys
 from pathlib import Path
-from subprocess import TimeoutExpired
 
 import pytest
 
-from children import PATIENCE, child, finished
-from command_line import command, made, run, scene  # noqa: F401 - fixtures
+from children import finished
 from draws import drawn
 
 AT_IMPORT = """
@@ -74,24 +68,6 @@ def test_llvmlite_notes_what_it_gave_away_before_ctrl_c_is_raised() -> None:
     """Its ``ExecutionEngine.add_module`` gives a module to LLVM, and notes it in the next line."""
     done = finished([sys.executable, "-c", IN_LLVMLITE])
     assert (done.returncode, done.stdout, done.stderr) == (0, "True\n", "")
-
-
-@pytest.mark.long
-def test_ctrl_c_after_any_delay_leaves_no_traceback_of_ours(scene: Path) -> None:
-    """Before hapticdb's first line Python prints a traceback, which names no file of hapticdb."""
-    codes = set()
-    for n in drawn(range(30)):
-        with child(command("info", scene)) as process:
-            with contextlib.suppress(TimeoutExpired):
-                process.wait(timeout=0.02 + 0.03 * n)
-            if process.poll() is None:
-                process.send_signal(signal.SIGINT)
-            _, err = process.communicate(timeout=PATIENCE)
-        codes.add(process.returncode)
-        assert "hapticdb/cli" not in err
-        if process.returncode == 130:
-            assert err == "hapticdb: interrupted\n"
-    assert codes <= {0, 130, -signal.SIGINT, 1}
 
 
 def test_who_ignores_ctrl_c_goes_on_ignoring_it(scene: Path) -> None:

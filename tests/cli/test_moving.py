@@ -1,7 +1,5 @@
 """The verbs copy and diff, with right and wrong arguments."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
@@ -9,17 +7,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from command_line import (  # noqa: F401 - fixtures among them
-    Run,
-    boxes,
-    made,
-    on_terminal,
-    refused,
-    rows_of,
-    run,
-    scene,
-    succeeded,
-)
+from command_line import Run, on_terminal, refused, succeeded
 from hapticdb import Grid
 from hapticdb.cli.verbs import moving
 from hapticdb.store.base import Object, Rows

@@ -1,14 +1,12 @@
 """The listing of objects: filtered, cut where a terminal shows it, in columns."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 
 import pytest
 
 from assemblies import box, write_obj
-from command_line import Run, on_terminal, refused, run, succeeded  # noqa: F401 - fixtures
+from command_line import Run, on_terminal, refused, succeeded
 from hapticdb.cli import main, render
 from hapticdb.cli.verbs.listing import PAGE
 

@@ -1,7 +1,5 @@
 """The command line on PostgreSQL: the same as on a file, and a server's own failures."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import re
 import shutil
 from pathlib import Path
@@ -14,7 +12,7 @@ from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixtur
     test_info_speaks_to_people,
     test_statistics_are_renewed_after_many_edits,
 )
-from command_line import PLACES, Run, boxes, command, made, poses, refused, rows_of, run, tool  # noqa: F401 - fixtures
+from command_line import Run, refused, rows_of
 from hapticdb.store.urls import redact
 from servers import Place
 

@@ -46,7 +46,11 @@ def test_sigterm_keeps_a_recording_that_is_under_way(
             person.press("Record")
             until(lambda: (person.look(), _size(folder) > 200_000)[1])
             server.send_signal(signal.SIGTERM)
+            assert server.stderr is not None
+            told = server.stderr.read()
             assert server.wait(PATIENCE) == TERMINATED
+    assert "?token=" not in told
+    assert "stopped" in told or verb == "view"
     (path,) = _recorded(folder)
     recording = Recording(path)
     assert not recording.n_torn

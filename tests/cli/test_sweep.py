@@ -1,7 +1,5 @@
 """The verb sweep, with right and wrong arguments."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 import re
 from pathlib import Path
@@ -12,7 +10,7 @@ import trimesh
 
 import hapticdb
 from assemblies import write_obj
-from command_line import Run, command, made, poses, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, poses, refused, succeeded
 from contact_scenes import box, imported, shell_of
 from hapticdb.cli.csv_files import SWEPT
 from hapticdb.sweeps import run as sweeping

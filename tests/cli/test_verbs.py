@@ -1,7 +1,5 @@
 """The verbs info to touch on a small environment, with right and wrong arguments."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 import re
 from pathlib import Path
@@ -12,7 +10,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import Run, boxes, made, poses, refused, rows_of, run, scene, succeeded, tool  # noqa: F401 - fixtures
+from command_line import Run, poses, refused, rows_of, succeeded, tool
 from hapticdb.paper.strategies import STRATEGIES
 
 Scene = Path | str

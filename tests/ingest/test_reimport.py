@@ -1,7 +1,5 @@
 """A file that is imported once more: what was removed or has changed meanwhile."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 from pathlib import Path
 from typing import Any
@@ -11,7 +9,7 @@ import pytest
 import trimesh
 
 import hapticdb
-from command_line import Run, boxes, made, refused, rows_of, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, boxes, refused, rows_of, succeeded
 from hapticdb.store.sqlite.tables.file_tables import FileTables
 
 

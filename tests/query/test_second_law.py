@@ -28,15 +28,26 @@ STIFFNESS = 750.0
 Array = NDArray[np.float64]
 
 
+class Depth(NamedTuple):
+    """Depth of a hit in voxels, as a product."""
+
+    scale: float
+    parts: Array
+
+
 class PenaltyNumbers(NamedTuple):
-    """A plain penalty as kernels take it."""
+    """A plain penalty as kernels take it, with numbers of all kinds that a law may have."""
 
     stiffness: float
+    is_on: bool
+    depth: Depth
 
 
 def penalty(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
     """Every hit is felt half a voxel deep."""
-    return 0.5 * size, 1.0
+    if not law.is_on:
+        raise ValueError("this law is off")
+    return law.depth.scale * law.depth.parts[1] * size, 1.0
 
 
 kernels.define(PenaltyNumbers, kernels.Leaves(respond=penalty))
@@ -46,7 +57,9 @@ class Penalty:
     """A plain penalty on occupancy, as `Environment.touch` takes a law."""
 
     stiffness = STIFFNESS
-    for_kernels = PenaltyNumbers(STIFFNESS)
+
+    def __init__(self, *, is_on: bool = True) -> None:
+        self.for_kernels = PenaltyNumbers(STIFFNESS, is_on, Depth(2.0, np.array([np.nan, 0.25])))
 
 
 @pytest.fixture
@@ -95,3 +108,5 @@ def test_frames_of_both_kinds_feel_a_law_that_no_kernel_knows(env: Environment) 
         assert felt.hits[n] == felt.contacts[n] == len(wanted.hits)
         n_felt += len(wanted.hits)
     assert n_felt > 0
+    with pytest.raises(ValueError, match="this law is off"):
+        env.touch(shell, poses()[0], law=Penalty(is_on=False))

@@ -1,9 +1,6 @@
 """Cells are fetched before the hand arrives, though the database is slow, fails or changes."""
 
 import functools
-import os
-import signal
-import time
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -339,16 +336,8 @@ def test_objects_are_named_and_named_anew_after_a_write(tmp_path: Path, sphere: 
 
 
 @pytest.fixture
-def away(tmp_path: Path) -> Path:
-    """Path of a file; the database does not answer while the file exists."""
-    return tmp_path / "away"
-
-
-@pytest.fixture
-def resident(world: Environment, away: Path) -> Iterator[ResidentCells]:
-    with ResidentCells(
-        world.url, budget_bytes=8 << 20, wrap=functools.partial(troubled, away=str(away))
-    ) as cells:
+def resident(world: Environment) -> Iterator[ResidentCells]:
+    with ResidentCells(world.url, budget_bytes=8 << 20) as cells:
         yield cells
 
 
@@ -369,32 +358,6 @@ def test_a_process_brings_in_what_is_told_and_notices_writes(
     figures = resident.figures()
     assert figures.resident > 0
     assert figures.restarts == figures.losses == 0
-
-
-@pytest.mark.long
-def test_a_process_killed_at_any_moment_is_replaced_and_frames_are_right_again(
-    world: Environment, resident: ResidentCells, away: Path, sphere: PointShell
-) -> None:
-    """Also when the database does not answer at that moment."""
-    side = Side(resident.table, world.grid, sphere)
-    rng = np.random.default_rng(5)
-    ids = ids_by_voxel(world)
-    for n in range(3):
-        pose = np.eye(4)
-        pose[:3, 3] = rng.uniform(-0.4, 0.4, 3)
-        side.be_at(pose)
-        time.sleep(float(rng.uniform(0, 0.02)))
-        os.kill(resident.pid, signal.SIGKILL)
-        if n == 2:
-            away.touch()
-        until(lambda n=n: resident.restarts == n + 1, resident.supervise)  # type: ignore[misc]
-        if n == 2:
-            time.sleep(1.0)
-            away.unlink()
-        side.be_at(pose)
-        until(lambda: side.is_served)
-        found = side.reader.feel(pose)
-        assert (found[0], found[2]) == (touch_of_shell(ids, world.grid, sphere, pose).hits, 0)
 
 
 def test_what_fails_at_the_start_is_told_in_one_line(

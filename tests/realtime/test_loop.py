@@ -14,7 +14,6 @@ from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
-from hapticdb.kernels import law as laws
 from hapticdb.realtime import loop as subject
 from hapticdb.realtime.board import Board
 from hapticdb.realtime.coupling import Coupling
@@ -23,6 +22,7 @@ from hapticdb.realtime.report import LoopAnswer, counts_of
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.timing import Timing
 from hapticdb.recording.frame import State
+from query.test_second_law import Penalty
 from realtime.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, at, still, stroking
 from realtime.worlds import make
 from voxels import floor_voxels, write_voxels
@@ -31,39 +31,6 @@ N_RING = 4096
 DIRECT = Coupling().direct(SCRIPTED, 1.0, 0.012)
 """What bounds the forces of the tests' loops."""
 Floats = NDArray[np.float64]
-
-
-class Depth(NamedTuple):
-    """Depth of a point, as a part of that below the tangent plane."""
-
-    scale: float
-    parts: Floats
-
-
-class Numbers(NamedTuple):
-    """Numbers of all kinds that a user's law may have."""
-
-    stiffness: float
-    is_on: bool
-    depth: Depth
-
-
-class OwnLaw(NamedTuple):
-    """A user's law, from outside the package."""
-
-    stiffness: float
-    for_kernels: Numbers
-
-
-def respond(law, is_hit, sample, px, py, pz, nx, ny, nz, cx, cy, cz, size):  # type: ignore[no-untyped-def]  # noqa: ANN001, ANN201, ARG001
-    """As the tangent-plane law does; no force where it is off."""
-    if not law.is_on:
-        raise ValueError("this law is off")
-    depth = (cx - px) * nx + (cy - py) * ny + (cz - pz) * nz
-    return law.depth.scale * law.depth.parts[1] * max(depth, 0.0), 1.0
-
-
-laws.define(Numbers, laws.Leaves(respond=respond))
 
 
 class Ran(NamedTuple):
@@ -136,17 +103,11 @@ def test_a_slow_hand_misses_deadlines_and_the_grid_stays(run: Run) -> None:
 
 
 @pytest.mark.long
-def test_a_users_law_may_have_numbers_of_any_kind_and_raise(run: Run) -> None:
-    def felt_by(law: object) -> Floats:
-        frames = run(still(0.010), law=law, seconds=0.1, has_baseline=False).frames
-        return np.asarray(frames["applied"][-1])
-
-    numbers = Numbers(750.0, True, Depth(2.0, np.array([np.nan, 0.5])))
-    plain = felt_by(TangentPlane(750.0))
-    assert plain.any()
-    np.testing.assert_allclose(felt_by(OwnLaw(750.0, numbers)), plain, rtol=1e-12, atol=1e-12)
+def test_a_users_law_is_felt_and_may_raise(run: Run) -> None:
+    frames = run(still(0.010), law=Penalty(), seconds=0.2, has_baseline=False).frames
+    assert frames["applied"][-1, 2] > 0.0
     with pytest.raises(ValueError, match="this law is off"):
-        felt_by(OwnLaw(750.0, numbers._replace(is_on=False)))
+        run(still(0.010), law=Penalty(is_on=False), seconds=0.1, has_baseline=False)
 
 
 def test_a_clutch_that_opens_for_the_first_time_compiles_nothing(run: Run) -> None:

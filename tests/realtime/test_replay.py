@@ -95,18 +95,11 @@ def test_what_the_device_received_is_recorded_and_replays_bit_for_bit(
 
 
 @pytest.fixture(scope="module")
-def sqlite(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    with make(tmp_path_factory.mktemp("local"), bits=6) as made:
-        write_points(made.store, floor_points(31.5), "floor")
-        yield made
-
-
-@pytest.fixture(scope="module")
 def session(
-    sqlite: Environment, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
+    distance_floor: Environment, sphere: PointShell, tmp_path_factory: pytest.TempPathFactory
 ) -> Path:
     path = tmp_path_factory.mktemp("session") / "s.hdbrec"
-    record(sqlite, sphere, path)
+    record(distance_floor, sphere, path)
     return path
 
 
@@ -123,23 +116,23 @@ def rewritten(path: Path, frames: Frames, header: Header | None = None) -> Path:
 
 @pytest.mark.parametrize("field", ["tool", "applied", "contacts", "hand"])
 def test_a_changed_bit_is_named_by_its_frame(
-    sqlite: Environment, session: Path, field: str
+    distance_floor: Environment, session: Path, field: str
 ) -> None:
     frames = recorded(session)
     n = int(np.flatnonzero(frames["contacts"])[40])
     frames[field].reshape(len(frames), -1)[n].view(np.uint8)[1] ^= 1
-    found = parting(rewritten(session, frames), sqlite)
+    found = parting(rewritten(session, frames), distance_floor)
     assert (found.frame, found.time) == (n, frames["time"][n])
     assert found.reason == "for no known reason"
     assert found.describe().startswith(f"parts at frame {n} ({found.time:.3f} s), for no known")
 
 
 def test_lost_frames_another_build_and_a_gpu_are_named_as_reasons(
-    sqlite: Environment, session: Path
+    distance_floor: Environment, session: Path
 ) -> None:
     frames, header = recorded(session), Recording(session).header
     n = int(np.flatnonzero(frames["contacts"])[40])
-    found = parting(rewritten(session, np.delete(frames, np.s_[n - 20 : n])), sqlite)
+    found = parting(rewritten(session, np.delete(frames, np.s_[n - 20 : n])), distance_floor)
     assert found.frame >= n - 20
     assert found.reason == f"since frames before frame {n - 20} were lost"
     frames["applied"][n] += 1.0
@@ -147,7 +140,7 @@ def test_lost_frames_another_build_and_a_gpu_are_named_as_reasons(
         (changed(header, build="other"), "another build"),
         (changed(header, frames_on="cuda"), "a GPU"),
     ):
-        found = parting(rewritten(session, frames, other), sqlite)
+        found = parting(rewritten(session, frames, other), distance_floor)
         assert found.frame == n
         assert words in found.reason
 
@@ -182,11 +175,11 @@ def test_unknown_cells_are_named_and_all_before_them_is_equal(
 
 
 def test_a_large_tool_a_filter_and_a_new_coupling_replay_bit_for_bit(
-    sqlite: Environment, tmp_path: Path
+    distance_floor: Environment, tmp_path: Path
 ) -> None:
     coupling = Coupling(stiffness=700.0, cap=2.0)
     path = tmp_path / "s.hdbrec"
-    cells = hapticdb.ResidentCells(sqlite.url, where=["floor"])
+    cells = hapticdb.ResidentCells(distance_floor.url, where=["floor"])
     with cells, Session(
         cells, standing_plate(), sliding(-0.001), rate=RATE, record=path, staleness=NEVER_STALE,
         coupling=coupling, has_baseline=False,
@@ -195,19 +188,19 @@ def test_a_large_tool_a_filter_and_a_new_coupling_replay_bit_for_bit(
     frames = recorded(path)
     assert frames["contacts"].any()
     assert (frames["spring"][:, 2] == 2.0).all()
-    added = write_points(sqlite.store, floor_points(33.5), "another floor")
+    added = write_points(distance_floor.store, floor_points(33.5), "another floor")
     try:
-        found = replay(Recording(path), sqlite)
+        found = replay(Recording(path), distance_floor)
     finally:
-        sqlite.remove(added)
+        distance_floor.remove(added)
     assert found.is_equal, found.describe()
 
 
 def test_another_grid_is_refused_and_nothing_is_not_equal(
-    tmp_path: Path, sqlite: Environment, session: Path
+    tmp_path: Path, distance_floor: Environment, session: Path
 ) -> None:
     with make(tmp_path, bits=7) as other, pytest.raises(GridError, match="was recorded on"):
         replay(Recording(session), other)
-    found = replay(Recording(rewritten(session, recorded(session)[:0])), sqlite)
+    found = replay(Recording(rewritten(session, recorded(session)[:0])), distance_floor)
     assert (found.is_equal, found.n_frames) == (False, 0)
     assert found.describe() == "nothing to compare: the recording has no frames"

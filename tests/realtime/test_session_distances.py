@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from banded import write_points
 from children import PATIENCE
 from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane
 from hapticdb.devices.protocol import Device
@@ -25,7 +24,6 @@ from realtime.sessions import (
     NEVER_STALE,
     RATE,
     felt_at,
-    floor_points,
     floored,
     recorded,
     until,
@@ -41,15 +39,8 @@ RADIUS = 0.012
 
 
 @pytest.fixture(scope="module")
-def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    with make(tmp_path_factory.mktemp("distance"), bits=6) as made:
-        write_points(made.store, floor_points(HEIGHT), "floor")
-        yield made
-
-
-@pytest.fixture(scope="module")
-def cells(env: Environment) -> Iterator[ResidentCells]:
-    with ResidentCells(env.url, budget_bytes=4 << 20) as made:
+def cells(distance_floor: Environment) -> Iterator[ResidentCells]:
+    with ResidentCells(distance_floor.url, budget_bytes=4 << 20) as made:
         yield made
 
 
@@ -110,7 +101,11 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
 
 @pytest.mark.parametrize("law", [TangentPlane(800.0), DistanceField(800.0)])
 def test_direct_rendering_sends_the_wrench_of_a_touch_up_to_the_caps(
-    cells: ResidentCells, ball: PointShell, env: Environment, tmp_path: Path, law: ForceLaw
+    cells: ResidentCells,
+    ball: PointShell,
+    distance_floor: Environment,
+    tmp_path: Path,
+    law: ForceLaw,
 ) -> None:
     """The tool is at the hand; the device gets each frame's wrench, once the force has risen."""
     coupling = Coupling(cap=1.0, torque_cap=1e-3)
@@ -126,7 +121,7 @@ def test_direct_rendering_sends_the_wrench_of_a_touch_up_to_the_caps(
     assert (frames["tool"] == frames["hand"]).all()
     assert not frames["applied"][0].any()
     late = frames[frames["time"] > 0.1]
-    wrenches = felt_at(env, ball, late, law)
+    wrenches = felt_at(distance_floor, ball, late, law)
     for part, cap in ((slice(0, 3), 1.0), (slice(3, 6), 1e-3)):  # about the centre, the origin here
         sizes = np.linalg.norm(wrenches[:, part], axis=1, keepdims=True)
         capped = wrenches[:, part] * np.minimum(1.0, cap / np.maximum(sizes, 1e-30))

@@ -2,7 +2,6 @@
 
 import os
 import signal
-from collections.abc import Iterator
 from pathlib import Path
 
 import numpy as np
@@ -17,16 +16,9 @@ from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording
 from hapticdb.recording.frame import State
 from realtime.hands import Beckoned, at, still
-from realtime.sessions import NEVER_STALE, RATE, Recorded, floored, recorded, until
+from realtime.sessions import NEVER_STALE, RATE, Recorded, recorded, until
 from realtime.worlds import block, make
 from voxels import write_voxels
-
-
-@pytest.fixture
-def env(tmp_path: Path) -> Iterator[Environment]:
-    """An environment on SQLite: a floor with its top at z = 0."""
-    with floored(make(tmp_path, bits=6)) as made:
-        yield made
 
 
 def held_for(frames: Recorded) -> NDArray[np.float64]:
@@ -56,11 +48,11 @@ def check_falling(frames: Recorded) -> None:
 
 @pytest.mark.long
 def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
-    env: Environment, sphere: PointShell, tmp_path: Path
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "killed.hdbrec"
     with (
-        ResidentCells(env.url, budget_bytes=1 << 20) as cells,
+        ResidentCells(voxel_floor.url, budget_bytes=1 << 20) as cells,
         Session(
             cells, sphere, still(0.010), law="plane", rate=RATE, staleness=0.2, record=path
         ) as session,
@@ -89,7 +81,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
     is_held = frames["state"] & State.HELD > 0
     assert frames["applied"][~is_held][:50].any(axis=1).all()
     assert frames["applied"][last + 1 :].any(axis=1).any()
-    assert replay(Recording(path), env).is_equal
+    assert replay(Recording(path), voxel_floor).is_equal
 
 
 def test_unknown_cells_hold_and_fade(sphere: PointShell, tmp_path: Path) -> None:

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 
-from banded import write_points
 from children import PATIENCE
 from hapticdb import Environment, PointShell
 from hapticdb.devices.scripted import Player
@@ -18,8 +17,8 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
 from realtime.hands import at
-from realtime.sessions import NEVER_STALE, felt_at, floor_points, floored, recorded, standing_plate
-from realtime.worlds import SIZE, make
+from realtime.sessions import NEVER_STALE, felt_at, recorded, standing_plate
+from realtime.worlds import SIZE
 
 RATE = 100.0
 """Frames a second: periods so long that a busy machine keeps them."""
@@ -36,22 +35,11 @@ class Ground(NamedTuple):
 
 @pytest.fixture(scope="module", params=["plane", "distance"])
 def ground(
-    request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFactory
+    request: pytest.FixtureRequest, voxel_floor: Environment, distance_floor: Environment
 ) -> Iterator[Ground]:
-    folder = tmp_path_factory.mktemp(request.param)
-    with make(folder, bits=6) as made:
-        if request.param == "plane":
-            floored(made)
-        else:
-            write_points(made.store, floor_points(31.5), "floor")
-        with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
-            height = 0.0 if request.param == "plane" else 1.0 * SIZE
-            yield Ground(made, cells, height, request.param)
-
-
-@pytest.fixture(scope="module")
-def plate() -> PointShell:
-    return standing_plate()
+    made, height = {"plane": (voxel_floor, 0.0), "distance": (distance_floor, SIZE)}[request.param]
+    with ResidentCells(made.url, budget_bytes=4 << 20) as cells:
+        yield Ground(made, cells, height, request.param)
 
 
 def pressing(low: float) -> Player:
@@ -71,9 +59,8 @@ def felt(ground: Ground, shell: PointShell, path: Path) -> Report:
     return report
 
 
-def test_clusters_of_a_large_tool_sleep_and_change_no_bit(
-    ground: Ground, plate: PointShell, tmp_path: Path
-) -> None:
+def test_clusters_of_a_large_tool_sleep_and_change_no_bit(ground: Ground, tmp_path: Path) -> None:
+    plate = standing_plate()
     report = felt(ground, plate, tmp_path / "s.hdbrec")
     assert report.contact_frames > 0
     frames = recorded(tmp_path / "s.hdbrec")

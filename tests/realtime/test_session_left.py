@@ -3,7 +3,7 @@
 import contextlib
 import gc
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
@@ -19,18 +19,10 @@ from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recorder, Recording
 from hapticdb.resident.table import is_alive
 from realtime.hands import Noted, still
-from realtime.sessions import RATE, floored, until
-from realtime.worlds import make
+from realtime.sessions import RATE, until
 
 DEEP = 0.0085
 """Height in metres of a hand whose tool reaches into the floor; deeper if smaller."""
-
-
-@pytest.fixture(scope="module")
-def env(tmp_path_factory: pytest.TempPathFactory) -> Iterator[Environment]:
-    """An environment on SQLite: a floor with its top at z = 0."""
-    with floored(make(tmp_path_factory.mktemp("left"), bits=6)) as made:
-        yield made
 
 
 def force_in(path: Path) -> float:
@@ -39,12 +31,12 @@ def force_in(path: Path) -> float:
 
 @pytest.mark.long
 def test_a_session_that_is_dropped_takes_its_force_away_and_leaves_nothing(
-    env: Environment, sphere: PointShell, tmp_path: Path
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path, record = tmp_path / "wrench", tmp_path / "dropped.hdbrec"
     hand = Noted(still(DEEP), path)
     n_before = n_memories()
-    sessions = [Session(env.url, sphere, hand, law="plane", rate=RATE, record=record)]
+    sessions = [Session(voxel_floor.url, sphere, hand, law="plane", rate=RATE, record=record)]
     pids = sessions[0].pid, sessions[0].cells.pid
     until(lambda: sessions[0].n_frames > 100 and force_in(path) > 0, sessions[0])
     n_frames = sessions[0].n_frames
@@ -67,9 +59,9 @@ def n_memories() -> int:
     return sum("hapticdb-" in name.name for name in found)
 
 
-def test_cells_that_are_dropped_are_given_back(env: Environment) -> None:
+def test_cells_that_are_dropped_are_given_back(voxel_floor: Environment) -> None:
     n_before = n_memories()
-    cells = ResidentCells(env.url, budget_bytes=4 << 20)
+    cells = ResidentCells(voxel_floor.url, budget_bytes=4 << 20)
     pid = cells.pid
     del cells
     assert n_memories() == n_before
@@ -91,11 +83,11 @@ def in_a_fork(work: Callable[[], object]) -> int:
 
 @pytest.mark.long
 def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
-    env: Environment, sphere: PointShell, tmp_path: Path
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path
 ) -> None:
     path = tmp_path / "forked.hdbrec"
     with (
-        ResidentCells(env.url, budget_bytes=4 << 20) as cells,
+        ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells,
         Session(cells, sphere, still(DEEP), law="plane", rate=RATE, record=path) as session,
     ):
         until(lambda: session.n_frames > 50, session)
@@ -114,13 +106,13 @@ def test_a_forked_copy_that_leaves_a_session_does_not_end_it(
 
 
 def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
-    env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     def full(_: Recorder) -> None:
         raise FileError("no space is left: free some")
 
     path = tmp_path / "full.hdbrec"
-    session = Session(env.url, sphere, still(DEEP), law="plane", rate=RATE, record=path)
+    session = Session(voxel_floor.url, sphere, still(DEEP), law="plane", rate=RATE, record=path)
     pids = session.pid, session.cells.pid
     with monkeypatch.context() as patch:
         patch.setattr(Recorder, "close", full)
@@ -132,7 +124,7 @@ def test_a_recording_that_cannot_be_closed_keeps_no_process_and_no_memory(
 
 
 def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
-    env: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The first signal interrupts the start, the second the cleaning up after the first."""
     close, signals = Session.close, iter([KeyboardInterrupt()])
@@ -148,7 +140,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
     path = tmp_path / "never.hdbrec"
     monkeypatch.setattr(module, "Process", interrupted)
     monkeypatch.setattr(Session, "close", cut_off)
-    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+    with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
         with pytest.raises(KeyboardInterrupt):
             Session(cells, sphere, still(DEEP), law="plane", record=path)
         assert not path.exists()
@@ -157,8 +149,8 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
 # -- wrong arguments -----------------------------------------------------------------------------
 
 
-def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell) -> None:
-    with ResidentCells(env.url, budget_bytes=4 << 20) as cells:
+def test_cells_that_are_closed_are_refused(voxel_floor: Environment, sphere: PointShell) -> None:
+    with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
         pass
     with pytest.raises(UsageError, match=r"^these cells are closed: make others$"):
         Session(cells, sphere, still(0.03), law="plane")
@@ -167,7 +159,7 @@ def test_cells_that_are_closed_are_refused(env: Environment, sphere: PointShell)
 @pytest.mark.long
 @pytest.mark.parametrize(("place", "name"), [(resident_cells, "fetching"), (module, "loop's")])
 def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
-    env: Environment,
+    voxel_floor: Environment,
     sphere: PointShell,
     monkeypatch: pytest.MonkeyPatch,
     place: object,
@@ -175,4 +167,4 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
 ) -> None:
     monkeypatch.setattr(place, "START_PATIENCE", 0.0)
     with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
-        Session(env.url, sphere, still(0.03), law="plane")
+        Session(voxel_floor.url, sphere, still(0.03), law="plane")

@@ -5,7 +5,6 @@ import functools
 import itertools
 import time
 from collections.abc import Callable, Iterator
-from pathlib import Path
 from typing import Any, cast
 
 import numpy as np
@@ -23,7 +22,7 @@ class Troubled:
     """Passes calls to another store, with delays and errors.
 
     Each round trip takes `latency` and a random part of `jitter`, seconds, and fails with the
-    probability `errors`, or while the file `away` exists. `wait` lets seconds pass. Each store
+    probability `errors`. `wait` lets seconds pass. Each store
     opened in a process gets other random numbers.
     """
 
@@ -34,24 +33,15 @@ class Troubled:
         latency: float = 0.0,
         jitter: float = 0.0,
         errors: float = 0.0,
-        away: str | None = None,
         seed: int = 0,
         wait: Wait = time.sleep,
     ) -> None:
         self._store = store
         self._latency, self._jitter, self._errors = latency, jitter, errors
-        self._away = Path(away) if away else None
         self._rng = np.random.default_rng([seed, next(_openings)])
         self._wait = wait
-        self.check()
-
-    def check(self) -> None:
-        """Raise `ConnectionLostError` while the file `away` exists."""
-        if self._away and self._away.exists():
-            raise ConnectionLostError(f"{self._store.url} is away: wait")
 
     def _travel(self) -> None:
-        self.check()
         if self._latency or self._jitter:
             self._wait(self._latency + float(self._rng.uniform(0, self._jitter)))
         if self._rng.random() < self._errors:
@@ -63,10 +53,6 @@ class Troubled:
         self._travel()
         with self._store.snapshot():
             yield
-
-    def has_changed(self) -> bool:
-        self.check()
-        return bool(cast("Any", self._store).has_changed())
 
     def __getattr__(self, name: str) -> Any:  # noqa: ANN401 - whatever the store has
         found = getattr(self._store, name)

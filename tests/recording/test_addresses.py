@@ -1,7 +1,5 @@
 """Addresses that a file or a database names lead to no connection, server or other folder."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import shutil
 import socket
 from collections.abc import Iterator
@@ -10,7 +8,7 @@ from pathlib import Path
 import pytest
 
 import hapticdb
-from command_line import Run, made, refused, run, scene  # noqa: F401 - fixtures
+from command_line import Run, refused
 from hapticdb.mesh import read_file
 from hapticdb.recording.file import Recording
 from recordings import header, motion, write

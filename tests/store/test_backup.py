@@ -1,7 +1,5 @@
 """Backups of SQLite environments: made while others write, put back, never incomplete."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import json
 import os
 import sys
@@ -15,7 +13,7 @@ import pytest
 
 import hapticdb
 from children import child, finished
-from command_line import Run, refused, run, succeeded  # noqa: F401 - a fixture
+from command_line import Run, refused, succeeded
 from files_in_use import killed, make, write
 from hapticdb import backup_environment
 from hapticdb.store.sqlite import raw as sqlite_bytes

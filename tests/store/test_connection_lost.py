@@ -1,7 +1,5 @@
 """A connection that is lost at any moment loses no frame and no write, and repeats no write."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import contextlib
 import os
 import signal
@@ -19,20 +17,7 @@ import hapticdb
 from assemblies import placement
 from children import PATIENCE, child, descendants, joined, until
 from command_line import command, tool
-from crashes import (  # noqa: F401 - fixtures among them
-    EDITS,
-    N_PARTS,
-    PLACE,
-    After,
-    edited,
-    felt,
-    file,
-    server,
-    small,
-    template,
-    undisturbed,
-    url,
-)
+from crashes import EDITS, N_PARTS, PLACE, After, felt, small
 from hapticdb import Environment, PointShell
 from hapticdb.errors import StuckError
 from hapticdb.paper.strategies import STRATEGIES, Strategy

@@ -33,7 +33,6 @@ from hapticdb.ingest.voxelizing import rows_of_part
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.store.base import Object, Rows
 from hapticdb.store.postgres.address import parse
-from hapticdb.store.postgres.connecting import link
 from servers import Place
 from validity import assert_valid
 
@@ -250,34 +249,6 @@ def shift(url: str, step: str, n_times: int) -> None:
         assert main(["move", url, "1", "--translate", step, "--json"]) == 0
 
 
-@pytest.mark.long
-def test_two_imports_of_one_file_and_a_remover_leave_whole_objects(url: str, folder: Path) -> None:
-    n_removed = 0
-    file = folder / "balls.obj"
-    with (
-        processes(import_once, (url, file), (url, file)) as both,
-        hapticdb.open(url) as env,
-    ):
-        deadline = time.monotonic() + PATIENCE
-        while any(child.is_alive() for child in both):
-            assert time.monotonic() < deadline
-            for obj in env.objects()[1:]:
-                if obj.id % 2:
-                    env.remove(obj.id)
-                    n_removed += 1
-        assert [child.exitcode for child in both] == [0, 0]
-        assert_valid(env)
-        names = [obj.name for obj in env.objects()]
-        assert len(names) == len(set(names))
-        added = [change.id for change in env.store.changes() if change.action == "add"]
-        assert len(added) == len(set(added)) >= 9
-        assert len(names) == len(added) - n_removed
-
-
-def import_once(url: str, file: Path) -> None:
-    hapticdb.import_files(url, [file])
-
-
 def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) -> None:
     shell, expected = two_tools(), hits_at(url)
     name = parse(url).environment
@@ -315,26 +286,6 @@ def stopped(pid: int) -> Iterator[None]:
     finally:
         with contextlib.suppress(ProcessLookupError):
             os.kill(pid, signal.SIGCONT)
-
-
-@pytest.mark.long
-def test_a_server_that_stops_answering_is_told_and_the_next_call_connects_anew(
-    url: str, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(link, "GRACE_MS", 100)
-    shell, expected = two_tools(), hits_at(url)
-    with hapticdb.open(f"{url}&options=-cstatement_timeout%3D500", read_only=True) as env:
-        until(lambda: answers(env, shell, expected))
-        touch = partial(env.touch, shell, np.eye(4), law="plane")
-        touches = [partial(touch, strategy=strategy) for strategy in STRATEGIES]
-        asks: list[Callable[[], object]] = [*touches, env.objects, env.size, env.quantiles]
-        asks.append(partial(env.voxels, 1))
-        for ask in asks:
-            with stopped(backend_of(env)):
-                with pytest.raises(StuckError, match="did not answer") as told:
-                    ask()
-                assert "\n" not in str(told.value)
-                until(lambda: answers(env, shell, expected))
 
 
 def test_ctrl_c_does_not_wait_for_a_server_that_stopped_answering(

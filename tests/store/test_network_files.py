@@ -5,14 +5,12 @@ from pathlib import Path
 
 import pytest
 
-from command_line import Run, made, refused, run, scene, succeeded  # noqa: F401 - fixtures
+from command_line import Run, refused, succeeded
 from hapticdb.errors import ReadOnlyError
 from hapticdb.grid import Grid
 from hapticdb.store.sqlite import file as sqlite_file
 from hapticdb.store.sqlite.store import SQLiteStore
 from voxels import blob, write_voxels
-
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
 
 GRID = Grid(0.01, (0.0, 0.0, 0.0), 6)
 

@@ -4,8 +4,6 @@ The contract suite holds there, too. Plans show that keys reach the partitions t
 kills that every server comes back by itself.
 """
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import contextlib
 from collections.abc import Iterator
 from functools import partial
@@ -18,22 +16,9 @@ import pytest
 
 import hapticdb
 from assemblies import ball
-from command_line import Run, refused, run  # noqa: F401 - a fixture
+from command_line import Run, refused
 from contract.store import StoreContract
-from crashes import (  # noqa: F401 - fixtures among them
-    EDITS,
-    N_PARTS,
-    After,
-    Killer,
-    crash,
-    edited,
-    felt,
-    file,
-    options,
-    running,
-    template,
-    undisturbed,
-)
+from crashes import EDITS, N_PARTS, After, Killer, crash, felt, options, running
 from hapticdb import Grid, PointShell
 from hapticdb.errors import AccessError, ConnectionLostError, EnvironmentExistsError, UsageError
 from hapticdb.paper.strategies import STRATEGIES, Strategy

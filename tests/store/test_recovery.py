@@ -3,8 +3,6 @@
 Each test has a server of its own, with full durability, and ends that server as a crash does.
 """
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import threading
 import time
 from pathlib import Path
@@ -16,26 +14,18 @@ import pytest
 import hapticdb
 from assemblies import placement
 from children import PATIENCE
-from crashes import (  # noqa: F401 - fixtures among them
+from crashes import (
     EDITS,
     N_PARTS,
     PLACE,
     After,
     Killer,
-    _impatient,
     crash,
-    crashing,
-    edited,
     felt,
-    file,
     moments,
     options,
-    server,
     small,
     steps_of,
-    template,
-    undisturbed,
-    url,
 )
 from hapticdb import Environment, PointShell
 from hapticdb.ingest.files import ImportProgress
@@ -162,20 +152,3 @@ def test_a_long_touch_goes_on_through_a_crash(
                 strategy = STRATEGIES[n_frames % len(STRATEGIES)]
                 assert felt(env, sphere, pose, strategy) == wanted
                 n_frames += 1
-
-
-@pytest.mark.long
-@pytest.mark.usefixtures("_impatient")
-def test_a_touch_tells_in_one_line_that_the_server_stays_away_and_is_usable_afterwards(
-    server: Server, url: str, file: Path, sphere: PointShell
-) -> None:
-    small(url, file).close()
-    with hapticdb.open(url, read_only=True) as env:
-        expected = felt(env, sphere, np.eye(4))
-        kill(server)
-        for ask in (lambda: env.touch(sphere, np.eye(4)), env.objects, env.size):
-            with pytest.raises(hapticdb.errors.ConnectionLostError) as told:
-                ask()
-            assert "\n" not in str(told.value)
-        server.start()
-        assert felt(env, sphere, np.eye(4)) == expected

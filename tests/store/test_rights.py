@@ -1,7 +1,5 @@
 """Roles: their rights over plain connections and through hapticdb; passwords stay hidden."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import contextlib
 import json
 import os
@@ -24,7 +22,7 @@ from psycopg.errors import InsufficientPrivilege
 
 import hapticdb
 import servers
-from command_line import PLACES, Run, boxes, poses, refused, run, tool  # noqa: F401 - fixtures
+from command_line import PLACES, Run, boxes, poses, refused, tool
 from hapticdb import Grid, PointShell
 from hapticdb.cli import app
 from hapticdb.difference import diff_environments

@@ -1,7 +1,5 @@
 """Reads from a standby, through a URL that names both servers and prefers the standby."""
 
-# ruff: noqa: F811 - fixtures are imported, and arguments bear their names
-
 import contextlib
 import shutil
 import tempfile
@@ -16,7 +14,7 @@ import pytest
 
 import hapticdb
 from children import until
-from command_line import PLACES, Run, made, refused, run  # noqa: F401 - fixtures
+from command_line import PLACES, Run, refused
 from hapticdb import PointShell
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.realtime.fetching import Fetcher, FetchRequest

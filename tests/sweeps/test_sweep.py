@@ -155,14 +155,6 @@ def test_nothing_deeper_than_twice_the_tolerance_is_clear(env: Environment) -> N
             assert hit.at_least > CONTACT
 
 
-def test_what_was_left_may_not_be_touched_again(env: Environment) -> None:
-    away = (0.0, 0.0, 0.5 * CUBE + 0.01)
-    found = sweep(env, TOOL, line(SEATED, away, SEATED))
-    assert names(found) == ["plate"]
-    assert found.hits[0].fraction == pytest.approx(1.0, abs=0.01)
-    assert found.touching[0].until < 0.1
-
-
 def test_a_tolerance_tells_what_touches(env: Environment) -> None:
     path = line((0.0, 0.0, 0.5 * CUBE + 2e-4), (0.05, 0.0, 0.5 * CUBE + 2e-4))
     assert sweep(env, TOOL, path).verdict == "clear"

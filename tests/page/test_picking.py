@@ -56,7 +56,7 @@ def test_the_first_object_is_that_of_a_search_over_all_triangles(seed: int, size
         pose[:3, :3] = Rotation.random(random_state=rng).as_matrix()
         pose[:3, 3] = rng.uniform(-1, 1, 3) * size
         members[number] = Member(number, pose, shape.bounds(pose), (0, 0, 0), shape)
-        triangles[number] = shape.facets.triangles @ pose[:3, :3].T + pose[:3, 3]
+        triangles[number] = shape.facets.vertices[shape.facets.faces] @ pose[:3, :3].T + pose[:3, 3]
     hidden = set(rng.integers(0, 12, 3).tolist())
     for _ in range(10):
         start = rng.uniform(-4, 4, 3) * size

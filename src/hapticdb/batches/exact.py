@@ -27,7 +27,7 @@ def exact_clearance(
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 
     tool = MovingSurface(shell)
-    found = ClearanceBatch(len(poses), reach, 0.0)
+    found = ClearanceBatch(len(poses), reach)
     places = np.zeros((len(poses), 3))
     found.revision = store.revision()
     bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)

@@ -161,7 +161,7 @@ class Feeler(Closes):
         search = self._search(limit / size)
 
         def searched() -> ClearanceBatch:
-            found = ClearanceBatch(len(places), float(limit), self.shell.cover)
+            found = ClearanceBatch(len(places), float(limit))
             found.revision = self._residency.revision
             if self._known_revision != found.revision:
                 self._threads.forget()

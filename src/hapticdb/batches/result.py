@@ -114,15 +114,13 @@ class ClearanceBatch:
         surface. If exact: from the tool's surface to the nearest surface of an object.
     points (B,) int64 : index of a nearest point, -1 where nothing is within reach
     reach : greatest distance that was searched, metres
-    cover : covering radius of the shell, metres, if it is known
     revision : revision of the environment that was searched
     """
 
-    def __init__(self, n_poses: int, reach: float, cover: float | None) -> None:
+    def __init__(self, n_poses: int, reach: float) -> None:
         self.distances: Floats = np.full(n_poses, reach)
         self.points: Ints = np.full(n_poses, -1, dtype=np.int64)
         self.reach = reach
-        self.cover = cover
         self.revision = 0
 
     def __len__(self) -> int:
@@ -139,8 +137,3 @@ class ClearanceBatch:
     def is_beyond(self) -> NDArray[np.bool_]:
         """Whether nothing is within reach of each pose, (B,)."""
         return np.asarray(self.points < 0)
-
-    @property
-    def at_least(self) -> Floats | None:
-        """Distance that the tool's surface has at least, metres, (B,); None without `cover`."""
-        return None if self.cover is None else np.maximum(self.distances - self.cover, 0.0)

@@ -1,1 +1,1 @@
-"""PointShells: points sampled on a surface, their normals, and how well they cover it."""
+"""PointShells: points sampled on a surface, and their normals."""

@@ -1,10 +1,5 @@
-"""Covering radius of points on a surface, and which positions the surface encloses.
+"""Spacing of points on a surface, pieces of it, and which positions it encloses."""
 
-The covering radius of points on a surface is the least r such that each position on the surface has
-a point within r. It bounds the size of a detail that may pass between the points without a hit.
-"""
-
-import contextlib
 from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -17,13 +12,6 @@ from hapticdb.kernels.triangles.depth import Solid
 if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
-CLOSE = 0.1
-"""Tolerance of a computed covering radius: it exceeds the least one by at most this share, or comes
-from triangles with sides of at most this share of the points' spacing. A smaller value cuts more
-triangles."""
-AT_ONCE = 1 << 16
-"""Triangles that are cut and measured at a time. A larger value takes more memory."""
-
 Floats = NDArray[np.float64]
 
 
@@ -35,37 +23,6 @@ def spacing_of(area: float, n_points: int) -> float:
 def points_for(area: float, spacing: float) -> int:
     """Number of points of a hexagonal lattice on an area; the inverse of `spacing_of`."""
     return int(np.ceil(2.0 * area / (np.sqrt(3.0) * spacing**2)))
-
-
-def covering_radius(triangles: Floats, points: Floats) -> float:
-    """Bound the covering radius of points (N, 3) on triangles (F, 3, 3) from above, metres.
-
-    The distance to a point is convex, so no position in a triangle is farther from a point than the
-    triangle's farthest corner. Triangles are halved across their longest side until that bound is
-    within `CLOSE` of a distance that occurs. The result is raised by more than its rounding errors.
-    """
-    from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for sweeps alone
-
-    tree = cKDTree(points)
-    edges = triangles - np.roll(triangles, 1, axis=1)
-    area = 0.5 * np.linalg.norm(np.cross(edges[:, 0], edges[:, 1]), axis=1).sum()
-    fine = CLOSE * spacing_of(float(area), len(points))
-    found = bound = 0.0
-    waiting = [triangles[at : at + AT_ONCE] for at in range(0, len(triangles), AT_ONCE)]
-    while waiting:
-        cut = waiting.pop()
-        if len(cut) > AT_ONCE:
-            waiting += [cut[AT_ONCE:], cut[:AT_ONCE]]
-            continue
-        distances, nearest = tree.query(cut.mean(axis=1), workers=-1)
-        found = max(found, float(np.max(distances)))
-        corners = np.linalg.norm(cut - points[nearest][:, None], axis=2).max(axis=1)
-        longest = np.linalg.norm(cut - np.roll(cut, -1, axis=1), axis=2).max(axis=1)
-        is_done = (corners <= (1.0 + CLOSE) * found) | (longest <= fine)
-        bound = max(bound, float(corners[is_done].max(initial=0.0)))
-        if not is_done.all():
-            waiting.append(halves(cut[~is_done]))
-    return (1.0 + 1e-6) * bound
 
 
 def halves(triangles: Floats) -> Floats:
@@ -81,22 +38,6 @@ class Ball(NamedTuple):
     """A sphere about the origin; radius in metres."""
 
     radius: float
-
-    def covering_radius(self, points: Floats) -> float:
-        """Bound the covering radius of points (N, 3) on the sphere from above, metres.
-
-        The farthest positions are the middles of the caps that the faces of the points' convex hull
-        cut off. If the points have no hull, or all lie on one side, it is the sphere's diameter.
-        """
-        from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - as above
-
-        heights = np.zeros(0)
-        if len(points) > 3:
-            with contextlib.suppress(QhullError):
-                heights = -ConvexHull(points / self.radius).equations[:, 3]
-        if not len(heights) or heights.min() <= 0.0:
-            return 2.0 * self.radius
-        return (1.0 + 1e-6) * self.radius * float(np.sqrt(2.0 - 2.0 * heights.min()))
 
 
 class Interior:

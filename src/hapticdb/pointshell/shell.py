@@ -20,7 +20,7 @@ from hapticdb import mesh
 from hapticdb.errors import FileError, UsageError
 from hapticdb.kernels import curves
 from hapticdb.kernels.surfaces import sampling
-from hapticdb.pointshell.coverage import Ball, covering_radius, points_for
+from hapticdb.pointshell.coverage import Ball, points_for
 from hapticdb.pointshell.inset import draw_inward
 from hapticdb.pointshell.orientation import Surface, orient
 from hapticdb.poses import as_floats
@@ -76,9 +76,6 @@ class PointShell:
     seed: int = 0
     defects: str = ""
     """Defects of that file, in words; not saved."""
-    cover: float | None = None
-    """Covering radius, metres: no position on the tool's surface is farther from the nearest
-    point. None if it is not known; `with_cover` computes it."""
     surface: Surface | Ball | None = field(default=None, repr=False)
     """On which the points lie, or from which they were drawn inward; not saved."""
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
@@ -89,8 +86,6 @@ class PointShell:
     """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
 
     def __post_init__(self) -> None:
-        if self.cover is not None and not (np.isfinite(self.cover) and self.cover >= 0.0):
-            raise UsageError(f"a covering radius of {self.cover} m: give 0 or more, or None")
         for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
             array = _as_floats(getattr(self, name), name)
             if array.ndim != len(shape) or array.shape[-1] != 3:
@@ -260,17 +255,6 @@ class PointShell:
             link, seed, surface=surface, inset=insets[order],
         )  # fmt: skip
 
-    def with_cover(self) -> "PointShell":
-        """Return the shell with its covering radius, if its surface is known.
-
-        This takes about as long as making the shell.
-        """
-        if self.cover is not None or self.surface is None:
-            return self
-        if isinstance(self.surface, Ball):
-            return replace(self, cover=self.surface.covering_radius(self.points))
-        return replace(self, cover=covering_radius(self.surface.triangles, self.points))
-
     def save(self, path: str | PathLike[str]) -> None:
         """Write the shell to a `.npz` file of exactly that name; `FileError` if that fails."""
         try:
@@ -284,7 +268,6 @@ class PointShell:
                     is_closed=np.array(self.is_closed),
                     link=np.array(self.link),
                     seed=np.array(self.seed),
-                    cover=np.array(np.nan if self.cover is None else self.cover),
                     inset=self.inset,
                 )
         except OSError as error:
@@ -300,7 +283,6 @@ class PointShell:
                 saved = np.load(file, allow_pickle=False)
                 if str(saved.get("format")) != FORMAT:
                     raise FileError(f"{path}: not a saved shell, or of another version")  # noqa: TRY301 - told as it is
-                cover = float(saved["cover"])
                 return cls(
                     saved["points"],
                     saved["normals"],
@@ -308,7 +290,6 @@ class PointShell:
                     bool(saved["is_closed"]),
                     str(saved["link"]),
                     int(saved["seed"]),
-                    cover=None if np.isnan(cover) else cover,
                     inset=saved["inset"],
                     has_unit=True,
                 )

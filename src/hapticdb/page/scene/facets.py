@@ -30,11 +30,6 @@ class Facets(NamedTuple):
     vertices: NDArray[np.floating]
     faces: NDArray[np.integer]
 
-    @property
-    def triangles(self) -> NDArray[np.float64]:
-        """Corners (F, 3, 3), metres."""
-        return np.asarray(self.vertices[self.faces], dtype=np.float64)
-
 
 def sharpened(facets: Facets) -> Facets:
     """The same triangles in the same order, with vertices split where edges are sharp.

@@ -43,9 +43,7 @@ def make(path: Path, kind: Kind = ("brick", "z"), bits: int = 5) -> Environment:
 
 
 def small_options(
-    curve: CurveName | None = None,
-    layout: Layout | None = None,
-    jobs: int | None = None,
+    curve: CurveName | None = None, layout: Layout | None = None, jobs: int | None = None
 ) -> ImportOptions:
     """Options that ask for `small_grid`."""
     grid = GridOptions(bits=BITS, voxel_size=SIZE, origin=ORIGIN, curve=curve)

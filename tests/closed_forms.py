@@ -8,13 +8,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from bands import steps_of
 from hapticdb.grid import Grid
-from hapticdb.kernels.field.lattice import (
-    BEYOND,
-    CELL_SIDE,
-    CELL_VALUES,
-    HALF_WIDTH,
-    STEPS,
-)
+from hapticdb.kernels.field.lattice import BEYOND, CELL_SIDE, CELL_VALUES, HALF_WIDTH, STEPS
 from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.records import SESSION, pose_numbers, views_of
 from hapticdb.kernels.resident.cells import (

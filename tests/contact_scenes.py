@@ -1,7 +1,4 @@
-"""Scenes in contact whose outcome is known in closed form; lengths in millimetres.
-
-Both surfaces are triangles (F, 3, 3) in one frame: the tool where its path starts, and the object.
-"""
+"""Scenes in contact whose outcome is known in closed form; lengths in millimetres."""
 
 from collections.abc import Mapping, Sequence
 from pathlib import Path

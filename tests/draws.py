@@ -1,9 +1,4 @@
-"""How much of many cases a run tries.
-
-A test that loops over many steps or cases asks `drawn` for some of them. Each run draws other ones;
-its header names the seed, and `--draw=SEED` draws the same again. `--every-step` takes all of them,
-and 200 examples of hypothesis, instead of 25, where a test does not give a number itself.
-"""
+"""How much of many cases a run tries."""
 
 import random
 from collections.abc import Sequence

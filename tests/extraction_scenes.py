@@ -85,20 +85,6 @@ def lid(folder: Path, gap: float) -> Path:
     )
 
 
-HALF_STUD = 0.01
-"""Half the edge of the stud of `studded`, metres: the depth of its middle."""
-
-
-def studded(folder: Path) -> Path:
-    """Two bricks: the stud of the lower one fills a hole in the upper one."""
-    stud = box((-HALF_STUD, -HALF_STUD, 0.0), (HALF_STUD, HALF_STUD, 0.03))
-    return imported(
-        folder,
-        lower=joined(box((-0.05, -0.05, -0.05), (0.05, 0.05, 0.005)), stud),
-        upper=walls((-HALF_STUD, -HALF_STUD, 0.005), (HALF_STUD, HALF_STUD, 0.03), 0.03, "-z"),
-    )
-
-
 def recessed(folder: Path, tilt: float) -> Path:
     """A bolt in a block, with a twentieth of a voxel of room around shaft and head, and below.
 
@@ -120,9 +106,7 @@ def recessed(folder: Path, tilt: float) -> Path:
     )
     turn = trimesh.transformations.rotation_matrix(tilt, [0.0, 1.0, 0.0])
     return imported(
-        folder,
-        block=joined(*block).apply_transform(turn),
-        bolt=bolt.apply_transform(turn),
+        folder, block=joined(*block).apply_transform(turn), bolt=bolt.apply_transform(turn)
     )
 
 
@@ -233,21 +217,6 @@ def bayonet(folder: Path) -> Path:
         box((0.03, -0.08, 0.02), (0.08, 0.08, 0.035)),
     ]
     return imported(folder, well=joined(*well), bar=box((-0.05, -0.015, 0.0), (0.05, 0.015, 0.02)))
-
-
-def slot(folder: Path) -> Path:
-    """A plate that lies in a room with an upright slot in a wall: it turns to pass it."""
-    room = walls((-0.1, -0.1, -0.1), (0.1, 0.1, 0.1), 0.02, "+x")
-    sides = [
-        box((0.1, -0.12, -0.12), (0.12, -0.04, 0.12)),
-        box((0.1, 0.04, -0.12), (0.12, 0.12, 0.12)),
-    ]
-    return imported(
-        folder,
-        1.6 * SIZE,
-        room=joined(room, *sides),
-        plate=box((-0.05, -0.05, -0.01), (0.05, 0.05, 0.01)),
-    )
 
 
 def room_with_a_door(folder: Path) -> Path:

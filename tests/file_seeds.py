@@ -1,7 +1,4 @@
-"""Small sound files of every format: `mutate_files` damages them.
-
-Libraries are imported where they are used, because each fork copies what its process has loaded.
-"""
+"""Small sound files of every format: `mutate_files` damages them."""
 
 import json
 import os

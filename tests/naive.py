@@ -1,8 +1,4 @@
-"""The oracle: plain Python versions of the kernels, slow and meant to be obviously right.
-
-Numbers are exact here. Every float is an integer divided by a power of two, so tests on integers
-decide without rounding what the kernels decide in float64.
-"""
+"""The oracle: plain Python versions of the kernels, slow and meant to be obviously right."""
 
 from collections.abc import Iterable, Sequence
 from fractions import Fraction
@@ -37,11 +33,7 @@ TOUCH = Fraction(1, 10**9)
 
 
 def cross(a: Vector, b: Vector) -> Vector:
-    return (
-        a[1] * b[2] - a[2] * b[1],
-        a[2] * b[0] - a[0] * b[2],
-        a[0] * b[1] - a[1] * b[0],
-    )
+    return (a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0])
 
 
 def dot(a: Vector, b: Vector) -> int:

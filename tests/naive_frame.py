@@ -1,8 +1,4 @@
-"""One frame in plain Python, slow and obviously right: the oracle of every strategy.
-
-Sums and products are in the order that hapticdb promises, so the wrench is the same bit for bit.
-The hits come from a plain set.
-"""
+"""One frame in plain Python, slow and obviously right: the oracle of every strategy."""
 
 import math
 from collections.abc import Callable, Collection, Mapping, Sequence

@@ -1,7 +1,4 @@
-"""The motion between given poses in plain formulas: an oracle for paths, and for sweeps along them.
-
-A tool's middle moves on straight lines, and the tool turns about it evenly, about one axis.
-"""
+"""The motion between given poses in plain formulas: an oracle for paths and sweeps."""
 
 import numpy as np
 from numpy.typing import NDArray

@@ -1,7 +1,4 @@
-"""PostgreSQL servers in folders, for tests and benchmarks: a Unix socket leads there, no password.
-
-A server runs until `stop`, whatever becomes of the process that started it.
-"""
+"""PostgreSQL servers in folders, reached by a Unix socket without a password."""
 
 import contextlib
 import importlib.util

@@ -1,8 +1,4 @@
-"""Pulls drawn at random that start in contact; what is true of each is known as it is made.
-
-Lengths in millimetres. A tool rests on the plane z = 0, and all objects lie below it; or it is a
-peg in its bore, lies in a closed tin, or within a body.
-"""
+"""Pulls drawn at random that start in contact; what is true of each is known as it is made."""
 
 from collections.abc import Callable
 from typing import NamedTuple

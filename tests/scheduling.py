@@ -5,10 +5,8 @@ import signal
 import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
-from pathlib import Path
 from subprocess import PIPE
 
-import distributed
 from distributed import Client
 
 from children import child
@@ -48,17 +46,3 @@ def stop_scheduler(address: str) -> None:
     with Client(address, set_as_default=False) as client:
         pid = client.run_on_scheduler(os.getpid)
     os.kill(pid, signal.SIGSTOP)
-
-
-@contextmanager
-def bare_worker(folder: Path, address: str) -> Iterator[None]:
-    """A worker that finds all packages but hapticdb."""
-    folder.mkdir()
-    for path in Path(distributed.__file__).parents[1].iterdir():
-        if "hapticdb" not in path.name:
-            (folder / path.name).symlink_to(path)
-    command = [sys.executable, "-S", "-m", "distributed.cli.dask_worker", address, "--no-nanny"]
-    kept = {**os.environ, "PYTHONPATH": str(folder)}
-    with child([*command, "--no-dashboard"], env=kept, cwd=folder) as process:
-        yield
-        os.killpg(process.pid, signal.SIGKILL)

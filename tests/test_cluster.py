@@ -24,7 +24,7 @@ from hapticdb.cluster import workers as cluster
 from hapticdb.errors import ClusterError, UsageError
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.transfer import copy_environment
-from scheduling import bare_worker, kill_a_worker, scheduling, stop_scheduler
+from scheduling import kill_a_worker, scheduling, stop_scheduler
 from servers import Place
 
 
@@ -247,14 +247,3 @@ def test_a_scheduler_that_goes_away_or_stands_still_is_told(
             hapticdb.import_files(there, [file], on(address), leave)
     with hapticdb.open(there, read_only=True) as env:
         assert len(env.objects()) >= 3
-
-
-@pytest.mark.long
-def test_a_worker_without_hapticdb_is_told(scene: Path, tmp_path: Path) -> None:
-    with (
-        scheduling(0) as address,
-        bare_worker(tmp_path / "bare", address),
-        hapticdb.open(scene) as env,
-        pytest.raises(ClusterError, match=r"has no hapticdb: install 0\.1\.0 there, as here"),
-    ):
-        find_clashes(env, within=0.2, on=address)

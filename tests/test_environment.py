@@ -1,7 +1,6 @@
 """An opened environment: its objects, moving and removing them, and what other readers see."""
 
 import shutil
-import sys
 from pathlib import Path
 
 import numpy as np
@@ -22,7 +21,6 @@ from assemblies import (
     voxel_set,
     write_obj,
 )
-from children import PIPE, child
 from hapticdb import Environment, PointShell
 from hapticdb.check import check_environment
 from hapticdb.environment import opened
@@ -30,7 +28,6 @@ from hapticdb.grid import CurveName
 from hapticdb.ingest import files
 from hapticdb.mesh import MeshFile, parse_in_process
 from hapticdb.paper.cost_model import machine_name
-from hapticdb.paper.strategies import Strategy
 from hapticdb.store.base import Layout
 from mesh_files import gltf
 from voxels import KINDS
@@ -257,56 +254,6 @@ def test_an_environment_opened_to_read_refuses_every_write(env: Environment) -> 
         with pytest.raises(hapticdb.errors.ReadOnlyError, match="opened to read"):
             write()
     assert rows_of(Path(env.url)) == before
-
-
-EDIT = """
-import sys
-import numpy as np
-import hapticdb
-
-with hapticdb.open(sys.argv[1]) as env:
-    for line in sys.stdin:
-        exec(line)
-        print("done", flush=True)
-"""
-
-
-def test_edits_of_another_process_are_felt_by_the_next_touch(
-    tmp_path: Path, sphere: PointShell
-) -> None:
-    balls = {"one": ball((0, 0, 0), 0.04), "two": ball((0.11, 0, 0), 0.04)}
-    file = write_obj(tmp_path / "balls.obj", balls)
-    hapticdb.import_files(tmp_path / "e.db", [file], small_options())
-    env = hapticdb.open(tmp_path / "e.db")
-
-    def edit(line: str) -> None:
-        assert editor.stdin is not None
-        assert editor.stdout is not None
-        print(line, file=editor.stdin, flush=True)
-        assert editor.stdout.readline() == "done\n"
-
-    def felt() -> list[tuple[int, float]]:
-        """Ids and x positions (metres) of the objects that are hit; all strategies must agree."""
-        strategies: tuple[Strategy, ...] = ("auto", "statement", "cbgroup")
-        found = [env.touch(sphere, pose, s, law="plane").objects for s in strategies]
-        places = [[(o.id, float(o.transform[0, 3])) for o in objects] for objects in found]
-        assert places[0] == places[1] == places[2]
-        return places[0]
-
-    pose = placement(0.04, 0, 0)
-    with child([sys.executable, "-c", EDIT, env.url], stdin=PIPE, stderr=None) as editor:
-        assert felt() == [(1, 0.0)]
-        edit("env.move(1, np.eye(4) + np.eye(4)[0][:, None] * [[0, 0, 0, -0.1]])")
-        assert felt() == []
-        edit("env.move(2, np.eye(4) + np.eye(4)[0][:, None] * [[0, 0, 0, -0.1]])")
-        assert felt() == [(2, -0.1)]
-        edit("env.move(1, np.eye(4))")
-        assert felt() == [(1, 0.0), (2, -0.1)]
-        edit("env.remove(2)")
-        assert felt() == [(1, 0.0)]
-        assert [o.id for o in env.objects()] == [1]
-        with pytest.raises(hapticdb.errors.ObjectNotFoundError):
-            env.touch(sphere, pose, exclude=[2])
 
 
 def test_a_calibration_is_kept_for_this_machine(env: Environment, sphere: PointShell) -> None:

@@ -11,13 +11,7 @@ from hypothesis.extra.numpy import arrays
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, UsageError
-from hapticdb.poses import (
-    quaternion_of,
-    read_poses,
-    read_timed_poses,
-    rotation_of,
-    write_poses,
-)
+from hapticdb.poses import quaternion_of, read_poses, read_timed_poses, rotation_of, write_poses
 
 HEADER = "x,y,z,qw,qx,qy,qz\n"
 

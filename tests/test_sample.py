@@ -14,10 +14,7 @@ from hapticdb.poses import read_poses
 from hapticdb.sample import SampleFiles, write_sample
 
 Floats = NDArray[np.float64]
-PLANTED = {
-    ("engine/block", "engine/alternator"),
-    ("frame/cross_member_middle", "supply/fuel_line"),
-}
+PLANTED = {("engine/block", "engine/alternator"), ("frame/cross_member_middle", "supply/fuel_line")}
 """Pairs of the car's parts that overlap on purpose, in the order of the file."""
 
 

@@ -1,8 +1,5 @@
 """Copies of environments: equal content in any layout and curve; a cut-off copy can go on."""
 
-import signal
-import subprocess
-import sys
 from contextlib import closing
 from dataclasses import replace
 from pathlib import Path
@@ -18,14 +15,13 @@ from numpy.typing import NDArray
 
 import hapticdb
 from assemblies import PAIRS, Kind, left_behind, make, placement, rows_of, voxel_set
-from children import child
 from hapticdb import Environment, Grid, copy_environment, diff_environments
 from hapticdb.check import check_environment
 from hapticdb.grid import CurveName
 from hapticdb.ingest import geometry
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.kernels.field import packing
-from hapticdb.store.base import Band, Layout, Rows
+from hapticdb.store.base import Band, Rows
 from hapticdb.store.sqlite.store import SQLiteStore
 from hapticdb.transfer import CopyReport
 from voxels import blob, voxel_object, with_distances, write_voxels
@@ -266,60 +262,6 @@ def test_two_copies_at_once_make_one(tmp_path: Path) -> None:
     report = copy_environment(source, tmp_path / "b.db", progress=overtake)
     assert (report.copied, report.present) == (1, 3)
     assert diff_environments(source, tmp_path / "b.db").is_equal
-
-
-COPY = """
-import sys, time
-import hapticdb
-
-def say(done, total):
-    print(done, flush=True)
-    if done == total - 1:  # so that no signal comes when it has ended
-        time.sleep(600)
-
-source, target, layout = sys.argv[1:]
-print(0, flush=True)
-hapticdb.copy_environment(source, target, layout=layout, progress=say)
-"""
-N_OBJECTS = 40
-
-
-@pytest.fixture(scope="module")
-def many(tmp_path_factory: pytest.TempPathFactory) -> Path:
-    """An environment of forty objects with some thousand voxels each."""
-    path = tmp_path_factory.mktemp("many") / "a.db"
-    rng = np.random.default_rng(5)
-    with make(path, bits=8) as env:
-        for n in range(N_OBJECTS):
-            write_voxels(env.store, blob(n, tuple(rng.integers(30, 220, 3)), 16), f"blob {n}")
-    return path
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("how", [signal.SIGKILL, signal.SIGINT], ids=str)
-@pytest.mark.parametrize(("n_objects", "layout"), [(1, "voxel"), (33, "brick")])
-def test_an_interrupted_copy_started_again_ends_as_an_undisturbed_one(
-    many: Path, tmp_path: Path, how: signal.Signals, n_objects: int, layout: Layout
-) -> None:
-    target = tmp_path / "b.db"
-    command = [sys.executable, "-c", COPY, str(many), str(target), layout]
-    with child(command, stderr=subprocess.DEVNULL) as copying:
-        assert copying.stdout is not None
-        assert any(int(line) >= n_objects for line in copying.stdout)
-        copying.send_signal(how)
-    assert copying.returncode == -how
-    with hapticdb.open(target, read_only=True) as env:
-        left = env.objects()
-        assert all(len(env.voxels(obj.id)) == obj.voxels for obj in left)
-    assert [obj.id for obj in left] == list(range(1, len(left) + 1))
-    assert len(left) >= n_objects
-    report = copy_environment(many, target, layout=layout)
-    assert (report.present, report.copied) == (len(left), N_OBJECTS - len(left))
-    found = diff_environments(many, target)
-    assert found.is_equal
-    assert (found.compared, found.renumbered) == (N_OBJECTS, ())
-    copy_environment(many, tmp_path / "whole.db", layout=layout)
-    assert rows_of(target) == rows_of(tmp_path / "whole.db")
 
 
 def with_packed(ijk: NDArray[np.int64], grid: Grid, seed: int) -> Rows:

@@ -1,8 +1,4 @@
-"""What two surfaces do to one another at poses of a path, by formulas of our own: an oracle.
-
-A place is inside a surface where its winding number, the sum of solid angles (van Oosterom and
-Strackee 1983), is more than a half in absolute value. Nothing of hapticdb takes part.
-"""
+"""What two surfaces do to one another at poses of a path, by formulas of our own: an oracle."""
 
 from functools import cached_property
 

@@ -1,8 +1,4 @@
-"""Checks on numba's simulator of a GPU, which `test_on_gpu` runs in a process of their own.
-
-The flag that chooses the simulator is read when numba is imported. Each check prints its name when
-it has passed. Blocks have few threads here, since each is a thread of the system.
-"""
+"""Checks on numba's simulator of a GPU, which `test_on_gpu` runs in a process of their own."""
 
 import sys
 import tempfile

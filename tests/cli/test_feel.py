@@ -145,14 +145,8 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         ([*PLAY, "--clutch", 40], ["button 40", "0 to 30"]),
         ([*PLAY, "--budget", 0.5], ["--budget 0.5: give MiB"]),
         ([*PLAY, "--stiffness", 1e300], ["stiffness of 1e+300 N/m", "above 0, up to 1e+09"]),
-        (
-            [*PLAY, "--law", "plane", "--rendering", "coupled"],
-            ["coupled needs distances"],
-        ),
-        (
-            [*PLAY, "--rendering", "direct", "--delay", 5],
-            ["--delay belongs to"],
-        ),
+        ([*PLAY, "--law", "plane", "--rendering", "coupled"], ["coupled needs distances"]),
+        ([*PLAY, "--rendering", "direct", "--delay", 5], ["--delay belongs to"]),
         ([*PLAY, "--exclude", "nobody"], ["--exclude", "nobody"]),
         ([*PLAY, "--record", "nowhere/felt.hdbrec"], ["nowhere/felt.hdbrec"]),
         ([*PLAY, "--record", "tool.npz"], ["tool.npz is there already", "--replace"]),
@@ -243,12 +237,7 @@ def test_a_session_goes_on_without_its_recording_where_the_disk_fails(scene: Pat
 
 
 @pytest.mark.parametrize(
-    ("text", "n_bytes"),
-    [
-        ("1", 1 << 20),
-        ("1.5 GiB", 3 << 29),
-        ("4g", 4 << 30),
-    ],
+    ("text", "n_bytes"), [("1", 1 << 20), ("1.5 GiB", 3 << 29), ("4g", 4 << 30)]
 )
 def test_a_size_is_mib_or_has_its_unit(text: str, n_bytes: int) -> None:
     assert size_bytes(text, "--record-limit") == n_bytes
@@ -267,8 +256,7 @@ def frames_in(path: Path) -> bool:
 
 
 @pytest.mark.parametrize(
-    ("number", "code", "words"),
-    [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")],
+    ("number", "code", "words"), [(signal.SIGINT, 130, "Ctrl-C"), (signal.SIGTERM, 143, "SIGTERM")]
 )
 def test_a_signal_ends_a_session_with_its_report(
     scene: Path, number: signal.Signals, code: int, words: str

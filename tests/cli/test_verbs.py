@@ -184,12 +184,6 @@ def test_a_touch_that_cannot_be_is_one_line(
     refused(touch(run, scene, *options.split()), word)
 
 
-def test_bad_poses_are_named(run: Run, scene: Scene, tmp_path: Path) -> None:
-    for text in ("", "1,2,3\n", "x,y,z,qw,qx,qy,qz\n1,2,3,1,0,0\n", "x,y\n\0"):
-        (tmp_path / "bad.csv").write_text(text)
-        refused(touch(run, scene, "--poses", "bad.csv"), "bad.csv")
-
-
 def test_a_few_poses_are_touched_without_measuring_costs_first(run: Run, scene: Path) -> None:
     args = ("touch", scene, "--tool", "tool.npz", "--poses", "path.csv", "--json")
     used = {json.loads(line)["query"]["strategy"] for line in run(*args)[1].splitlines()}

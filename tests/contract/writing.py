@@ -9,11 +9,7 @@ import numpy as np
 import pytest
 
 from contract.case import StoreCase
-from hapticdb.errors import (
-    ConflictError,
-    EnvironmentExistsError,
-    ObjectNotFoundError,
-)
+from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.pairs import Mark, PairRow

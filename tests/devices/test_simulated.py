@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from devices.test_scripted import SetClock
-from hapticdb.devices.protocol import Reading, SupportsEnd
+from hapticdb.devices.protocol import Reading
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import UsageError
@@ -125,22 +125,6 @@ def test_the_motors_are_capped() -> None:
     assert angle_between(np.eye(3), rested.pose[:3, :3]) == pytest.approx(0.2 / 0.3, abs=1e-4)
 
 
-def test_it_keeps_up_with_a_hand_that_moves_steadily() -> None:
-    clock = SetClock()
-    end = np.eye(4)
-    end[0, 3] = 1.0
-    hand = Player([0.0, 1.0], [np.eye(4), end], clock=clock)
-    device = SimulatedDevice(hand, clock=clock)
-    device.read()
-    reading = run(device, clock, 0.5)
-    assert reading.pose[0, 3] == pytest.approx(0.5, abs=1e-4)
-    assert reading.velocity[0] == pytest.approx(1.0, abs=1e-3)
-    assert not device.is_over
-    run(device, clock, 0.6)
-    assert isinstance(device, SupportsEnd)
-    assert device.is_over
-
-
 def test_a_long_pause_is_skipped_but_for_its_end() -> None:
     clock, hand = SetClock(), Still()
     device = SimulatedDevice(hand, grip=0.0, turn_grip=0.0, latency=0.0, clock=clock)
@@ -157,6 +141,11 @@ def test_buttons_are_the_hand_s_and_a_hand_without_an_end_has_none() -> None:
     hand.buttons = 5
     assert device.read().buttons == 5
     assert not device.is_over
+    clock = SetClock()
+    scripted = SimulatedDevice(Player([0.0, 1.0], [np.eye(4)] * 2, clock=clock), clock=clock)
+    for clock.now, is_over in ((0.0, False), (0.5, False), (1.1, True)):
+        scripted.read()
+        assert scripted.is_over == is_over
 
 
 @pytest.mark.parametrize(

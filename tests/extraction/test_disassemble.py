@@ -7,15 +7,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from disassembly_scenes import (
-    CHAIN,
-    STACK,
-    WINDOW,
-    Scene,
-    held_by_a_head,
-    least_gap,
-    made,
-)
+from disassembly_scenes import CHAIN, STACK, WINDOW, Scene, held_by_a_head, least_gap, made
 from extraction_scenes import corner, lid, shadow_planner
 from hapticdb import Disassembly, disassemble
 from hapticdb.errors import MissingExtraError

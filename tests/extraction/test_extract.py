@@ -25,15 +25,13 @@ from extraction_scenes import (
     recessed,
     room_with_a_door,
     shadow_planner,
-    studded,
     threaded,
     walls,
 )
 from hapticdb import extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
-from hapticdb.extraction.judge import judge
 from hapticdb.extraction.planner import Planner
-from hapticdb.extraction.problem import Exit, problem_of
+from hapticdb.extraction.problem import Exit
 from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
 from hapticdb.sweeps.result import Swept
@@ -69,19 +67,6 @@ def test_a_part_that_still_touches_at_its_end_slides(tmp_path: Path) -> None:
     found = found_in(ledge(tmp_path), "plate", motions=0, out=0.01)
     assert (found.verdict, found.is_free) == ("slides", True)
     assert extraction_line(found).startswith("slides straight, 10 mm")
-
-
-@pytest.mark.long
-def test_bricks_with_a_stud_come_apart_along_the_stud_only(tmp_path: Path) -> None:
-    """Pulled across, the walls of the upper one pass through the stud of the lower one."""
-    with hapticdb.open(studded(tmp_path), read_only=True) as env:
-        problem = problem_of(env, ("upper",), (), (), seed=0, contact=5e-5, overlap=0.0)
-        along, across = (
-            judge(problem, np.stack([np.eye(4), shifted(0.2 * axis)]), "pull")
-            for axis in np.eye(3)[[2, 0]]
-        )
-    assert along.verdict == "comes out"
-    assert (across.verdict, [obj.name for obj in across.in_way]) == ("not decided", ["lower"])
 
 
 @pytest.mark.parametrize("tilt", [0.0, 0.4])

@@ -6,16 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from extraction_scenes import (
-    bayonet,
-    found_in,
-    grounded,
-    is_out,
-    ledge,
-    pocket,
-    slot,
-    solids,
-)
+from extraction_scenes import bayonet, found_in, grounded, is_out, ledge, pocket, solids
 from hapticdb import Extraction
 
 Floats = NDArray[np.float64]
@@ -102,13 +93,3 @@ def test_a_block_on_the_floor_of_a_closed_box_has_no_way(tmp_path: Path) -> None
     assert (found.verdict, found.is_planned) == ("no way found", True)
     assert [one.object.name for one in found.blockers] == ["cage"]
     assert 0 < found.motions <= 2 * 200
-
-
-@pytest.mark.long
-def test_a_plate_is_turned_to_pass_a_slot(tmp_path: Path) -> None:
-    url = slot(tmp_path)
-    found = found_in(url, "plate", seed=1)
-    assert (found.verdict, found.near) == ("comes out", ())
-    assert is_out(found, url)
-    assert places_in_boxes(found, url, "plate", 0.0) == 0
-    assert turn_of(poses_of(found)).max() > 0.5

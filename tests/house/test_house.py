@@ -1,7 +1,4 @@
-"""Rules of the project, checked on the sources: direction of imports, texts, waits, public names.
-
-ARCHITECTURE.md draws the floors; this file tests them.
-"""
+"""Rules of the project, checked on the sources: imports, texts, waits, public names."""
 
 import ast
 import inspect

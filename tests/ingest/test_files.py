@@ -74,11 +74,7 @@ def refusal(report: FileReport, kind: type[hapticdb.errors.HapticDBError]) -> st
 
 @pytest.mark.parametrize(("layout", "curve"), KINDS)
 def test_every_layout_and_curve_holds_the_voxels_of_the_oracle(
-    tmp_path: Path,
-    file: Path,
-    wanted: list[set[Voxel]],
-    layout: Layout,
-    curve: CurveName,
+    tmp_path: Path, file: Path, wanted: list[set[Voxel]], layout: Layout, curve: CurveName
 ) -> None:
     report = import_one(tmp_path / "e.db", file, small_options(curve, layout))
     assert report.status == "imported"

@@ -1,13 +1,8 @@
-"""An import interrupted at any moment leaves a valid database; run again, it ends as undisturbed.
-
-Each interrupted import is a process of its own that says how many parts it has committed, and
-waits before the last of them, so that no signal comes when it has ended.
-"""
+"""An import interrupted at any moment leaves a valid database, and can be run again."""
 
 import os
 import signal
 import sys
-import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -19,7 +14,6 @@ import pytest
 import hapticdb
 from assemblies import Mesh, Rows, ball, left_behind, rows_of, small_options, write_obj
 from children import PATIENCE, child, until
-from draws import drawn
 from hapticdb import GridOptions, ImportOptions
 from hapticdb.ingest.files import ImportProgress
 from hapticdb.resident.table import is_alive
@@ -91,32 +85,6 @@ def assert_finishes(database: Path, file: Path, undisturbed: Rows, jobs: int = 1
     assert report.present + len(report.added) == N_PARTS
     assert left_behind(database.parent) == ["e.db"]
     assert rows_of(database) == undisturbed
-
-
-@pytest.mark.long
-@pytest.mark.parametrize("n_parts", drawn(range(6, N_PARTS - 5), 6))
-def test_a_killed_import_run_again_ends_as_an_undisturbed_one(
-    folder: Path, undisturbed: Rows, tmp_path: Path, n_parts: int
-) -> None:
-    """kill -9 after so many parts, and somewhere in the next one."""
-    rng = np.random.default_rng(n_parts)
-    database = tmp_path / "e.db"
-    with importing(database, folder / "balls.obj", int(rng.integers(1, 4))) as process:
-        wait_for(process, n_parts)
-        time.sleep(rng.uniform(0, 0.02))
-        process.kill()
-        process.wait(PATIENCE)
-    left = rows_of(database, "object", "voxel", "change")
-    n_left = len(left["object"])
-    assert n_parts <= n_left <= N_PARTS
-    assert [row[0] for row in left["object"]] == list(range(1, n_left + 1))
-    # every object is whole, and nothing of the next one is there
-    counts = np.bincount([row[1] for row in left["voxel"]], minlength=n_left + 1)
-    assert counts[1:].tolist() == [row[5] for row in left["object"]]
-    assert [row[0] for row in left["change"]] == list(range(1, n_left + 1))
-    with hapticdb.open(database, read_only=True) as env:
-        assert len(env.objects()) == n_left
-    assert_finishes(database, folder / "balls.obj", undisturbed, int(rng.integers(1, 4)))
 
 
 @pytest.mark.parametrize("is_there", [False, True])

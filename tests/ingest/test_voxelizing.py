@@ -10,10 +10,7 @@ from hapticdb.errors import FileError
 from hapticdb.grid import GridOptions
 from hapticdb.ingest.files import ImportOptions, ImportProgress, import_files
 from hapticdb.ingest.layout import Bricks
-from hapticdb.ingest.voxelizing import (
-    bricks_of_pieces,
-    pieces_of_points,
-)
+from hapticdb.ingest.voxelizing import bricks_of_pieces, pieces_of_points
 from hapticdb.kernels.surfaces import voxelize
 from mesh_files import text
 

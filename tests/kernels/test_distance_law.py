@@ -1,7 +1,4 @@
-"""The distance law in frames on rows and on resident cells, against plain Python and closed forms.
-
-Bands are made by brute force from triangles (`bands`), without a database.
-"""
+"""The distance law on rows and on resident cells, against plain Python and closed forms."""
 
 from functools import cache
 from typing import NamedTuple

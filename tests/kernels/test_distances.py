@@ -11,12 +11,7 @@ from bands import band_of, distance_to_triangle
 from hapticdb.kernels.field.lattice import BEYOND, HALF_WIDTH, VOXELS_A_STEP
 from hapticdb.kernels.field.packing import unpack
 from hapticdb.kernels.surfaces import distances
-from hapticdb.kernels.surfaces.distances import (
-    BLOCK,
-    BLOCK_BRICKS,
-    PAIRS_OF_PIECE,
-    band_pieces,
-)
+from hapticdb.kernels.surfaces.distances import BLOCK, BLOCK_BRICKS, PAIRS_OF_PIECE, band_pieces
 from naive import z_order
 
 JIT = not numba.config.DISABLE_JIT

@@ -145,10 +145,7 @@ def touched(low: float, high: float, side: int) -> NDArray[np.int64]:
 def test_wide_rectangles_mark_the_voxels_that_they_touch(
     bits: int, axes: list[int], halves: tuple[int, int, int, int], most: int
 ) -> None:
-    """Between two layers or within one, and their sides so, too: all is in halves of a voxel.
-
-    A row has more columns than are marked at once. Each piece begins and ends within a row.
-    """
+    """Between two layers or within one, and their sides so, too: all is in halves of a voxel."""
     side = 1 << bits
     layer, begin, end, width = (n / 2 for n in halves)
     low, high = np.array([begin, 3.0, layer]), np.array([side - end, 3.0 + width, layer])

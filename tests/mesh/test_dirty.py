@@ -1,8 +1,4 @@
-"""Every file of the dirty folder is read with known counts, or refused with a one-line error.
-
-The numbers of triangles and defects were checked: for text files by reading the file, for derived
-files against the way they were made, for the others against trimesh's load of the same file.
-"""
+"""Every file of the dirty folder is read with known counts, or refused with a one-line error."""
 
 from collections.abc import Callable
 from pathlib import Path

@@ -1,7 +1,4 @@
-"""Files of the kinds that people report about programs like this one, each read rightly or told.
-
-Areas, volumes and bounds follow from the shapes that the files were written to hold.
-"""
+"""Files of the kinds that people report about programs like this one, each read rightly or told."""
 
 from pathlib import Path
 from typing import NamedTuple

@@ -3,13 +3,7 @@
 import pytest
 
 from hapticdb.page.scene.names import assemblies_of, found_ids
-from hapticdb.page.wording import (
-    escaped,
-    note_html,
-    plain_name,
-    rows_html,
-    short_name,
-)
+from hapticdb.page.wording import escaped, note_html, plain_name, rows_html, short_name
 
 HOSTILE = '<img src=x onerror="alert(1)">&amp;</td><script>'
 

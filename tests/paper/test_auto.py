@@ -49,11 +49,7 @@ def keep_figures(store: Store, model: CostModel) -> None:
 @pytest.mark.parametrize("layout", BITS)
 @pytest.mark.parametrize(
     ("model", "n_points", "used"),
-    [
-        (ONE_RANGE, 3000, "cbgroup"),
-        (NO_GAP_CLOSED, 3000, "array"),
-        (ONE_RANGE, 500, "array"),
-    ],
+    [(ONE_RANGE, 3000, "cbgroup"), (NO_GAP_CLOSED, 3000, "array"), (ONE_RANGE, 500, "array")],
 )
 def test_auto_names_what_it_used_and_answers_as_every_strategy(
     tmp_path: Path, layout: Layout, model: CostModel, n_points: int, used: str

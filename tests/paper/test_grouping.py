@@ -77,13 +77,7 @@ def test_gaps_are_voxel_keys_on_bricks(voxels: list[int], gap: int) -> None:
 
 def costs_of(descent: float, row: float) -> CostModel:
     """A model in which only a descent and a scanned row cost anything."""
-    return CostModel(
-        statement=0.0,
-        descent=descent,
-        block=row,
-        row=row / 2,
-        rows_per_block=2.0,
-    )
+    return CostModel(statement=0.0, descent=descent, block=row, row=row / 2, rows_per_block=2.0)
 
 
 def all_groupings(keys: list[int]) -> Iterator[list[tuple[int, int]]]:

@@ -16,14 +16,7 @@ from hapticdb.paper.cost_model import CostModel, machine_name
 from hapticdb.paper.strategies import STRATEGIES
 from hapticdb.query.law import LAW_NAMES
 from hapticdb.store.base import Band, Keys, Rows
-from kernels.test_distance_law import (
-    expected,
-    grid_of,
-    merged,
-    objects,
-    random_pose,
-    random_shell,
-)
+from kernels.test_distance_law import expected, grid_of, merged, objects, random_pose, random_shell
 from naive_frame import NaiveTouch
 from servers import Place
 from voxels import blob, voxel_object, write_voxels

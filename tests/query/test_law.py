@@ -1,8 +1,4 @@
-"""The wrench against closed forms: cases 1, 2, 5 and 8, averaging.
-
-The scene of most is the floor: every voxel below the plane z = 0 is solid, eight layers deep. Its
-voxels measure 2^-8 m where a point must lie exactly on a border, 5 mm elsewhere.
-"""
+"""The wrench against closed forms: cases 1, 2, 5 and 8, averaging."""
 
 import math
 from collections.abc import Iterator

@@ -1,8 +1,4 @@
-"""A law from outside the package: a plain penalty on occupancy, through frames of both kinds.
-
-No kernel knows it. `hapticdb.kernels.law.define` enters its functions, and the kernels are compiled
-once more for its type.
-"""
+"""A law from outside the package: a plain penalty on occupancy, through frames of both kinds."""
 
 from pathlib import Path
 from typing import NamedTuple

@@ -1,7 +1,4 @@
-"""Tools with thin walls under the distance law, and the share by which their two sides differ.
-
-Scenes are bands made by brute force, in voxels from the grid's origin; frames are frames on rows.
-"""
+"""Tools with thin walls under the distance law, and the share by which their two sides differ."""
 
 from functools import cache
 

@@ -1,9 +1,4 @@
-"""Hands whose looks are on numba's simulator of a GPU, which `test_on_gpu` runs in a process.
-
-A hand on the processor makes the same moves, and both are compared bit for bit: the simulator does
-not fuse a multiplication and an addition. Each check prints its name when it has passed. Blocks
-have few threads here, since each is a thread of the system.
-"""
+"""Hands whose looks are on numba's simulator of a GPU, which `test_on_gpu` runs in a process."""
 
 import sys
 import tempfile

@@ -19,11 +19,7 @@ from hapticdb.errors import DatabaseError, HapticDBError
 from hapticdb.kernels.period.telling import name_voxels
 from hapticdb.kernels.records import TOLD
 from hapticdb.kernels.resident.cells import LISTED, cell_key
-from hapticdb.realtime.fetching import (
-    CONFIRM_EVERY,
-    Fetcher,
-    FetchRequest,
-)
+from hapticdb.realtime.fetching import CONFIRM_EVERY, Fetcher, FetchRequest
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.tracking import Wish
 from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
@@ -105,8 +101,7 @@ class LockStep:
         self.pose[:3, 3] = np.array(env.grid.origin) + env.grid.edge / 2
         self.side = Side(self.table, env.grid, shell)
         self.fetcher = Fetcher(
-            FetchRequest(env.url, self.table, env.grid, wrap=wrap),
-            clock=lambda: self.now,
+            FetchRequest(env.url, self.table, env.grid, wrap=wrap), clock=lambda: self.now
         )
 
     def wait(self, seconds: float) -> None:

@@ -1,6 +1,5 @@
 """The fetching process when its file is deleted, restored or replaced, also by another grid."""
 
-import contextlib
 import os
 import signal
 import threading
@@ -15,20 +14,17 @@ from numpy.typing import NDArray
 
 import hapticdb
 from children import PATIENCE
-from hapticdb import Environment, Grid, PointShell
+from hapticdb import Environment, PointShell
 from hapticdb.errors import GridError
 from hapticdb.realtime import resident_cells
 from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.realtime.processes import Process
 from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
-from hapticdb.store.postgres.schema_of import drop
-from hapticdb.store.postgres.store import PostgresStore
 from hapticdb.store.sqlite.file import remove_file
 from naive_frame import touch_of_shell
 from realtime.test_fetching import Side, until
-from realtime.worlds import SIZE, block, ids_by_voxel, make
-from servers import Place
+from realtime.worlds import block, ids_by_voxel, make
 from voxels import write_voxels
 
 
@@ -122,27 +118,6 @@ def test_a_lost_file_is_held_open_until_another_is_there_that_else_might_get_its
         until(lambda: side.is_served, fetching.round)
         assert side.reader.feel(pose)[0] == naive.hits
         fetching.close()
-
-
-@pytest.mark.long
-def test_an_environment_of_a_server_made_anew_is_felt_instead(
-    place: Place, sphere: PointShell
-) -> None:
-    url, pose = place(), np.eye(4)
-    half = SIZE * (1 << 7) / 2
-    grid = Grid(SIZE, (-half, -half, -half), 7)
-    with hapticdb.create(url, grid) as env:
-        write_voxels(env.store, block((50, 50, 58), (78, 78, 63)))
-    with ResidentCells(url, budget_bytes=LEAST_BUDGET) as cells:
-        side = served(cells, sphere, pose)
-        before = side.reader.feel(pose)[0]
-        with contextlib.closing(PostgresStore.open(url)) as store:
-            drop(store._connection)
-        with hapticdb.create(url, grid) as env:  # has the same revision
-            write_voxels(env.store, block((62, 56, 56), (68, 72, 72)))
-            naive = touch_of_shell(ids_by_voxel(env), grid, sphere, pose)
-        assert naive.hits != before
-        until(lambda: side.reader.feel(pose)[0] == naive.hits)
 
 
 def test_another_grid_ends_the_fetching_and_is_told(

@@ -20,14 +20,7 @@ from hapticdb.realtime.resident_cells import ResidentCells
 from hapticdb.realtime.session import Session
 from hapticdb.recording.file import Recording, State
 from realtime.hands import Beckoned, Steady, at, still
-from realtime.sessions import (
-    NEVER_STALE,
-    RATE,
-    felt_at,
-    floored,
-    recorded,
-    until,
-)
+from realtime.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
 from realtime.worlds import SIZE, make
 
 HEIGHT = 31.5

@@ -94,8 +94,7 @@ def test_a_recording_opens_a_file_beside_it_wherever_the_person_is(
 
 
 @pytest.mark.parametrize(
-    ("name", "text"),
-    [("a.gltf", GLTF), ("a.dae", COLLADA), ("a.obj", WAVEFRONT), ("a.ply", PLY)],
+    ("name", "text"), [("a.gltf", GLTF), ("a.dae", COLLADA), ("a.obj", WAVEFRONT), ("a.ply", PLY)]
 )
 def test_addresses_in_a_file_of_geometry_are_not_followed(
     tmp_path: Path, listening: socket.socket, name: str, text: str

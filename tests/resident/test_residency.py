@@ -118,11 +118,7 @@ def test_what_is_resident_is_what_the_database_holds(
 
 
 def test_cells_follow_the_words_of_a_filter(tmp_path: Path, table: CellTable) -> None:
-    """What others add is in the cells if the words choose it then; words that end choose nothing.
-
-    The name of the last object makes a pattern an exact name, so that objects that nobody has
-    written are felt no longer.
-    """
+    """What others add is in the cells if the words choose it then."""
 
     def named(name: str, number: int, material: str) -> int:
         ijk = block((16 * number, 3, 3), (16 * number + 40, 9, 9))
@@ -311,10 +307,7 @@ def test_slots_of_a_load_that_failed_are_used_again(
 def test_what_a_writer_that_died_has_left_is_read_again_before_it_is_believed(
     tmp_path: Path, table: CellTable
 ) -> None:
-    """The environment may since have been replaced by another with as many writes.
-
-    Urgent cells are read again within one version, so no version lacks them.
-    """
+    """The environment may since have been replaced by another with as many writes."""
     for name in ("first", "second"):
         (tmp_path / name).mkdir()
     env, other = make(tmp_path / "first"), make(tmp_path / "second")
@@ -369,11 +362,7 @@ def shell_of(places: NDArray[np.int64], env: Environment) -> PointShell:
 
 
 def test_no_frame_sees_an_object_at_two_places_or_a_torn_cell(tmp_path: Path) -> None:
-    """Frames run in a thread while the object moves and the writer loads, evicts and refreshes.
-
-    The object has a voxel in each of several cells. Every cell has the same pattern of voxels, of
-    which a frame must hit all or none.
-    """
+    """Frames run in a thread while the object moves and the writer loads, evicts and refreshes."""
     env = make(tmp_path, bits=8)
     pattern = np.array([[5, 5, 5], [6, 6, 6], [20, 9, 31], [31, 31, 0]])
     corners = 32 * block((0, 0, 0), (7, 7, 7))

@@ -17,12 +17,7 @@ from hypothesis import strategies as st
 from children import PATIENCE, child, joined, until
 from hapticdb.errors import UsageError
 from hapticdb.kernels.resident.cells import READER_STRIDE
-from hapticdb.resident.table import (
-    LEAST_BUDGET,
-    MOST_READERS,
-    CellTable,
-    is_alive,
-)
+from hapticdb.resident.table import LEAST_BUDGET, MOST_READERS, CellTable, is_alive
 
 
 @given(st.integers(LEAST_BUDGET, 16 << 20), st.booleans())

@@ -53,8 +53,7 @@ def test_values_of_widgets_pass(content: object) -> None:
 
 
 @pytest.mark.parametrize(
-    "type_",
-    ["ShareUrlRequest", "FileTransferStartUpload", "RunJavascriptMessage", "no such type"],
+    "type_", ["ShareUrlRequest", "FileTransferStartUpload", "RunJavascriptMessage", "no such type"]
 )
 def test_types_that_our_page_does_not_use_never_pass(type_: str) -> None:
     for more in ({}, {"uuid": "a"}, {"name": "/tool", "updates": {"visible": False}}):

@@ -235,10 +235,7 @@ def test_frames_are_read_from_the_index_alone(
 
 @pytest.mark.parametrize("reset", ["SET search_path TO {other}", "DISCARD ALL"])
 def test_a_write_behind_a_pooler_of_transactions_is_refused(place: Place, reset: str) -> None:
-    """Each transaction there may be on a server connection with another search path, or with none.
-
-    A write from then on would be in another environment, or in the schema public.
-    """
+    """A transaction there may have another search path, or none."""
     stores = [PostgresStore.create(place(), GRID, "brick") for _ in range(2)]
     for store in stores:
         write_voxels(store, floor_voxels(GRID), "floor")

@@ -87,11 +87,7 @@ def empty(path: Path) -> None:
 )
 @pytest.mark.parametrize("read_only", [False, True])
 def test_what_is_no_environment_is_told_apart_and_left_alone(
-    path: Path,
-    damage: Callable[[Path], None],
-    error: type[Exception],
-    words: str,
-    read_only: bool,
+    path: Path, damage: Callable[[Path], None], error: type[Exception], words: str, read_only: bool
 ) -> None:
     damage(path)
     before = path.read_bytes() if path.exists() else None

@@ -1,8 +1,4 @@
-"""Many clients on PostgreSQL: each frame is of one revision, none blocks, no write is lost.
-
-Readers and writers are separate processes. That none blocks is shown by the outcome: a reader ends
-while a writer still holds its lock, a writer ends while a reader still holds its snapshot.
-"""
+"""Many clients on PostgreSQL: each frame is of one revision, none blocks, no write is lost."""
 
 import contextlib
 import multiprocessing

@@ -1,8 +1,4 @@
-"""An environment whose rows lie on three other servers, by postgres_fdw.
-
-The contract suite holds there, too. Plans show that keys reach the partitions that have them, and
-kills that every server comes back by itself.
-"""
+"""An environment whose rows lie on three other servers, by postgres_fdw."""
 
 import contextlib
 from collections.abc import Iterator

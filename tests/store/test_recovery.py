@@ -1,7 +1,4 @@
-"""A server that dies at any moment leaves a valid environment; the same command then finishes.
-
-Each test has a server of its own, with full durability, and ends that server as a crash does.
-"""
+"""A server that dies at any moment leaves a valid environment; the same command then finishes."""
 
 import threading
 import time
@@ -41,11 +38,7 @@ from validity import Contents, assert_valid, contents, valid_contents
 @pytest.mark.usefixtures("_impatient")
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
-    server: Server,
-    url: str,
-    file: Path,
-    undisturbed: dict[Layout, Contents],
-    layout: Layout,
+    server: Server, url: str, file: Path, undisturbed: dict[Layout, Contents], layout: Layout
 ) -> None:
     for n_parts, delay in moments(1):
         killer = Killer(n_parts, delay, lambda: kill(server))
@@ -66,11 +59,7 @@ def test_an_import_cut_off_by_crashes_is_finished_by_the_same_command(
 @pytest.mark.long
 @pytest.mark.parametrize("layout", ["voxel", "brick"])
 def test_an_import_goes_on_by_itself_when_the_server_comes_back(
-    server: Server,
-    url: str,
-    file: Path,
-    undisturbed: dict[Layout, Contents],
-    layout: Layout,
+    server: Server, url: str, file: Path, undisturbed: dict[Layout, Contents], layout: Layout
 ) -> None:
     crashes = [Killer(n, delay, lambda: crash(server)) for n, delay in moments(2)]
 

@@ -203,10 +203,7 @@ def stranger(database: str, admin: psycopg.Connection) -> Iterator[psycopg.Conne
 
 
 def test_words_of_strangers_on_the_channel_hide_no_edit(
-    url: str,
-    reader: PostgresStore,
-    stranger: psycopg.Connection,
-    monkeypatch: pytest.MonkeyPatch,
+    url: str, reader: PostgresStore, stranger: psycopg.Connection, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """Each edit is noticed by its own notification, as without forged ones."""
     monkeypatch.setattr(watching, "HEARING_S", 1e9)

@@ -1,8 +1,4 @@
-"""Random pulls that start in contact: nothing free goes through material, nothing free is hit.
-
-The truth of a pull comes from how it is made (`random_pulls`), from winding numbers and crossings
-(`winding`), and from clashes at both ends. Lengths in millimetres.
-"""
+"""Random pulls that start in contact: nothing free goes through material, nothing free is hit."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -139,8 +135,7 @@ def against_winding(case: Case, body: Body, reach: float) -> str:
     for n, step in enumerate(case.steps(*LOOKS)):
         back = np.linalg.inv(step)
         deep = max(
-            thing.depth_of(placed(tool.samples, step)),
-            tool.depth_of(placed(thing.samples, back)),
+            thing.depth_of(placed(tool.samples, step)), tool.depth_of(placed(thing.samples, back))
         )
         if deep > reach:
             return f"{deep:.3f} deep at look {n}, {reach:.3f} is allowed"

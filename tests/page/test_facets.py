@@ -18,14 +18,14 @@ def test_splitting_keeps_every_triangle_in_its_place(seed: int, n_faces: int) ->
     rng = np.random.default_rng(seed)
     vertices = rng.integers(-2, 3, (12, 3)) / 2.0  # many equal positions
     before = Facets(vertices, rng.integers(0, 12, (n_faces, 3)))
-    after = sharpened(before)
+    (after,) = sharpened([before])
     assert np.array_equal(after.vertices[after.faces], before.vertices[before.faces])
     assert len(after.vertices) <= 3 * n_faces
 
 
 def test_a_cylinder_is_sharp_at_its_rims_alone() -> None:
     rod = facets_of(trimesh.creation.cylinder(1.0, 2.0, sections=64))
-    assert len(sharpened(rod).vertices) == 4 * 64 + 2  # each rim twice, and two centres
+    assert len(sharpened([rod])[0].vertices) == 4 * 64 + 2  # each rim twice, and two centres
 
 
 @given(st.integers(0, 2**32), st.integers(1, 60))

@@ -142,11 +142,7 @@ class Feeler(Closes):
         return self._at_one_revision(lambda: self._touch(places, order, objects, progress))
 
     def clearance(
-        self,
-        poses: ArrayLike,
-        reach: float | None = None,
-        *,
-        progress: PoseCallback | None = None,
+        self, poses: ArrayLike, reach: float | None = None, *, progress: PoseCallback | None = None
     ) -> ClearanceBatch:
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 

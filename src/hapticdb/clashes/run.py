@@ -336,10 +336,7 @@ class PairSearch:
             yield Clash(a, b, *names, "not known", 0.0, None, None, "not looked at")
 
     def _settle(
-        self,
-        shown: dict[tuple[int, int], PairRow],
-        looked: set[tuple[int, int]],
-        mark: Mark | None,
+        self, shown: dict[tuple[int, int], PairRow], looked: set[tuple[int, int]], mark: Mark | None
     ) -> None:
         """Note that statuses were told: what is new now is the same next time."""
         self._waiting = [

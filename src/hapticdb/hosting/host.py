@@ -29,13 +29,7 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
 from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.realtime.board import Board
-from hapticdb.realtime.coupling import (
-    Coupling,
-    DirectRendering,
-    Rendering,
-    radius_of,
-    rendering_of,
-)
+from hapticdb.realtime.coupling import Coupling, DirectRendering, Rendering, radius_of, rendering_of
 from hapticdb.realtime.resident_cells import ResidentCells, without_distances
 from hapticdb.realtime.stations import without_surface
 from hapticdb.realtime.timing import Timing

@@ -36,12 +36,7 @@ Measured at a mesh of 327,680 triangles, bytes of resident memory per byte of th
 OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 if all points
 differ only in their positions; STEP 114 (0.2 MB).
 """
-_PACKED = {
-    ".3mf",
-    ".laz",
-    ".step",
-    ".stp",
-}
+_PACKED = {".3mf", ".laz", ".step", ".stp"}
 
 
 def main() -> None:

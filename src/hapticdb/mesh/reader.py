@@ -181,10 +181,7 @@ def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
         "MKL_NUM_THREADS": "1",
         "MALLOC_ARENA_MAX": "2",
     }
-    with (
-        scratch_folder() as scratch,
-        tempfile.TemporaryFile() as words,
-    ):
+    with scratch_folder() as scratch, tempfile.TemporaryFile() as words:
         child = subprocess.Popen(  # noqa: S603 - our own interpreter and file
             [sys.executable, "-P", str(_CHILD)],
             stdin=subprocess.PIPE,

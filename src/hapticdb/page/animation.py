@@ -202,7 +202,7 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
 def _of_triangles(triangles: Floats) -> Facets:
     """Triangles (F, 3, 3) with smooth and sharp edges."""
     faces = np.arange(3 * len(triangles), dtype=np.int64).reshape(-1, 3)
-    return sharpened(Facets(triangles.reshape(-1, 3), faces))
+    return sharpened([Facets(triangles.reshape(-1, 3), faces)])[0]
 
 
 def _of_voxels(env: Environment, obj: Object) -> Facets:

@@ -33,7 +33,7 @@ class TabbedBrowser(Browser):
         with tabs.add_tab("Parts"):
             self.parts = PartsPanel(self, gui)
         with tabs.add_tab("Sweep"):
-            self.sweeps = SweepPanel(self, gui)
+            SweepPanel(self, gui)
         with tabs.add_tab("Clashes"):
             self.clashes = ClashPanel(self, gui)
         with tabs.add_tab("Record"):

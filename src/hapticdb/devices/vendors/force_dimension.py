@@ -39,12 +39,7 @@ class ForceDimensionDevice:
         The model's profile, as of `hapticdb.devices.profiles.PROFILES`.
     """
 
-    def __init__(
-        self,
-        serial: int | None = None,
-        *,
-        profile: DeviceProfile = PROFILE,
-    ) -> None:
+    def __init__(self, serial: int | None = None, *, profile: DeviceProfile = PROFILE) -> None:
         self.serial = serial
         self._torque_cap = profile.torque_cap or TORQUE_CAP
         self.profile = replace(profile, torque_cap=self._torque_cap)

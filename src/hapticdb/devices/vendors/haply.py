@@ -60,11 +60,7 @@ class HaplyDevice:
     """
 
     def __init__(
-        self,
-        device_id: str | None = None,
-        *,
-        url: str = URL,
-        profile: DeviceProfile = PROFILE,
+        self, device_id: str | None = None, *, url: str = URL, profile: DeviceProfile = PROFILE
     ) -> None:
         parts = urlsplit(url)
         if parts.scheme != "ws" or parts.hostname not in LOOPBACK:

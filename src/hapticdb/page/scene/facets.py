@@ -31,18 +31,14 @@ class Facets(NamedTuple):
     faces: NDArray[np.integer]
 
 
-def sharpened(facets: Facets) -> Facets:
+def sharpened(several: Sequence[Facets]) -> list[Facets]:
     """The same triangles in the same order, with vertices split where edges are sharp.
 
     A browser shades a vertex with the mean normal of its faces. So faces share a vertex here only
-    if a path of smooth edges around that point joins them. Equal positions count as one point,
-    because many files repeat them for every triangle.
+    if a path of smooth edges around that point joins them. Equal positions of one shape count as
+    one point, because many files repeat them for every triangle. Many small shapes together are ten
+    times faster than one after another.
     """
-    return sharpened_each([facets])[0]
-
-
-def sharpened_each(several: Sequence[Facets]) -> list[Facets]:
-    """`sharpened` of each; ten times faster for many small shapes than one after another."""
     n_vertices = [len(facets.vertices) for facets in several]
     first = np.cumsum([0, *n_vertices])
     vertices = np.concatenate([facets.vertices for facets in several])

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.page.colours import Rgba, few
-from hapticdb.page.scene.facets import Facets, sharpened_each
+from hapticdb.page.scene.facets import Facets, sharpened
 
 _EMBREE_SIZE = 100.0
 """Size to which a shape is scaled before Embree sees it: Embree has absolute tolerances, and parts
@@ -144,7 +144,7 @@ def draw_each(shapes: Iterable[PartShape]) -> None:
     missing = [shape for shape in shapes if shape.split is None]
     if not missing:
         return
-    split = sharpened_each([shape.facets for shape in missing])
+    split = sharpened([shape.facets for shape in missing])
     for shape, (vertices, faces) in zip(missing, split, strict=True):
         shape.split = Facets(vertices.astype(np.float32), faces.astype(np.uint32))
 

@@ -13,7 +13,7 @@ from pathlib import Path
 
 import hapticdb
 from children import finished
-from hapticdb.kernels._machine_code import sources_digest
+from hapticdb.kernels._cache import sources_digest
 from sources import PACKAGE, ROOT, modules, named, python_files
 
 # domains that may import less than their floor allows -> what they may import

@@ -1,10 +1,11 @@
-"""The folder in which machine code is kept between processes.
+"""The folder in which machine code is kept between processes; found without loading numba.
 
 Whoever can write into it has their code run by this process, and so has whoever can replace it or a
 folder above it.
 """
 
 import atexit
+import hashlib
 import os
 import shutil
 import stat
@@ -15,6 +16,16 @@ from pathlib import Path
 
 LENT = "HAPTICDB_KERNELS"
 """Environment variable by which a process gives its own folder to the processes that it starts."""
+
+
+def sources_digest(folder: Path) -> str:
+    """Digest of the names and contents of the Python sources below `folder`, 16 hex digits."""
+    digest = hashlib.sha256()
+    for source in sorted(folder.rglob("*.py")):
+        content = source.read_bytes()
+        digest.update(f"{source.relative_to(folder)}\0{len(content)}\0".encode())
+        digest.update(content)
+    return digest.hexdigest()[:16]
 
 
 @cache

@@ -16,6 +16,8 @@ import llvmlite.binding
 import numba
 import numpy as np
 
+from hapticdb.kernels._cache import sources_digest
+
 BUILDING = "HAPTICDB_BUILDING"
 """Environment variable of a process that only compiles: the folder of the set that it adds to."""
 
@@ -45,16 +47,6 @@ def level() -> Level:
     if cpu and all(has.get(word) for word in words.split()):
         return Level(cpu, ",".join(f"+{word}" for word in words.split()))
     return Level(llvmlite.binding.get_host_cpu_name(), has.flatten())
-
-
-def sources_digest(folder: Path) -> str:
-    """Digest of the names and contents of the Python sources below `folder`, 16 hex digits."""
-    digest = hashlib.sha256()
-    for source in sorted(folder.rglob("*.py")):
-        content = source.read_bytes()
-        digest.update(f"{source.relative_to(folder)}\0{len(content)}\0".encode())
-        digest.update(content)
-    return digest.hexdigest()[:16]
 
 
 @cache

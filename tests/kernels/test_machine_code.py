@@ -11,6 +11,7 @@ import threading
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
+from unittest.mock import MagicMock
 
 import numba
 import pytest
@@ -69,12 +70,17 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     return made
 
 
-def test_the_set_that_came_is_used(folders: Folders, built: list[Path]) -> None:
+def test_the_set_that_came_is_used(
+    folders: Folders, built: list[Path], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A user's cache is not made for it."""
+    cache_folder = MagicMock()
+    monkeypatch.setattr(_sets, "cache_folder", cache_folder)
     write_set(folders.shipped)
     assert code_of(ENTRY) == b"code"
     assert code_of("rigid.other") is None
     assert built == []
-    assert not folders.cache.exists()
+    assert not cache_folder.called
 
 
 @pytest.mark.parametrize(

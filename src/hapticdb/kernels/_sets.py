@@ -35,10 +35,17 @@ def fitting_set() -> tuple[Path, dict[str, str]] | None:
 
     None if that fails: then each entry is compiled when it is first called.
     """
-    for folder in (SHIPPED, own := own_set()):
-        manifest = manifest_of(folder)
-        if manifest.get("for") == built_for():
-            return folder, manifest["entries"]
+    return _read(SHIPPED) or _read(own_set()) or _built()
+
+
+def _read(folder: Path) -> tuple[Path, dict[str, str]] | None:
+    """A set and digests of its files; None if it does not fit here."""
+    manifest = manifest_of(folder)
+    return (folder, manifest["entries"]) if manifest.get("for") == built_for() else None
+
+
+def _built() -> tuple[Path, dict[str, str]] | None:
+    """The set of this machine, built now, with a line that says so."""
     from hapticdb.kernels import _building  # noqa: PLC0415 - where it is not needed, nobody waits
 
     sys.stderr.write(
@@ -47,11 +54,11 @@ def fitting_set() -> tuple[Path, dict[str, str]] | None:
     )
     sys.stderr.flush()
     try:
-        _building.build_set(own)
+        _building.build_set(own_set())
     except OSError as error:
         sys.stderr.write(f"hapticdb: each kernel is compiled when it is first called: {error}\n")
         return None
-    return own, manifest_of(own)["entries"]
+    return _read(own_set())
 
 
 def own_set() -> Path:

@@ -62,7 +62,9 @@ def test_auto_names_what_it_used_and_answers_as_every_strategy(
         assert len(auto.hits) > 10
         for strategy in STRATEGIES:
             touch = env.touch(shell, pose, strategy)
-            if strategy in {"auto", used}:
+            if strategy == "auto" and layout == "brick":  # all bricks are in memory
+                assert touch.query[:4] == ("array", 0, 0, 0)
+            elif strategy in {"auto", used}:
                 assert touch.query[:4] == auto.query[:4]  # strategy, statements, ranges, rows
             assert touch.force.tobytes() == auto.force.tobytes()
             assert touch.torque.tobytes() == auto.torque.tobytes()

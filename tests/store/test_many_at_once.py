@@ -251,7 +251,7 @@ def test_a_stuck_frame_is_told_in_one_line(url: str, admin: psycopg.Connection) 
     with hapticdb.open(f"{url}&options=-cstatement_timeout%3D400", read_only=True) as env:
         # the first frame that groups by cost measures the costs, which a lock would stop
         until(lambda: answers(env, shell, expected, strategy="cbgroup"))
-        for strategy in STRATEGIES:
+        for strategy in STRATEGIES[1:]:  # `auto` has its bricks in memory
             with admin.transaction():
                 admin.execute(f"LOCK TABLE {name}.brick IN ACCESS EXCLUSIVE MODE")
                 with pytest.raises(StuckError, match="did not answer in time") as told:
@@ -296,7 +296,7 @@ def test_ctrl_c_does_not_wait_for_a_server_that_stopped_answering(
             with stopped(backend_of(env)):
                 threading.Timer(0.2, os.kill, (os.getpid(), signal.SIGINT)).start()
                 with pytest.raises(KeyboardInterrupt):
-                    env.touch(shell, np.eye(4))
+                    env.touch(shell, np.eye(4), "array")
         finally:
             signal.signal(signal.SIGINT, before)
         assert not [one for one in caplog.records if one.name.startswith("psycopg")]

@@ -91,9 +91,9 @@ def asked(monkeypatch: pytest.MonkeyPatch) -> list[int]:
     found: list[int] = []
     ask = watching.Watch._ask
 
-    def counted(watch: watching.Watch) -> bool:
+    def counted(watch: watching.Watch) -> None:
         found.append(1)
-        return ask(watch)
+        ask(watch)
 
     monkeypatch.setattr(watching.Watch, "_ask", counted)
     return found

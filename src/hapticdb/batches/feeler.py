@@ -24,7 +24,6 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import DEFAULT_BUDGET, CellTable
-from hapticdb.store.base import Store
 from hapticdb.store.filtering import Filter
 
 if TYPE_CHECKING:
@@ -56,7 +55,7 @@ class Feeler(Closes):
 
     def __init__(
         self,
-        store: Store,
+        query: HapticQuery,
         shell: PointShell,
         felt: Filter,
         law: ForceLaw,
@@ -69,18 +68,18 @@ class Feeler(Closes):
         n_jobs = available_jobs(jobs)
         self.shell = shell
         self.law = law
-        self._store = store
+        self._store = query.store
         self._felt = felt
         self._is_torn = False
         self._is_closed = False
         self._known_revision: int | None = None
-        self._query = HapticQuery(store)
+        self._query = query
         self._gpu: GpuFrames | None = None
         has_distances = reads_distances(law.for_kernels)
         budget = DEFAULT_BUDGET if budget_bytes is None else budget_bytes
         self._table = CellTable.create(budget, distances=has_distances)
         try:
-            self._residency = Residency(store, self._table, felt.exclude, where=felt.where)
+            self._residency = Residency(query.store, self._table, felt.exclude, where=felt.where)
             self._frames = ResidentFrames(self._residency, shell, law)
             self._threads = BatchThreads(self._frames, n_jobs)
             if device == "cuda":
@@ -301,7 +300,10 @@ def touch_at(
     there: Whereabouts, shell: PointShell, felt: Filter, law: ForceLaw, poses: Floats
 ) -> TouchBatch:
     """Touch at a piece: the task of a worker, which runs one for each of its threads."""
-    with closing(there.open()) as store, Feeler(store, shell, felt, law, jobs=1) as feeler:
+    with (
+        closing(there.open()) as store,
+        Feeler(HapticQuery(store), shell, felt, law, jobs=1) as feeler,
+    ):
         return feeler.touch(poses)
 
 

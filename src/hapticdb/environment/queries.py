@@ -224,4 +224,4 @@ class Queries:
 
         felt = self._filters.of(where, exclude)
         chosen = self._query.law_now(as_law(law))
-        return Feeler(self._store, shell, felt, chosen, budget_bytes, jobs, device)
+        return Feeler(self._query, shell, felt, chosen, budget_bytes, jobs, device)

@@ -26,7 +26,7 @@ from hapticdb.kernels._linking import EntryCompiler, link_leaves_into_entries
 from hapticdb.kernels._machine_code import BUILDING
 from hapticdb.kernels._sets import code_of
 
-INT, FLOAT, NONE = types.int64, types.float64, types.none
+INT, FLOAT, BOOL, NONE = types.int64, types.float64, types.boolean, types.none
 INTS, INTS2 = INT[::1], INT[:, ::1]
 INTS32, INTS32_2, INTS32_3 = types.int32[::1], types.int32[:, ::1], types.int32[:, :, ::1]
 BYTES, WORDS32_2, WORDS = types.uint8[::1], types.uint32[:, ::1], types.uint64[::1]

@@ -86,6 +86,38 @@ GRID: Layout = _record(
 )
 """The grid of an environment and its rows, for a frame on rows."""
 
+DECODED_BYTES = 64 << 20
+"""Most memory that the decoded bricks of an environment's frames take. SQLite's page cache is
+smaller by as much; PostgreSQL has none in the client. Larger: more of a scene is read once."""
+ENTRIES_A_ROW = 4
+"""Most entries of the directory for each row: half of them stay free, and many bricks are empty."""
+BRICK: Layout = _record(
+    [
+        ("key", "<i8"),
+        ("first", "<i4"),  # slot of its first row
+        ("end", "<i4"),  # slot behind its last row; 0 where the entry is free
+        ("least", "<i4"),  # slot of the least of its rows that count, -1 if none does
+        ("filter", "<i4"),  # number of the filter under which that was found
+    ]
+)
+"""A brick in memory, by its key (`kernels.query.bricks`): an entry of the directory."""
+
+
+def _decoded(n_values: int) -> Layout:
+    """Slots of decoded rows with so many distances, as many as fit into `DECODED_BYTES`."""
+    row = [("id", "<i8", ()), ("found", "<i8", ()), ("occupancy", "u1", (64,))]
+    row += [("counts", "u1", ()), ("touched", "u1", ()), ("distances", "u1", (n_values,))]
+    slots = DECODED_BYTES // (np.dtype(row).itemsize + ENTRIES_A_ROW * BRICK.itemsize)
+    return _record([(name, kind, (slots, *shape)) for name, kind, shape in row])
+
+
+OCCUPIED, MEASURED = _decoded(1), _decoded(1000)
+"""Rows in memory without and with distances; slot 0 stays unused.
+
+id, occupancy, distances : of a row, or the least distances of some rows; counts : whether its
+object is felt, True for a least; found, touched : memory of a frame, which leaves touched False.
+"""
+
 RESULTS = 10
 """Numbers of a frame's result; `kernels.resident.cells` names them."""
 

@@ -13,8 +13,10 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.kernels import law as laws
 from hapticdb.kernels.field import lattice, packing
+from hapticdb.kernels.query import bricks as brick_kernels
 from hapticdb.kernels.query import contact, refining
 from hapticdb.poses import as_floats
+from hapticdb.query.bricks import BrickMemory, Found
 from hapticdb.query.known_objects import KnownObjects
 from hapticdb.query.law import PLANE, ForceLaw
 from hapticdb.query.touches import Query, Touch
@@ -26,8 +28,6 @@ from hapticdb.store.parsing import damaged
 if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
-MOST_KEYS = 2048
-"""Row keys of successive poses after which one statement is sent for all of them."""
 MOST_POINTS = 1 << 17
 """Most shell points, summed over the poses that one statement serves: 12 MB."""
 LEAST_GROUPED = 1024
@@ -40,6 +40,9 @@ NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 Asked = tuple[str, int, int, int]
 """Fields of `Query` without the last, which is known only at the end of a frame."""
+NOTHING_ASKED: Asked = ("array", 0, 0, 0)
+Source = Callable[[bool], Found]
+"""Gives the rows of a frame, with distances if they are read."""
 Group = Callable[[Keys, bool], Ranges]
 """Groups the row keys (U,) of a frame into ranges; whether their distances are read, too."""
 
@@ -57,15 +60,17 @@ class HapticQuery:
     """Runs frames against one store.
 
     group : groups frames of many keys by cost; without it, all keys are looked up; known : objects
-    of the last frame's revision; grid : the environment's.
+    of the last frame's revision; grid : the environment's. Bricks stay decoded in memory.
     """
 
     def __init__(self, store: Store, group: Group | None = None) -> None:
-        self._store = store
+        self.store = store
         self._group = group
         self.known = KnownObjects(store)
         least = getattr(store, "grouping_threshold", LEAST_GROUPED)
         self._least_grouped = math.inf if least is None else least
+        self._has_bricks = store.layout == "brick"
+        self._memory: BrickMemory | None = None
         self.grid = store.grid.for_kernels(row_shift(store.layout))
 
     def touch(
@@ -83,15 +88,19 @@ class HapticQuery:
             if known.version is not None and (law is None or known.fits(law)):
                 exclude = NOTHING_EXCLUDED if felt is ALL else known.left_out(felt)
                 touch = self._frame(*asked, exclude, law or known.own_law)
-            if touch is None or self._store.version() != known.version:
+            if touch is None or self._version_after(touch) != known.version:
                 touch = self._touch_anew(*asked, felt, law)
         except ConnectionLostError:
             touch = self._touch_anew(*asked, felt, law)
         for stray in set(touch.ids).difference(known.by_id):
-            raise damaged(self._store.url, f"rows of object {stray}, which is not there")
+            raise damaged(self.store.url, f"rows of object {stray}, which is not there")
         if not felt.is_empty:
             known.check_words(felt)
         return touch
+
+    def _version_after(self, touch: Touch) -> int:
+        """The store's version after a touch: what it has read tells, or else what is committed."""
+        return self.store.version() if touch.query.statements else self.store.newest()
 
     def _touch_anew(
         self,
@@ -103,38 +112,109 @@ class HapticQuery:
     ) -> Touch:
         """Look a shell up in a snapshot, whose objects are loaded first."""
         known = self.known
-        with self._store.snapshot():
+        with self.store.snapshot():
             chosen = known.law_of_newest(law)
-            return self._frame(shell, pose, form, known.left_out(felt), chosen)
+            touch = self._frame(shell, pose, form, known.left_out(felt), chosen)
+        assert touch is not None  # noqa: S101 - a snapshot is of one revision
+        return touch
 
     def law_now(self, law: ForceLaw | None) -> ForceLaw:
         """The law of a frame at the newest revision, whose objects are loaded."""
         try:
-            with self._store.snapshot():
+            with self.store.snapshot():
                 return self.known.law_of_newest(law)
         except ConnectionLostError:  # inside a snapshot all is repeated, once
-            with self._store.snapshot():
+            with self.store.snapshot():
                 return self.known.law_of_newest(law)
 
     def _frame(
         self, shell: "PointShell", pose: ArrayLike, form: Form | None, exclude: Keys, law: ForceLaw
-    ) -> Touch:
-        """Look a shell up; the result names the objects that are known."""
+    ) -> Touch | None:
+        """Look a shell up; the result names the objects that are known.
+
+        None if bricks were read for it that are of another revision than those objects.
+        """
         reads = laws.reads_distances(law.for_kernels)
         started = time.perf_counter_ns()
-        located = locate(shell, pose, self.grid)
+        if form is None and self._has_bricks:
+            return self._over_bricks(shell, as_pose(pose), exclude, law, reads, started)
+        located = locate(shell, as_pose(pose), self.grid)
         if form is not None:
             return form.touch(located, exclude, law, started)
-        keys, ranges = located.keys, None
+        rows, asked = self._fetched(located.keys, reads)
+        return self._over_rows(located, rows, asked, exclude, law, started)
+
+    def _over_bricks(
+        self,
+        shell: "PointShell",
+        pose: NDArray[np.float64],
+        exclude: Keys,
+        law: ForceLaw,
+        reads: bool,  # noqa: FBT001 - private
+        started: int,
+    ) -> Touch | None:
+        """Look a shell up in memory, after reading what is missing there; None as for `_frame`."""
+        memory, known, asked = self._memory_for(exclude, reads), self.known, NOTHING_ASKED
+        total = len(shell.points)
+        placed, at = np.empty((total + 1, 6)), np.empty((2, total), dtype=np.int64)
+        felt, met = np.empty(6 + 2 * total), np.empty(2 * total, dtype=np.int64)
+        while True:
+            n_hits, n_apart, n_ids = brick_kernels.touch_bricks(
+                shell.points, shell.normals, shell.center, pose, self.grid, memory.directory,
+                memory.decoded, exclude, memory.number, law.for_kernels, asked is NOTHING_ASKED,
+                placed, at, felt, met,
+            )  # fmt: skip
+            if n_hits != brick_kernels.INCOMPLETE:
+                break
+            keys = met[:n_apart]
+            rows, asked = self._fetched(keys, reads)
+            if self.store.version() != known.version:
+                return None
+            if not memory.enter(keys, rows):
+                if not memory.n_kept:  # more than fits: `keys` are all of the frame's
+                    located = locate(shell, pose, self.grid)
+                    return self._over_rows(located, rows, asked, exclude, law, started)
+                memory.clear()
+        if n_hits == brick_kernels.NOT_RIGID:
+            raise _not_rigid()
+        query = Query(*asked, (time.perf_counter_ns() - started) / 1000)
+        apart = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
+        return Touch(
+            felt[:3], felt[3:6], met[:n_hits], felt[6 : 6 + n_hits],
+            memory.decoded["found"][:n_ids].tolist(), law, query, apart, placed,
+            partial(self._pairs_of, memory.rows(placed, at), exclude), known.by_id,
+        )  # fmt: skip
+
+    def _memory_for(self, exclude: Keys, reads: bool) -> BrickMemory:  # noqa: FBT001 - private
+        """Bricks of the known objects; made at the first frame, which loads kernels."""
+        if self._memory is None:
+            self._memory = BrickMemory(self.store.url)
+        self._memory.choose(self.known.by_id, exclude, reads=reads)
+        return self._memory
+
+    def _fetched(self, keys: Keys, reads: bool) -> tuple[Rows, Asked]:  # noqa: FBT001 - private
+        """Rows of keys (U,), and how they were asked for."""
+        ranges = None
         if len(keys) >= self._least_grouped and self._group is not None:
-            ranges = self._group(keys, reads)  # by this frame alone, not by frames before it
+            ranges = self._group(keys, reads)  # by these keys alone, not by frames before
         if ranges is None or KEYS_PER_RANGE * len(ranges.lows) > len(keys):
-            rows = self._store.lookup(keys, distances=reads)
-            asked: Asked = ("array", 1, len(keys), len(rows.keys))
-        else:
-            rows = self._store.scan(*ranges, distances=reads)
-            asked = ("cbgroup", 1, len(ranges.lows), len(rows.keys))
-        payload = self.distances_of(rows, keys) if reads else None
+            rows = self.store.lookup(keys, distances=reads)
+            return rows, ("array", 1, len(keys), len(rows.keys))
+        rows = self.store.scan(*ranges, distances=reads)
+        return rows, ("cbgroup", 1, len(ranges.lows), len(rows.keys))
+
+    def _over_rows(
+        self,
+        located: "contact.Located",
+        rows: Rows,
+        asked: Asked,
+        exclude: Keys,
+        law: ForceLaw,
+        started: int,
+    ) -> Touch:
+        """Result of a frame from its rows, decoded for it alone."""
+        reads = laws.reads_distances(law.for_kernels)
+        payload = self.distances_of(rows, located.keys) if reads else None
         return self.refined(located, rows, payload, exclude, law, asked, started)
 
     def distances_of(self, rows: Rows, keys: Keys) -> NDArray[np.uint8]:
@@ -143,13 +223,13 @@ class HapticQuery:
             return np.empty((0, lattice.ROW_VALUES), dtype=np.uint8)
         if rows.distances is None:
             raise UsageError(
-                f"{self._store.url} has no distances to surfaces, which this law reads: give "
+                f"{self.store.url} has no distances to surfaces, which this law reads: give "
                 "the law TangentPlane"
             )
         try:
             return packing.unpack(*rows.distances, refining.asked_rows(keys, rows.keys))
         except ValueError as error:
-            raise damaged(self._store.url, str(error)) from error
+            raise damaged(self.store.url, str(error)) from error
 
     def refined(
         self,
@@ -173,27 +253,25 @@ class HapticQuery:
             *located, row_keys, row_ids, occupancy, payload, exclude, self.grid,
             law.for_kernels, felt, met,
         )  # fmt: skip
+
+        def source(reads: bool) -> Found:  # noqa: FBT001 - as `Source`
+            return located, rows, self.distances_of(rows, located.keys) if reads else None
+
         query = Query(*asked, (time.perf_counter_ns() - started) / 1000)
         apart = met[total : total + n_apart], felt[6 + total : 6 + total + n_apart]
         return Touch(
             felt[:3], felt[3:6], met[:n_hits], felt[6 : 6 + n_hits],
             met[2 * total : 2 * total + n_ids].tolist(), law, query, apart, located.placed,
-            partial(self._pairs_of, located, rows, exclude), self.known.by_id,
+            partial(self._pairs_of, source, exclude), self.known.by_id,
         )  # fmt: skip
 
     def _pairs_of(
-        self,
-        located: "contact.Located",
-        rows: Rows,
-        exclude: Keys,
-        law: ForceLaw,
-        points: NDArray[np.int64],
+        self, source: Source, exclude: Keys, law: ForceLaw, points: NDArray[np.int64]
     ) -> NDArray[np.int64]:
         """Every (point, object) pair (P, 2) of points of a frame that a law has felt."""
         reads = laws.reads_distances(law.for_kernels)
         law = law if reads else PLANE  # every law that reads none feels the objects of hits
-        payload = self.distances_of(rows, located.keys) if reads else None
-        keys, ids, occupancy, _ = rows
+        located, (keys, ids, occupancy, _), payload = source(reads)
         return refining.pairs_of_points(  # type: ignore[no-any-return]
             *located, keys, ids, occupancy, payload, exclude, self.grid, law.for_kernels, points
         )
@@ -201,56 +279,72 @@ class HapticQuery:
     def run_many(
         self, shell: "PointShell", poses: NDArray[np.float64], exclude: Keys, law: ForceLaw
     ) -> Iterator[Touch]:
-        """Touches at rigid poses (n, 4, 4); a statement for several counts at the first."""
-        batch: list[contact.Located] = []
-        n_keys, most = 0, max(MOST_POINTS // max(len(shell), 1), 1)
-        for pose in poses:
-            batch.append(locate(shell, pose, self.grid))
-            n_keys += len(batch[-1].keys)
-            if n_keys >= MOST_KEYS or len(batch) >= most:
-                yield from self._look_up_together(batch, exclude, law)
-                batch, n_keys = [], 0
-        if batch:
-            yield from self._look_up_together(batch, exclude, law)
+        """Touches at rigid poses (n, 4, 4), in a snapshot; a statement reads for many of them."""
+        self.known.learn()
+        most = max(MOST_POINTS // max(len(shell), 1), 1)
+        for start in range(0, len(poses), most):
+            located = [locate(shell, pose, self.grid) for pose in poses[start : start + most]]
+            keys = np.unique(np.concatenate([one.keys for one in located]))
+            if not self._has_bricks:
+                yield from self._over_voxels(located, keys, exclude, law)
+                continue
+            self._read_ahead(keys, exclude, law)
+            for pose in poses[start : start + most]:
+                touch = self._frame(shell, pose, None, exclude, law)
+                assert touch is not None  # noqa: S101 - a snapshot is of one revision
+                yield touch
 
-    def _look_up_together(
-        self, batch: "list[contact.Located]", exclude: Keys, law: ForceLaw
-    ) -> Iterator[Touch]:
-        """Touches at poses, in their order; one statement fetches the rows of all poses."""
-        started = time.perf_counter_ns()
-        keys = np.unique(np.concatenate([located.keys for located in batch]))
+    def _read_ahead(self, keys: Keys, exclude: Keys, law: ForceLaw) -> None:
+        """Read bricks (U,) into memory, unless they are there or do not fit."""
         reads = laws.reads_distances(law.for_kernels)
-        fetched = self._store.lookup(keys, distances=reads)
+        memory = self._memory_for(exclude, reads)
+        absent = memory.absent(keys)
+        memory.enter(absent, self.store.lookup(absent, distances=reads))
+
+    def _over_voxels(
+        self, batch: "list[contact.Located]", keys: Keys, exclude: Keys, law: ForceLaw
+    ) -> Iterator[Touch]:
+        """Touches over voxel rows, in their order; one statement fetches the rows of all poses."""
+        started = time.perf_counter_ns()
+        fetched = self.store.lookup(keys)
         asked: Asked = ("array", 1, len(keys), len(fetched))
-        row_keys = fetched.keys
-        distances = self.distances_of(fetched, keys) if reads else None
         for located in batch:
             low = high = 0
             if located.keys.size:
                 # methods, since numpy's functions of the same name take twice as long, 1 us each
-                low = int(row_keys.searchsorted(located.keys[0], "left"))
-                high = int(row_keys.searchsorted(located.keys[-1], "right"))
+                low = int(fetched.keys.searchsorted(located.keys[0], "left"))
+                high = int(fetched.keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
-            payload = None if distances is None else distances[low:high]
-            yield self.refined(located, rows, payload, exclude, law, asked, started)
-            asked, started = ("array", 0, 0, 0), time.perf_counter_ns()
+            yield self.refined(located, rows, None, exclude, law, asked, started)
+            asked, started = NOTHING_ASKED, time.perf_counter_ns()
 
 
-def locate(shell: "PointShell", pose: ArrayLike, grid: NDArray[np.void]) -> "contact.Located":
+def locate(
+    shell: "PointShell", pose: NDArray[np.float64], grid: NDArray[np.void]
+) -> "contact.Located":
     """Place a shell at a rigid pose, else UsageError, and find its row keys; grid of `GRID`."""
-    given = as_floats(pose, "a pose")
-    if given.shape != (4, 4):
-        raise UsageError(f"a pose of shape {given.shape}: give a 4 x 4 matrix, world_from_tool")
     total = len(shell.points)
     # an array that a kernel returns costs twice as much as one that it is given
     placed, asked = np.empty((total + 1, 6)), np.empty((2, total), dtype=np.int64)
     keys = np.empty(total, dtype=np.int64)
     count = contact.locate(
-        shell.points, shell.normals, shell.center, given, grid, placed, asked, keys
+        shell.points, shell.normals, shell.center, pose, grid, placed, asked, keys
     )
     if count < 0:
-        raise UsageError("a pose that is no rigid transform: give finite numbers and a rotation")
+        raise _not_rigid()
     return contact.Located(placed, asked, keys[:count])
+
+
+def _not_rigid() -> UsageError:
+    return UsageError("a pose that is no rigid transform: give finite numbers and a rotation")
+
+
+def as_pose(pose: ArrayLike) -> NDArray[np.float64]:
+    """A pose as an array (4, 4) of float64; refuses other shapes."""
+    given = as_floats(pose, "a pose")
+    if given.shape != (4, 4):
+        raise UsageError(f"a pose of shape {given.shape}: give a 4 x 4 matrix, world_from_tool")
+    return given
 
 
 def as_poses(poses: ArrayLike) -> NDArray[np.float64]:

@@ -356,6 +356,12 @@ class Store(Protocol):
     def version(self) -> int:
         """Counter that changes when the last read may have seen another revision."""
 
+    def newest(self) -> int:
+        """As `version`, of what is committed now, without a round trip to a server.
+
+        A server's notification of a commit takes a moment. Inside a snapshot the server is asked.
+        """
+
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
 

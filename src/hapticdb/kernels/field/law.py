@@ -78,6 +78,9 @@ e, which is above the reach for g > 3 / (16 (h - e - reach)). For D > h + sqrt(3
 beyond h, and u = h.
 """
 
+I1, J1, K1 = np.uint64(ROW_SIDE * ROW_SIDE), np.uint64(ROW_SIDE), np.uint64(1)
+"""Ways in a row's distances from a centre to the next one on each axis."""
+
 
 class DistanceFieldLaw(NamedTuple):
     """Distance law. stiffness: K, N/m."""
@@ -102,18 +105,20 @@ def _least_of_rows(law, payload, counts, first, end, x, y, z):  # noqa: ARG001
 def _least_of_brick(payload, counts, first, end, x, y, z, i, j, k):
     """U at a point in, or under 1/2 voxel beside, the brick whose first voxel is (i, j, k)."""
     x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
-    at = row_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k)
+    # unsigned: an index that may be negative is tested at each of the 8 reads
+    at = np.uint64(row_place(np.int64(x0) - i, np.int64(y0) - j, np.int64(z0) - k))
     q000 = q001 = q010 = q011 = q100 = q101 = q110 = q111 = np.int64(STEPS)
-    for row in range(first, end):
-        if counts[row]:
+    for signed in range(first, end):
+        if counts[signed]:
+            row = np.uint64(signed)
             q000 = min(q000, np.int64(payload[row, at]))
-            q001 = min(q001, np.int64(payload[row, at + 1]))
-            q010 = min(q010, np.int64(payload[row, at + ROW_SIDE]))
-            q011 = min(q011, np.int64(payload[row, at + ROW_SIDE + 1]))
-            q100 = min(q100, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE]))
-            q101 = min(q101, np.int64(payload[row, at + ROW_SIDE * ROW_SIDE + 1]))
-            q110 = min(q110, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1)]))
-            q111 = min(q111, np.int64(payload[row, at + ROW_SIDE * (ROW_SIDE + 1) + 1]))
+            q001 = min(q001, np.int64(payload[row, at + K1]))
+            q010 = min(q010, np.int64(payload[row, at + J1]))
+            q011 = min(q011, np.int64(payload[row, at + J1 + K1]))
+            q100 = min(q100, np.int64(payload[row, at + I1]))
+            q101 = min(q101, np.int64(payload[row, at + I1 + K1]))
+            q110 = min(q110, np.int64(payload[row, at + I1 + J1]))
+            q111 = min(q111, np.int64(payload[row, at + I1 + J1 + K1]))
     return VOXELS_A_STEP * trilinear(
         q000, q001, q010, q011, q100, q101, q110, q111, x - 0.5 - x0, y - 0.5 - y0, z - 0.5 - z0
     )

@@ -30,7 +30,7 @@ array. A row with more or fewer bytes than its bits need is damaged.
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf
+from hapticdb.kernels._jit import BOOLS, BYTES, BYTES2, INT, INTS, READ_BYTES, entry, leaf, maker
 from hapticdb.kernels.bits import lowest_bit
 from hapticdb.kernels.field.lattice import BEYOND, ROW_SIDE, ROW_VALUES
 
@@ -284,27 +284,40 @@ def _unpack_row(row, masks, lines, out, n):
     return np.int64(at)
 
 
+@maker
+def unpacking_memory():
+    """Arrays in which `unpack_one` works."""
+    row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
+    return row, np.empty(ROW_SIDE, np.uint64), np.empty(2 * ROW_SIDE, np.uint64)
+
+
+@leaf
+def unpack_one(data, ends, n, memory, out, to):
+    """Unpack row n of packed rows into row `to` of out (R, 1000); whether it is sound.
+
+    data (n,), ends (R,) as `pack` gives them, or damaged; memory of `unpacking_memory`.
+    """
+    row, masks, lines = memory
+    start = ends[n - 1] if n else np.int64(0)
+    size = ends[n] - start
+    if start < 0 or size < 1 or size > MOST_ROW_BYTES or ends[n] > data.shape[0]:
+        return False
+    for byte in range(size):
+        row[byte] = data[start + byte]
+    n_bits = _unpack_row(row, masks, lines, out, np.uint64(to))
+    return (n_bits + 7) >> 3 == size and np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1) == 0
+
+
 @entry(READ_BYTES, INTS, BOOLS, BYTES2)
 def unpack_kernel(data, ends, wanted, out):
-    """Unpack the wanted rows; return the first row that is damaged, or -1.
+    """Unpack the wanted rows; return the first of these that is damaged, or -1.
 
     data (n,), ends (R,) as `pack` gives them; wanted (R,) bool; out (R, 1000), left as it is in
     rows that are not wanted.
     """
-    row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
-    masks = np.empty(ROW_SIDE, np.uint64)
-    lines = np.empty(2 * ROW_SIDE, np.uint64)
+    memory = unpacking_memory()
     for n in range(ends.shape[0]):
-        start = ends[n - 1] if n else np.int64(0)
-        size = ends[n] - start
-        if start < 0 or size < 1 or size > MOST_ROW_BYTES or ends[n] > data.shape[0]:
-            return n
-        if not wanted[n]:
-            continue
-        for byte in range(size):
-            row[byte] = data[start + byte]
-        n_bits = _unpack_row(row, masks, lines, out, np.uint64(n))
-        if (n_bits + 7) >> 3 != size or np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1):
+        if wanted[n] and not unpack_one(data, ends, n, memory, out, n):
             return n
     return -1
 

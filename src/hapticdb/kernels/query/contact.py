@@ -52,7 +52,7 @@ def center_of(x, origin, size):
 
 
 @inlined
-def _place_shell(points, normals, center, transform, placed):
+def place_shell(points, normals, center, transform, placed):
     """Write points and normals of a placed shell, last its centre, to placed (N + 1, 6), world."""
     total = points.shape[0]
     for n in range(total):
@@ -66,13 +66,44 @@ def _place_shell(points, normals, center, transform, placed):
 
 
 @inlined
-def _number_of_key(table, found, count, key):
+def address_of(placed, n, place):
+    """Row key and address, as `Located` has it, of point n of a placed shell; -1 outside."""
+    x = np.floor((placed[n, 0] - place.x) / place.voxel)
+    y = np.floor((placed[n, 1] - place.y) / place.voxel)
+    z = np.floor((placed[n, 2] - place.z) / place.voxel)
+    if not (0.0 <= x < place.side and 0.0 <= y < place.side and 0.0 <= z < place.side):
+        return np.int64(-1), np.int64(-1)
+    i, j, k = np.int64(x), np.int64(y), np.int64(z)
+    key = key_of(i, j, k, place.bits, place.curve)
+    row_key = key >> place.shift
+    if place.shift == 0 or place.curve == Z_ORDER:
+        return row_key, key  # a Z-order key ends in the bit number
+    return row_key, (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
+
+
+@inlined
+def place_of_key(key, capacity):
+    """Where the search for a key begins in an open-addressing table of a power of two entries."""
+    # Fibonacci hashing (Knuth, volume 3, section 6.4)
+    return ((key * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
+
+
+@maker
+def new_table(total):
+    """Table for `number_of_key`, of at most so many keys."""
+    capacity = 16
+    while capacity < 2 * total:
+        capacity *= 2
+    return np.full(capacity, -1, dtype=np.int32)
+
+
+@inlined
+def number_of_key(table, found, count, key):
     """Number of a row key: its place in found (N,). A new key is entered there as number `count`.
 
     table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
     """
-    # Fibonacci hashing (Knuth, volume 3, section 6.4) into a table at most half full
-    at = ((key * 0x9E3779B97F4A7C1) >> 20) & (table.shape[0] - 1)
+    at = place_of_key(key, table.shape[0])  # at most half of the table is full
     while table[at] >= 0 and found[table[at]] != key:
         at = (at + 1) & (table.shape[0] - 1)
     if table[at] < 0:
@@ -107,34 +138,20 @@ def locate(points, normals, center, pose, grid, placed, asked, keys):
     """
     if not is_rigid(pose):
         return -1
-    _place_shell(points, normals, center, transform_of(pose), placed)
+    place_shell(points, normals, center, transform_of(pose), placed)
     place, total = grid[()], points.shape[0]
-    size, side, bits, curve, shift = place.voxel, place.side, place.bits, place.curve, place.shift
-    capacity = 16
-    while capacity < 2 * total:
-        capacity *= 2
-    table = np.full(capacity, -1, dtype=np.int32)
+    table = new_table(total)
     found = np.empty(total, dtype=np.int64)
     count = 0
     last_key, last_number = -1, -1  # points next to each other in the shell often share a row
     for n in range(total):
-        x = np.floor((placed[n, 0] - place.x) / size)
-        y = np.floor((placed[n, 1] - place.y) / size)
-        z = np.floor((placed[n, 2] - place.z) / size)
-        if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
-            asked[0, n] = -1
+        row_key, asked[0, n] = address_of(placed, n, place)
+        if row_key < 0:
             asked[1, n] = -1
             continue
-        i, j, k = np.int64(x), np.int64(y), np.int64(z)
-        key = key_of(i, j, k, bits, curve)
-        row_key = key >> shift
-        if shift == 0 or curve == Z_ORDER:
-            asked[0, n] = key  # a Z-order key ends in the bit number
-        else:
-            asked[0, n] = (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
         if row_key != last_key:
             last_key = row_key
-            last_number = _number_of_key(table, found, count, row_key)
+            last_number = number_of_key(table, found, count, row_key)
             count = max(count, last_number + 1)
         asked[1, n] = last_number
     sort_keys(found, count, asked, keys)

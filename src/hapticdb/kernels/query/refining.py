@@ -66,25 +66,26 @@ def _rows_of_keys(keys, row_keys):
 
 @maker
 def _counting_rows(row_ids, exclude):
-    """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct.
+    """Mask (R,) bool of the rows whose objects are not in exclude (E,), ascending and distinct."""
+    counts = np.empty(row_ids.shape[0], dtype=np.bool_)
+    for row in range(row_ids.shape[0]):
+        counts[row] = is_felt(row_ids[row], exclude)
+    return counts
+
+
+@inlined
+def is_felt(object_id, exclude):
+    """Whether an object is not in exclude (E,), ascending and distinct.
 
     An excluded id has id - exclude[0] smaller ids before it, less the ids in between that are not
     excluded: the search begins there, which is close where almost all are excluded.
     """
-    counts = np.empty(row_ids.shape[0], dtype=np.bool_)
-    for row in range(row_ids.shape[0]):
-        counts[row] = True
     total = exclude.shape[0]
-    if total > 0:
-        first, last = exclude[0], exclude[total - 1]
-        n_between = last - first + 1 - total
-        for row in range(row_ids.shape[0]):
-            before = row_ids[row] - first
-            if before < 0 or row_ids[row] > last:
-                continue
-            at = first_bound(row_ids[row], exclude, max(before - n_between, np.int64(0)))
-            counts[row] = exclude[at] != row_ids[row]
-    return counts
+    if total == 0 or object_id < exclude[0] or object_id > exclude[total - 1]:
+        return True
+    before, n_between = object_id - exclude[0], exclude[total - 1] - exclude[0] + 1 - total
+    at = first_bound(object_id, exclude, max(before - n_between, np.int64(0)))
+    return exclude[at] != object_id
 
 
 @inlined
@@ -141,6 +142,15 @@ def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size,
     """
     if not sample <= reach(law):
         return
+    n_unknown = 0
+    for row in range(first, end):
+        if counts[row] and not touched[row]:
+            n_unknown += 1
+    if n_unknown == 0:
+        return
+    if end - first == 1:
+        touched[first] = True
+        return
     n_touched, nearest, least = np.int64(0), np.int64(-1), NOTHING_NEAR
     for row in range(first, end):
         if not counts[row]:
@@ -157,6 +167,55 @@ def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size,
                 n_touched += 1
     if n_touched == 0:
         touched[nearest] = True
+
+
+NO_TALLY = (NO_WRENCH, 0.0, 0, 0)
+"""Sums of force and torque, of weights, of hits, and of points felt that are no hits."""
+
+
+@inlined
+def feel_point(
+    law, payload, counts, touched, occupancy, rows, least, n, address, placed, place, felt, met,
+    tally,
+):  # fmt: skip
+    """Feel point n of a placed shell, and add it to `NO_TALLY`.
+
+    rows, least : first row and the row behind the last of the point's brick: those of its objects,
+    and those by whose least distances it is felt; felt and met as for `refine`.
+    """
+    total = placed.shape[0] - 1
+    first, end = rows
+    low, high = least
+    sums, weight, n_hits, n_apart = tally
+    at = _in_grid(placed, n, place)
+    sample = sample_rows(law, payload, counts, low, high, *at)
+    is_hit = False
+    for row in range(first, end):
+        if counts[row] and _has_voxel(occupancy, row, address):
+            is_hit = True
+            touched[row] = True
+    if not is_hit and not sample <= reach(law):
+        return tally
+    point = _point_at(placed, n, place)
+    depth, counted = respond(law, is_hit, sample, *point, place.voxel)
+    share = _share_of(law, payload, counts, low, high, at, point, sample)
+    depth *= share
+    weight += counted * share
+    if is_hit:
+        met[n_hits] = n
+        felt[6 + n_hits] = max(depth, 0.0)
+        n_hits += 1
+    elif depth > 0.0:
+        met[total + n_apart] = n
+        felt[6 + total + n_apart] = depth
+        n_apart += 1
+    if depth > 0.0:
+        _touch_near_rows(
+            law, payload, counts, touched, first, end, at, point, place.voxel, sample, is_hit
+        )
+        center = placed[total, 0], placed[total, 1], placed[total, 2]
+        sums = accumulate(sums, point, center, depth, law.stiffness)
+    return sums, weight, n_hits, n_apart
 
 
 @entry(
@@ -181,42 +240,17 @@ def refine(
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
     starts, ends = _rows_of_keys(keys, row_keys)
     counts = _counting_rows(row_ids, exclude)
-    center = placed[total, 0], placed[total, 1], placed[total, 2]
-    sums, weight = NO_WRENCH, 0.0
-    n_hits = n_apart = np.int64(0)
+    tally = NO_TALLY
     for n in range(total):
         if asked[1, n] < 0:
             continue
-        first, end = starts[asked[1, n]], ends[asked[1, n]]
-        if first == end:
-            continue
-        at = _in_grid(placed, n, place)
-        sample = sample_rows(law, payload, counts, first, end, *at)
-        is_hit = False
-        for row in range(first, end):
-            if counts[row] and _has_voxel(occupancy, row, asked[0, n]):
-                is_hit = True
-                touched[row] = True
-        if not is_hit and not sample <= reach(law):
-            continue
-        point = _point_at(placed, n, place)
-        depth, counted = respond(law, is_hit, sample, *point, place.voxel)
-        share = _share_of(law, payload, counts, first, end, at, point, sample)
-        depth *= share
-        weight += counted * share
-        if is_hit:
-            met[n_hits] = n
-            felt[6 + n_hits] = max(depth, 0.0)
-            n_hits += 1
-        elif depth > 0.0:
-            met[total + n_apart] = n
-            felt[6 + total + n_apart] = depth
-            n_apart += 1
-        if depth > 0.0:
-            _touch_near_rows(
-                law, payload, counts, touched, first, end, at, point, place.voxel, sample, is_hit
-            )
-            sums = accumulate(sums, point, center, depth, law.stiffness)
+        rows = starts[asked[1, n]], ends[asked[1, n]]
+        if rows[0] != rows[1]:
+            tally = feel_point(
+                law, payload, counts, touched, occupancy, rows, rows, n, asked[0, n], placed,
+                place, felt, met, tally,
+            )  # fmt: skip
+    sums, weight, n_hits, n_apart = tally
     average_into(felt, weight, sums)
     return n_hits, n_apart, _distinct_ids(touched, row_ids, met, 2 * total)
 

@@ -60,7 +60,7 @@ class PostgresStore(ServerTables):
         self.engine = "PostgreSQL {}.{}".format(*divmod(connection.server_version, 10_000))
         groups_keys_itself = connection.server_version >= GROUPS_KEYS_ITSELF
         self.grouping_threshold = None if groups_keys_itself else GROUPING_THRESHOLD
-        watch = Watch(connection, self.identity)
+        self._watch = watch = Watch(connection, self.identity)
         self.watch, self.has_changed = watch.begin, watch.has_changed
         if not self.is_read_only:
             self._loading.mend()
@@ -98,6 +98,13 @@ class PostgresStore(ServerTables):
             if self._is_spread:
                 self._connection.rows(SIZE_OF_PARTITIONS)
             yield
+
+    def newest(self) -> int:
+        if self._connection.is_in_transaction:
+            return self.revision()
+        if self._watch.look():
+            self._seen = self._watch.revision
+        return self._seen
 
     def lag(self) -> Lag | None:
         if not self._connection.is_standby:

@@ -40,13 +40,16 @@ def channel_of(environment: str) -> str:
 
 
 class Watch:
-    """Commits of others that one connection has noticed."""
+    """Commits of others that one connection has noticed.
+
+    revision : the newest noticed.
+    """
 
     def __init__(self, connection: ServerConnection, identity: int) -> None:
         self._connection = connection
         self._identity = identity
         self._listening_on: psycopg.Connection[tuple[object, ...]] | None = None
-        self._revision = -1
+        self.revision = self._told = -1
         self._is_hinted = False
         self._is_deaf = True
         self._due = self._asked = 0.0
@@ -56,6 +59,7 @@ class Watch:
         self._connection.check_outside()
         self._connection.again(self._listen)
         self._ask()
+        self._told = self.revision
 
     def has_changed(self) -> bool:
         """Whether something was committed since `begin` or the last call.
@@ -65,12 +69,24 @@ class Watch:
         ConnectionLostError when the environment was remade.
         """
         self._connection.check_outside()
+        self.look(HINTED_S)
+        before, self._told = self._told, self.revision
+        return before != self._told
+
+    def look(self, pause: float = 0.0) -> bool:
+        """Ask for `revision` if there may be another; whether it was asked for.
+
+        pause : shortest time between two hinted round trips.
+        """
         if self._connection.again(self._listen):
-            self._ask()
-            return True
-        now = time.monotonic()
-        is_hinted = self._is_hinted and now >= self._asked + HINTED_S
-        return (is_hinted or now >= self._due) and self._ask()
+            self._told = -1
+        else:
+            now = time.monotonic()
+            is_hinted = self._is_hinted and now >= self._asked + pause
+            if not is_hinted and now < self._due:
+                return False
+        self._ask()
+        return True
 
     def _listen(self) -> bool:
         """Receive notifications, or begin to listen on a new connection; whether it is new."""
@@ -94,14 +110,12 @@ class Watch:
     def _hear(self, _: psycopg.Notify) -> None:
         self._is_hinted = True
 
-    def _ask(self) -> bool:
-        """Whether the revision has changed since it was last asked for."""
+    def _ask(self) -> None:
         # cleared before the question, so that a commit after the answer sets it again
-        before, self._is_hinted = self._revision, False
+        self._is_hinted = False
         found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:
             raise failures.remade(self._connection.shown)
-        self._revision = wire.read_int8(found or b"")
+        self.revision = wire.read_int8(found or b"")
         self._asked = time.monotonic()
         self._due = self._asked + (DEAF_S if self._is_deaf else HEARING_S)
-        return self._revision != before

@@ -105,6 +105,11 @@ class FileConnection:
             self._seen = seen
         return seen
 
+    def newest(self) -> int:
+        """As `version`, of the file's log as it is now: the pragma reads that."""
+        self.fetch("PRAGMA data_version")
+        return self.version()
+
     def watch(self) -> None:
         """Begin to notice commits from now on; may be called again."""
         self.has_changed()

@@ -18,6 +18,7 @@ from hapticdb.errors import (
     NotAnEnvironmentError,
     ReadOnlyError,
 )
+from hapticdb.kernels.records import DECODED_BYTES
 from hapticdb.store.refusals import check_format, made_before
 from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.place import OpenedFile
@@ -29,8 +30,9 @@ BEFORE_FORMAT_1 = int.from_bytes(b"HAPT")
 SCHEMA = Path(__file__).with_name("schema.sql")
 BUSY_TIMEOUT_MS = 10_000
 """Milliseconds that a write waits for another process's write before it gives up."""
-CACHE_KIB = 256 * 1024
-"""KiB of a connection's page cache, enough for a large car; taken as pages are read."""
+CACHE_KIB = 256 * 1024 - DECODED_BYTES // 1024
+"""KiB of a connection's page cache: with decoded bricks, enough for a large car; taken as pages are
+read."""
 SHARED_BYTES = 32 << 10
 """Bytes of the file -shm, without which no connection reads an environment in WAL mode."""
 MOUNTS = Path("/proc/self/mountinfo")

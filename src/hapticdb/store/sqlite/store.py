@@ -74,8 +74,8 @@ class SQLiteStore(FileTables):
         self.name = connection.path.name
         self.engine = f"SQLite {apsw.sqlite_lib_version()}"
         self.identity = connection.file.identity
-        self.version, self.watch = connection.version, connection.watch
-        self.has_changed = connection.has_changed
+        self.version, self.newest = connection.version, connection.newest
+        self.watch, self.has_changed = connection.watch, connection.has_changed
 
     @classmethod
     def open(cls, path: str | Path, *, read_only: bool = False) -> "SQLiteStore":

@@ -70,6 +70,11 @@ class ServerConnection(Link, Closes):
         """Refuse a call from any thread but the connection's owner."""
         check_thread(self._thread, self.shown)
 
+    @property
+    def is_in_transaction(self) -> bool:
+        """Whether a snapshot or a write is open."""
+        return self._depth > 0
+
     def check_outside(self) -> None:
         """Refuse to look for the commits of others inside a transaction."""
         check_outside(self._depth, self.shown)

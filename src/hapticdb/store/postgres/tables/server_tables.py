@@ -154,6 +154,7 @@ class ServerTables(Tables):
 
     def _commit(self, work: Callable[[], Result]) -> Result:
         result = self._connection.write(work, self._is_written)
+        self._seen = -1  # no read has seen this write
         self._loading.note()
         return result
 

@@ -1,0 +1,240 @@
+"""A frame over decoded bricks that are kept in memory: one call if all of its bricks are there.
+
+A brick is a range of slots, a row for each object near it. A point is felt by the least distances
+of the rows that count: the only one of them, or a slot behind the brick's rows. The sums are those
+of `refining`, over the same numbers in the same order.
+"""
+
+import numpy as np
+
+from hapticdb.kernels._jit import (
+    BOOL,
+    FLOATS,
+    FLOATS2,
+    INT,
+    INTS,
+    INTS2,
+    READ_BYTES,
+    READ_FLOATS,
+    READ_FLOATS2,
+    entry,
+    inlined,
+    maker,
+    record_of,
+)
+from hapticdb.kernels.field.lattice import ROW_VALUES
+from hapticdb.kernels.field.law import DISTANCE_FIELD
+from hapticdb.kernels.field.packing import unpack_one, unpacking_memory
+from hapticdb.kernels.law import TANGENT_PLANE, average_into
+from hapticdb.kernels.query.contact import (
+    address_of,
+    new_table,
+    number_of_key,
+    place_of_key,
+    place_shell,
+)
+from hapticdb.kernels.query.refining import NO_TALLY, feel_point, is_felt
+from hapticdb.kernels.query.sorting import insert_distinct, sorting_order
+from hapticdb.kernels.records import BRICK, GRID, MEASURED, OCCUPIED
+from hapticdb.kernels.rigid import is_rigid, transform_of
+
+NOT_RIGID, INCOMPLETE = -1, -2
+"""Instead of the number of hits: of a pose that is not rigid, and without all bricks in memory."""
+
+
+BY_DISTANCE = {record_of(OCCUPIED): record_of(MEASURED), TANGENT_PLANE: DISTANCE_FIELD}
+
+
+@inlined
+def _entry_of(directory, key):
+    """Place of a key's entry, or of the free entry where it belongs."""
+    # 8 bricks of a cube are neighbours: a frame takes few pages of memory
+    at = (place_of_key(key >> 3, directory.shape[0] >> 3) << 3) | (key & 7)
+    while directory[at].end != 0 and directory[at].key != key:
+        at = (at + 1) & (directory.shape[0] - 1)
+    return at
+
+
+@inlined
+def _set_least(rows, first, end):
+    """Set the slot behind a brick's rows to the least distances of those that count."""
+    rows.counts[end] = True
+    for value in range(rows.distances.shape[1]):
+        rows.distances[end, value] = 255
+    for row in range(first, end):
+        if rows.counts[row]:
+            for value in range(rows.distances.shape[1]):
+                here = rows.distances[row, value]
+                rows.distances[end, value] = min(rows.distances[end, value], here)
+
+
+@inlined
+def _choose(brick, rows, exclude, number):
+    """Find out which rows of a brick count under a filter of that number, and their least."""
+    first, end = np.int64(brick.first), np.int64(brick.end)
+    least, n_felt = np.int64(-1), 0
+    for row in range(first, end):
+        rows.counts[row] = is_felt(rows.id[row], exclude)
+        if rows.counts[row]:
+            least = np.int64(row)
+            n_felt += 1
+    if n_felt > 1:
+        least = end
+        _set_least(rows, first, end)
+    brick.least, brick.filter = np.int32(least), np.int32(number)
+
+
+@maker
+def _missing_keys(directory, asked, keys):
+    """Write the distinct keys of bricks that are not there, ascending; how many they are."""
+    found, count = np.empty(asked.shape[1], dtype=np.int64), np.int64(0)
+    table = new_table(asked.shape[1])
+    for n in range(asked.shape[1]):
+        if asked[1, n] >= 0 and directory[asked[1, n]].end == 0:
+            number = number_of_key(table, found, count, asked[0, n] >> 9)
+            count = max(count, number + 1)
+    order = sorting_order(found[:count])
+    for n in range(count):
+        keys[n] = found[order[n]]
+    return count
+
+
+@inlined
+def _find_touched(directory, rows, asked):
+    """Write the distinct ids of touched rows to `found`, ascending, and clear the marks."""
+    count = np.int64(0)
+    for n in range(asked.shape[1]):
+        at = asked[1, n]
+        if at < 0 or (n > 0 and at == asked[1, n - 1]):
+            continue
+        for row in range(directory[at].first, directory[at].end):
+            if rows.touched[row]:
+                rows.touched[row] = False
+                count = insert_distinct(rows.found, 0, count, rows.id[row])
+    return count
+
+
+@inlined
+def _find_bricks(directory, place, placed, asked, is_new):
+    """Set asked, its addresses only if they are new; whether all bricks are there."""
+    is_complete, last_key, last_at = True, np.int64(-1), np.int64(-1)
+    for n in range(asked.shape[1]):
+        if is_new:
+            row_key, asked[0, n] = address_of(placed, n, place)
+        else:
+            row_key = asked[0, n] >> 9
+        if row_key < 0:
+            asked[1, n] = -1
+            continue
+        if row_key != last_key:
+            last_key, last_at = row_key, _entry_of(directory, row_key)
+            is_complete &= directory[last_at].end != 0
+        asked[1, n] = last_at
+    return is_complete
+
+
+@entry(
+    READ_FLOATS2, READ_FLOATS2, READ_FLOATS, FLOATS2, record_of(GRID), record_of(BRICK, 1),
+    record_of(OCCUPIED), INTS, INT, TANGENT_PLANE, BOOL, FLOATS2, INTS2, FLOATS, INTS,
+    also=BY_DISTANCE,
+)  # fmt: skip
+def touch_bricks(
+    points, normals, center, pose, grid, directory, decoded, exclude, number, law, is_new, placed,
+    asked, felt, met,
+):  # fmt: skip
+    """Feel a shell at a pose -> hits H, other points felt A, and ids I, these in `found`.
+
+    points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; directory (C,)
+    and rows in memory; exclude (E,), ascending, of the filter of that number; is_new : not placed
+    by a call before. placed and felt take what `locate` and `refine` give, met (2 N,) likewise, but
+    no ids; asked (2, N) the addresses, and the places in the directory, -1 outside the grid.
+
+    Without all bricks in memory: `INCOMPLETE`, and the number of those missing, whose keys are in
+    met, ascending. `NOT_RIGID` if the pose is not.
+    """
+    if not is_rigid(pose):
+        return np.int64(NOT_RIGID), np.int64(0), np.int64(0)
+    if is_new:
+        place_shell(points, normals, center, transform_of(pose), placed)
+    place, rows = grid[()], decoded[()]
+    if not _find_bricks(directory, place, placed, asked, is_new):
+        return np.int64(INCOMPLETE), _missing_keys(directory, asked, met), np.int64(0)
+    occupancy = rows.occupancy.reshape(-1)
+    tally = NO_TALLY
+    for n in range(asked.shape[1]):
+        if asked[1, n] < 0:
+            continue
+        brick = directory[asked[1, n]]
+        if brick.filter != number:
+            _choose(brick, rows, exclude, number)
+        least = np.int64(brick.least)
+        if least >= 0:
+            tally = feel_point(
+                law, rows.distances, rows.counts, rows.touched, occupancy,
+                (np.int64(brick.first), np.int64(brick.end)), (least, least + 1), n, asked[0, n],
+                placed, place, felt, met, tally,
+            )  # fmt: skip
+    sums, weight, n_hits, n_apart = tally
+    average_into(felt, weight, sums)
+    return n_hits, n_apart, _find_touched(directory, rows, asked)
+
+
+@entry(record_of(BRICK, 1), record_of(BRICK, 1))
+def copy_entries(directory, larger):
+    """Enter the bricks of a directory into a larger one."""
+    for at in range(directory.shape[0]):
+        if directory[at].end != 0:
+            larger[_entry_of(larger, directory[at].key)] = directory[at]
+
+
+@entry(record_of(BRICK, 1), INTS, INTS)
+def absent_bricks(directory, keys, found):
+    """Write those of the keys (U,) that are not in the directory to found (U,); their number."""
+    count = 0
+    for n in range(keys.shape[0]):
+        if directory[_entry_of(directory, keys[n])].end == 0:
+            found[count] = keys[n]
+            count += 1
+    return count
+
+
+@inlined
+def _decode(rows, slot, bits, data, ends, row, memory):
+    """Decode a fetched row into a slot; whether it is sound."""
+    for byte in range(64):
+        rows.occupancy[slot, byte] = bits[64 * row + byte]
+    if rows.distances.shape[1] < ROW_VALUES:
+        return True
+    return unpack_one(data, ends, row, memory, rows.distances, slot)
+
+
+@entry(
+    record_of(BRICK, 1), record_of(OCCUPIED), INTS, INTS, INTS, READ_BYTES, READ_BYTES, INTS, INT,
+    also=BY_DISTANCE,
+)  # fmt: skip
+def enter_bricks(directory, decoded, keys, row_keys, row_ids, bits, data, ends, used):
+    """Enter bricks, and decode their rows straight into slots from `used` on.
+
+    keys (U,) of bricks that are not there, ascending; row_keys (R,), ascending, row_ids (R,) and
+    occupancy bits (64 R,) of their rows, among which others may lie; data (n,), ends (R,): packed
+    distances. Needs R + R / 2 free slots. Returns the first free slot then, or -1 - r if row r is
+    damaged.
+    """
+    memory, rows = unpacking_memory(), decoded[()]
+    row = 0
+    for n in range(keys.shape[0]):
+        key, first = keys[n], used
+        while row < row_keys.shape[0] and row_keys[row] < key:
+            row += 1
+        while row < row_keys.shape[0] and row_keys[row] == key:
+            if not _decode(rows, used, bits, data, ends, row, memory):
+                return -1 - row
+            rows.id[used] = row_ids[row]
+            used += 1
+            row += 1
+        brick = directory[_entry_of(directory, key)]
+        brick.key, brick.first, brick.end = key, np.int32(first), np.int32(used)
+        brick.least, brick.filter = np.int32(-1), np.int32(-1)
+        if used - first > 1:
+            used += 1  # for the least
+    return used

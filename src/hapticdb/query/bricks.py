@@ -1,0 +1,160 @@
+"""Decoded bricks in the memory of this process, up to `store.base.DECODED_BYTES`."""
+
+from collections.abc import Mapping
+from weakref import ref
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.kernels.query import bricks as kernels
+from hapticdb.kernels.query import contact
+from hapticdb.kernels.records import BRICK, ENTRIES_A_ROW, MEASURED, OCCUPIED
+from hapticdb.store.base import (
+    BRICK_SHIFT,
+    NO_DISTANCES,
+    NO_KEYS,
+    Keys,
+    Object,
+    Rows,
+)
+from hapticdb.store.parsing import damaged
+
+LEAST_ENTRIES = 1 << 10
+"""Entries of the directory of a few bricks. It grows with them: pages of memory that are written to
+for the first time, here and there in a large table, would cost a first visit more than its keys."""
+MOST_FRAMES = 256
+"""Frames after which those that nobody holds any more are forgotten."""
+
+Records = NDArray[np.void]
+Found = tuple["contact.Located", Rows, NDArray[np.uint8] | None]
+"""A located shell, the rows of its keys, and their distances (R, 1000) if they are read."""
+
+
+class RowsInMemory:
+    """Rows of the bricks of one frame: those in memory, and copies once these are dropped.
+
+    placed, asked : as the frame's kernel left them.
+    """
+
+    __slots__ = ("__weakref__", "_asked", "_bricks", "_copies", "_placed")
+
+    def __init__(
+        self,
+        bricks: tuple[Records, Records],
+        placed: NDArray[np.float64],
+        asked: NDArray[np.int64],
+    ) -> None:
+        self._bricks: tuple[Records, Records] | None = bricks
+        self._placed, self._asked = placed, asked
+
+    def __call__(self, reads: bool) -> Found:  # noqa: FBT001 - whether distances are read
+        """The located shell with rows of all its keys."""
+        located, rows, distances = self.copied()
+        return located, rows, distances if reads else None
+
+    def copied(self) -> Found:
+        """Copy the rows, once."""
+        if self._bricks is None:
+            return self._copies
+        directory, decoded = self._bricks
+        addresses, at = self._asked
+        points = np.flatnonzero(at >= 0)
+        keys, where = np.unique(addresses[points] >> BRICK_SHIFT, return_index=True)
+        held = directory[at[points[where]]]
+        lengths = (held["end"] - held["first"]).astype(np.int64)
+        ends = np.cumsum(lengths)
+        slots = np.arange(lengths.sum()) + np.repeat(held["first"] - (ends - lengths), lengths)
+        bits = decoded["occupancy"][slots].reshape(-1)
+        bits.flags.writeable = False
+        rows = Rows(np.repeat(keys, lengths), decoded["id"][slots], bits)
+        numbers = np.full_like(at, -1)
+        numbers[points] = np.searchsorted(keys, addresses[points] >> BRICK_SHIFT)
+        located = contact.Located(self._placed, np.stack([addresses, numbers]), keys)
+        self._copies: Found = located, rows, decoded["distances"][slots]
+        self._bricks = None
+        return self._copies
+
+
+class BrickMemory:
+    """Bricks of one revision, by key, those without a row included.
+
+    All are dropped when the objects are others, and when a frame needs more than fits.
+
+    directory (C,) of `BRICK`, at most half full; decoded () of `OCCUPIED` or `MEASURED`; n_kept :
+    bricks; most_rows : slots; number : of the filter that `choose` was given last.
+    """
+
+    def __init__(self, url: str) -> None:
+        self._url = url
+        self._objects: Mapping[int, Object] | None = None
+        self._reads = False
+        self._exclude = NO_KEYS
+        self._frames: list[ref[RowsInMemory]] = []
+        self.number = 0
+        self._allocate(reads=False)
+
+    def _allocate(self, *, reads: bool) -> None:
+        """Make room for rows. The system gives pages of memory as they are written to."""
+        self._reads = reads
+        self.decoded: Records = np.zeros((), MEASURED if reads else OCCUPIED)
+        self.most_rows = len(self.decoded["id"])
+        self.clear()
+
+    def clear(self) -> None:
+        """Drop all bricks; frames that somebody still holds get copies of theirs."""
+        for held in self._frames:
+            if (frame := held()) is not None:
+                frame.copied()
+        self._frames.clear()
+        self.directory: Records = np.zeros(LEAST_ENTRIES, BRICK)
+        self._used, self.n_kept = 1, 0
+
+    def choose(self, objects: Mapping[int, Object], exclude: Keys, *, reads: bool) -> None:
+        """Keep bricks of these objects alone, with distances if they are read, for a filter.
+
+        objects : of one revision, replaced as a whole when they are others.
+        """
+        if objects is not self._objects:
+            self._objects = objects
+            self.clear()
+        if reads is not self._reads:
+            self.clear()
+            self._allocate(reads=reads)
+        if exclude is not self._exclude and not np.array_equal(exclude, self._exclude):
+            self.number += 1
+        self._exclude = exclude
+
+    def absent(self, keys: Keys) -> Keys:
+        """Those of ascending keys (U,) whose bricks are not there."""
+        found = np.empty_like(keys)
+        return found[: kernels.absent_bricks(self.directory, keys, found)]
+
+    def enter(self, keys: Keys, rows: Rows) -> bool:
+        """Enter bricks (U,) that are not there, ascending, with their rows; whether they fit."""
+        most = self._used + len(rows) + len(rows) // 2
+        n_kept = self.n_kept + len(keys)
+        if most > self.most_rows or 2 * n_kept > ENTRIES_A_ROW * self.most_rows:
+            return False
+        while 2 * n_kept > len(self.directory):
+            larger = np.zeros(2 * len(self.directory), BRICK)
+            kernels.copy_entries(self.directory, larger)
+            self.directory = larger
+        band = rows.distances if self._reads else NO_DISTANCES.distances
+        assert band is not None  # noqa: S101 - they were asked for
+        used = kernels.enter_bricks(
+            self.directory, self.decoded, keys, rows.keys, rows.ids, rows.occupancy, *band,
+            self._used,
+        )  # fmt: skip
+        if used < 0:
+            self.clear()
+            raise damaged(self._url, f"row {-1 - used} of {len(rows)} rows of distances is damaged")
+        self._used, self.n_kept = used, n_kept
+        return True
+
+    def rows(self, placed: NDArray[np.float64], asked: NDArray[np.int64]) -> RowsInMemory:
+        """Rows of a frame, placed and asked as its kernel left them."""
+        frame = RowsInMemory((self.directory, self.decoded), placed, asked)
+        if len(self._frames) >= MOST_FRAMES:
+            self._frames = [held for held in self._frames if held() is not None]
+        self._frames.append(ref(frame))
+        return frame

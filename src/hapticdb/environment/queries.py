@@ -87,8 +87,9 @@ class Queries:
             processors
         objects, progress, device : for many poses, as for `Feeler.touch` and `feeler`
         strategy : for one pose, form of the query: ``statement``, ``array``, ``points``,
-            ``maxgap``, ``cbgroup``, or ``auto``: ``cbgroup`` for a frame with many keys in few
-            ranges, else ``array``. All strategies find the same hits, ids and wrench, bit for bit.
+            ``maxgap``, ``cbgroup``, which all read the database, or ``auto``: decoded bricks stay
+            in memory, and missing ones are read as by ``array``, or many as by ``cbgroup``.
+            All strategies find the same hits, ids and wrench, bit for bit.
         where, exclude : felt are the objects that `where` chooses, all if it is empty, without
             those of `exclude`: a part that is taken out must not hit itself. Ids, names, patterns
             and ``attribute=value``, as for `find`; read again whenever others have written.

@@ -88,7 +88,7 @@ class HapticQuery:
             if known.version is not None and (law is None or known.fits(law)):
                 exclude = NOTHING_EXCLUDED if felt is ALL else known.left_out(felt)
                 touch = self._frame(*asked, exclude, law or known.own_law)
-            if touch is None or self._version_after(touch) != known.version:
+            if touch is None or not self._is_newest(touch, form):
                 touch = self._touch_anew(*asked, felt, law)
         except ConnectionLostError:
             touch = self._touch_anew(*asked, felt, law)
@@ -98,9 +98,14 @@ class HapticQuery:
             known.check_words(felt)
         return touch
 
-    def _version_after(self, touch: Touch) -> int:
-        """The store's version after a touch: what it has read tells, or else what is committed."""
-        return self.store.version() if touch.query.statements else self.store.newest()
+    def _is_newest(self, touch: Touch, form: Form | None) -> bool:
+        """Whether nothing was committed since the known objects were read, as far as it was read.
+
+        A frame over bricks has looked after each statement; without one it looks now.
+        """
+        if form is not None or not self._has_bricks:
+            return self.store.version() == self.known.version
+        return touch.query.statements > 0 or self.store.newest() == self.known.version
 
     def _touch_anew(
         self,

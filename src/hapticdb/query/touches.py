@@ -18,8 +18,9 @@ PairsOf = Callable[[ForceLaw, NDArray[np.int64]], NDArray[np.int64]]
 class Query(NamedTuple):
     """How a frame asked the database.
 
-    strategy : the strategy used, never `auto`; statements : SQL statements run; ranges : index
-    ranges, single keys included; rows : rows read, false hits included; elapsed_us : of the frame.
+    strategy : the strategy used, never `auto`; statements : SQL statements run, 0 if all bricks
+    were in memory; ranges : index ranges, single keys included; rows : rows read, false hits
+    included; elapsed_us : of the frame.
     """
 
     strategy: str

@@ -302,8 +302,9 @@ def unpack_one(data, ends, n, memory, out, to):
     size = ends[n] - start
     if start < 0 or size < 1 or size > MOST_ROW_BYTES or ends[n] > data.shape[0]:
         return False
-    for byte in range(size):
-        row[byte] = data[start + byte]
+    first = np.uint64(start)
+    for byte in range(np.uint64(size)):
+        row[byte] = data[first + byte]
     n_bits = _unpack_row(row, masks, lines, out, np.uint64(to))
     return (n_bits + 7) >> 3 == size and np.int64(row[size - 1]) >> (((n_bits - 1) & 7) + 1) == 0
 

@@ -115,17 +115,14 @@ def _find_touched(directory, rows, asked):
 
 
 @inlined
-def _find_bricks(directory, place, placed, asked, is_new):
-    """Set asked, its addresses only if they are new; whether all bricks are there."""
+def _find_bricks(directory, asked):
+    """Set the places of the addresses' bricks; whether all are there."""
     is_complete, last_key, last_at = True, np.int64(-1), np.int64(-1)
     for n in range(asked.shape[1]):
-        if is_new:
-            row_key, asked[0, n] = address_of(placed, n, place)
-        else:
-            row_key = asked[0, n] >> 9
-        if row_key < 0:
+        if asked[0, n] < 0:
             asked[1, n] = -1
             continue
+        row_key = asked[0, n] >> 9
         if row_key != last_key:
             last_key, last_at = row_key, _entry_of(directory, row_key)
             is_complete &= directory[last_at].end != 0
@@ -154,10 +151,12 @@ def touch_bricks(
     """
     if not is_rigid(pose):
         return np.int64(NOT_RIGID), np.int64(0), np.int64(0)
+    place, rows = grid[()], decoded[()]
     if is_new:
         place_shell(points, normals, center, transform_of(pose), placed)
-    place, rows = grid[()], decoded[()]
-    if not _find_bricks(directory, place, placed, asked, is_new):
+        for n in range(asked.shape[1]):
+            _, asked[0, n] = address_of(placed, n, place)
+    if not _find_bricks(directory, asked):
         return np.int64(INCOMPLETE), _missing_keys(directory, asked, met), np.int64(0)
     occupancy = rows.occupancy.reshape(-1)
     tally = NO_TALLY
@@ -198,14 +197,22 @@ def absent_bricks(directory, keys, found):
     return count
 
 
-@inlined
-def _decode(rows, slot, bits, data, ends, row, memory):
-    """Decode a fetched row into a slot; whether it is sound."""
-    for byte in range(64):
-        rows.occupancy[slot, byte] = bits[64 * row + byte]
-    if rows.distances.shape[1] < ROW_VALUES:
-        return True
-    return unpack_one(data, ends, row, memory, rows.distances, slot)
+@maker
+def _decode(rows, slots, bits, data, ends):
+    """Decode fetched rows into their slots, those with one -> -1, or the first damaged row.
+
+    A loop of its own: between the entries' searches, unpacking takes a third longer.
+    """
+    memory, has_distances = unpacking_memory(), rows.distances.shape[1] == ROW_VALUES
+    for row in range(slots.shape[0]):
+        if slots[row] < 0:
+            continue
+        to, first = np.uint64(slots[row]), np.uint64(64 * row)  # unsigned: LLVM copies vectors
+        for byte in range(np.uint64(64)):
+            rows.occupancy[to, byte] = bits[first + byte]
+        if has_distances and not unpack_one(data, ends, row, memory, rows.distances, slots[row]):
+            return row
+    return -1
 
 
 @entry(
@@ -220,16 +227,14 @@ def enter_bricks(directory, decoded, keys, row_keys, row_ids, bits, data, ends, 
     distances. Needs R + R / 2 free slots. Returns the first free slot then, or -1 - r if row r is
     damaged.
     """
-    memory, rows = unpacking_memory(), decoded[()]
+    slots, rows = np.full(row_keys.shape[0], -1, dtype=np.int64), decoded[()]
     row = 0
     for n in range(keys.shape[0]):
         key, first = keys[n], used
         while row < row_keys.shape[0] and row_keys[row] < key:
             row += 1
         while row < row_keys.shape[0] and row_keys[row] == key:
-            if not _decode(rows, used, bits, data, ends, row, memory):
-                return -1 - row
-            rows.id[used] = row_ids[row]
+            slots[row], rows.id[used] = used, row_ids[row]
             used += 1
             row += 1
         brick = directory[_entry_of(directory, key)]
@@ -237,4 +242,5 @@ def enter_bricks(directory, decoded, keys, row_keys, row_ids, bits, data, ends, 
         brick.least, brick.filter = np.int32(-1), np.int32(-1)
         if used - first > 1:
             used += 1  # for the least
-    return used
+    damaged = _decode(rows, slots, bits, data, ends)
+    return used if damaged < 0 else -1 - damaged

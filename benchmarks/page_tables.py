@@ -98,15 +98,10 @@ def frames(results: Results) -> str:
 
 def edits(results: Results) -> str:
     """Milliseconds from the commit of an edit to the first frame that felt it."""
-    rows = [
-        [
-            one["engine"],
-            f"{one['edits']}",
-            f"{one['voxels']:,}",
-            *(f"{ms:.1f}" for ms in one["felt_after_ms"].values()),
-        ]
-        for one in results["realtime"]["edits"]
-    ]
+    rows = []
+    for one in results["realtime"]["edits"]:
+        after = (f"{ms:.1f}" for ms in one["felt_after_ms"].values())
+        rows.append([one["engine"], f"{one['edits']}", f"{one['voxels']:,}", *after])
     head = ["engine", "moves", "voxels", "median, ms", "90 % within, ms", "worst, ms"]
     return table(head, rows)
 
@@ -131,14 +126,10 @@ def far_away(results: Results) -> str:
 
 def gpu_frames(results: Results) -> str:
     """Times of a frame on a GPU, pose in and wrench out, and on one processor."""
-    rows = [
-        [
-            f"{one['points']:,}",
-            *(f"{one['gpu'][share]:.2f}" for share in ("p50_ms", "p99_ms")),
-            us_text(one["one_processor"]["p50_ms"]),
-        ]
-        for one in results["gpu"]["frames"]
-    ]
+    rows = []
+    for one in results["gpu"]["frames"]:
+        times = (f"{one['gpu'][share]:.2f}" for share in ("p50_ms", "p99_ms"))
+        rows.append([f"{one['points']:,}", *times, us_text(one["one_processor"]["p50_ms"])])
     return table(["points", "p50, ms", "p99, ms", "one processor, p50, ms"], rows)
 
 
@@ -195,9 +186,6 @@ def fits(results: Results) -> str:
         rows.append([one["fit"], one["verdict"], *gaps, f"{one['cpu_s']:.2f}", *felt])
     head = ["peg", "verdict", "nominal gap, mm", "proved gap, mm", "processor time, s"]
     return table([*head, "on the axis, N", "beside it, N"], rows)
-
-
-# --- pages ----------------------------------------------------------------------------------------
 
 
 def scale_ahead(results: Results) -> str:

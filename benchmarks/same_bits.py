@@ -8,18 +8,15 @@ Each commit runs this script once, on the same machine, and writes digests into 
     python benchmarks/same_bits.py /tmp/bits/after --out after.json --replay /tmp/bits/before-*.rec
     python benchmarks/same_bits.py --compare before.json after.json
 
-The first argument is a folder for databases. Databases that exist there are not imported again: a
-copy of one commit's folder shows whether the other commit reads it equally. Each run records one
-session for each environment, beside the folder (``before-sqlite-brick.rec``); ``--replay`` replays
-the recordings of another commit instead of the run's own.
+The folder's databases are imported unless they are there: a copy of one commit's folder shows
+whether the other commit reads it equally. A run records a session for each environment beside the
+folder (``before-sqlite-brick.rec``); ``--replay`` replays those of another commit instead.
 
 The environments hold the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
-PostgreSQL found. Compared are: the stored rows; force, torque, hits, depths and objects at 10,000
+PostgreSQL found. Compared are the stored rows; force, torque, hits, depths and objects at 10,000
 poses, for each strategy and for all poses at once; the statements of a strategy, unless they depend
 on measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the force
-pushes back. A session runs on a clock that counts its calls, so its frames do not depend on the
-machine's load. Only public names and the command line are used: modules may move between the two
-commits.
+pushes back, on a clock that counts its calls. Only public names and the command line are used.
 """
 
 import argparse

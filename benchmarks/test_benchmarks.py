@@ -17,6 +17,7 @@ import many
 import page_tables
 import records
 import scale
+import visits
 from feel.measures import MEASURES
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.poses import read_poses
@@ -52,6 +53,7 @@ def test_the_evaluation_has_every_experiment_on_every_engine_and_layout(
     for name in ("figure8", "figure9", "figure10"):
         places = {(cell["engine"], cell["layout"]) for cell in results[name]["cells"]}
         assert len(places) == len(LAYOUTS) * 2, name
+    results["visits"] = {"cells": visits.measure(tmp_path / "brick.db", "car", TINY)}
     results["scale"] = scale.evaluate(tmp_path, scale.Effort((3e3, 3e4, 1e5), 7, 10))
     beside = {one["engine"] for one in results["many"]["cells"] if one.get("edits_per_s")}
     assert len(beside) == 2

@@ -59,26 +59,18 @@ def claim(results: Results) -> str:
     return table(["random poses", *map(named, COMPARED), "best / bitmap"], rows)
 
 
-def claim_laws(results: Results) -> str:
-    """The distance law's fastest frames beside the plane's, on bricks."""
-    cells = [
-        cell
-        for cell in cells_of(results, "claim")
-        if (cell["layout"], cell["file"]) == ("brick", "cached")
-    ]
-    lines = []
-    for (poses,), every in grouped(cells, ("poses",)).items():
-        ratios = []
-        for group in grouped(every, ("engine",)).values():
-            best = [
-                min(typical(c) for c in group if c["law"] == law) for law in ("distance", "plane")
-            ]
-            ratios.append(best[0] / best[1])
-        said = f"{min(ratios):.1f} to {max(ratios):.1f}"
-        lines.append(
-            f"- {poses} poses: the fastest distance frame takes {said} times the fastest plane one."
-        )
-    return "\n".join(lines)
+def visits(results: Results) -> str:
+    """Frames over bricks met for the first time and again, beside frames that read."""
+    rows = []
+    for where, group in grouped(cells_of(results, "visits"), ("environment",)).items():
+        us = {(c["law"], c.get("visit", c["strategy"])): typical(c) for c in group}
+        for law in ("plane", "distance"):
+            again, bitmap = us[law, "again"], us["plane", "bitmap"]
+            times = [us[law, one] for one in ("points", "array", "first", "again")]
+            ratios = again / bitmap, us[law, "array"] / again, again / us["plane", "again"]
+            rows.append([f"{where[0]}, {law}", *map(us_text, times), *map(us_text, ratios)])
+    head = ["us a frame", "points", "array", "first visit", "again"]
+    return table([*head, "again / bitmap", "array / again", "again / plane"], rows)
 
 
 def table_1(results: Results) -> str:
@@ -280,7 +272,7 @@ def exactness(results: Results) -> str:
 
 EVALUATION: dict[str, Callable[[Results], str]] = {
     "claim": claim,
-    "claim-laws": claim_laws,
+    "visits": visits,
     "table1": table_1,
     "figure9": figure_9,
     "figure10-counts": figure_10,

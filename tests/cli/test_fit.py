@@ -1,6 +1,7 @@
 """Fit under the distance law: tools drawn inward, and the clearance that is told from contact."""
 
 import json
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -8,7 +9,9 @@ import pytest
 
 import hapticdb
 from bands import band_rows
-from command_line import Run, poses, succeeded, tool
+from children import finished
+from command_line import Run, command, poses, succeeded, tool
+from hapticdb.kernels._cache import LENT, cache_folder
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
 from voxels import voxel_object
@@ -86,3 +89,22 @@ def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, flo
         code, out, _ = run(*args, *rest, *more)
         assert code == 0
         assert json.loads(out)["shell"]["inset"] == {"least": inset, "greatest": inset}
+
+
+def test_a_tool_that_is_kept_is_told_of_alike_and_loads_no_scipy(
+    floor: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("XDG_CACHE_HOME", str(floor.parent / "cache"))
+    monkeypatch.setenv(LENT, str(cache_folder()))
+    tool(floor.with_name("tool.stl"), is_open=True)
+    args = ("touch", floor, "--tool", "tool.stl", "--poses", "path.csv", "--json")
+    line = [sys.executable, "-X", "importtime", *command(*args)[1:]]
+    results = [finished(line, check=True) for _ in range(2)]
+    notes = [[one for one in r.stderr.splitlines() if "hapticdb: " in one] for r in results]
+    assert any("is open" in one for one in notes[0])
+    assert notes[0] == notes[1]
+    first, second = ([json.loads(one) for one in r.stdout.splitlines()] for r in results)
+    for one, other in zip(first, second, strict=True):
+        assert one["force"] == other["force"]
+        assert one["shell"] == other["shell"]
+    assert ["scipy.s" in r.stderr for r in results] == [True, False]

@@ -10,6 +10,7 @@ from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
+    from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
 
 
@@ -19,23 +20,28 @@ def check_there(tool: str) -> None:
         raise FileError(f"cannot read {tool}: there is no such file")
 
 
-def shell_of(
+def tool_of(
     tool: str,
     unit: str | None,
     points: int | None,
     seed: int | None,
     inset: float = 0.0,
-) -> "PointShell":
-    """Shell of a tool's file, its defects told; --points and --seed as they were given.
+    *,
+    has_surface: bool = False,
+) -> "Tool":
+    """Tool of a file, its defects told; --points and --seed as they were given.
 
-    inset : how far its points are drawn inward, metres; a saved shell stays as it was saved.
+    inset : how far its points are drawn inward, metres; a saved shell stays as it was saved;
+    has_surface : whether its triangles are wanted, so that the file is read in any case.
     """
     if tool.lower().endswith(".npz") and (points is not None or seed is not None):
         raise UsageError(f"{tool} is a saved shell: leave out --points and --seed")
     with render.bar("sampling the tool", "points"):
-        from hapticdb.pointshell.shell import PointShell
+        from hapticdb.pointshell.kept import kept_tool, made_tool
 
-        shell = PointShell.from_file(tool, points, unit=unit, seed=seed or 0, inset=inset)
+        make = made_tool if has_surface else kept_tool
+        found = make(tool, points, unit=unit, seed=seed or 0, inset=inset)
+    shell = found.shell
     if shell.defects:
         render.note(f"{tool}: found in the file: {shell.defects}")
     if not shell.is_closed:
@@ -46,10 +52,10 @@ def shell_of(
             f"{tool}: a saved shell, drawn in by {length_text(deepest)}: contact begins up to "
             f"{length_text(deepest - inset)} late; give the mesh it was made of, if that matters"
         )
-    return shell
+    return found
 
 
-def warn_of_size(env: "Environment", shell: "PointShell", left_out: Iterable[int]) -> None:
+def warn_of_size(env: "Environment", tool: "Tool", left_out: Iterable[int]) -> None:
     """Note a tool longer than the scene, or shorter than a voxel: its unit may be wrong.
 
     Lengths are the longest sides of boxes. A unit that a person or the file gave is believed.
@@ -60,9 +66,9 @@ def warn_of_size(env: "Environment", shell: "PointShell", left_out: Iterable[int
 
     gone = set(left_out)
     scene = scene_bounds(obj for obj in env.objects() if obj.id not in gone)
-    if shell.has_unit or scene is None:
+    if tool.shell.has_unit or scene is None:
         return
-    length, extent = float(np.ptp(shell.outline, axis=0).max()), float(np.ptp(scene, axis=0).max())
+    length, extent = tool.length, float(np.ptp(scene, axis=0).max())
     if length > extent:
         compared = f"longer than the scene ({length_text(extent)})"
     elif length < env.grid.voxel_size:

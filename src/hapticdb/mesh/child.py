@@ -66,7 +66,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
     from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415
     from hapticdb.mesh.parse import cause_of, parse, reader_of  # noqa: PLC0415
-    from hapticdb.mesh.raw import UnreadableError  # noqa: PLC0415
+    from hapticdb.mesh.raw import NAMED, UnreadableError  # noqa: PLC0415
 
     before = None
     try:
@@ -101,6 +101,7 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         "names_unit": file.names_unit,
         "up": file.up,
         "notes": file.notes,
+        "named": sorted(NAMED),
     }
     out.write(json.dumps(head).encode() + b"\n")
     out.write(np.array([part.world_from_part for part in file.parts]).data)

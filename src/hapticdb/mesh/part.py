@@ -139,6 +139,8 @@ class MeshFile:
     """Axis that points up, x, y or z; None if neither the format nor the file says it."""
     notes: tuple[str, ...] = ()
     """What the file holds that is not read, or not as it is meant; a line each."""
+    named: tuple[str, ...] = ()
+    """Names of the files beside it that `read_file` looked for: buffers, materials, pictures."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:

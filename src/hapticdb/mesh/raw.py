@@ -115,8 +115,13 @@ def told(n: int, words: str, **named: str) -> list[str]:
     return [f"{n:,} {words.format(**forms, **named)}"] if n > 0 else []
 
 
+NAMED: set[str] = set()
+"""Names by which this process has looked for files beside those that it reads."""
+
+
 def beside(folder: Path, name: str) -> Path | None:
     """File that another one names, as written or with percent-encoding such as %20 resolved."""
+    NAMED.add(name)
     for candidate in (name, unquote(name), unquote(name).replace("\\", "/")):
         try:
             if (folder / candidate).is_file():

@@ -249,7 +249,7 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
         vertices, faces, colours = geometries[n]
         shape = (vertices, faces, placed.copy(), Defects(**found), shared[n], colours)
         parts.append(Part(name, *shape, head["chords"][n]))
-    said = (head["names_unit"], head["up"], tuple(head["notes"]))
+    said = (head["names_unit"], head["up"], tuple(head["notes"]), tuple(head["named"]))
     return MeshFile(link, parts, Defects(**head["defects"]), *said)
 
 

@@ -84,6 +84,8 @@ class PointShell:
     """Chord error of the surface, metres: of the tessellations of STEP files; not saved."""
     has_unit: bool = field(default=False, repr=False)
     """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
+    named: tuple[str, ...] = field(default=(), repr=False)
+    """Names of files that were looked for beside that file; not saved."""
 
     def __post_init__(self) -> None:
         for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
@@ -182,7 +184,7 @@ class PointShell:
         found = "; ".join(filter(None, [file.defects.describe(), *file.notes]))
         chord = max(part.placed_chord for part in parts)
         has_unit = unit is not None or file.names_unit
-        return replace(shell, defects=found, has_unit=has_unit, chord=chord)
+        return replace(shell, defects=found, has_unit=has_unit, chord=chord, named=file.named)
 
     @classmethod
     def from_mesh(

@@ -30,13 +30,13 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import check_there, shell_of, warn_of_size
+from hapticdb.cli.tools import check_there, tool_of, warn_of_size
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
-from hapticdb.realtime.fork_server import prepare
 
 if TYPE_CHECKING:
+    from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.realtime.coupling import Rendering
     from hapticdb.realtime.report import Report
@@ -204,7 +204,7 @@ def feel(
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
     check_there(tool)
-    drawn_in = partial(_shell, tool, tool_unit, points, seed, device)
+    drawn_in = partial(_tool, tool, tool_unit, points, seed, device)
     felt, shell = _looked_at(url, where, exclude, drawn_in, law or "distance", not conservative)
     session_page.tell_cost(len(shell), rate, law or "distance", frames_on)
     begin = partial(
@@ -237,21 +237,21 @@ def _begun(
         yield session
 
 
-def _shell(
+def _tool(
     tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float
-) -> "PointShell":  # fmt: skip
-    """Make the tool's shell, drawn inward by `inset` metres."""
+) -> "Tool":  # fmt: skip
+    """Make the tool, its points drawn inward by `inset` metres."""
     # a saved shell takes no seed, and a random hand does
     is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
     seed = None if is_for_hand_alone else seed
-    return shell_of(tool, unit, points, seed, inset=inset)
+    return tool_of(tool, unit, points, seed, inset=inset)
 
 
 def _looked_at(
     url: str,
     where: Sequence[str] | None,
     exclude: Sequence[str] | None,
-    drawn_in: "Callable[[float], PointShell]",
+    drawn_in: "Callable[[float], Tool]",
     law: LawName,
     is_inset: bool,  # noqa: FBT001 - of one call
 ) -> "tuple[Felt, PointShell]":
@@ -260,9 +260,9 @@ def _looked_at(
 
     with hapticdb.open(url, read_only=True) as env:
         felt = felt_objects(env, where, exclude)
-        shell = drawn_in(inset_of(env.grid.voxel_size, law) if is_inset else 0.0)
-        warn_of_size(env, shell, felt.left_out)
-    return felt, shell
+        tool = drawn_in(inset_of(env.grid.voxel_size, law) if is_inset else 0.0)
+        warn_of_size(env, tool, felt.left_out)
+    return felt, tool.shell
 
 
 def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool) -> int:
@@ -281,7 +281,12 @@ def _begin_loop(
     processor: int | None,
     frames_on: FramesOn,
 ) -> "Rendering":
-    """Load kernels in the fork server, check the loop; returns the rendering."""
+    """Start the fork server, check the loop; returns the rendering."""
+    from hapticdb.realtime.fork_server import prepare
+
+    # at once: another interpreter with numba takes as long to load as all that is done here
+    prepare("hapticdb.realtime.loop:work", with_kernels=True)
+    prepare("hapticdb.realtime.fetching:fetch", with_kernels=True)
     from hapticdb.query.law import DISTANCE, as_law
     from hapticdb.realtime.coupling import rendering_of
 
@@ -290,7 +295,6 @@ def _begin_loop(
         from hapticdb.realtime.on_gpu import check_frames
 
         check_frames(frames_on, chosen)
-    prepare("hapticdb.realtime.loop:work", with_kernels=True)
 
     with render.bar("loading", ""):
         from hapticdb.realtime.timing import Timing

@@ -21,7 +21,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
-from hapticdb.cli.tools import shell_of, warn_of_size
+from hapticdb.cli.tools import tool_of, warn_of_size
 from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
@@ -234,8 +234,10 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
                 shell = env.shell(*job.parts, points=1, inset=0.0)
         else:
             is_saved = asked.tool.lower().endswith(".npz")
-            shell = shell_of(asked.tool, options.tool_unit, None if is_saved else 1, None)
-            warn_of_size(env, shell, felt.left_out)
+            points = None if is_saved else 1
+            tool = tool_of(asked.tool, options.tool_unit, points, None, has_surface=True)
+            warn_of_size(env, tool, felt.left_out)
+            shell = tool.shell
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude,

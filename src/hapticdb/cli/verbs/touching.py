@@ -39,7 +39,7 @@ from hapticdb.cli.options import (
     UrlArgument,
     WhereOption,
 )
-from hapticdb.cli.tools import shell_of, shell_record, shell_text, warn_of_size
+from hapticdb.cli.tools import shell_record, shell_text, tool_of, warn_of_size
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -133,8 +133,9 @@ def touch(
         chosen: ForceLaw = distance if name == "distance" else plane
         felt = felt_objects(env, where, exclude)
         reach = inset_of(env.grid.voxel_size, name)
-        shell = shell_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
-        warn_of_size(env, shell, felt.left_out)
+        held = tool_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
+        warn_of_size(env, held, felt.left_out)
+        shell = held.shell
         if out is not None:
             pieces = env.touch_pieces(
                 shell, path, where=felt.where, exclude=felt.exclude, law=chosen, on=on

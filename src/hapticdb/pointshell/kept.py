@@ -1,0 +1,147 @@
+"""Shells of tools' files, kept in the user's cache from one process to the next.
+
+Making the shell of the sample's wrench takes 0.9 s of processor time and a process that reads the
+file; reading a kept one takes 15 ms, most of them for the digests. An entry is named by a digest of
+all that shapes its shell: the file's bytes, the request, the sources of this package, and the
+versions of the libraries. It begins with a digest of its content, holds those of the files beside
+the tool's own, and is ignored if any of them differs.
+"""
+
+import contextlib
+import hashlib
+import json
+import os
+import sys
+import tempfile
+import time
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from hapticdb.kernels._cache import sources_digest
+from hapticdb.mesh.parse import is_tessellated
+from hapticdb.mesh.raw import beside
+from hapticdb.pointshell.shell import DEFAULT_POINTS, PointShell
+
+MOST_BYTES = 256 << 20
+"""Most bytes of all entries together. Larger: more tools begin at once."""
+DIGEST_BYTES = 32
+"""Bytes of a SHA-256."""
+NUMBERS = 7
+"""Numbers of a point in an entry: position, normal, inset."""
+KEPT = ("is_closed", "seed", "defects", "chord", "has_unit")
+"""Fields of a shell that an entry holds as they are."""
+
+
+class Tool(NamedTuple):
+    """A tool of a file: its shell, without triangles where it was kept, and its longest side, m."""
+
+    shell: PointShell
+    length: float
+
+
+def made_tool(path: str, points: int | None, *, unit: str | None, seed: int, inset: float) -> Tool:
+    """Tool of a file that is read now; arguments and errors are those of `PointShell.from_file`."""
+    shell = PointShell.from_file(path, points, unit=unit, seed=seed, inset=inset)
+    return Tool(shell, float(np.ptp(shell.outline, axis=0).max()))
+
+
+def kept_tool(path: str, points: int | None, *, unit: str | None, seed: int, inset: float) -> Tool:
+    """The same, bit for bit, but for its triangles; from the cache if it holds the tool."""
+    began = time.time()
+    n_points = DEFAULT_POINTS if points is None else points
+    entry = _entry(Path(path), (n_points, unit, seed, inset))
+    found = None if entry is None else _read(entry, Path(path).resolve())
+    if found is None:
+        found = made_tool(path, points, unit=unit, seed=seed, inset=inset)
+        if entry is not None:
+            _write(entry, found, began)
+    return found
+
+
+def _entry(path: Path, request: tuple[object, ...]) -> Path | None:
+    """File of the entry of a request; None for what is not kept, a saved shell or no file."""
+    suffix = path.suffix.lower()
+    if suffix == ".npz" or not path.is_file():
+        return None
+    libraries = ("numpy", "scipy", *(["cascadio"] if is_tessellated(path) else []))
+    sources = sources_digest(Path(__file__).parent.parent)
+    with contextlib.suppress(OSError, ImportError, RuntimeError):  # no home directory
+        known = (*request, suffix, sources, sys.byteorder, *map(version, libraries))
+        digest = hashlib.sha256(f"{known}\0{_digest(path)}".encode())
+        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
+        return Path(base, "hapticdb", "shells", digest.hexdigest())
+    return None
+
+
+def _digest(file: Path | None) -> str | None:
+    """SHA-256 of a file's bytes; None where it cannot be read."""
+    with contextlib.suppress(OSError):
+        if file is not None:
+            with file.open("rb") as stream:
+                return hashlib.file_digest(stream, "sha256").hexdigest()
+    return None
+
+
+def _read(entry: Path, file: Path) -> Tool | None:
+    """Tool that an entry holds; None if it is missing, damaged, another user's or not of now."""
+    try:
+        with entry.open("rb") as stream:
+            is_own = os.fstat(stream.fileno()).st_uid == os.geteuid()
+            digest, content = stream.read(DIGEST_BYTES), stream.read()
+    except OSError:
+        return None
+    if not is_own or hashlib.sha256(content).digest() != digest:
+        return None
+    line, _, numbers = content.partition(b"\n")
+    head: dict[str, Any] = json.loads(line)
+    if any(_digest(beside(file.parent, name)) != one for name, one in head["named"].items()):
+        return None
+    with contextlib.suppress(OSError):  # what is used goes last
+        os.utime(entry)
+    rows = np.frombuffer(numbers).reshape(-1, NUMBERS)
+    shell = PointShell(
+        rows[:, :3], rows[:, 3:6], np.array(head["center"]), link=str(file), inset=rows[:, 6],
+        named=tuple(head["named"]), **{name: head[name] for name in KEPT},
+    )  # fmt: skip
+    return Tool(shell, head["length"])
+
+
+def _write(entry: Path, tool: Tool, began: float) -> None:
+    """Keep a tool, unless a file was written since `began`; nothing if the folder cannot be."""
+    shell = tool.shell
+    file = Path(shell.link)
+    files = {name: beside(file.parent, name) for name in shell.named}
+    head = {name: getattr(shell, name) for name in KEPT} | {
+        "center": shell.center.tolist(),
+        "length": tool.length,
+        "named": {name: _digest(one) for name, one in files.items()},
+    }
+    rows = np.column_stack([shell.points, shell.normals, shell.inset])
+    content = json.dumps(head).encode() + b"\n" + rows.tobytes()
+    with contextlib.suppress(OSError):
+        read = [file, *filter(None, files.values())]
+        if len(content) > MOST_BYTES or max(one.stat().st_ctime for one in read) >= began:
+            return
+        entry.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        number, unfinished = tempfile.mkstemp(dir=entry.parent)
+        try:
+            with os.fdopen(number, "wb") as stream:
+                stream.write(hashlib.sha256(content).digest() + content)
+            Path(unfinished).replace(entry)
+        finally:
+            Path(unfinished).unlink(missing_ok=True)
+        _make_room(entry.parent)
+
+
+def _make_room(folder: Path) -> None:
+    """Remove the entries that were not used for the longest time, down to `MOST_BYTES`."""
+    found = sorted((one.stat().st_mtime, one.stat().st_size, one) for one in folder.iterdir())
+    left = sum(size for _, size, _ in found)
+    for _, size, one in found:
+        if left <= MOST_BYTES:
+            break
+        one.unlink()
+        left -= size

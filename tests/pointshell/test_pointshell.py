@@ -9,10 +9,13 @@ import trimesh
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.spatial.transform import Rotation
 
 from hapticdb.errors import FileError, UsageError
+from hapticdb.pointshell.orientation import components
 from hapticdb.pointshell.shell import PointShell, fibonacci_sphere
 
 Floats = NDArray[np.float64]
@@ -350,3 +353,15 @@ def test_a_file_without_a_surface_is_named(tmp_path: Path) -> None:
         PointShell.from_file(cloud)
     with pytest.raises(FileError, match=r"missing\.stl"):
         PointShell.from_file(tmp_path / "missing.stl")
+
+
+@settings(max_examples=200, deadline=None)
+@given(st.data())
+def test_components_are_numbered_by_their_lowest_nodes(data: st.DataObject) -> None:
+    n = data.draw(st.integers(1, 30))
+    node = st.integers(0, n - 1)
+    pairs = np.array(data.draw(st.lists(st.tuples(node, node))), np.int64).reshape(-1, 2)
+    graph = coo_array((np.ones(len(pairs)), pairs.T), shape=(n, n))
+    found = components(pairs, n)
+    assert found.dtype == np.int64
+    assert found.tolist() == connected_components(graph, directed=False)[1].tolist()

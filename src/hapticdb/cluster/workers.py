@@ -4,7 +4,6 @@ A task is one call that can be pickled and writes nothing. So dask can run it ag
 is lost, and an interrupted command leaves what the same work leaves here.
 """
 
-import asyncio
 import pickle
 import time
 from collections import deque
@@ -129,6 +128,8 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
     if address is None:
         yield None
         return
+    import asyncio  # noqa: PLC0415 - 15 ms, which every verb that opens an environment would take
+
     try:
         import dask  # noqa: PLC0415 - an extra
 

@@ -155,12 +155,21 @@ def join_corners(triangles: Floats) -> Ints:
 
 
 def components(pairs: Ints, n: int) -> Ints:
-    """Component (n,) of each node of a graph of edges (E, 2), numbered by lowest node."""
-    from scipy.sparse import coo_array  # noqa: PLC0415 - 0.3 s, where surfaces are oriented
-    from scipy.sparse.csgraph import connected_components  # noqa: PLC0415
+    """Component (n,) of each node of a graph of edges (E, 2), numbered by lowest node.
 
-    graph = coo_array((np.ones(len(pairs), np.bool_), pairs.T), shape=(n, n))
-    return np.asarray(connected_components(graph, directed=False)[1], np.int64)
+    In each pass, whole components are joined to lower ones, until no edge leads to another. As fast
+    as scipy's function, whose import takes a third of a second.
+    """
+    lowest = np.arange(n)
+    tail, head = pairs.T
+    while len(tail):
+        tail, head = lowest[tail], lowest[head]
+        is_open = tail != head
+        tail, head = tail[is_open], head[is_open]
+        lowest[np.maximum(tail, head)] = np.minimum(tail, head)
+        while (lowest != (lower := lowest[lowest])).any():
+            lowest = lower
+    return np.asarray((np.cumsum(lowest == np.arange(n)) - 1)[lowest], np.int64)
 
 
 def _neighbours(number: Ints, sides: Ints) -> Ints:

@@ -15,7 +15,9 @@ from children import PATIENCE, child, descendants, named, until
 from command_line import Run, command, on_terminal, refused, succeeded
 from hapticdb.cli.session_page import tell_cost
 from hapticdb.cli.values import size_bytes
+from hapticdb.errors import UsageError
 from hapticdb.query.law import LawName
+from hapticdb.realtime import coupling, fork_server
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
 
@@ -162,6 +164,21 @@ def test_a_mistake_is_one_line_and_leaves_no_process(
 ) -> None:
     refused(run(*feel(*args)), *words)
     assert processes() == set()
+
+
+def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.MonkeyPatch) -> None:
+    done: list[str] = []
+
+    def refuse(*_: object) -> None:
+        done.append("options")
+        raise UsageError("enough is seen")
+
+    monkeypatch.setattr(fork_server, "prepare", lambda work, _: done.append(work))
+    monkeypatch.setattr(coupling, "rendering_of", refuse)
+    refused(run(*feel(*PLAY)), "enough is seen")
+    assert done == [
+        "hapticdb.realtime.loop:work", "hapticdb.realtime.fetching:fetch", "options"
+    ]  # fmt: skip
 
 
 def test_an_environment_or_a_tool_that_is_none_is_one_line(run: Run, scene: Path) -> None:

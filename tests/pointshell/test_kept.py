@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 import trimesh
 
+from hapticdb import user_cache
 from hapticdb.errors import FileError, UsageError
-from hapticdb.pointshell import kept
 from hapticdb.pointshell.kept import Tool, kept_tool, made_tool
 from hapticdb.pointshell.shell import PointShell
 from mesh_files import TRIANGLE, gltf
@@ -122,7 +122,7 @@ def test_an_edit_of_the_file_or_of_the_sources_makes_the_tool_anew(
     after = tool(file)
     assert is_read()
     assert not np.array_equal(before.shell.points, after.shell.points)
-    monkeypatch.setattr(kept, "sources_digest", lambda _: "edited")
+    monkeypatch.setattr(user_cache, "sources_digest", lambda _: "edited")
     tool(file)
     assert is_read()
     other = ball(file.with_suffix(".OBJ"))  # the bytes of the first one, elsewhere
@@ -207,7 +207,7 @@ def test_the_entries_that_were_used_last_stay(file: Path, monkeypatch: pytest.Mo
     (first,) = entries()
     tool(file, seed=1)
     (second,) = set(entries()) - {first}
-    monkeypatch.setattr(kept, "MOST_BYTES", 2 * first.stat().st_size + 100)
+    monkeypatch.setattr(user_cache, "MOST_BYTES", 2 * first.stat().st_size + 100)
     for entry, age in ((first, 200), (second, 100)):
         os.utime(entry, (0, age))
     tool(file)  # used now
@@ -215,7 +215,7 @@ def test_the_entries_that_were_used_last_stay(file: Path, monkeypatch: pytest.Mo
     assert first in entries()
     assert second not in entries()
     assert len(entries()) == 2
-    monkeypatch.setattr(kept, "MOST_BYTES", 100)
+    monkeypatch.setattr(user_cache, "MOST_BYTES", 100)
     tool(file, seed=4)  # too large to be kept
     assert len(entries()) == 2
 

@@ -1,8 +1,10 @@
 """Statement costs at a start: stored, measured on a near database, or all taken as equal."""
 
+import time
 from collections.abc import Iterator
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 from hapticdb import Environment
@@ -13,7 +15,7 @@ from hapticdb.resident.source import ASKED, FAR, costs_at_start
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Store
 from realtime.troubled import troubled
-from realtime.worlds import make, scatter
+from realtime.worlds import make, move, scatter
 
 MEASURED = CostModel(*range(1, 6))
 ELSEWHERE = "a machine without kept figures"
@@ -37,6 +39,7 @@ class Line:
 @pytest.fixture
 def env(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Environment]:
     monkeypatch.setattr(module, "machine_name", lambda: ELSEWHERE)
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     with make(tmp_path) as made:
         scatter(made, n_objects=1, n_voxels=500)
         yield made
@@ -55,13 +58,30 @@ def measured(monkeypatch: pytest.MonkeyPatch) -> list[Store]:
     return seen
 
 
+def write(env: Environment) -> None:
+    """Give the object another voxel: another revision."""
+    move(env.store, env.objects()[0].id, np.array([[1, 2, 3]]))
+
+
 def test_a_database_nearby_is_measured(env: Environment, measured: list[Store]) -> None:
     """One slow answer does not make it far."""
     line = Line(FAR / 2)
     assert costs_at_start(line.to(env), lambda: line.now) == MEASURED
+    write(env)
     readings = iter([0.0, *[1.0] * (2 * ASKED - 1)])
     assert costs_at_start(env.store, lambda: next(readings)) == MEASURED
     assert len(measured) == 2
+
+
+def test_a_measurement_is_kept_until_the_environment_is_written(
+    env: Environment, measured: list[Store]
+) -> None:
+    far = Line(10.0)
+    for n_measured in (1, 2):
+        assert costs_at_start(env.store, time.monotonic) == MEASURED
+        assert costs_at_start(far.to(env), lambda: far.now) == MEASURED
+        assert len(measured) == n_measured
+        write(env)
 
 
 def test_kept_figures_are_taken_and_nothing_is_measured(

@@ -1,18 +1,15 @@
 """Shells of tools' files, kept in the user's cache from one process to the next.
 
 Making the shell of the sample's wrench takes 0.9 s of processor time and a process that reads the
-file; reading a kept one takes 15 ms, most of them for the digests. An entry is named by a digest of
-all that shapes its shell: the file's bytes, the request, the sources of this package, and the
-versions of the libraries. It begins with a digest of its content, holds those of the files beside
-the tool's own, and is ignored if any of them differs.
+file; reading a kept one takes 16 ms, most of them for the digests. Its entry is named by the file's
+bytes, the request and the versions of the libraries. It holds digests of the files beside the
+tool's own, and is ignored if one of them differs.
 """
 
 import contextlib
 import hashlib
 import json
-import os
 import sys
-import tempfile
 import time
 from importlib.metadata import version
 from pathlib import Path
@@ -20,15 +17,11 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from hapticdb.kernels._cache import sources_digest
 from hapticdb.mesh.parse import is_tessellated
 from hapticdb.mesh.raw import beside
 from hapticdb.pointshell.shell import DEFAULT_POINTS, PointShell
+from hapticdb.user_cache import content_of, entry_of, keep
 
-MOST_BYTES = 256 << 20
-"""Most bytes of all entries together. Larger: more tools begin at once."""
-DIGEST_BYTES = 32
-"""Bytes of a SHA-256."""
 NUMBERS = 7
 """Numbers of a point in an entry: position, normal, inset."""
 KEPT = ("is_closed", "seed", "defects", "chord", "has_unit")
@@ -66,13 +59,11 @@ def _entry(path: Path, request: tuple[object, ...]) -> Path | None:
     suffix = path.suffix.lower()
     if suffix == ".npz" or not path.is_file():
         return None
-    libraries = ("numpy", "scipy", *(["cascadio"] if is_tessellated(path) else []))
-    sources = sources_digest(Path(__file__).parent.parent)
-    with contextlib.suppress(OSError, ImportError, RuntimeError):  # no home directory
-        known = (*request, suffix, sources, sys.byteorder, *map(version, libraries))
-        digest = hashlib.sha256(f"{known}\0{_digest(path)}".encode())
-        base = os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache"
-        return Path(base, "hapticdb", "shells", digest.hexdigest())
+    libraries = ["numpy", "scipy", "mapbox_earcut"]
+    libraries += ["cascadio"] if is_tessellated(path) else []
+    with contextlib.suppress(ImportError):  # an extra is missing
+        versions = [version(name) for name in libraries]
+        return entry_of("shells", request, suffix, _digest(path), versions, sys.byteorder)
     return None
 
 
@@ -86,21 +77,14 @@ def _digest(file: Path | None) -> str | None:
 
 
 def _read(entry: Path, file: Path) -> Tool | None:
-    """Tool that an entry holds; None if it is missing, damaged, another user's or not of now."""
-    try:
-        with entry.open("rb") as stream:
-            is_own = os.fstat(stream.fileno()).st_uid == os.geteuid()
-            digest, content = stream.read(DIGEST_BYTES), stream.read()
-    except OSError:
-        return None
-    if not is_own or hashlib.sha256(content).digest() != digest:
+    """Tool that an entry holds; None if there is none, or a file beside the tool's has changed."""
+    content = content_of(entry)
+    if content is None:
         return None
     line, _, numbers = content.partition(b"\n")
     head: dict[str, Any] = json.loads(line)
     if any(_digest(beside(file.parent, name)) != one for name, one in head["named"].items()):
         return None
-    with contextlib.suppress(OSError):  # what is used goes last
-        os.utime(entry)
     rows = np.frombuffer(numbers).reshape(-1, NUMBERS)
     shell = PointShell(
         rows[:, :3], rows[:, 3:6], np.array(head["center"]), link=str(file), inset=rows[:, 6],
@@ -110,7 +94,7 @@ def _read(entry: Path, file: Path) -> Tool | None:
 
 
 def _write(entry: Path, tool: Tool, began: float) -> None:
-    """Keep a tool, unless a file was written since `began`; nothing if the folder cannot be."""
+    """Keep a tool, unless one of its files was written since `began`."""
     shell = tool.shell
     file = Path(shell.link)
     files = {name: beside(file.parent, name) for name in shell.named}
@@ -120,28 +104,6 @@ def _write(entry: Path, tool: Tool, began: float) -> None:
         "named": {name: _digest(one) for name, one in files.items()},
     }
     rows = np.column_stack([shell.points, shell.normals, shell.inset])
-    content = json.dumps(head).encode() + b"\n" + rows.tobytes()
     with contextlib.suppress(OSError):
-        read = [file, *filter(None, files.values())]
-        if len(content) > MOST_BYTES or max(one.stat().st_ctime for one in read) >= began:
-            return
-        entry.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        number, unfinished = tempfile.mkstemp(dir=entry.parent)
-        try:
-            with os.fdopen(number, "wb") as stream:
-                stream.write(hashlib.sha256(content).digest() + content)
-            Path(unfinished).replace(entry)
-        finally:
-            Path(unfinished).unlink(missing_ok=True)
-        _make_room(entry.parent)
-
-
-def _make_room(folder: Path) -> None:
-    """Remove the entries that were not used for the longest time, down to `MOST_BYTES`."""
-    found = sorted((one.stat().st_mtime, one.stat().st_size, one) for one in folder.iterdir())
-    left = sum(size for _, size, _ in found)
-    for _, size, one in found:
-        if left <= MOST_BYTES:
-            break
-        one.unlink()
-        left -= size
+        if max(one.stat().st_ctime for one in [file, *filter(None, files.values())]) < began:
+            keep(entry, json.dumps(head).encode() + b"\n" + rows.tobytes())

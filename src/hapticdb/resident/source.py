@@ -1,6 +1,8 @@
 """Cells of an environment, read from its store into slots of a cell table."""
 
+import json
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
@@ -22,6 +24,8 @@ from hapticdb.store.base import (
     Store,
     row_shift,
 )
+from hapticdb.store.urls import scheme_of
+from hapticdb.user_cache import content_of, entry_of, keep
 
 ROWS_AT_ONCE = 1024
 """Rows whose distances are unpacked together, into a megabyte. A larger value makes fewer calls; a
@@ -128,6 +132,7 @@ def costs_at_start(
 ) -> CostModel:
     """Cost model from the figures that the store keeps for this machine, or else from measurement.
 
+    A measurement takes 0.4 s, and is kept in the user's cache for the environment as it is now.
     clock : returns seconds, to time a round trip; may_measure : whether there is time for a
     measurement, and a row to measure. If not, or if a round trip takes longer than `FAR`, all parts
     cost the same: results are equal, ranges less efficient.
@@ -135,9 +140,17 @@ def costs_at_start(
     kept = store.costs(machine_name())
     if kept:
         return CostModel.from_figures(kept)
-    if may_measure and _round_trip(store, clock) <= FAR:
-        return calibrate(store)
-    return CostModel.of_equal_parts()
+    where = store.url if scheme_of(store.url) else Path(store.url).absolute()
+    entry = entry_of("costs", str(where), store.revision(), machine_name())
+    content = None if entry is None else content_of(entry)
+    if content is not None:
+        return CostModel.from_figures(json.loads(content))
+    if not may_measure or _round_trip(store, clock) > FAR:
+        return CostModel.of_equal_parts()
+    costs = calibrate(store)
+    if entry is not None:
+        keep(entry, json.dumps(costs.figures()).encode())
+    return costs
 
 
 def _round_trip(store: Store, clock: Callable[[], float]) -> float:

@@ -18,6 +18,7 @@ import page_tables
 import records
 import scale
 import visits
+import warm
 from feel.measures import MEASURES
 from hapticdb import GridOptions, ImportOptions, PointShell
 from hapticdb.poses import read_poses
@@ -120,3 +121,9 @@ def test_the_feel_has_every_measure_and_curve(tmp_path: Path, sample: SampleFile
     assert page_tables.tables()["walls"](found).count("\n") == 3
     feeling.plot(curves, tmp_path / "feel.svg")
     assert {(c["curve"], c["law"]) for c in curves} == {one[:2] for one in feeling.PANELS}
+
+
+def test_every_warm_verb_is_timed(tmp_path: Path) -> None:
+    cells = warm.measure(tmp_path, {"this": records.ROOT}, 1)
+    assert [cell["verb"] for cell in cells] == [*warm.VERBS]
+    assert all(cell["cpu_s"] > 0.0 for cell in cells)

@@ -115,6 +115,15 @@ def first_start(results: Results) -> str:
     )
 
 
+def warm(results: Results) -> str:
+    """Processor time of verbs once all is compiled and the tool is kept."""
+    return "\n".join(
+        f"- `{cell['verb']}`: {cell['cpu_s']:.2f} s of processor time."
+        for cell in cells_of(results, "warm")
+        if cell["side"] == "this"
+    )
+
+
 def grouping(results: Results) -> str:
     """Time of CBGroup alone by the number of keys, and its fit."""
     cells = cells_of(results, "grouping")
@@ -282,6 +291,7 @@ EVALUATION: dict[str, Callable[[Results], str]] = {
     "speed": speed,
     "costs": costs,
     "first-start": first_start,
+    "warm": warm,
     "growth": growth,
     "scale-growth": scale_growth,
     "evaluation-conditions": lambda results: facts(results["figure9"], "load"),

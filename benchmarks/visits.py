@@ -32,7 +32,9 @@ def measure(url: Path, name: str, budget: Budget) -> list[Cell]:
             again = subject.alternative(task, "auto", law=law, visit="again")
             for pose in task.poses:
                 again.frame(pose), first.frame(pose)
-            first.before = query.query._memory.clear  # noqa: SLF001 - no user drops it
+            memory = query.query._memory  # noqa: SLF001 - no user drops it
+            assert memory is not None
+            first.before = memory.clear
             cells += in_turns([*read, first, again], task.poses, limit_s=4 * budget.cell_s)
     return cells
 

@@ -123,16 +123,20 @@ class DistancesContract(StoreCase):
         assert band.count(*EVERYWHERE) == len(band.scan(*EVERYWHERE)) == len(self.rows(band, 2))
 
     def test_figure_3_finds_the_voxels_alone(self, band: Store) -> None:
-        """At each voxel of a box around the objects, where most bricks of an object hold none."""
-        voxels = np.argwhere(np.ones((36, 32, 32))) + np.array([4, 8, 8])
+        """At voxels of a box around the objects, where most bricks of an object hold none."""
+        box = np.argwhere(np.ones((36, 32, 32))) + np.array([4, 8, 8])
+        voxels = np.random.default_rng(0).choice(box, 800, replace=False)
         order = Grid(1.0, (0, 0, 0), 3).encode(voxels & 7)
         addresses = (band.grid.encode(voxels) >> 9 << 9) | order
         frame = LocatedShell(np.zeros((len(voxels) + 1, 6)), addresses, 1.0, NO_KEYS)
         ordinals, ids = band.statement_hits(frame)
         found = {(*voxels[n].tolist(), i) for n, i in zip(ordinals, ids.tolist(), strict=True)}
-        assert len(found) == len(ids)
+        assert len(found) == len(ids) > 50
         assert found == {
-            (*voxel, i) for i, place in PLACES.items() for voxel in blob(i, place).tolist()
+            (*voxel, i)
+            for i, place in PLACES.items()
+            for voxel in blob(i, place).tolist()
+            if voxel in voxels.tolist()
         }
 
     def test_nothing_asked_has_no_distances(self, band: Store) -> None:

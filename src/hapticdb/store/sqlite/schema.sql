@@ -22,7 +22,7 @@ CREATE TABLE environment (
   bits            INTEGER NOT NULL,  -- for each axis, 1 to 21: 2^bits voxels
   curve           TEXT NOT NULL,     -- order of the keys: z, hilbert or lexicographic
   layout          TEXT NOT NULL,     -- voxel or brick: the table of rows
-  wants_distances INTEGER NOT NULL CHECK (wants_distances IN (0, 1))  -- of new objects
+  wants_distances INTEGER NOT NULL CHECK (wants_distances IN (0, 1))  -- whether parts get some
 ) STRICT;
 
 -- ## object: a part at its place

@@ -19,7 +19,8 @@ from hapticdb.store.base import Keys, Layout, LocatedShell, row_shift
 
 TEST: dict[Layout, str] = {
     "voxel": "z_val = shell.value",
-    "brick": "z_val = shell.value >> 9 AND has_voxel(occupancy, shell.value & 511)",
+    "brick": "z_val = shell.value >> 9"
+    " AND occupancy IS NOT NULL AND has_voxel(occupancy, shell.value & 511)",
 }
 """The condition of the statements on a row."""
 WRENCH: dict[Layout, str] = {
@@ -55,13 +56,12 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
     def force() -> _Force:
         return _Force(grid, layout)
 
-    def has_voxel(occupancy: bytes | None, voxel: int) -> int:
-        if occupancy is None:
-            return 0
+    def has_voxel(occupancy: bytes, voxel: int) -> int:
         try:
-            mask, byte = int.from_bytes(occupancy[:8], "little"), voxel >> 3
-            at = 8 + (mask & ((1 << byte) - 1)).bit_count()
-            return occupancy[at] >> (voxel & 7) & 1 if mask >> byte & 1 else 0
+            if not occupancy[voxel >> 6] >> (voxel >> 3 & 7) & 1:
+                return 0
+            before = int.from_bytes(occupancy[:8], "little") & ((1 << (voxel >> 3)) - 1)
+            return occupancy[8 + before.bit_count()] >> (voxel & 7) & 1
         except (TypeError, IndexError) as error:
             cause = "a brick of the wrong length"
             raise parsing.damaged(connection.filename, cause) from error

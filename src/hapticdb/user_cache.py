@@ -1,6 +1,6 @@
 """The user's cache: what takes long to make, and is named by a digest of all that shapes it.
 
-Each process may do without: what is missing, damaged, another user's, or of other sources is made
+It lies beside the machine code of kernels. What is missing, damaged or of other sources is made
 anew.
 """
 
@@ -10,7 +10,7 @@ import os
 import tempfile
 from pathlib import Path
 
-from hapticdb.kernels._cache import sources_digest
+from hapticdb.kernels._cache import cache_folder, sources_digest
 
 MOST_BYTES = 256 << 20
 """Most bytes of all entries of a kind. Larger: more of them are found again."""
@@ -18,28 +18,20 @@ DIGEST_BYTES = 32
 """Bytes of a SHA-256, with which an entry begins."""
 
 
-def entry_of(kind: str, *shaping: object) -> Path | None:
-    """File of an entry that these values, and the sources of this package, shape.
-
-    Below XDG_CACHE_HOME or ~/.cache; None without a home directory.
-    """
-    try:
-        base = Path(os.environ.get("XDG_CACHE_HOME") or Path.home() / ".cache")
-        known = repr((sources_digest(Path(__file__).parent), *shaping))
-    except (OSError, RuntimeError):
-        return None
-    return base / "hapticdb" / kind / hashlib.sha256(known.encode(errors="replace")).hexdigest()
+def entry_of(kind: str, *shaping: object) -> Path:
+    """File of an entry that these values, and the sources of this package, shape."""
+    known = repr((sources_digest(Path(__file__).parent), *shaping))
+    return cache_folder() / kind / hashlib.sha256(known.encode(errors="replace")).hexdigest()
 
 
 def content_of(entry: Path) -> bytes | None:
-    """Content of an entry; None if it is missing, damaged or another user's."""
+    """Content of an entry; None if it is missing or damaged."""
     try:
         with entry.open("rb") as stream:
-            is_own = os.fstat(stream.fileno()).st_uid == os.geteuid()
             digest, content = stream.read(DIGEST_BYTES), stream.read()
     except OSError:
         return None
-    if not is_own or hashlib.sha256(content).digest() != digest:
+    if hashlib.sha256(content).digest() != digest:
         return None
     with contextlib.suppress(OSError):  # what is used goes last
         os.utime(entry)
@@ -51,7 +43,7 @@ def keep(entry: Path, content: bytes) -> None:
     if len(content) > MOST_BYTES:
         return
     with contextlib.suppress(OSError):
-        entry.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
+        entry.parent.mkdir(exist_ok=True)
         number, unfinished = tempfile.mkstemp(dir=entry.parent)
         try:
             with os.fdopen(number, "wb") as stream:

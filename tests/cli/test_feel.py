@@ -173,7 +173,7 @@ def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.Mo
         done.append("options")
         raise UsageError("enough is seen")
 
-    monkeypatch.setattr(fork_server, "prepare", lambda work, _: done.append(work))
+    monkeypatch.setattr(fork_server, "prepare", lambda work, **_: done.append(work))
     monkeypatch.setattr(coupling, "rendering_of", refuse)
     refused(run(*feel(*PLAY)), "enough is seen")
     assert done == [

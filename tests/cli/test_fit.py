@@ -1,6 +1,7 @@
 """Fit under the distance law: tools drawn inward, and the clearance that is told from contact."""
 
 import json
+import os
 import sys
 from pathlib import Path
 
@@ -11,7 +12,6 @@ import hapticdb
 from bands import band_rows
 from children import finished
 from command_line import Run, command, poses, succeeded, tool
-from hapticdb.kernels._cache import LENT, cache_folder
 from hapticdb.kernels.field.packing import pack
 from hapticdb.store.base import Band, Rows
 from voxels import voxel_object
@@ -91,12 +91,10 @@ def test_a_tool_that_is_felt_is_drawn_in_unless_it_is_conservative(run: Run, flo
         assert json.loads(out)["shell"]["inset"] == {"least": inset, "greatest": inset}
 
 
-def test_a_tool_that_is_kept_is_told_of_alike_and_loads_no_scipy(
-    floor: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setenv("XDG_CACHE_HOME", str(floor.parent / "cache"))
-    monkeypatch.setenv(LENT, str(cache_folder()))
-    tool(floor.with_name("tool.stl"), is_open=True)
+def test_a_tool_that_is_kept_is_told_of_alike_and_loads_no_scipy(floor: Path) -> None:
+    cube = tool(floor.with_name("tool.stl"), is_open=True)
+    comment = os.urandom(40).hex().encode()  # so that it is not kept yet
+    cube.write_bytes(comment + cube.read_bytes()[80:])
     args = ("touch", floor, "--tool", "tool.stl", "--poses", "path.csv", "--json")
     line = [sys.executable, "-X", "importtime", *command(*args)[1:]]
     results = [finished(line, check=True) for _ in range(2)]

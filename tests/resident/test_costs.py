@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hapticdb import Environment
+from hapticdb import Environment, user_cache
 from hapticdb.paper.cost_model import CostModel
 from hapticdb.resident import source as module
 from hapticdb.resident.residency import Residency
@@ -39,7 +39,7 @@ class Line:
 @pytest.fixture
 def env(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Environment]:
     monkeypatch.setattr(module, "machine_name", lambda: ELSEWHERE)
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+    monkeypatch.setattr(user_cache, "cache_folder", lambda: tmp_path)
     with make(tmp_path) as made:
         scatter(made, n_objects=1, n_voxels=500)
         yield made

@@ -61,7 +61,7 @@ def _entry(path: Path, request: tuple[object, ...]) -> Path | None:
         return None
     libraries = ["numpy", "scipy", "mapbox_earcut"]
     libraries += ["cascadio"] if is_tessellated(path) else []
-    with contextlib.suppress(ImportError):  # an extra is missing
+    with contextlib.suppress(ImportError, RuntimeError):  # an extra is missing; nobody's home
         versions = [version(name) for name in libraries]
         return entry_of("shells", request, suffix, _digest(path), versions, sys.byteorder)
     return None

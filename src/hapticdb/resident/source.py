@@ -142,14 +142,12 @@ def costs_at_start(
         return CostModel.from_figures(kept)
     where = store.url if scheme_of(store.url) else Path(store.url).absolute()
     entry = entry_of("costs", str(where), store.revision(), machine_name())
-    content = None if entry is None else content_of(entry)
-    if content is not None:
+    if (content := content_of(entry)) is not None:
         return CostModel.from_figures(json.loads(content))
     if not may_measure or _round_trip(store, clock) > FAR:
         return CostModel.of_equal_parts()
     costs = calibrate(store)
-    if entry is not None:
-        keep(entry, json.dumps(costs.figures()).encode())
+    keep(entry, json.dumps(costs.figures()).encode())
     return costs
 
 

@@ -1,6 +1,7 @@
 """Compiled kernels come from folders that nobody else can write into or replace."""
 
 import os
+import pwd
 import sys
 import tempfile
 from collections.abc import Callable
@@ -48,7 +49,7 @@ def test_a_folder_that_others_could_write_into_or_replace_is_not_used(
     assert first == folders / "home/cache/hapticdb"
     assert cache_folder() == first
     spoil({"hapticdb": first, "cache": first.parent, "home": folders / "home"}[which])
-    with pytest.warns(RuntimeWarning, match=f"not kept in {first}: .*{which} *"):
+    with pytest.warns(RuntimeWarning, match=f"nothing is kept in {first}: .*{which} *"):
         second = cache_folder()
     assert second.parent == folders / "temporary"
     spoil(second)
@@ -111,6 +112,15 @@ def test_a_process_without_a_folder_says_so_in_a_line_and_removes_its_own(folder
     assert own == started
     assert Path(own).parent == folders / "temporary"
     assert not Path(own).exists()
-    said = f"hapticdb: compiled kernels are not kept in {folders}/home/cache/hapticdb: others can"
+    said = f"hapticdb: nothing is kept in {folders}/home/cache/hapticdb: others can"
     assert done.stderr.startswith(said)
     assert done.stderr.count("\n") == 1
+
+
+def test_a_user_without_a_home_keeps_files_among_temporary_ones(
+    folders: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
+        monkeypatch.delenv(name, raising=False)
+    monkeypatch.setattr(pwd, "getpwuid", lambda _: {}["nobody"])
+    assert cache_folder() == folders / f"temporary/hapticdb-{os.geteuid()}"

@@ -1,4 +1,4 @@
-"""The folder in which machine code is kept between processes; found without loading numba.
+"""The folder in which machine code and tools are kept between processes; found without numba.
 
 Whoever can write into it has their code run by this process, and so has whoever can replace it or a
 folder above it.
@@ -39,21 +39,21 @@ def cache_folder() -> Path:
     if Path(lent).is_dir() and lent:
         return Path(lent)
     root = os.environ.get("NUMBA_CACHE_DIR") or os.environ.get("XDG_CACHE_HOME")
-    base = Path(root) if root else Path.home() / ".cache"
-    temporary = Path(tempfile.gettempdir())
-    for folder in (base / "hapticdb", temporary / f"hapticdb-{os.geteuid()}"):
+    temporary = Path(tempfile.gettempdir(), f"hapticdb-{os.geteuid()}")
+    for one in (Path(root or "~/.cache", "hapticdb"), temporary):
         try:
+            folder = one.expanduser()
             folder.mkdir(mode=0o700, parents=True, exist_ok=True)
             found = folder.resolve(strict=True)
             if (fault := _fault(found)) is not None:
                 warnings.warn(
-                    f"compiled kernels are not kept in {folder}: {fault}",
+                    f"nothing is kept in {folder}: {fault}",
                     RuntimeWarning,
                     stacklevel=2,
                 )
             elif os.access(found, os.W_OK):
                 return found
-        except (OSError, RuntimeError):  # a loop of links
+        except (OSError, RuntimeError):  # nobody's home, or a loop of links
             continue
     own = os.environ[LENT] = tempfile.mkdtemp(prefix="hapticdb-")
     atexit.register(_remove, own, os.getpid())
@@ -66,7 +66,7 @@ def _fault(folder: Path) -> str | None:
     Every folder above counts, up to the home directory or the root. In one with the sticky bit, as
     that of temporary files, nobody replaces what is another's.
     """
-    home = Path.home().resolve()
+    home = Path(os.path.expanduser("~")).resolve()  # noqa: PTH111 - no error without a home
     for each in (folder, *folder.parents):
         known = each.stat()
         if known.st_uid not in {0, os.geteuid()}:

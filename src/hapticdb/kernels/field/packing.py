@@ -53,16 +53,30 @@ FULL_MASK = np.uint64((1 << ROW_SIDE) - 1)
 """Mask of a line in which no residual is 0."""
 
 
+def _codes() -> NDArray[np.uint64]:
+    """Code and number of its bits (2, 256) of each residual modulo 256; 0 has none."""
+    codes = np.zeros((2, 256), np.uint64)
+    for residual in range(1, 256):
+        number = 2 * residual - 1 if residual <= 128 else 2 * (256 - residual)
+        n = number.bit_length() - 1
+        codes[:, residual] = n | (number - (1 << n)) << 3, n + 3
+    return codes
+
+
+CODES = _codes()
+
+
 @leaf
 def _put_bits(out, at, held, n_held, value, n):
-    """Append the n bits of value to the bits held; whole bytes go to out from place `at` on."""
+    """Append the n bits of value to the bits held; 32 of them go to out from place `at` on."""
     held |= value << n_held
     n_held += n
-    while n_held >= 8:
-        out[at] = held & 255
-        at += 1
-        held >>= 8
-        n_held -= 8
+    if n_held >= np.uint64(32):
+        for _ in range(4):
+            out[at] = held & np.uint64(255)
+            held >>= np.uint64(8)
+            at += ONE
+        n_held -= np.uint64(32)
     return at, held, n_held
 
 
@@ -92,12 +106,12 @@ def _set_residuals(values, n, padded, residuals):
 
 @leaf
 def _set_masks(residuals, masks):
-    """Set the mask of each line, masks (100,) int64."""
+    """Set the mask of each line, masks (100,) uint64."""
     for line in range(LINES):
         at = _place_padded(line)
-        mask = np.int64(0)
+        mask = NONE
         for z in range(ROW_SIDE):
-            mask |= np.int64(residuals[at + z] != 0) << z
+            mask |= np.uint64(residuals[at + z] != 0) << np.uint64(z)
         masks[line] = mask
 
 
@@ -105,28 +119,23 @@ def _set_masks(residuals, masks):
 def _put_mask(out, at, held, n_held, mask, back, up):
     """Append a line's mask, given those of the plane before and of the line before."""
     if mask == back:
-        return _put_bits(out, at, held, n_held, np.int64(0), np.int64(1))
+        return _put_bits(out, at, held, n_held, NONE, ONE)
     if back == up:
-        return _put_bits(out, at, held, n_held, (mask << 1) | 1, np.int64(11))
+        return _put_bits(out, at, held, n_held, (mask << ONE) | ONE, np.uint64(11))
     if mask == up:
-        return _put_bits(out, at, held, n_held, np.int64(1), np.int64(2))
-    return _put_bits(out, at, held, n_held, (mask << 2) | 3, np.int64(12))
+        return _put_bits(out, at, held, n_held, ONE, np.uint64(2))
+    return _put_bits(out, at, held, n_held, (mask << np.uint64(2)) | np.uint64(3), np.uint64(12))
 
 
 @leaf
 def _put_residuals(out, at, held, n_held, residuals, line, mask):
     """Append the residuals of a line that its mask names."""
-    first, z = _place_padded(line), np.int64(0)
-    while mask >> z:
-        if (mask >> z) & 1:
-            residual = np.int64(residuals[first + z])
-            number = 2 * residual - 1 if residual <= 128 else 2 * (256 - residual)
-            n = np.int64(0)
-            while number >> (n + 1):
-                n += 1
-            code = n | ((number - (1 << n)) << 3)
-            at, held, n_held = _put_bits(out, at, held, n_held, code, n + 3)
-        z += 1
+    first = np.uint64(_place_padded(line))
+    while mask:
+        residual = residuals[first + np.uint64(lowest_bit(np.int64(mask)))]
+        mask &= mask - ONE
+        code, n = CODES[0, residual], CODES[1, residual]
+        at, held, n_held = _put_bits(out, at, held, n_held, code, n)
     return at, held, n_held
 
 
@@ -134,7 +143,7 @@ def _put_residuals(out, at, held, n_held, residuals, line, mask):
 def _is_like_before(masks, first):
     """Whether the masks of the plane from line `first` on are those of the plane before."""
     for line in range(first, first + ROW_SIDE):
-        if masks[line] != (masks[line - ROW_SIDE] if first else 0):
+        if masks[line] != (masks[line - ROW_SIDE] if first else NONE):
             return False
     return True
 
@@ -142,22 +151,23 @@ def _is_like_before(masks, first):
 @leaf
 def _pack_row(masks, residuals, out, at):
     """Write the packed bytes of a row to out from `at` on; return where they end."""
-    held, n_held = np.int64(0), np.int64(0)
+    held = n_held = NONE
     for first in range(0, LINES, ROW_SIDE):
         is_same = _is_like_before(masks, first)
-        at, held, n_held = _put_bits(out, at, held, n_held, np.int64(is_same), np.int64(1))
-        up = np.int64(0)
+        at, held, n_held = _put_bits(out, at, held, n_held, np.uint64(is_same), ONE)
+        up = NONE
         for line in range(first, first + ROW_SIDE):
             mask = masks[line]
             if not is_same:
-                back = masks[line - ROW_SIDE] if first else np.int64(0)
+                back = masks[line - ROW_SIDE] if first else NONE
                 at, held, n_held = _put_mask(out, at, held, n_held, mask, back, up)
             if mask:
                 at, held, n_held = _put_residuals(out, at, held, n_held, residuals, line, mask)
             up = mask
-    if n_held:
-        out[at] = held
-        at += 1
+    for _ in range(0, np.int64(n_held), 8):
+        out[at] = held & np.uint64(255)
+        held >>= np.uint64(8)
+        at += ONE
     return at
 
 
@@ -170,14 +180,14 @@ def pack_kernel(values, first, ends, out):
     """
     padded = np.full(PADDED**3, BEYOND, np.uint8)
     residuals = np.empty(PADDED**3, np.uint8)
-    masks = np.empty(LINES, np.int64)
-    at = np.int64(0)
+    masks = np.empty(LINES, np.uint64)
+    at = NONE
     for n in range(ends.shape[0]):
         _set_residuals(values, first + n, padded, residuals)
         _set_masks(residuals, masks)
         at = _pack_row(masks, residuals, out, at)
-        ends[n] = at
-    return at
+        ends[n] = np.int64(at)
+    return np.int64(at)
 
 
 @leaf

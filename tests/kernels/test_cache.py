@@ -6,6 +6,7 @@ import sys
 import tempfile
 from collections.abc import Callable
 from pathlib import Path
+from unittest.mock import MagicMock
 
 import pytest
 
@@ -122,5 +123,5 @@ def test_a_user_without_a_home_keeps_files_among_temporary_ones(
 ) -> None:
     for name in ("HOME", "XDG_CACHE_HOME", "NUMBA_CACHE_DIR"):
         monkeypatch.delenv(name, raising=False)
-    monkeypatch.setattr(pwd, "getpwuid", lambda _: {}["nobody"])
+    monkeypatch.setattr(pwd, "getpwuid", MagicMock(side_effect=KeyError))
     assert cache_folder() == folders / f"temporary/hapticdb-{os.geteuid()}"

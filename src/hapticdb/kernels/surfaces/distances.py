@@ -282,14 +282,12 @@ def _segment_square(x, y, z, u, v, w, inverse):
 
 @inlined
 def cover(squares, spans, line, first, end):
-    """Let a line's span hold the centres first..end, new ones at `NOTHING`."""
+    """Let a line's span hold the centres first..end; all of a new line begin at `NOTHING`."""
     low, high = spans[line, 0], spans[line, 1]
     if low >= high:
-        low = high = first
-    for k in range(first, low):
-        squares[line * SIDE + k] = NOTHING
-    for k in range(high, end):
-        squares[line * SIDE + k] = NOTHING
+        for k in range(np.uint64(line * SIDE), np.uint64((line + 1) * SIDE)):
+            squares[k] = NOTHING
+        low, high = first, end
     spans[line, 0] = min(low, first)
     spans[line, 1] = max(high, end)
 
@@ -325,19 +323,20 @@ def _enter_line(shape, kind, squares, at, x, y, base_z, first, end):
     across = across_x * across_x + across_y * across_y
     height_here = sides[0, AT_X] * u + sides[0, AT_Y] * v
     low_z, high_z, corner_z, slope_z = box[0, 2], box[1, 2], corners[0, 2], sides[0, AT_Z]
-    for k in range(first, end):
-        z = base_z + k
+    z = base_z + first - 1.0
+    for here in range(np.uint64(at + first), np.uint64(at + end)):
+        z += 1.0
         w = z - corner_z
         along = gap(z, low_z, high_z)
         square = across + along * along
         if kind == FACE:
             height = height_here + slope_z * w
             square = max(square, height * height)
-        if square < squares[at + k]:
+        if square < squares[here]:
             if kind != POINT:
                 near = _edge_square(sides, edges, kind == LINE, x, y, z, u, v, w)
                 square = max(square, near)
-            squares[at + k] = min(squares[at + k], square)
+            squares[here] = min(squares[here], square)
 
 
 @leaf
@@ -365,27 +364,38 @@ def enter(shape, kind, block, i, j, k):
                 _enter_line(shape, kind, squares, line * SIDE, x, y, z0, first_z, end_z)
 
 
+@inlined
+def _brick_at(centre):
+    """Place in its block, on an axis, of the last brick whose row has begun at a centre."""
+    return min(max(centre, 0) // BRICK, BLOCK // BRICK - 1)
+
+
 @leaf
-def _quantise(block):
-    """Set the steps of a block from its squared distances."""
+def _quantise(block, reached):
+    """Set the steps of a block from its squared distances, and which bricks' rows meet a span.
+
+    reached (8, 8) int64: bit k of item (i, j) for the brick at (i, j, k).
+    """
     squares, spans, steps = block
     for n in range(steps.shape[0]):
         steps[n] = BEYOND
-    for line in range(SIDE * SIDE):
-        for here in range(line * SIDE + spans[line, 0], line * SIDE + spans[line, 1]):
-            if squares[here] < NOTHING:
-                steps[here] = step_of(np.sqrt(squares[here]))
-
-
-@leaf
-def _has_span(spans, i, j, k):
-    """Whether a row that begins at centre (i, j, k) of a block meets a line's span."""
-    for x in range(i, i + ROW_SIDE):
-        for y in range(j, j + ROW_SIDE):
+    for x in range(reached.shape[0]):
+        for y in range(reached.shape[1]):
+            reached[x, y] = 0
+    for x in range(SIDE):
+        for y in range(SIDE):
             line = x * SIDE + y
-            if spans[line, 0] < k + ROW_SIDE and spans[line, 1] > k:
-                return True
-    return False
+            low, high = spans[line, 0], spans[line, 1]
+            if low >= high:
+                continue
+            for here in range(np.uint64(line * SIDE + low), np.uint64(line * SIDE + high)):
+                if squares[here] < NOTHING:
+                    steps[here] = step_of(np.sqrt(squares[here]))
+            # a row goes on for two centres beyond the first one of the next
+            bits = (2 << _brick_at(high - 1)) - (1 << _brick_at(low - 2))
+            for i in range(_brick_at(x - 2), _brick_at(x) + 1):
+                for j in range(_brick_at(y - 2), _brick_at(y) + 1):
+                    reached[i, j] |= bits
 
 
 @leaf
@@ -397,9 +407,9 @@ def _copy_row(steps, i, j, k, out, n):
     least = np.int64(BEYOND)
     for x in range(ROW_SIDE):
         for y in range(ROW_SIDE):
-            here = ((i + x) * SIDE + j + y) * SIDE + k
-            to = (x * ROW_SIDE + y) * ROW_SIDE
-            for z in range(ROW_SIDE):
+            here = np.uint64(((i + x) * SIDE + j + y) * SIDE + k)
+            to = np.uint64((x * ROW_SIDE + y) * ROW_SIDE)
+            for z in range(np.uint64(ROW_SIDE)):
                 step = steps[here + z]
                 out[n, to + z] = step
                 least = min(least, np.int64(step))
@@ -416,6 +426,7 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
     """
     shape = _Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     bricks = np.int64(1) << max(bits - 3, 0)
+    reached = np.empty((BLOCK // BRICK, BLOCK // BRICK), np.int64)
     n_rows = 0
     end = at[0] + PAIRS_OF_PIECE
     while at[0] < pairs.shape[0] and n_rows + BLOCK_BRICKS <= out.shape[0]:
@@ -430,14 +441,15 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
             kind = _set_shape(triangles, pairs[at[0], 1], shape, 0.0)
             enter(shape, kind, block, i * BLOCK - 1, j * BLOCK - 1, k * BLOCK - 1)
             at[0] += 1
-        _quantise(block)
+        _quantise(block, reached)
         for brick in range(BLOCK_BRICKS):
             place = np.int64(brick)
             x, y, z = compact(place >> 2), compact(place >> 1), compact(place)
             if max((i << BLOCK_BITS) + x, (j << BLOCK_BITS) + y, (k << BLOCK_BITS) + z) >= bricks:
                 continue
-            x, y, z = x * BRICK, y * BRICK, z * BRICK
-            if _has_span(block.spans, x, y, z) and _copy_row(block.steps, x, y, z, out, n_rows):
+            if not (reached[x, y] >> z) & 1:
+                continue
+            if _copy_row(block.steps, x * BRICK, y * BRICK, z * BRICK, out, n_rows):
                 keys[n_rows] = (key << (3 * BLOCK_BITS)) | brick
                 n_rows += 1
     return n_rows

@@ -3,13 +3,14 @@
 import contextlib
 import gc
 import os
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from children import exit_code
+from children import child, exit_code
 from hapticdb import Environment, PointShell
 from hapticdb.errors import FileError, HapticDBError, UsageError
 from hapticdb.realtime import resident_cells
@@ -168,3 +169,32 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
     monkeypatch.setattr(place, "START_PATIENCE", 0.0)
     with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
         Session(voxel_floor.url, sphere, still(0.03), law="plane")
+
+
+STARTER = """
+import sys
+sys.path[:0] = sys.argv[3:]
+import hapticdb
+from hapticdb.realtime.session import Session
+from realtime.hands import still
+points = hapticdb.PointShell.load(sys.argv[2])
+with Session(sys.argv[1], points, still(0.010), law="plane", rate=100.0) as session:
+    session.wait(0.2)
+    print(session.pid, session.cells.pid, flush=True)
+    session.wait(600.0)
+"""
+
+
+@pytest.mark.long
+def test_processes_end_with_the_one_that_started_them(
+    voxel_floor: Environment, sphere: PointShell, tmp_path: Path
+) -> None:
+    sphere.save(tmp_path / "sphere.npz")
+    args = [sys.executable, "-c", STARTER, voxel_floor.url, str(tmp_path / "sphere.npz"), *sys.path]
+    with child(args, stderr=None) as starter:
+        assert starter.stdout is not None
+        pids = list(map(int, starter.stdout.readline().split()))
+        assert len(pids) == 2
+        assert all(map(is_alive, pids))
+        starter.kill()
+    until(lambda: not any(map(is_alive, pids)))

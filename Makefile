@@ -95,10 +95,15 @@ pins:
 	mv .venv-pins/user.txt .venv-pins/dev.txt requirements/
 	rm -rf .venv-pins
 
+# kernels are compiled beside the rest of the installation; Python compiles a module when it is first imported
 $(USER): requirements/user.txt pyproject.toml
 	$(PYTHON) -m venv .venv
-	$(PIP) --requirement requirements/user.txt
-	$(PIP) --no-deps --editable .
+	grep -E "^(llvmlite|numba|numpy)==" requirements/user.txt > .venv/kernels.txt
+	$(PIP) --no-compile --requirement .venv/kernels.txt
+	PYTHONPATH=src $(BIN)/python -c "from hapticdb.kernels._sets import fitting_set; fitting_set('frames')" & \
+	$(PIP) --no-compile --requirement requirements/user.txt && \
+	$(PIP) --no-compile --constraint requirements/dev.txt hatchling editables && \
+	$(PIP) --no-deps --no-build-isolation --editable . && wait
 	touch $(USER)
 
 $(READY): requirements/dev.txt $(USER)

@@ -12,12 +12,15 @@ FOLDER = "src/hapticdb/kernels/_machine"
 CODE = """
 import shutil
 from hapticdb.kernels import _building, _machine_code, _sets
-own = _sets.own_set()
 shutil.rmtree(_sets.SHIPPED, ignore_errors=True)
-if _machine_code.manifest_of(own).get("for") == _machine_code.built_for():
-    shutil.copytree(own, _sets.SHIPPED)
-else:
-    _building.build_set(_sets.SHIPPED)
+for group in _machine_code.GROUPS:
+    own = _sets.own_set(group)
+    if _machine_code.manifest_of(own).get("for") == _machine_code.built_for():
+        shutil.copytree(own, _sets.SHIPPED / group)
+    else:
+        _building.build_set(_sets.SHIPPED / group, group)
+for lock in _sets.SHIPPED.glob("*.lock"):
+    lock.unlink()
 """
 
 
@@ -42,4 +45,4 @@ class KernelHook(BuildHookInterface):  # type: ignore[type-arg]
             return
         build_data["pure_python"] = False
         build_data["infer_tag"] = True
-        build_data["artifacts"].append(f"{FOLDER}/*")
+        build_data["artifacts"].append(f"{FOLDER}/**")

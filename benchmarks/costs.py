@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 
 import hapticdb
 from hapticdb import GridOptions, ImportOptions
+from hapticdb.kernels._machine_code import GROUPS
 from hapticdb.kernels._sets import fitting_set
 from hapticdb.mesh import read_file
 from hapticdb.sample import SampleFiles
@@ -88,10 +89,13 @@ def measured(folder: Path, model: Model, bits: int) -> dict[str, Any]:
 def first_start(folder: Path, sample: SampleFiles) -> list[dict[str, Any]]:
     """Seconds of first commands of a new copy as a wheel has it, and of the same commands again."""
     places = {"car": sample.car, "tool": sample.wrench, "path": sample.path}
-    shutil.copytree(PACKAGE, folder / "hapticdb", ignore=shutil.ignore_patterns("__pycache__"))
-    fitting = fitting_set()
-    assert fitting is not None
-    shutil.copytree(fitting[0], folder / "hapticdb/kernels/_machine", dirs_exist_ok=True)
+    shutil.copytree(
+        PACKAGE, folder / "hapticdb", ignore=shutil.ignore_patterns("__pycache__", "_machine")
+    )
+    for group in GROUPS:
+        fitting = fitting_set(group)
+        assert fitting is not None
+        shutil.copytree(fitting[0], folder / "hapticdb/kernels/_machine" / group)
     variables = os.environ | {"NUMBA_CACHE_DIR": str(folder / "cache"), "PYTHONPATH": str(folder)}
     cells = []
     for name, words in FIRST.items():

@@ -16,7 +16,7 @@ import draws
 from banded import write_points
 from command_line import made, run, scene  # noqa: F401 - fixtures
 from hapticdb import Environment, PointShell
-from hapticdb.kernels import _sets
+from hapticdb.kernels import _machine_code, _sets
 from hapticdb.pointshell.shell import fibonacci_sphere
 from realtime.sessions import floor_points, floored
 from realtime.worlds import make
@@ -40,7 +40,8 @@ def pytest_configure(config: pytest.Config) -> None:
     of_a_worker: dict[str, str] | None = getattr(config, "workerinput", None)
     if of_a_worker is None:  # once, before the processes that run tests start
         children.begin_run()
-        _sets.fitting_set()
+        for group in _machine_code.GROUPS:
+            _sets.fitting_set(group)
     else:
         children.begin_run(Path(of_a_worker["shared"]))
 

@@ -35,7 +35,7 @@ class Folders(NamedTuple):
 
     @property
     def own(self) -> Path:
-        return self.cache / f"kernels-{_machine_code.build()}"
+        return self.cache / f"kernels-{_machine_code.build()}-frames"
 
 
 def write_set(folder: Path, **other: str) -> None:
@@ -49,8 +49,8 @@ def write_set(folder: Path, **other: str) -> None:
 
 @pytest.fixture
 def folders(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Folders]:
-    found = Folders(tmp_path / "_machine", tmp_path / "cache")
-    monkeypatch.setattr(_sets, "SHIPPED", found.shipped)
+    found = Folders(tmp_path / "_machine/frames", tmp_path / "cache")
+    monkeypatch.setattr(_sets, "SHIPPED", found.shipped.parent)
     monkeypatch.setattr(_sets, "cache_folder", lambda: found.cache)
     fitting_set.cache_clear()
     yield found
@@ -62,7 +62,8 @@ def built(monkeypatch: pytest.MonkeyPatch) -> list[Path]:
     """Folders whose sets were built, without compiling."""
     made: list[Path] = []
 
-    def build_set(folder: Path) -> None:
+    def build_set(folder: Path, group: str) -> None:
+        assert group == "frames"
         made.append(folder)
         write_set(folder)
 
@@ -109,7 +110,7 @@ def test_one_that_does_not_fit_is_built_once_and_a_line_says_why(
         assert code_of(ENTRY) == b"code"
     said = capsys.readouterr().err
     assert said.count("\n") == 1
-    assert "compiling kernels, once on this machine" in said
+    assert "compiling kernels (frames), once on this machine" in said
     assert f"({reason}" in said
     assert built == [folders.own]
 
@@ -166,7 +167,7 @@ def test_building_that_is_interrupted_ends_its_processes_and_leaves_nothing(
 
     monkeypatch.setattr(subprocess, "Popen", remembered)
     with pytest.raises(KeyboardInterrupt):
-        fitting_set()
+        fitting_set("frames")
     assert started
     for pid in started:
         with pytest.raises(ProcessLookupError):
@@ -189,12 +190,12 @@ def test_a_copy_with_its_set_needs_no_cache_and_none_of_what_numba_compiles_with
 ) -> None:
     """As an installed wheel: else each process would start half a second later."""
     fitting_set.cache_clear()
-    found = fitting_set()
+    found = fitting_set("frames")
     assert found is not None
     package = tmp_path / "hapticdb"
     unwanted = shutil.ignore_patterns("__pycache__", "_machine")
     shutil.copytree(Path(_machine_code.__file__).parents[1], package, ignore=unwanted)
-    shutil.copytree(found[0], package / "kernels" / SHIPPED.name)
+    shutil.copytree(found[0], package / "kernels" / SHIPPED.name / "frames")
     env = os.environ | {"PYTHONPATH": str(tmp_path), "NUMBA_CACHE_DIR": str(tmp_path / "cache")}
     done = finished([sys.executable, "-c", LOADED], env=env, check=True)
     assert done.stdout.strip() == f"False {package}/kernels/rigid.py"

@@ -1,4 +1,4 @@
-"""All entries compiled side by side into a set (`_machine_code`): the build hook's work.
+"""Entries compiled side by side into a set (`_machine_code`): the build hook's work.
 
 numba compiles one function at a time in a process, with any number of threads. Each process takes
 whole modules, whose entries share leaves.
@@ -20,6 +20,7 @@ from hapticdb.kernels._machine_code import (
     BUILDING,
     built_for,
     digest_of,
+    group_of,
     level,
     manifest_of,
 )
@@ -31,14 +32,14 @@ LONGEST = (
 """Modules whose entries take longest to compile, which come first: 13 s to 2 s of 50."""
 PATIENCE = 1200.0
 """Seconds after which processes that compile are ended. Larger: a slower machine may compile."""
-MOST_SETS = 10
-"""Sets that are kept in a folder, the newest ones: 6 MB each."""
+MOST_SETS = 30
+"""Sets that are kept in a folder, the newest ones: 2 MB each."""
 SERVE = "from hapticdb.kernels._building import serve; serve()"
 """Python code that a compiling process runs."""
 
 
-def build_set(folder: Path) -> None:
-    """Compile all entries into a folder, which is there when it is complete, or not at all.
+def build_set(folder: Path, group: str) -> None:
+    """Compile all entries of a group into a folder, which is there as a whole or not at all.
 
     Raises OSError if that cannot be done here. A second process waits for the first one.
     """
@@ -49,7 +50,7 @@ def build_set(folder: Path) -> None:
             return
         made = Path(tempfile.mkdtemp(prefix=folder.name, dir=folder.parent))
         try:
-            _compile_into(made)
+            _compile_into(made, group)
             entries = {file.name: digest_of(file.read_bytes()) for file in made.iterdir()}
             manifest = json.dumps({"for": built_for(), "entries": entries}, indent=1)
             (made / "manifest.json").write_text(manifest)
@@ -62,23 +63,24 @@ def build_set(folder: Path) -> None:
             shutil.rmtree(old, ignore_errors=True)
 
 
-def _modules() -> list[str]:
-    """Modules that define entries, those of `LONGEST` first."""
+def _modules(group: str) -> list[str]:
+    """Modules that define entries of a group, those of `LONGEST` first."""
     folder = Path(__file__).parent
     found = {
         ".".join(source.relative_to(folder).with_suffix("").parts)
         for source in folder.rglob("[a-z]*.py")
         if re.search(r"^@entry\(", source.read_text(), re.MULTILINE)
     }
-    return [*LONGEST, *sorted(found.difference(LONGEST))]
+    ordered = [*LONGEST, *sorted(found.difference(LONGEST))]
+    return [module for module in ordered if group_of(module) == group]
 
 
-def _compile_into(folder: Path) -> None:
-    """Compile all entries in a process for each processor; OSError if one fails.
+def _compile_into(folder: Path, group: str) -> None:
+    """Compile all entries of a group in a process for each processor; OSError if one fails.
 
     They take the numbers of modules, a byte each, from one pipe.
     """
-    modules, known = _modules(), level()
+    modules, known = _modules(group), level()
     asked, ask = os.pipe()
     os.write(ask, bytes(range(len(modules))))
     os.close(ask)

@@ -1,7 +1,7 @@
 """What a set of machine code is built for.
 
-A set is a folder with a file for each entry and a manifest: for which sources, numba, Python and
-level of processors it was built, and a digest of each file.
+A set is a folder with a file for each entry of one group and a manifest: for which sources, numba,
+Python and level of processors it was built, and a digest of each file.
 """
 
 import hashlib
@@ -31,6 +31,18 @@ LEVELS = {"x86_64": ("x86-64-v3", V3), "aarch64": ("generic", "fp-armv8 neon")}
 More than x86-64-v3 gains nothing: a frame by the plane law takes 110.5 us with it and 110.3 with
 AVX-512, by the distance law 474 and 487.
 """
+
+
+GROUPS = "frames", "session", "triangles"
+"""Groups of entries that are built together: who only imports and touches waits for the first."""
+
+
+def group_of(entry: str) -> str:
+    """Group of an entry or a module, by its room: ``period.loop`` is of a session."""
+    room = entry.partition(".")[0]
+    if room == "triangles":
+        return room
+    return "session" if room in {"hand", "motion", "period", "resident"} else "frames"
 
 
 class Level(NamedTuple):

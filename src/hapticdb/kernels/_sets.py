@@ -1,8 +1,8 @@
-"""The set of machine code that fits here: it comes with the package, or is built on this machine.
+"""Sets of machine code that fit here: they come with the package, or are built on this machine.
 
-A wheel has one for processors of `_machine_code.LEVELS`. Where it does not fit, all entries are
-compiled once into the user's cache, and a line says why. A set is as trusted as the sources beside
-it, or as the cache's folder.
+A wheel has them for processors of `_machine_code.LEVELS`. Where they do not fit, all entries of a
+group are compiled once into the user's cache, and a line says why. A set is as trusted as the
+sources beside it, or as the cache's folder.
 """
 
 import sys
@@ -10,15 +10,15 @@ from functools import cache
 from pathlib import Path
 
 from hapticdb.kernels._cache import cache_folder
-from hapticdb.kernels._machine_code import build, built_for, digest_of, manifest_of
+from hapticdb.kernels._machine_code import build, built_for, digest_of, group_of, manifest_of
 
 SHIPPED = Path(__file__).with_name("_machine")
-"""Folder of the set that comes with the package."""
+"""Folder of the sets that come with the package, each under its group's name."""
 
 
 def code_of(entry: str) -> bytes | None:
     """Machine code of an entry, by its name in `_jit.SIGNATURES`; None if no set has it."""
-    found = fitting_set()
+    found = fitting_set(group_of(entry))
     if found is None:
         return None
     folder, entries = found
@@ -30,12 +30,12 @@ def code_of(entry: str) -> bytes | None:
 
 
 @cache
-def fitting_set() -> tuple[Path, dict[str, str]] | None:
-    """Folder of the set that fits here, and digests of its files; it is built if there is none.
+def fitting_set(group: str) -> tuple[Path, dict[str, str]] | None:
+    """Folder of the set of a group that fits here, and digests of its files, or else it is built.
 
     None if that fails: then each entry is compiled when it is first called.
     """
-    return _read(SHIPPED) or _read(own_set()) or _built()
+    return _read(SHIPPED / group) or _read(own_set(group)) or _built(group)
 
 
 def _read(folder: Path) -> tuple[Path, dict[str, str]] | None:
@@ -44,26 +44,26 @@ def _read(folder: Path) -> tuple[Path, dict[str, str]] | None:
     return (folder, manifest["entries"]) if manifest.get("for") == built_for() else None
 
 
-def _built() -> tuple[Path, dict[str, str]] | None:
+def _built(group: str) -> tuple[Path, dict[str, str]] | None:
     """The set of this machine, built now, with a line that says so."""
     from hapticdb.kernels import _building  # noqa: PLC0415 - where it is not needed, nobody waits
 
     sys.stderr.write(
-        "hapticdb: compiling kernels, once on this machine: about half a minute on two processors "
-        f"({_reason(manifest_of(SHIPPED).get('for'), built_for())})\n"
+        f"hapticdb: compiling kernels ({group}), once on this machine: about 10 s on two "
+        f"processors ({_reason(manifest_of(SHIPPED / group).get('for'), built_for())})\n"
     )
     sys.stderr.flush()
     try:
-        _building.build_set(own_set())
+        _building.build_set(own_set(group), group)
     except OSError as error:
         sys.stderr.write(f"hapticdb: each kernel is compiled when it is first called: {error}\n")
         return None
-    return _read(own_set())
+    return _read(own_set(group))
 
 
-def own_set() -> Path:
-    """Folder of the set that this machine builds."""
-    return cache_folder() / f"kernels-{build()}"
+def own_set(group: str) -> Path:
+    """Folder of the set of a group that this machine builds."""
+    return cache_folder() / f"kernels-{build()}-{group}"
 
 
 def _reason(found: dict[str, str] | None, wanted: dict[str, str]) -> str:

@@ -24,13 +24,13 @@ from hapticdb.sample import write_sample
 
 LONGEST_S = 600.0
 """Seconds after which a verb counts as hung."""
-IMPORT = ("import", "car.db", "car.glb", "--bits", "9", "--extent", "1.6")
+IMPORT = ("import", "car.db", "../car.glb", "--bits", "9", "--extent", "1.6")
 VERBS = {
     "info": ("info", "car.db"),
-    "touch": ("touch", "car.db", "--tool", "wrench.stl", "--poses", "path.csv"),
-    "sweep": ("sweep", "car.db", "--part", "body/hood", "--path", "up.csv"),
+    "touch": ("touch", "car.db", "--tool", "../wrench.stl", "--poses", "../path.csv"),
+    "sweep": ("sweep", "car.db", "--part", "body/hood", "--path", "../up.csv"),
     "feel": (
-        "feel", "car.db", "--tool", "wrench.stl", "--device", "path.csv", "--seconds", "0.2",
+        "feel", "car.db", "--tool", "../wrench.stl", "--device", "../path.csv", "--seconds", "0.2",
     ),
 }  # fmt: skip
 UP = "x,y,z,qw,qx,qy,qz\n0,0,0,1,0,0,0\n0,0,0.3,1,0,0,0\n"
@@ -65,13 +65,15 @@ def measure(folder: Path, sides: dict[str, Path], rounds: int) -> list[dict[str,
     """Medians of each verb on each side; a first, untimed run compiles and keeps."""
     write_sample(folder)
     (folder / "up.csv").write_text(UP)
-    timed(folder, next(iter(sides.values())), *IMPORT)
     cells = []
+    for side, checkout in sides.items():
+        (folder / side).mkdir()
+        timed(folder / side, checkout, *IMPORT)
     for name, words in VERBS.items():
-        for checkout in sides.values():
-            timed(folder, checkout, *words)
+        for side, checkout in sides.items():
+            timed(folder / side, checkout, *words)
         turns = [
-            {side: timed(folder, checkout, *words) for side, checkout in sides.items()}
+            {side: timed(folder / side, checkout, *words) for side, checkout in sides.items()}
             for _ in range(rounds)
         ]
         for side in sides:

@@ -109,7 +109,7 @@ def costs(results: Results) -> str:
 def first_start(results: Results) -> str:
     """Seconds of first commands, and of the same commands again."""
     return "\n".join(
-        f"- `{cell['command']}`: {cell['first_s']:.0f} s the first time, "
+        f"- `{cell['command']}`: {cell['first_s']:.1f} s the first time, "
         f"{cell['again_s']:.1f} s from then on."
         for cell in cells_of(results, "first_start")
     )

@@ -1,23 +1,16 @@
 """The tool that a file holds."""
 
 from collections.abc import Iterable
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
-from hapticdb.errors import FileError, UsageError
+from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
-
-
-def check_there(tool: str) -> None:
-    """Refuse a tool whose file is missing."""
-    if not Path(tool).exists():
-        raise FileError(f"cannot read {tool}: there is no such file")
 
 
 def tool_of(

@@ -17,7 +17,7 @@ SHIPPED = Path(__file__).with_name("_machine")
 
 
 def code_of(entry: str) -> bytes | None:
-    """Machine code of an entry, by its name in `_jit.SIGNATURES`; None if no set has it."""
+    """Machine code of an entry, by its name in `_jit.ENTRIES`; None if no set has it."""
     found = fitting_set(group_of(entry))
     if found is None:
         return None

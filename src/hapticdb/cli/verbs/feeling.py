@@ -30,7 +30,7 @@ from hapticdb.cli.options import (
     WhereOption,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import check_there, tool_of, warn_of_size
+from hapticdb.cli.tools import tool_of, warn_of_size
 from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
@@ -203,7 +203,6 @@ def feel(
     limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
     hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
     (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
-    check_there(tool)
     drawn_in = partial(_tool, tool, tool_unit, points, seed, device)
     felt, shell = _looked_at(url, where, exclude, drawn_in, law or "distance", not conservative)
     session_page.tell_cost(len(shell), rate, law or "distance", frames_on)

@@ -25,13 +25,13 @@ import scipy.spatial  # noqa: F401 - a quarter of a second that is no part of a 
 import hapticdb
 import records
 from hapticdb.clashes import run
-from hapticdb.clashes.judge import Judged, PlacedPair
-from hapticdb.clashes.shapes import Shapes
+from hapticdb.exact.clash import Judged, PlacedPair
+from hapticdb.exact.shapes import Shapes
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels._jit import load_entries
 from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.store.base import NO_ROWS
-from hapticdb.store.pairs import Kind
+from hapticdb.verdicts import Kind
 
 FILE = "assembly_vw_t1/vw_t1.glb"
 APART = 0.3
@@ -96,7 +96,7 @@ def distance(shapes: Shapes, pair: PlacedPair, within: float, contact: float) ->
         return None
     near = nearest(a.tree, b.tree, pair.pose[None], np.full(1, within))
     at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
-    kind: Kind = "apart" if np.isfinite(at_most) else "far"
+    kind = Kind.APART if np.isfinite(at_most) else Kind.FAR
     return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])
 
 

@@ -22,12 +22,12 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from batch_peers import tree_of_boxes
 from hapticdb import PointShell
+from hapticdb.exact.sweep import sweep
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.surfaces.sides import triangle_tree
 from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.mesh import read_file
-from hapticdb.sweeps.run import sweep
 
 if "CI" in os.environ:
     import coal

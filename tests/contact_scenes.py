@@ -12,10 +12,10 @@ from scipy.spatial.transform import Rotation
 import hapticdb
 from assemblies import write_obj
 from hapticdb import Environment, PointShell
-from hapticdb.clashes.judge import Judged, judge
+from hapticdb.exact.clash import Judged, judge
+from hapticdb.exact.sweep import sweep
+from hapticdb.exact.swept import Swept
 from hapticdb.pointshell.shape import CollisionShape
-from hapticdb.sweeps.result import Swept
-from hapticdb.sweeps.run import sweep
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]

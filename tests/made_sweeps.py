@@ -6,8 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb import Object
-from hapticdb.sweeps.result import Gap, PathPlace, Swept, TouchedObject
-from hapticdb.sweeps.way import Way
+from hapticdb.exact.path import Way
+from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 
 Floats = NDArray[np.float64]
 

@@ -38,6 +38,8 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment as Environment
     from hapticdb.environment import create as create
     from hapticdb.environment import open as open  # noqa: A004 - as in tarfile.open
+    from hapticdb.exact.sweep import sweep as sweep
+    from hapticdb.exact.swept import Swept as Swept
     from hapticdb.extraction.disassembly import Disassembly as Disassembly
     from hapticdb.extraction.disassembly import disassemble as disassemble
     from hapticdb.extraction.result import Extraction as Extraction
@@ -65,8 +67,6 @@ if TYPE_CHECKING:
     from hapticdb.recording.file import Recording as Recording
     from hapticdb.store.base import Object as Object
     from hapticdb.store.connect import backup_environment as backup_environment
-    from hapticdb.sweeps.result import Swept as Swept
-    from hapticdb.sweeps.run import sweep as sweep
     from hapticdb.transfer import CopyReport as CopyReport
     from hapticdb.transfer import copy_environment as copy_environment
 

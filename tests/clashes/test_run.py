@@ -27,6 +27,7 @@ from hapticdb.store.connect import grant
 from hapticdb.store.pairs import PairRow
 from hapticdb.store.postgres.address import parse
 from hapticdb.transfer import copy_environment
+from hapticdb.verdicts import Kind
 from servers import Place, roles, url_as
 
 MM = 1e-3
@@ -228,7 +229,7 @@ def test_only_what_is_near_a_change_is_read(path: Path, monkeypatch: pytest.Monk
 
 def test_what_another_writes_meanwhile_is_looked_at(path: Path) -> None:
     with hapticdb.open(path) as env, hapticdb.open(path) as other:
-        late = PairRow(1, 4, "touching", 0.0, 0.0, (0.0,) * 6, "same", 1, "of an older scene")
+        late = PairRow(1, 4, Kind.TOUCHING, 0.0, 0.0, (0.0,) * 6, "same", 1, "of an older scene")
         find_clashes(env, progress=lambda *_: other.store.put_pairs([late]) and None)
         assert told(find_clashes(env)) == {
             (1, 2, "touching", "same"), (2, 3, "touching", "same"), (3, 4, "touching", "same"),

@@ -13,7 +13,7 @@ from assemblies import write_obj
 from command_line import Run, poses, refused, succeeded
 from contact_scenes import box, imported, shell_of
 from hapticdb.cli.csv_files import SWEPT
-from hapticdb.sweeps import run as sweeping
+from hapticdb.exact import sweep as sweeping
 
 TOOL = ("--tool", "tool.stl")
 

@@ -13,14 +13,15 @@ from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoun
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.pairs import Mark, PairRow
+from hapticdb.verdicts import Kind
 from voxels import EVERYWHERE, blob, kind, voxel_object, write_voxels
 
 BALL, CONE = bytes(range(256)) * 40, b"\0cone"
 """Surfaces, made up: a store never unpacks them."""
 
 PLACE = (0.1, -0.2, 1 / 3, 0.1, -0.2, 0.5)
-FIRST = PairRow(1, 2, "apart", 0.1, 0.1 + 2**-50, PLACE, "new", 2, "a setting")
-SECOND = PairRow(1, 3, "overlapping", 1e-3, None, PLACE, "new", 2, "a setting")
+FIRST = PairRow(1, 2, Kind.APART, 0.1, 0.1 + 2**-50, PLACE, "new", 2, "a setting")
+SECOND = PairRow(1, 3, Kind.OVERLAPPING, 1e-3, None, PLACE, "new", 2, "a setting")
 
 
 def made_up(store: Store) -> set[str]:
@@ -233,7 +234,7 @@ class WritingContract(StoreCase):
         assert list(store.pairs()) == []
         store.put_pairs([SECOND, FIRST])
         assert list(store.pairs()) == [FIRST, SECOND]
-        changed = SECOND._replace(kind="touching", at_most=0.0, status="changed", revision=3)
+        changed = SECOND._replace(kind=Kind.TOUCHING, at_most=0.0, status="changed", revision=3)
         store.put_pairs([changed], [(1, 2), (7, 8)])
         assert list(store.pairs()) == [changed]
         store.put_pairs([], [(1, 3)])
@@ -242,7 +243,7 @@ class WritingContract(StoreCase):
 
     def test_a_later_revision_stays(self, store: Store) -> None:
         store.put_pairs([FIRST])
-        store.put_pairs([FIRST._replace(kind="touching", revision=1)])
+        store.put_pairs([FIRST._replace(kind=Kind.TOUCHING, revision=1)])
         assert list(store.pairs()) == [FIRST]
 
     def test_the_mark_is_that_of_who_wrote_last(self, store: Store) -> None:

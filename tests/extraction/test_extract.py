@@ -30,12 +30,12 @@ from extraction_scenes import (
 )
 from hapticdb import extract
 from hapticdb.errors import MissingExtraError, ObjectNotFoundError, UsageError
+from hapticdb.exact.sweep import sweep
+from hapticdb.exact.swept import Swept
 from hapticdb.extraction.planner import Planner
 from hapticdb.extraction.problem import Exit
 from hapticdb.extraction.pulls import shifted
 from hapticdb.extraction.verdict import extraction_line
-from hapticdb.sweeps.result import Swept
-from hapticdb.sweeps.run import sweep
 
 # --- straight pulls ------------------------------------------------------------------------------
 

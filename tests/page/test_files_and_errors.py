@@ -15,14 +15,14 @@ import hapticdb
 from assemblies import drop_surfaces
 from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
+from hapticdb.exact.path import Way
+from hapticdb.exact.swept import Gap
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.panels.touch import PART
 from hapticdb.page.process import new_server, open_page
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
 from hapticdb.page.wording import FAULT, error_text
-from hapticdb.sweeps.result import Gap
-from hapticdb.sweeps.way import Way
 from made_sweeps import place_at, swept
 from page_person import PagePerson
 from recordings import begun

@@ -10,6 +10,7 @@ import numpy as np
 from hapticdb.clashes.run import BUDGET, PairQuery, PairSearch, is_same
 from hapticdb.store.base import Object, Store
 from hapticdb.store.pairs import PairRow
+from hapticdb.verdicts import Kind
 
 SETTING = re.compile(r"within (\S+) contact (\S+) by motions")
 """`PairQuery.setting`, read back."""
@@ -101,7 +102,7 @@ def _judged_again(
                 f"again {row.kind} by {row.at_least:.6g} m",
                 kept,
             )
-        elif kept.kind != "far" and not _is_there(kept, objects):
+        elif kept.kind != Kind.FAR and not _is_there(kept, objects):
             yield PairFault(f"pair {row.a}, {row.b}: its place is not where the two meet", kept)
 
 
@@ -112,7 +113,9 @@ def _is_there(row: PairRow, objects: Mapping[int, Object]) -> bool:
     slack = NEAR + SHARE * float(np.ptp(boxes, axis=1).max())
     is_in = (places >= boxes[:, 0] - slack) & (places <= boxes[:, 1] + slack)
     apart = float(np.linalg.norm(places[1] - places[0]))
-    least, most = (0.0, 0.0) if row.kind == "overlapping" else (row.at_least, row.at_most or np.inf)
+    least, most = (
+        (0.0, 0.0) if row.kind == Kind.OVERLAPPING else (row.at_least, row.at_most or np.inf)
+    )
     return (
         bool(is_in.all()) and least - NEAR <= apart * (1.0 + SHARE) <= most + NEAR + SHARE * apart
     )

@@ -6,13 +6,12 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from hapticdb.store.pairs import KIND, KINDS, KeptPairs, Kind, PairRow, Status
+from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Status
 from hapticdb.units import length_text, notebook_html
+from hapticdb.verdicts import REPORTED, Kind
 
 Shown = Literal[Status, "accepted", "not looked at"]
-GRAVITY: tuple[Kind, ...] = ("overlapping", "inside", "not known", "touching", "apart")
-"""Kinds that are told, the gravest first."""
-ASKED: tuple[Kind, ...] = ("overlapping",)
+ASKED = (Kind.OVERLAPPING,)
 """Kinds that are looked for unless others are asked for."""
 
 
@@ -55,7 +54,7 @@ class Clash(NamedTuple):
         if self.is_left:
             return "-"
         at_least = length_text(self.at_least)
-        if self.kind != "overlapping":
+        if self.kind != Kind.OVERLAPPING:
             return at_least
         if not self.at_least:
             at_most = "" if self.at_most is None else f"up to {length_text(self.at_most)} "
@@ -84,7 +83,7 @@ def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
     because = accepted(row, known)
     a_name, b_name = (known[i][0] if i in known else None for i in (row.a, row.b))
     return Clash(
-        row.a, row.b, a_name, b_name, "apart" if status == "gone" else row.kind, row.at_least,
+        row.a, row.b, a_name, b_name, Kind.APART if status == "gone" else row.kind, row.at_least,
         row.at_most, row.place,
         "accepted" if because is not None and status != "gone" else status, because,
     )  # fmt: skip
@@ -128,7 +127,7 @@ class Clashes:
     def pairs(self) -> tuple[Clash, ...]:
         """All pairs, the gravest first, and the deepest or nearest of each kind."""
         # when they are asked for: that takes as long as a search after one change (make clashes)
-        rest = (clash_of(row, "same", self.known) for row in self.rest if row.kind != "far")
+        rest = (clash_of(row, "same", self.known) for row in self.rest if row.kind != Kind.FAR)
         return tuple(sorted((*self.told, *rest), key=gravity))
 
     def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
@@ -141,7 +140,7 @@ class Clashes:
         """How many pairs are of each kind, those that are gone left out."""
         found = Counter[str](row[KIND] for row in self.rest.rows)
         found.update(one.kind for one in self.told if one.status != "gone")
-        return {kind: found[kind] for kind in GRAVITY}
+        return {kind: found[kind] for kind in REPORTED}
 
     def statuses(self) -> dict[str, int]:
         """How many pairs have each status."""
@@ -150,6 +149,5 @@ class Clashes:
 
 def gravity(one: Clash) -> tuple[int, float, int, int]:
     """Sort key: the gravest first."""
-    size = -one.at_least if one.kind == "overlapping" else one.at_least
-    kind = GRAVITY.index(one.kind) if one.kind in GRAVITY else len(KINDS)
-    return kind, size, one.a, one.b
+    size = -one.at_least if one.kind == Kind.OVERLAPPING else one.at_least
+    return one.kind.gravity, size, one.a, one.b

@@ -15,21 +15,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.judge import Judged, PlacedPair, judge_placed
 from hapticdb.clashes.near import FEW, near_pairs
 from hapticdb.clashes.result import Clash, Clashes, Known, accepted, clash_of, shapes_of
-from hapticdb.clashes.shapes import Shapes
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
+from hapticdb.exact.clash import Judged, PlacedPair, judge_placed
+from hapticdb.exact.separation import CONTACT
+from hapticdb.exact.shapes import Shapes
 from hapticdb.store.base import Object, Progress, Store
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
+from hapticdb.verdicts import Kind
 
 Floats = NDArray[np.float64]
-WITHIN, CONTACT = 1e-3, 5e-5
-"""Defaults of the greatest distance that is told, and of the contact tolerance, metres."""
+WITHIN = 1e-3
+"""Default of the greatest distance of a pair, metres."""
 BUDGET = 256 << 20
 """Default of the memory for shapes, bytes."""
 SAME = 1e-9
@@ -119,7 +121,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     rows = [
         row
         for row in env.store.pairs()
-        if row.kind != "far"
+        if row.kind != Kind.FAR
         and ((row.a in ones and row.b in others) or (row.b in ones and row.a in others))
     ]
     if not rows:
@@ -181,7 +183,9 @@ class PairSearch:
             looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
             keys = [key for key in near if key not in looked]
             by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}
-        n_kept = len(looked) + sum(row[KIND] != "far" or row[BECAUSE] is None for row in rest.rows)
+        n_kept = len(looked) + sum(
+            row[KIND] != Kind.FAR or row[BECAUSE] is None for row in rest.rows
+        )
         known = zip(outlines.names, outlines.digests, strict=True)
         self._known = dict(zip(outlines.ids.tolist(), known, strict=True))
         stale = [(by_id[a], by_id[b]) for a, b in keys]
@@ -325,15 +329,15 @@ class PairSearch:
         for key, row in shown.items():
             status: Status = row.status
             if key not in looked:
-                if row.kind == "far" or key in waiting:
+                if row.kind == Kind.FAR or key in waiting:
                     continue
                 status = "gone"
-            elif row.kind == "far" and status != "gone":
+            elif row.kind == Kind.FAR and status != "gone":
                 continue
             yield clash_of(row, status, self._known)
         for a, b in left:
             names = self._known[a][0], self._known[b][0]
-            yield Clash(a, b, *names, "not known", 0.0, None, None, "not looked at")
+            yield Clash(a, b, *names, Kind.NOT_KNOWN, 0.0, None, None, "not looked at")
 
     def _settle(
         self, shown: dict[tuple[int, int], PairRow], looked: set[tuple[int, int]], mark: Mark | None
@@ -347,7 +351,7 @@ class PairSearch:
             if key in looked:
                 continue
             if accepted(row, self._known) is not None:
-                self._waiting.append(row._replace(kind="far", status="same"))
+                self._waiting.append(row._replace(kind=Kind.FAR, status="same"))
             else:
                 gone.append(key)
         self._write(gone, mark)
@@ -376,11 +380,11 @@ def _is_asked(a: int, b: int, of: set[int] | None, against: set[int] | None) -> 
 def _compared(row: PairRow, old: PairRow | None) -> PairRow:
     """A row with its status, and what the former one says of acceptance."""
     if old is None:
-        return row._replace(status="same" if row.kind == "far" else "new")
+        return row._replace(status="same" if row.kind == Kind.FAR else "new")
     # an earlier call that came to no end has left what it would have told
-    was_told = (old.kind != "far" and old.status != "new") or old.status == "gone"
+    was_told = (old.kind != Kind.FAR and old.status != "new") or old.status == "gone"
     status: Status
-    if row.kind == "far":
+    if row.kind == Kind.FAR:
         status = "gone" if was_told else "same"
     elif not was_told:
         status = "new"

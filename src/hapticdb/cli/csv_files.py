@@ -20,11 +20,11 @@ if TYPE_CHECKING:
     import numpy as np
     from numpy.typing import NDArray
 
+    from hapticdb.exact.swept import PathPlace, Swept
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.query.touches import Touch
     from hapticdb.recording.frame import Frames
     from hapticdb.store.base import Object
-    from hapticdb.sweeps.result import PathPlace, Swept
 
 STDOUT = "-"
 FORMULAS = ("=", "+", "-", "@")

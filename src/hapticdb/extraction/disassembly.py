@@ -9,18 +9,20 @@ import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import partial
-from typing import Any, Literal, NamedTuple
+from typing import Any, NamedTuple
 
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
-from hapticdb.extraction.result import Blocker, Extraction, WayOutVerdict, ids_of
+from hapticdb.exact.separation import CONTACT
+from hapticdb.exact.sweep import sweep
+from hapticdb.extraction.result import Blocker, Extraction, ids_of
 from hapticdb.extraction.run import DEFAULT_MOTIONS, extract
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import CONTACT, sweep
+from hapticdb.verdicts import PathVerdict
 
 DEFAULT_ORDER_SECONDS = 600.0
 """Default time of the search for an order."""
@@ -33,7 +35,6 @@ LEAST = 0.1
 """Seconds of a search for which no time is left: it tries one pull."""
 SHARE = 0.25
 """Greatest share of the whole time for one search. Larger: fewer searches, each more thorough."""
-DisassemblyVerdict = Literal["comes out", "overlaps", "no order found"]
 
 
 class Removal(NamedTuple):
@@ -62,7 +63,7 @@ class FailedSearch(NamedTuple):
 
     parts: tuple[Object, ...]
     n_gone: int
-    verdict: WayOutVerdict | None
+    verdict: PathVerdict | None
     blockers: tuple[Blocker, ...]
     reason: str = ""
 
@@ -102,15 +103,15 @@ class Disassembly:
         return bool(self.steps) and self.steps[-1].ids == ids_of(self.parts)
 
     @property
-    def verdict(self) -> DisassemblyVerdict:
+    def verdict(self) -> PathVerdict:
         """Each step is proved on its whole path, or but for overlaps where its parts stand.
 
         "no order found" proves nothing.
         """
         if not self.is_found:
-            return "no order found"
-        overlaps = any(step.found.verdict == "overlaps" for step in self.steps)
-        return "overlaps" if overlaps else "comes out"
+            return PathVerdict.NO_ORDER
+        overlaps = any(step.found.verdict is PathVerdict.OVERLAPS for step in self.steps)
+        return PathVerdict.OVERLAPS if overlaps else PathVerdict.COMES_OUT
 
     @property
     def blockers(self) -> tuple[Blocker, ...]:

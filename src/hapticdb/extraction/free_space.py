@@ -13,12 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.closing import Closes
+from hapticdb.exact.path import Way
 from hapticdb.extraction.problem import Problem, guarded_shell
 from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
-from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]

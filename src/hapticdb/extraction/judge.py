@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.sweep import sweep
 from hapticdb.extraction.free_space import Room
 from hapticdb.extraction.problem import Problem
 from hapticdb.extraction.result import How, WayOut
-from hapticdb.sweeps.run import sweep
 
 Floats = NDArray[np.float64]
 

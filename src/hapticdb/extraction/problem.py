@@ -9,12 +9,12 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
+from hapticdb.exact.path import Way
 from hapticdb.grid import corners_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import scene_bounds
 from hapticdb.store.base import Object
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 

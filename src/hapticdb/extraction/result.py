@@ -7,14 +7,14 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.swept import Swept
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import Swept
 from hapticdb.units import notebook_html
+from hapticdb.verdicts import PathVerdict
 
 Floats = NDArray[np.float64]
 
-WayOutVerdict = Literal["comes out", "slides", "overlaps", "not decided", "no way found"]
 How = Literal["pull", "screw", "plan"]
 
 
@@ -49,19 +49,13 @@ class WayOut:
     swept: Swept
 
     @property
-    def verdict(self) -> WayOutVerdict:
-        """What is proved.
-
-        "comes out": nothing is hit on the whole path, and nothing is touched at its end. "slides":
-        nothing is hit, but the parts still touch what they touch at their start. "overlaps": as
-        either, but for overlaps at the start. "not decided": the time ended the sweep, or it
-        refutes the path.
-        """
-        if self.swept.verdict == "overlaps":
-            return "overlaps"
+    def verdict(self) -> PathVerdict:
+        """What is proved: of a path that is refuted, nothing."""
+        if self.swept.verdict is PathVerdict.OVERLAPS:
+            return PathVerdict.OVERLAPS
         if self.swept.comes_out:
-            return "comes out"
-        return "slides" if self.swept.is_free else "not decided"
+            return PathVerdict.COMES_OUT
+        return PathVerdict.SLIDES if self.swept.is_free else PathVerdict.NOT_DECIDED
 
     @property
     def in_way(self) -> tuple[Object, ...]:
@@ -129,7 +123,7 @@ class Extraction:
     seed: int
 
     def __repr__(self) -> str:
-        way = "no way found" if self.way is None else f"{self.way.verdict}, by a {self.way.how}"
+        way = self.verdict if self.way is None else f"{self.verdict}, by a {self.way.how}"
         names = ", ".join(part.name for part in self.parts[:3])
         return f"Extraction({names}: {way}, pulls tried: {self.pulls}, {self.seconds:.2f} s)"
 
@@ -141,9 +135,9 @@ class Extraction:
         return notebook_html(self, rows)
 
     @property
-    def verdict(self) -> WayOutVerdict:
+    def verdict(self) -> PathVerdict:
         """Proved result, or that no way was found: which is no proof that there is none."""
-        return "no way found" if self.way is None else self.way.verdict
+        return PathVerdict.NO_PATH if self.way is None else self.way.verdict
 
     @property
     def is_free(self) -> bool:

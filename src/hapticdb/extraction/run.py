@@ -15,6 +15,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import MissingExtraError, UsageError
+from hapticdb.exact.path import checked_poses
+from hapticdb.exact.separation import CONTACT
 from hapticdb.extraction.free_space import FreeSpace
 from hapticdb.extraction.goals import GoalPose, Goals, GoalsOutside
 from hapticdb.extraction.judge import judge
@@ -26,8 +28,7 @@ from hapticdb.extraction.result import Blocker, Extraction, WayOut, ids_of
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.run import CONTACT
-from hapticdb.sweeps.way import checked_poses
+from hapticdb.verdicts import PathVerdict
 
 Floats = NDArray[np.float64]
 
@@ -164,15 +165,15 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
     way = None if refuting else way
     with FreeSpace(problem, asked.budget_bytes) as space:
         pulls = Pulls(problem, space, leaving, asked.seed)
-        if way is None or way.verdict == "not decided":
+        if way is None or way.verdict is PathVerdict.NOT_DECIDED:
             pulled = pulls.sweep(problem.until - (1.0 - SHARE_OF_LIKELY) * asked.seconds)
             if pulled is None or asked.to is not None:
                 pulls.run(until, progress)
                 pulled = _best_pull(problem, pulls)
             way = pulled if asked.to is None else way
-            if asked.screw is not None and (way is None or way.verdict == "not decided"):
+            if asked.screw is not None and (way is None or way.verdict is PathVerdict.NOT_DECIDED):
                 way = unscrewed(problem, leaving, asked.screw, until) or way
-        if asked.motions and (way is None or way.verdict == "not decided"):
+        if asked.motions and (way is None or way.verdict is PathVerdict.NOT_DECIDED):
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)
                 if asked.to is None

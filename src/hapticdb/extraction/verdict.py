@@ -2,11 +2,7 @@
 
 from typing import Any
 
-from hapticdb.extraction.disassembly import Disassembly, FailedSearch
-from hapticdb.extraction.result import Extraction, WayOut
-from hapticdb.pointshell.shell import PointShell
-from hapticdb.store.base import Object
-from hapticdb.sweeps.verdict import (
+from hapticdb.exact.report import (
     MOST_NAMED,
     gap_text,
     names_of,
@@ -16,7 +12,12 @@ from hapticdb.sweeps.verdict import (
     until_text,
     verdict_line,
 )
+from hapticdb.extraction.disassembly import Disassembly, FailedSearch
+from hapticdb.extraction.result import Extraction, WayOut
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.store.base import Object
 from hapticdb.units import length_text
+from hapticdb.verdicts import PathVerdict
 
 
 def extraction_line(found: Extraction) -> str:
@@ -70,7 +71,7 @@ def failed_line(failed: FailedSearch) -> str:
     if failed.reason:
         return failed.reason
     who = names_of([one.object for one in failed.blockers])
-    said = "no way found" if failed.verdict is None else str(failed.verdict)
+    said = str(failed.verdict or PathVerdict.NO_PATH)
     return f"{said}: blocked by {who}" if who else said
 
 

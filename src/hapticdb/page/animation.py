@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import FileError, MissingExtraError, pip_line
+from hapticdb.exact.report import names_of
 from hapticdb.extraction.result import Extraction
 from hapticdb.grid import corners_of
 from hapticdb.ingest.geometry import parts_of
@@ -22,7 +23,6 @@ from hapticdb.pointshell.orientation import Surface
 from hapticdb.poses import row_of_pose
 from hapticdb.store.attributes import AXES, up_axis
 from hapticdb.store.base import Object
-from hapticdb.sweeps.verdict import names_of
 
 if TYPE_CHECKING:
     from viser import SceneNodeHandle, ViserServer

@@ -10,13 +10,14 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
-from hapticdb.clashes.result import GRAVITY, Clash, Clashes
+from hapticdb.clashes.result import Clash, Clashes
 from hapticdb.environment import Environment
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.units import length_text
+from hapticdb.verdicts import REPORTED, Kind
 
 Floats = NDArray[np.float64]
 
@@ -101,7 +102,7 @@ def _matrix(told: Sequence[Clash]) -> str:
     weights: Counter[str] = Counter()
     for one, pair in zip(there, pairs, strict=True):
         for unit in pair:
-            weights[unit] += len(told) * (one.kind == "overlapping") + 1
+            weights[unit] += len(told) * (one.kind == Kind.OVERLAPPING) + 1
     units = sorted(unit for unit, _ in weights.most_common(MOST_UNITS))
     near: Counter[tuple[str, str]] = Counter()
     deep: Counter[tuple[str, str]] = Counter()
@@ -109,7 +110,7 @@ def _matrix(told: Sequence[Clash]) -> str:
         a, b = sorted(unit if unit in units else REST for unit in pair)
         for cell in {(a, b), (b, a)}:
             near[cell] += 1
-            deep[cell] += one.kind == "overlapping"
+            deep[cell] += one.kind == Kind.OVERLAPPING
     units += [REST] if any(REST in cell for cell in near) else []
     head = "".join(f"<th title='{_text(unit)}'>{n}" for n, unit in enumerate(units, 1))
     rows = ""
@@ -148,7 +149,7 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
     up, drawn = up_axis(objects.values()), 0
     for one in sorted(told, key=lambda one: not one.is_open):
         a, b = objects.get(one.a), objects.get(one.b)
-        if one.kind not in GRAVITY[:4] or one.place is None or a is None or b is None:
+        if one.kind not in REPORTED[:4] or one.place is None or a is None or b is None:
             continue
         surfaces = [part.surface() for _, part in parts_of(env.store, [a, b])]
         picture = io.BytesIO()

@@ -7,9 +7,9 @@ from typing import Any, Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import NDArray
 
-Kind = Literal["apart", "touching", "overlapping", "inside", "not known", "far"]
+from hapticdb.verdicts import Kind
+
 Status = Literal["new", "gone", "changed", "same"]
-KINDS: tuple[Kind, ...] = get_args(Kind)
 STATUSES: tuple[Status, ...] = get_args(Status)
 
 COLUMNS = "a, b, kind, at_least, at_most, a_x, a_y, a_z, b_x, b_y, b_z, status, revision, setting"
@@ -80,7 +80,7 @@ class Mark(NamedTuple):
         """What `put_pairs` returns, and the row that it writes; found : the mark's row, or none."""
         held = cls(*found[0]) if found else cls()
         mark = now if now is not None and held == was else cls(f"written {os.urandom(8).hex()}")
-        row = PairRow(*MARK, "far", 0.0, None, (0.0,) * 6, "same", mark.revision, mark.setting)
+        row = PairRow(*MARK, Kind.FAR, 0.0, None, (0.0,) * 6, "same", mark.revision, mark.setting)
         return (mark if held == was else None), row
 
 

@@ -29,8 +29,9 @@ from hapticdb.store.base import (
     Object,
     Rows,
 )
-from hapticdb.store.pairs import KINDS, STATUSES, Outlines, PairRow
+from hapticdb.store.pairs import STATUSES, Outlines, PairRow
 from hapticdb.store.refusals import made_before
+from hapticdb.verdicts import Kind
 
 KEY_END = 1 << 63
 """One above the largest count or key that an int64 holds."""
@@ -265,15 +266,15 @@ def pair_of(url: str, row: Sequence[Any]) -> PairRow:
     """Read a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
     a, b, kind, at_least, at_most, *place, status, revision, setting, because, shapes = row
     try:
-        is_finite = math.isfinite(at_least + (at_most or 0.0) + sum(place))
-    except TypeError:
-        is_finite = False
+        is_sound = math.isfinite(at_least + (at_most or 0.0) + sum(place))
+        kind = Kind(kind)
+    except (TypeError, ValueError):
+        is_sound = False
     if not (
-        is_finite
+        is_sound
         and type(a) is type(b) is type(revision) is int
         and 0 <= a < b < KEY_END
         and 0 <= revision < KEY_END
-        and kind in KINDS
         and status in STATUSES
         and isinstance(setting, str)
         and (because is None or isinstance(because, str))

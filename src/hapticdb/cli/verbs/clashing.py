@@ -15,13 +15,13 @@ from hapticdb.cli.values import budget_bytes, numbers_of
 from hapticdb.cli.verbs.sweeping import MM
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
+from hapticdb.verdicts import REPORTED, Kind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
-    from hapticdb.clashes.moving import Meeting
     from hapticdb.clashes.result import Clash, Clashes
-    from hapticdb.store.pairs import Kind
+    from hapticdb.exact.moving_clash import Meeting
 
 MOST_ROWS = 20
 """Rows of the table; further pairs are counted below it."""
@@ -209,7 +209,7 @@ def _moved(
         if rows:
             render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
         render.say(f"{render.counted(len(told), 'meeting')} on the way")
-    return int(any(one.kind in (kinds or ("overlapping",)) for one in told))
+    return int(any(one.kind in (kinds or (Kind.OVERLAPPING,)) for one in told))
 
 
 def _meetings(
@@ -218,7 +218,7 @@ def _meetings(
 ) -> "list[Meeting]":  # fmt: skip
     """When parts that move meet others: numbers of poses, or degrees."""
     import hapticdb
-    from hapticdb.clashes.moving import find_meetings, hinge
+    from hapticdb.exact.moving_clash import find_meetings, hinge
     from hapticdb.poses import read_poses
     from hapticdb.store.attributes import scene_bounds
 
@@ -258,12 +258,10 @@ def _exit_code(found: "Clashes", kinds: "tuple[Kind, ...]") -> int:
 
 def _checked(names: list[str] | None) -> "tuple[Kind, ...]":
     """Kinds of the names given; UsageError."""
-    from hapticdb.clashes.result import GRAVITY
-
     for name in names or ():
-        if name not in GRAVITY:
-            raise UsageError(f"--kind {name!r}: give one of {', '.join(sorted(GRAVITY))}")
-    return tuple(kind for kind in GRAVITY if kind in (names or ()))
+        if name not in REPORTED:
+            raise UsageError(f"--kind {name!r}: give one of {', '.join(sorted(REPORTED))}")
+    return tuple(kind for kind in REPORTED if kind in (names or ()))
 
 
 def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> int:

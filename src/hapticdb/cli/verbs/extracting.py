@@ -20,6 +20,7 @@ from hapticdb.cli.options import (
 from hapticdb.cli.values import budget_bytes, numbers_of
 from hapticdb.cli.verbs.sweeping import MM, ContactOption, OverlapOption
 from hapticdb.errors import UsageError
+from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -29,10 +30,6 @@ if TYPE_CHECKING:
     from hapticdb.extraction.disassembly import Disassembly
     from hapticdb.extraction.result import Extraction
 
-EXIT_CODES = {
-    "comes out": 0, "slides": 0, "overlaps": 4, "not decided": 3, "no way found": 1,
-    "no order found": 1,
-}  # fmt: skip
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way, and of the table of searches that failed."""
 
@@ -96,7 +93,7 @@ UpOption = Annotated[
     typer.Option(help="Axis that points up in the animation.", show_default="the files'"),
 ]
 
-HELP = """Search a path on which parts come out, judged by a sweep of their surfaces.
+HELP = f"""Search a path on which parts come out, judged by a sweep of their surfaces.
 
 The parts that WORDS choose move together as one rigid body. Straight pulls are
 tried first: along the axes, away from contacts and along them, at random; with
@@ -109,12 +106,8 @@ The path is written by --path as displacements from the present place, as
 'hapticdb sweep --part' takes them. The same seed gives the same path, unless
 --seconds end the search.
 
-Comes out: nothing is hit on the whole path, and nothing is touched at its end.
-Slides: nothing is hit, but the part still touches something at the end. Overlaps:
-it comes out or slides, but overlaps others by more than --contact and --overlap
-where it stands. Not decided: the time was over before the sweep of a path was. No
-way found: what blocks most of the straight pulls is named; this is no proof that
-there is none.
+Overlaps count if they are more than --contact and --overlap. Where no way is found,
+what blocks most of the straight pulls is named.
 
 With --disassemble, what blocks the parts is taken off first, each object alone
 and on a path that is proved; --keep names what stays. Each step has a file of its
@@ -124,8 +117,7 @@ necessary.
 --animation writes a page for any browser, with all that it needs in one file (pip
 install viser).
 
-The exit code is 0 when it comes out or slides, 4 when it overlaps, 3 when it is
-not decided, 1 when no path is found.
+{exit_codes(EXTRACT_VERDICTS)}
 
 Example: hapticdb extract car.db body/hood --path out.csv
 """
@@ -188,7 +180,7 @@ def extract(
             _report_order(env, order, asked)
         else:
             _report(env, found, felt.left_out, asked)
-    raise typer.Exit(EXIT_CODES[order.verdict if disassemble else found.verdict])
+    raise typer.Exit((order if disassemble else found).verdict.exit_status)
 
 
 def _metres(length: float | None) -> float | None:
@@ -291,8 +283,8 @@ def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
 
 def _show(found: "Extraction", asked: _Outputs) -> None:
     """Print the verdict, what is in the way, and the figures of the search."""
+    from hapticdb.exact.report import names_of
     from hapticdb.extraction.verdict import extraction_line
-    from hapticdb.sweeps.verdict import names_of
 
     render.say(extraction_line(found))
     if found.way is None and found.blockers:
@@ -317,8 +309,8 @@ def _show(found: "Extraction", asked: _Outputs) -> None:
 
 
 def _show_order(found: "Disassembly", ways: Sequence[_Way]) -> None:
+    from hapticdb.exact.report import names_of
     from hapticdb.extraction.verdict import disassembly_line, extraction_line, failed_line
-    from hapticdb.sweeps.verdict import names_of
 
     render.say(disassembly_line(found))
     for n, step in enumerate(found.steps):

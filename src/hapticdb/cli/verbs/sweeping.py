@@ -25,6 +25,7 @@ from hapticdb.cli.tools import tool_of, warn_of_size
 from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
+from hapticdb.verdicts import SWEEP_VERDICTS, WORST, exit_codes
 
 if TYPE_CHECKING:
     import numpy as np
@@ -32,12 +33,9 @@ if TYPE_CHECKING:
 
     from hapticdb.cli.choosing import Felt
     from hapticdb.environment import Environment
+    from hapticdb.exact.swept import Swept
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.sweeps.result import Swept
 
-EXIT_CODES = {"clear": 0, "slides": 0, "hits": 1, "not decided": 3, "overlaps": 4}
-WORST = (1, 3, 4, 0)
-"""Exit codes, the worst first: the code of a batch is the first that a sweep of it has."""
 MM = 1e-3
 """Metres of a millimetre: all lengths among the options are in millimetres."""
 MOST_OBJECTS = 20
@@ -88,7 +86,7 @@ BatchOption = Annotated[
     typer.Option(metavar="CSV", help="Many sweeps, one a line; see above."),
 ]
 
-HELP = """Say whether a tool or part is free on a path: what it hits, where, how near it comes.
+HELP = f"""Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
 Clear by a gap: no surface meets the tool's. Slides: it moves along what it
 touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
@@ -113,8 +111,8 @@ does not free it at the first pose, it starts inside.
 --batch reads a CSV file with the columns part or tool, and path; and if wanted
 where, exclude and contact (mm). Several words in a cell stand with ; between.
 
-The exit code is 0 when it is clear or slides, 4 when it overlaps, 1 when it hits,
-3 when it is not decided. A batch has the worst: 1 before 3 before 4 before 0.
+{exit_codes(SWEEP_VERDICTS)}
+A batch has the worst: 1 before 3 before 4 before 0.
 
 Example: hapticdb sweep car.db --part 17 --path out.csv
 """
@@ -224,7 +222,7 @@ def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
 
 def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
     """Make the tool, and move it along the path."""
-    from hapticdb.sweeps.run import sweep as sweep_path
+    from hapticdb.exact.sweep import sweep as sweep_path
 
     asked, felt = job.asked, job.felt
     began = perf_counter()
@@ -247,12 +245,12 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-    return _Told(job, shell, found, EXIT_CODES[found.verdict], perf_counter() - began)
+    return _Told(job, shell, found, found.verdict.exit_status, perf_counter() - began)
 
 
 def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, json: bool) -> int:
     """Run all sweeps, print a line or a row for each; returns the worst exit code."""
-    from hapticdb.sweeps.verdict import gap_text, percent
+    from hapticdb.exact.report import gap_text, percent
 
     rows, codes = [], set()
     for job in jobs:
@@ -272,7 +270,7 @@ def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, j
 
 
 def _say_json(told: _Told) -> None:
-    from hapticdb.sweeps.verdict import sweep_record
+    from hapticdb.exact.report import sweep_record
 
     job = told.job
     record = sweep_record(told.found, told.shell, job.parts, job.felt.left_out)
@@ -281,7 +279,7 @@ def _say_json(told: _Told) -> None:
 
 def _show(told: _Told) -> None:
     """Print the verdict, a table of what is hit or touched, and the figures that it stands on."""
-    from hapticdb.sweeps.verdict import gap_text, percent, until_text, verdict_line
+    from hapticdb.exact.report import gap_text, percent, until_text, verdict_line
 
     found = told.found
     render.say(verdict_line(found, told.shell))

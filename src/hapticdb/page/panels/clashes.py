@@ -5,10 +5,11 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticdb.clashes.result import GRAVITY, Clash, Clashes
-from hapticdb.clashes.run import CONTACT, WITHIN, find_clashes
+from hapticdb.clashes.result import Clash, Clashes
+from hapticdb.clashes.run import WITHIN, find_clashes
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
+from hapticdb.exact.separation import CONTACT
 from hapticdb.page import checks, colours
 from hapticdb.page.browser import LEAST_SHOWN, Browser
 from hapticdb.page.drawing import add_marks
@@ -16,6 +17,7 @@ from hapticdb.page.panels.working import Progress, Work
 from hapticdb.page.widgets import put
 from hapticdb.page.wording import note_html, rows_html, short_name
 from hapticdb.units import length_text
+from hapticdb.verdicts import REPORTED
 
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent
@@ -47,7 +49,7 @@ class ClashPanel:
         look = gui.add_button("Look for clashes", hint="Measures pairs of parts that have changed.")
         look.on_click(guard("viewer", self._look))
         self._work = Work(browser, gui, "a search for clashes")
-        self._kind = gui.add_dropdown("Kind", (ALL, *GRAVITY))
+        self._kind = gui.add_dropdown("Kind", (ALL, *REPORTED))
         self._status = gui.add_dropdown("Status", STATUSES)
         self._words = gui.add_text("Words", "", hint="Parts of both names, in any order.")
         for one in (self._kind, self._status, self._words):
@@ -98,7 +100,7 @@ class ClashPanel:
 
     def _fill(self) -> None:
         """List the pairs that the filters let pass, the gravest first."""
-        kind = checks.choice_of(self._kind.value, (ALL, *GRAVITY), "a kind")
+        kind = checks.choice_of(self._kind.value, (ALL, *REPORTED), "a kind")
         status = checks.choice_of(self._status.value, STATUSES, "a status")
         words = checks.text_of(self._words.value, LONGEST_TEXT, "words").casefold().split()
         pairs = self._found.pairs if self._found else ()

@@ -8,6 +8,9 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
+from hapticdb.exact.report import gap_text, percent, verdict_line
+from hapticdb.exact.sweep import sweep
+from hapticdb.exact.swept import PathPlace, Swept
 from hapticdb.page import checks, colours, tools
 from hapticdb.page.browser import Browser
 from hapticdb.page.drawing import add_marks, add_tool, put_at
@@ -15,9 +18,6 @@ from hapticdb.page.panels.working import Progress, Work
 from hapticdb.page.wording import escaped, note_html, plain_name, short_name, swatch
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import row_of_pose
-from hapticdb.sweeps.result import PathPlace, Swept
-from hapticdb.sweeps.run import sweep
-from hapticdb.sweeps.verdict import gap_text, percent, verdict_line
 
 if TYPE_CHECKING:
     from viser import GuiApi
@@ -26,9 +26,8 @@ Floats = NDArray[np.float64]
 
 MOST_NAMED = 8
 """Objects that the answer names, with where each is hit."""
-VERDICTS = {"hits": "#c62838", "not decided": "#a8730f", "overlaps": "#a8730f"}
-FREE = "#1f8a4c"
-"""Colours of verdicts; FREE: of all others."""
+COLOURS = {0: "#1f8a4c", 1: "#c62838", 3: "#a8730f", 4: "#a8730f"}
+"""Colours of verdicts, by their exit statuses."""
 WAYS = {
     "to the hand": None, "+x": (0, 1.0), "-x": (0, -1.0), "+y": (1, 1.0), "-y": (1, -1.0),
     "+z": (2, 1.0), "-z": (2, -1.0),
@@ -98,7 +97,7 @@ class SweepPanel:
         more = len(swept.hits) - MOST_NAMED
         self._work.said.content = (
             '<div style="margin:2px 12px;font-size:0.85em">'
-            f'<b style="color:{VERDICTS.get(swept.verdict, FREE)}">'
+            f'<b style="color:{COLOURS[swept.verdict.exit_status]}">'
             f"{escaped(name)}: {escaped(swept.verdict)}</b>"
             f'<div style="margin:3px 0">{escaped(plain_name(line))}</div>{hit}'
             f"{f'<div>and {more} more</div>' if more > 0 else ''}</div>"

@@ -8,7 +8,7 @@ import pytest
 
 import hapticdb
 from hapticdb import GridOptions, ImportOptions, PointShell
-from hapticdb.sweeps.run import sweep
+from hapticdb.exact.sweep import sweep
 
 FITS = {
     "rectangular 8 mm": ("rectangular_hole_8mm_subdiv_3x", "rectangular_peg_8mm_tight_subdiv_3x"),

@@ -28,7 +28,7 @@ from contact_scenes import (
     swept,
 )
 from hapticdb import Environment, PointShell
-from hapticdb.sweeps.result import Swept
+from hapticdb.exact.swept import Swept
 
 FRAMES = (0, 1, 2)
 """Seeds of the frames in which each scene stands; 0: as it is written."""

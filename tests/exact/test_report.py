@@ -7,8 +7,8 @@ import pytest
 
 from hapticdb import PointShell
 from hapticdb.cli.csv_files import SWEPT, rows_of_sweep
-from hapticdb.sweeps.result import Gap, Swept
-from hapticdb.sweeps.verdict import gap_text, sweep_record, verdict_line
+from hapticdb.exact.report import gap_text, sweep_record, verdict_line
+from hapticdb.exact.swept import Gap, Swept
 from made_sweeps import CORNERS, line, place_at, swept, thing, touching
 
 PATH = line()

@@ -12,10 +12,10 @@ from itertools import chain, islice
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.distance import Pair
+from hapticdb.exact.separation import GROWTH, NOTHING, SAME, MovedPair, Separation
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.shape import CollisionShape
-from hapticdb.sweeps.gap import Pair
-from hapticdb.sweeps.separation import GROWTH, NOTHING, SAME, MovedPair, Separation
 
 Floats = NDArray[np.float64]
 

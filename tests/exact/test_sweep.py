@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 import hapticdb
 from hapticdb import Environment, PointShell
 from hapticdb.errors import ObjectNotFoundError, UsageError
+from hapticdb.exact.separation import CONTACT
+from hapticdb.exact.sweep import sweep
+from hapticdb.exact.swept import Swept
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.poses import rotation_of
-from hapticdb.sweeps.result import Swept
-from hapticdb.sweeps.run import CONTACT, sweep
 
 Floats = NDArray[np.float64]
 
@@ -232,8 +233,8 @@ def test_time_ends_a_contact_that_is_followed(
     """The tool slides by many tolerances: each look at the clock takes a second of it."""
     seconds = count()
     clock = SimpleNamespace(monotonic=lambda: float(next(seconds)))
-    monkeypatch.setattr("hapticdb.sweeps.gap.time", clock)
-    monkeypatch.setattr("hapticdb.sweeps.run.time", clock)
+    monkeypatch.setattr("hapticdb.exact.distance.time", clock)
+    monkeypatch.setattr("hapticdb.exact.sweep.time", clock)
     path = line(SEATED, (0.05, 0.0, 0.5 * CUBE))
     with imported(tmp_path, {"plate": box_at((0.3, 0.3, 0.02), (0.0, 0.0, -0.01))}) as env:
         found = sweep(env, TOOL, path, contact=1e-6, seconds=20.0)

@@ -9,11 +9,11 @@ import pytest
 
 from contact_scenes import MM, Triple, box, imported, pulls, shell_of, swept
 from hapticdb import Environment, PointShell
-from hapticdb.clashes.judge import Judged, judge
+from hapticdb.exact.clash import Judged, judge
+from hapticdb.exact.report import verdict_line
+from hapticdb.exact.swept import Swept
 from hapticdb.mesh import read_file
 from hapticdb.pointshell.shape import CollisionShape
-from hapticdb.sweeps.result import Swept
-from hapticdb.sweeps.verdict import verdict_line
 from step_files import cylinder
 
 ERROR = 0.02

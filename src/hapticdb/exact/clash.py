@@ -1,7 +1,7 @@
 """What a pair of surfaces is: apart, touching, overlapping, one inside the other, or not known.
 
 A distance above zero is proved by `kernels.triangles.nearest`. Surfaces that meet only touch if a
-motion frees them that moves no place by more than the contact tolerance (`sweeps.separation`). How
+motion frees them that moves no place by more than the contact tolerance (`exact.separation`). How
 deep others overlap is bounded from below by the penetration depth of one in the closed bodies of
 the other, and from above by the least motion that frees them.
 """
@@ -11,12 +11,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.shapes import Shapes
+from hapticdb.exact.separation import Separation
+from hapticdb.exact.shapes import Shapes
 from hapticdb.kernels.triangles.nearest import Nearest, nearest
 from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import Object
-from hapticdb.store.pairs import Kind
-from hapticdb.sweeps.separation import Separation
+from hapticdb.verdicts import Kind
 
 Floats = NDArray[np.float64]
 
@@ -59,24 +59,24 @@ def judge(
     error = a.chord + b.chord
     near = _nearest(a, b, pose, within + error)
     if a.is_cloud or b.is_cloud:
-        return _told("not known" if near.pairs[0, 0] >= 0 else "far", near)
+        return _told(Kind.NOT_KNOWN if near.pairs[0, 0] >= 0 else Kind.FAR, near)
     gap, separation = float(near.at_least[0]), Separation(a, b)
     if gap > 0.0:
         if separation.is_nested(pose):
             near = near if near.pairs[0, 0] >= 0 else _nearest(a, b, pose)
-            return _told("inside" if gap > error or not error else "not known", near, error)
+            return _told(Kind.INSIDE if gap > error or not error else Kind.NOT_KNOWN, near, error)
         if near.pairs[0, 0] < 0:
-            return _told("far", near, error)
+            return _told(Kind.FAR, near, error)
         if gap - error > contact:
-            return _told("apart", near, error)
+            return _told(Kind.APART, near, error)
         if gap + error <= contact or not error:
-            return _told("touching", near, error)
-        return _told("not known", near, error)
+            return _told(Kind.TOUCHING, near, error)
+        return _told(Kind.NOT_KNOWN, near, error)
     freed = _freed(separation, pose, contact - error)
-    if freed == "touching" or (freed == "inside" and not error):
+    if freed == Kind.TOUCHING or (freed == Kind.INSIDE and not error):
         return _told(freed, near, error)
-    if error and _freed(separation, pose, contact + error) == "touching":
-        return _told("not known", near, error)
+    if error and _freed(separation, pose, contact + error) == Kind.TOUCHING:
+        return _told(Kind.NOT_KNOWN, near, error)
     return _overlap(separation, pose, contact, near, error)
 
 
@@ -90,8 +90,8 @@ def _freed(separation: Separation, pose: Floats, reach: float) -> Kind | None:
         return found
     for moved in separation.separating(pose, reach, TINY, gap=0.0, any_side=True):
         if not separation.is_nested(pose, moved.motion):
-            return "touching"
-        found = "inside"
+            return Kind.TOUCHING
+        found = Kind.INSIDE
     return found
 
 
@@ -116,4 +116,4 @@ def _overlap(
     at_most = separation.least(pose, least, separation.most_reach, TINY, gap=0.0)
     place = place if depth else near.on_a[0]
     at_most = np.inf if at_most is None else at_most + error
-    return Judged("overlapping", max(depth - error, 0.0), at_most, place, place)
+    return Judged(Kind.OVERLAPPING, max(depth - error, 0.0), at_most, place, place)

@@ -12,6 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
+from hapticdb.exact.contact import Contact
+from hapticdb.exact.distance import Least, OverTimeError, Pair, box_gaps, error_of
+from hapticdb.exact.path import Way
+from hapticdb.exact.separation import CONTACT, SAME, Separation
+from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.mesh import Part
@@ -20,14 +25,7 @@ from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
-from hapticdb.sweeps.contact import Contact
-from hapticdb.sweeps.gap import Least, OverTimeError, Pair, box_gaps, error_of
-from hapticdb.sweeps.result import Gap, PathPlace, Swept, TouchedObject
-from hapticdb.sweeps.separation import SAME, Separation
-from hapticdb.sweeps.way import Way
 
-CONTACT = 5e-5
-"""Default of the contact tolerance, metres."""
 FIRST_SHARE, LATER = 1 / 64, 4.0
 """Share of the path on which contacts are followed first, and the factor of each later share."""
 BEYOND = 4.0

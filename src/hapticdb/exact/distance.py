@@ -7,13 +7,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.path import Way
+from hapticdb.exact.separation import MovedPair
 from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.nearest import Nearest
 from hapticdb.kernels.triangles.sweeping import MEETING, Search
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.store.base import Object
-from hapticdb.sweeps.separation import MovedPair
-from hapticdb.sweeps.way import Way
 
 Floats = NDArray[np.float64]
 

@@ -6,7 +6,7 @@ import trimesh
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticdb.clashes.judge import Judged, judge
+from hapticdb.exact.clash import Judged, judge
 from hapticdb.pointshell.shape import CollisionShape
 
 Floats = NDArray[np.float64]

@@ -7,8 +7,8 @@ import pytest
 
 import hapticdb
 from assemblies import row_of_boxes
-from hapticdb.clashes.moving import find_meetings, hinge
 from hapticdb.errors import UsageError
+from hapticdb.exact.moving_clash import find_meetings, hinge
 
 CONTACT = 5e-5
 MEETING = 2e-5

@@ -9,11 +9,11 @@ from scipy.spatial.transform import Rotation
 
 from draws import drawn
 from hapticdb import PointShell
+from hapticdb.exact.distance import OverTimeError, Pair, error_of
+from hapticdb.exact.path import Way
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
-from hapticdb.sweeps.gap import OverTimeError, Pair, error_of
-from hapticdb.sweeps.way import Way
 from moving_boxes import Boxes, distances, mesh
 from naive_motion import poses_at
 

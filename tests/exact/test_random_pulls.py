@@ -21,7 +21,7 @@ from contact_scenes import (
 )
 from draws import drawn
 from hapticdb import Environment, PointShell
-from hapticdb.sweeps.result import Swept
+from hapticdb.exact.swept import Swept
 from random_pulls import Body, RandomPull, random_pull
 from winding import Surface, crossed, distances
 

@@ -24,6 +24,8 @@ Floats = NDArray[np.float64]
 DIRECTIONS = np.array([way for way in product((0.0, 1.0, -1.0), repeat=3) if any(way)])
 DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 """Unit vectors (26, 3) of shifts, beside the normals of the nearest triangles."""
+CONTACT = 5e-5
+"""Default of the contact tolerance, metres."""
 LEAST_BALL = 0.01
 """Least factor to which a ball shrinks."""
 SAME = 1e-6

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from hapticdb.exact.path import Way
 from hapticdb.pointshell.shell import fibonacci_sphere
-from hapticdb.sweeps.way import Way
 from naive_motion import middle_of, placed, poses_at
 
 Floats = NDArray[np.float64]

@@ -1,18 +1,17 @@
 """Results of a sweep, decided on surfaces: metres and fractions of the path."""
 
 from dataclasses import dataclass
-from typing import Literal, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.exact.path import Way
 from hapticdb.store.base import Object
-from hapticdb.sweeps.way import Way
 from hapticdb.units import length_text, notebook_html
+from hapticdb.verdicts import PathVerdict
 
 Floats = NDArray[np.float64]
-
-Verdict = Literal["clear", "slides", "overlaps", "hits", "not decided"]
 
 
 class PathPlace(NamedTuple):
@@ -129,18 +128,19 @@ class Swept:
         return notebook_html(self, rows)
 
     @property
-    def verdict(self) -> Verdict:
+    def verdict(self) -> PathVerdict:
         """What is proved: a hit, the time over, an overlap at the start, sliding, or clear.
 
         It slides if it moves on in contact with what it touches at the start, and hits nothing.
         """
         if self.hits or self.enclosed:
-            return "hits"
+            return PathVerdict.HITS
         if self.is_stopped or self.undecided:
-            return "not decided"
+            return PathVerdict.NOT_DECIDED
         if self.overlapping:
-            return "overlaps"
-        return "slides" if any(one.is_sliding for one in self.touching) else "clear"
+            return PathVerdict.OVERLAPS
+        is_sliding = any(one.is_sliding for one in self.touching)
+        return PathVerdict.SLIDES if is_sliding else PathVerdict.CLEAR
 
     @property
     def overlapping(self) -> tuple[TouchedObject, ...]:
@@ -152,7 +152,7 @@ class Swept:
     @property
     def is_free(self) -> bool:
         """Whether nothing is hit on the whole path: clear, slides, or but for what it overlaps."""
-        return self.verdict in {"clear", "slides", "overlaps"}
+        return self.verdict.is_free
 
     @property
     def comes_out(self) -> bool:

@@ -6,10 +6,11 @@ from typing import Any
 
 import numpy as np
 
+from hapticdb.exact.swept import PathPlace, Swept, TouchedObject
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object
-from hapticdb.sweeps.result import PathPlace, Swept, TouchedObject
 from hapticdb.units import length_text
+from hapticdb.verdicts import PathVerdict
 
 MOST_NAMED = 3
 """Greatest number of objects that a line names; the others are only counted."""
@@ -37,7 +38,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
 
     shell : the tool; its size tells whether it lies inside an object, or the object inside it.
     """
-    if found.verdict == "hits":
+    if found.verdict is PathVerdict.HITS:
         late = "the time was over: what is hit before may be missing" if found.is_stopped else ""
         clauses = [*_enclosed_clauses(found, shell), *_hit_clauses(found), late]
         return "; ".join(filter(None, clauses))
@@ -46,7 +47,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
             f"not decided: {names_of(found.undecided)} within the chord error of the triangles; "
             "import the STEP file with a finer --chord, such as 0.001"
         )
-    if found.verdict == "not decided":
+    if found.verdict is PathVerdict.NOT_DECIDED:
         return (
             "not decided: the time was over before the surfaces of all objects near the path were "
             "measured; give more --seconds"

@@ -10,11 +10,13 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from hapticdb.clashes.judge import judge
-from hapticdb.clashes.result import GRAVITY
-from hapticdb.clashes.run import CONTACT
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
+from hapticdb.exact.clash import judge
+from hapticdb.exact.distance import Pair, box_gaps
+from hapticdb.exact.path import Way
+from hapticdb.exact.separation import CONTACT
+from hapticdb.exact.sweep import center_of
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
@@ -22,10 +24,7 @@ from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.poses import rotation_of
 from hapticdb.store.base import Progress
 from hapticdb.store.finding import Words
-from hapticdb.store.pairs import Kind
-from hapticdb.sweeps.gap import Pair, box_gaps
-from hapticdb.sweeps.run import center_of
-from hapticdb.sweeps.way import Way
+from hapticdb.verdicts import Kind
 
 Floats = NDArray[np.float64]
 
@@ -165,11 +164,10 @@ def _gravest(
 ) -> tuple[Kind, float, tuple[float, ...]]:
     """The gravest of what a pair is at poses, how deep it is there, and where."""
     judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]
-    told = [one for one in judged if one.kind in GRAVITY[:4]] or judged
-    rank = {kind: n for n, kind in enumerate((*GRAVITY, "far"))}
-    worst = min(told, key=lambda one: (rank[one.kind], -one.at_least))
-    kind: Kind = "touching" if worst.kind in {"apart", "far"} else worst.kind
-    depth = worst.at_least if kind == "overlapping" else 0.0
+    told = [one for one in judged if not one.kind.is_free or one.kind is Kind.TOUCHING] or judged
+    worst = min(told, key=lambda one: (one.kind.gravity, -one.at_least))
+    kind = Kind.TOUCHING if worst.kind.is_free else worst.kind
+    depth = worst.at_least if kind == Kind.OVERLAPPING else 0.0
     return kind, depth, tuple(worst.on_a.tolist())
 
 

@@ -1,0 +1,1 @@
+"""Narrow phase: distances, sweeps, clashes, separation and penetration of triangles, proved."""

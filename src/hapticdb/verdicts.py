@@ -1,0 +1,77 @@
+"""Kinds of pairs of surfaces, and verdicts of paths, with their exit statuses."""
+
+from collections.abc import Iterable
+from enum import StrEnum
+from typing import Self
+
+
+class Kind(StrEnum):
+    """Relation of two surfaces, the gravest first; FAR: beyond the distance of the search."""
+
+    OVERLAPPING = "overlapping"
+    INSIDE = "inside"
+    NOT_KNOWN = "not known"
+    TOUCHING = "touching"
+    APART = "apart"
+    FAR = "far"
+
+    @property
+    def gravity(self) -> int:
+        """Rank, 0 of the gravest."""
+        return list(Kind).index(self)
+
+    @property
+    def is_free(self) -> bool:
+        """Whether the surfaces at most touch."""
+        return self in {Kind.TOUCHING, Kind.APART, Kind.FAR}
+
+
+REPORTED = tuple(Kind)[:-1]
+"""Kinds of pairs within the distance of a search."""
+
+
+class PathVerdict(StrEnum):
+    """Result of a sweep, an extraction or a disassembly, the worst of a batch first.
+
+    exit_status : of the command line; line : what it means.
+    """
+
+    exit_status: int
+    line: str
+
+    HITS = "hits", 1, "a surface is met, or the tool starts inside an object"
+    NO_PATH = "no way found", 1, "no proof that there is none"
+    NO_ORDER = "no order found", 1, "no proof that there is none"
+    NOT_DECIDED = "not decided", 3, "the time was over, or a chord error is too large"
+    OVERLAPS = "overlaps", 4, "nothing else is hit, but it overlaps others at the start"
+    CLEAR = "clear", 0, "nothing is hit"
+    SLIDES = "slides", 0, "nothing is hit, but it moves in contact"
+    COMES_OUT = "comes out", 0, "nothing is hit, nor touched at the end of the path"
+
+    def __new__(cls, text: str, exit_status: int, line: str) -> Self:
+        """Verdict of that text."""
+        member = str.__new__(cls, text)
+        member._value_ = text
+        member.exit_status, member.line = exit_status, line
+        return member
+
+    @property
+    def is_free(self) -> bool:
+        """Whether nothing is hit on the whole path, but for overlaps at the start."""
+        return self.exit_status in {0, PathVerdict.OVERLAPS.exit_status}
+
+
+def exit_codes(verdicts: Iterable[PathVerdict]) -> str:
+    """Exit status of each verdict and what it means, a sentence for help texts."""
+    found = "; ".join(f"{one.exit_status} {one}, {one.line}" for one in verdicts)
+    return f"Exit codes: {found}."
+
+
+SWEEP_VERDICTS = (
+    PathVerdict.CLEAR, PathVerdict.SLIDES, PathVerdict.OVERLAPS, PathVerdict.NOT_DECIDED,
+    PathVerdict.HITS,
+)  # fmt: skip
+EXTRACT_VERDICTS = (PathVerdict.COMES_OUT, *SWEEP_VERDICTS[1:-1], PathVerdict.NO_PATH)
+"""Verdicts of sweeps, and of extractions and disassemblies."""
+WORST = tuple(dict.fromkeys(verdict.exit_status for verdict in PathVerdict))
+"""Exit statuses, the worst first: that of a batch is the first which a sweep of it has."""

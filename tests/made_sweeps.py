@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb import Object
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 
 Floats = NDArray[np.float64]
@@ -23,7 +23,7 @@ def thing(name: str, number: int = 1, side: float = 0.1) -> Object:
     return Object(name, "a.glb", "", np.eye(4), 1, np.stack([-half, half]), id=number)
 
 
-def place_at(found: Object, fraction: float, path: Way, apart: float = 0.0) -> PathPlace:
+def place_at(found: Object, fraction: float, path: ToolPath, apart: float = 0.0) -> PathPlace:
     """Where the tool is at a share of the path; apart : metres between the two surfaces."""
     way = np.array([fraction * path.length])
     pose = path.at(way)[0]
@@ -32,12 +32,12 @@ def place_at(found: Object, fraction: float, path: Way, apart: float = 0.0) -> P
     return PathPlace(found, fraction, int(path.segments(way)[0]), pose, on_tool, on_object)
 
 
-def line(*places: tuple[float, float, float]) -> Way:
+def line(*places: tuple[float, float, float]) -> ToolPath:
     """A path of the tool through places; 1 m along x unless they are given."""
     places = places or ((0.0, 0.0, 0.0), (1.0, 0.0, 0.0))
     poses = np.tile(np.eye(4), (len(places), 1, 1))
     poses[:, :3, 3] = places
-    return Way.of(poses, CORNERS, np.zeros(3))
+    return ToolPath.of(poses, CORNERS, np.zeros(3))
 
 
 def touching(found: Object, until: float, **changed: Any) -> TouchedObject:  # noqa: ANN401 - its fields
@@ -46,7 +46,7 @@ def touching(found: Object, until: float, **changed: Any) -> TouchedObject:  # n
     return one._replace(**changed)
 
 
-def swept(path: Way | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - fields of a result
+def swept(path: ToolPath | None = None, **changed: Any) -> Swept:  # noqa: ANN401 - fields of a result
     """A sweep that meets nothing, with some fields changed."""
     path = path or line()
     fields: dict[str, Any] = {

@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from draws import drawn
 from hapticdb import PointShell
 from hapticdb.exact.distance import OverTimeError, Pair, error_of
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.kernels.surfaces.sides import TriangleTree, triangle_tree
 from hapticdb.kernels.triangles.sweeping import MEETING
 from hapticdb.pointshell.moving import MovingSurface
@@ -63,7 +63,7 @@ def check_a_path(rng: np.random.Generator) -> str:
     """Sweep a box past another; returns what was told."""
     still, tool = random_boxes(rng, 0.05), random_boxes(rng, 0.0)._replace(poses=np.eye(4)[None])
     poses, center = random_path(rng), rng.uniform(-0.02, 0.02, 3)
-    way = Way.of(poses, tool.corners()[0], center)
+    way = ToolPath.of(poses, tool.corners()[0], center)
     pair = Pair(tree_of(still), tool_of(tool), way)
     found, closed = pair.least(0.0, np.inf)
     assert found is not None
@@ -104,7 +104,7 @@ def test_a_box_slides_along_another_at_its_gap(gap: float) -> None:
     tool = Boxes(np.eye(4)[None], np.array([[0.02, 0.02, 0.02]]))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[-0.2, 0.0, 0.04 + gap], [0.2, 0.01, 0.04 + gap]]
-    pair = Pair(tree_of(still), tool_of(tool), Way.of(poses, tool.corners()[0], np.zeros(3)))
+    pair = Pair(tree_of(still), tool_of(tool), ToolPath.of(poses, tool.corners()[0], np.zeros(3)))
     found, closed = pair.least(0.0, np.inf)
     assert found is not None
     assert found.at_most == pytest.approx(gap, rel=1e-9)
@@ -115,7 +115,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
     poses = np.tile(np.eye(4), (2, 1, 1))
     poses[:, :3, 3] = [[0.3, 0.0, 0.0], [0.15, 0.02, 0.0]]
-    way = Way.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
+    way = ToolPath.of(poses, np.array([[-0.03] * 3, [0.03] * 3]), np.zeros(3))
     pair = Pair(tree_of(still), MovingSurface(PointShell.sphere(0.03)), way)
     found, _ = pair.least(0.0, np.inf)
     assert found is not None
@@ -126,7 +126,7 @@ def test_a_ball_is_as_far_as_its_middle_less_its_radius() -> None:
 
 def test_a_limit_of_time_ends_the_search() -> None:
     still = Boxes(np.eye(4)[None], np.array([[0.1, 0.1, 0.1]]))
-    way = Way.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
+    way = ToolPath.of(np.tile(np.eye(4), (2, 1, 1)), np.zeros((1, 3)), np.zeros(3))
     pair = Pair(tree_of(still), tool_of(still), way, time.monotonic() - 1.0)
     with pytest.raises(OverTimeError):
         pair.least(0.0, np.inf)

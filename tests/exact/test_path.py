@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.pointshell.shell import fibonacci_sphere
 from naive_motion import middle_of, placed, poses_at
 
@@ -61,7 +61,7 @@ def test_poses_on_the_way_are_those_of_plain_formulas(
 ) -> None:
     center = middle_of(corners)
     poses = path_poses(moved, seed, center)
-    path = Way.of(poses, corners, center)
+    path = ToolPath.of(poses, corners, center)
     for m, length in enumerate(np.diff(path.ways).tolist()):
         if not length:
             continue
@@ -79,7 +79,7 @@ def test_poses_on_the_way_are_those_of_plain_formulas(
 @given(axis=directions, seed=st.integers(0, 99), share=st.floats(0.0, 1.0))
 def test_half_a_turn_goes_evenly_one_way_round(axis: Any, seed: int, share: float) -> None:  # noqa: ANN401
     poses = path_poses([(0.0, (1, 0, 0), np.pi, axis)], seed, np.zeros(3))
-    path = Way.of(poses, BALL, np.zeros(3))
+    path = ToolPath.of(poses, BALL, np.zeros(3))
     turn = path.at([share * path.length])[0, :3, :3] @ poses[0, :3, :3].T
     found = Rotation.from_matrix(turn).as_rotvec()
     assert np.linalg.norm(found) == pytest.approx(np.pi * share, abs=1e-6)
@@ -103,7 +103,7 @@ def test_no_place_of_the_tool_moves_more_than_the_way(
     center = middle_of(corners) + about
     poses = path_poses(moved, seed, center)
     poses[:, :3, :3] += spread * np.random.default_rng(seed).uniform(-1.0, 1.0, (len(poses), 3, 3))
-    path = Way.of(poses, corners, center)
+    path = ToolPath.of(poses, corners, center)
     ways = path.length * np.array([0.0, *shares, 1.0])
     there = placed(path.at(ways), corners)
     moved_by = np.linalg.norm(there[:, None] - there[None], axis=3).max(axis=2)

@@ -15,7 +15,7 @@ import hapticdb
 from assemblies import drop_surfaces
 from children import until
 from hapticdb.errors import DatabaseError, FileError, HapticDBError
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.exact.swept import Gap
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.panels.touch import PART
@@ -231,7 +231,7 @@ def test_a_sweep_is_told_and_shown(
         (ball,) = (obj for obj in site.objects.values() if obj.link.endswith("/ball.stl"))
 
         def found(_: object, shell: hapticdb.PointShell, poses: Any, **__: object) -> Any:  # noqa: ANN401 - as `sweep`
-            path = Way.of(poses, shell.points, np.zeros(3))
+            path = ToolPath.of(poses, shell.points, np.zeros(3))
             place = place_at(ball, 0.5, path, 0.003)
             gap = Gap(0.003, 0.003, place)
             return swept(path, hits=(place,)) if hits else swept(path, gap=gap)

@@ -1,7 +1,7 @@
 """Contacts at the start of a path, followed by separating motions until the surfaces are apart.
 
 The path is free of a touched object if one small motion (`separation`) of the tool or the object
-lets the tool follow the path without a collision: then no place of the tool gets to another side of
+lets the tool follow the path without a collision: no place of the tool gets to another side of
 anything, however thin. Changes of the motion along the path are proved. The depth at single poses
 is no criterion, since it has no memory of sides.
 """
@@ -44,12 +44,12 @@ LOOKS = 1500
 
 
 class Contact:
-    """A contact from the start of the path, where the surfaces are within `contact` metres.
+    """A contact from the start of the path, between surfaces within `contact` metres.
 
-    start : overlap at the start that a motion frees, at most, metres, infinite where none does;
-    start_at_least : proved penetration depth there; reach : of the motions; by : the kind of the
-    last one, empty where none frees; error : as given; way : followed so far, metres; is_over,
-    is_apart, is_hit : whether it has ended, by surfaces that are apart, or that meet.
+    start : upper bound of the overlap at the start, metres, infinite without a separating motion;
+    start_at_least : proved penetration depth there; reach : of the motions; by : kind of the last
+    one, empty without any; error : as given; way : path parameter followed so far, metres;
+    is_over, is_apart, is_hit : whether it has ended, by separation or by a collision.
     """
 
     def __init__(
@@ -58,8 +58,8 @@ class Contact:
     ) -> None:  # fmt: skip
         """Begin; gap : of the surfaces, from below; seated : whether the tool may overlap more.
 
-        error : chord errors of both surfaces: motions have so much less reach, so that the true
-        surfaces are free, too. A negative one: where these hit, the true surfaces do.
+        error : chord errors of both surfaces. The reach of motions is less by them, so the true
+        surfaces are free, too; with a negative one, a hit is a hit of the true surfaces.
         """
         self._pair, self._contact, self.error = pair, contact, error
         self._separation = Separation(shape, pair.tool, pair.check_time)
@@ -100,9 +100,9 @@ class Contact:
         return next(self._motions, None)
 
     def _on_nearest_side(self, first: MovedPair) -> MovedPair:
-        """The first motion on the side that the least one leads to, of surfaces that coincide.
+        """The first motion on the side of the least one, for coinciding surfaces.
 
-        So a foil that lies on an open sheet is on the side of its face that touches the sheet.
+        So a foil on an open sheet is on the side of its touching face.
         """
         pose, found = self._pair.way.at([0.0])[0], self._separation
         for share in SHARES:
@@ -120,7 +120,7 @@ class Contact:
         return self.way > SLIDE * self._contact
 
     def advance(self, end: float) -> None:
-        """Follow the contact to a way, or to where it ends."""
+        """Follow the contact to a path parameter, or to its end."""
         while self.way < end and not self.is_over:
             stop, is_apart = self._next_apart(end)
             while self.way < stop and not self.is_over:
@@ -137,7 +137,7 @@ class Contact:
         return max(depth - abs(self.error), 0.0), place
 
     def _next_apart(self, end: float) -> tuple[float, bool]:
-        """The next look at which the surfaces are apart, or the last one of a block."""
+        """The next sample with separate surfaces, or the last one of a block."""
         stride = STRIDE * self._contact
         ways = np.minimum(self.way + stride * np.arange(1, self._block + 1), end)
         ways = ways[: int(np.searchsorted(ways, end)) + 1]
@@ -148,12 +148,12 @@ class Contact:
         return (float(ways[apart[0]]), True) if len(apart) else (float(ways[-1]), False)
 
     def _is_left(self, way: float) -> bool:
-        """Whether the tool itself gets from where its motion has moved it to where it is."""
+        """Whether the tool itself gets from its moved place back to its own."""
         assert self._moved is not None  # noqa: S101 - it is followed
         return self._separation.joins(self._moved, self._still, self._pair.way.at([way])[0])
 
     def _go_on(self, stop: float) -> None:
-        """Follow the motion to a way, change it where it meets the object, or note a hit."""
+        """Follow the motion to a path parameter, change it at a collision, or note a hit."""
         assert self._moved is not None  # noqa: S101 - as above
         met = self._pair.first_met(self._moved, self.way, stop)
         self.way = max(self.way, met)
@@ -172,7 +172,7 @@ class Contact:
             self.is_over = self.is_hit = True
 
     def _hand_over(self, met: float) -> bool:
-        """Change to a shift that gets beyond a meeting, a little before it."""
+        """Change to a shift beyond a collision, a little before it."""
         assert self._moved is not None  # noqa: S101 - as above
         beyond = min(met + BEYOND * self.reach, self._pair.way.length)
         there = self._pair.way.at([beyond])[0]

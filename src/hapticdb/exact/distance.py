@@ -1,4 +1,4 @@
-"""Distances of the tool and one object along a path, and where they meet first."""
+"""Distances of the tool and one object along a path, and their first collision."""
 
 import time
 from collections.abc import Sequence
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import MovedPair
 from hapticdb.kernels.surfaces.sides import TriangleTree
 from hapticdb.kernels.triangles.nearest import Nearest
@@ -18,15 +18,15 @@ from hapticdb.store.base import Object
 Floats = NDArray[np.float64]
 
 COARSE, FINE = 9e-6, 1e-6
-"""Metres to which a least distance is found, and per mille of it if that is more: always, and where
-it is soon found."""
+"""Tolerances of a least distance, metres, and per mille of it if more: coarse always, fine after a
+short search."""
 EASY = 20_000
-"""Looks up to which that is soon."""
+"""Proximity queries of a short search, at most."""
 STRETCHES = 256
-"""Stretches of a path on which boxes are compared. More: fewer objects are looked at."""
+"""Stretches of a path for the broad phase. More: fewer objects in the narrow phase."""
 STEPS = 1 << 16
-"""Entries of a search between two looks at the clock: some hundredths of a second. Larger: a limit
-of time is overrun by more."""
+"""Entries of a search between two readings of the clock: some hundredths of a second. Larger: a
+time limit is overrun by more."""
 
 
 class OverTimeError(Exception):
@@ -34,7 +34,7 @@ class OverTimeError(Exception):
 
 
 class Least(NamedTuple):
-    """A distance, metres, the way where it is found, and the places (3,) that are so near there."""
+    """A distance, metres, its path parameter, and the nearest places (3,) there."""
 
     at_most: float
     way: float
@@ -45,13 +45,12 @@ class Least(NamedTuple):
 class Pair:
     """The tool and one object along a path.
 
-    tree : triangles of the object, world frame; until : time of `time.monotonic` at which it ends
-    by OverTimeError; end : way up to which they are looked at, the whole path unless given; error :
-    chord errors of both, metres.
+    tree : triangles of the object, world frame; until : end, `time.monotonic`, by OverTimeError;
+    end : last path parameter, the whole path unless given; error : chord errors of both, metres.
     """
 
     def __init__(
-        self, tree: TriangleTree, tool: MovingSurface, way: Way, until: float = np.inf,
+        self, tree: TriangleTree, tool: MovingSurface, way: ToolPath, until: float = np.inf,
         end: float | None = None, error: float = 0.0,
     ) -> None:  # fmt: skip
         self.error = error
@@ -60,7 +59,7 @@ class Pair:
         self.looks = 0
 
     def measure(self, ways: Floats, farthest: Floats, enough: float = 0.0) -> Nearest:
-        """Measure at ways (n,), as `kernels.triangles.nearest`."""
+        """Measure at path parameters (n,), as `kernels.triangles.nearest`."""
         self.check_time()
         self.looks += len(ways)
         return self.tool.nearest(self.tree, self.way.at(ways), farthest, enough)
@@ -70,7 +69,7 @@ class Pair:
         return self.tool.nearest(self.tree, pose[None], np.array([np.inf]))
 
     def first_met(self, moved: MovedPair, begin: float, end: float) -> float:
-        """Way of the first meeting of surfaces after a small motion, from a way on; or the end."""
+        """Path parameter of the first collision after a small motion, or the end."""
         motion = self.way.motion
         search = Search(
             moved.object, moved.tool, motion._replace(centers=motion.centers + moved.motion.shift),
@@ -80,10 +79,10 @@ class Pair:
         return float(search.found.way[0]) if search.found.way[0] >= 0.0 else end
 
     def least(self, begin: float, best: float) -> tuple[Least | None, float]:
-        """Least distance from a way on, if it is less than `best`; else None.
+        """Least distance from a path parameter on, if it is less than `best`; else None.
 
-        Returns what is proved, too. If the surfaces meet, it is their first meeting. Where that
-        took few looks, it is found nine times as exactly.
+        Returns the proved bound, too. In a collision it is the first one. After few proximity
+        queries, the tolerance is nine times finer.
         """
         found, closed, looks = self._search(begin, best, COARSE)
         known = best if found is None else found.at_most
@@ -95,7 +94,7 @@ class Pair:
         return found, 0.0 if found.at_most <= MEETING else max(min(closed, found.at_most), 0.0)
 
     def _search(self, begin: float, best: float, fine: float) -> tuple[Least | None, float, int]:
-        """The same to `fine` metres, and how many looks it took."""
+        """The same to `fine` metres, and the number of proximity queries."""
         search = self.tool.search(self.tree, self.way.motion, begin=begin, best=best, fine=fine)
         self._finish(search, self.length)
         (at_most, closed), (way,), (on_object, on_tool) = search.found
@@ -108,7 +107,7 @@ class Pair:
         return found, float(closed), search.looks
 
     def _finish(self, search: Search, end: float) -> None:
-        """Search to an end; on a part of the path, as if they met there."""
+        """Search to an end; on a part of the path, as if they collided there."""
         if end < self.way.length:
             search.found.distance[0], search.found.way[0] = MEETING, end
         is_over = False
@@ -125,8 +124,10 @@ class Pair:
             raise OverTimeError
 
 
-def box_gaps(tool: MovingSurface, way: Way, objects: Sequence[Object]) -> tuple[Floats, Floats]:
-    """Ways (N + 1,) between stretches of a path; distances (O, N) of boxes, never too large."""
+def box_gaps(
+    tool: MovingSurface, way: ToolPath, objects: Sequence[Object]
+) -> tuple[Floats, Floats]:
+    """Ends (N + 1,) of stretches of a path; distances (O, N) of boxes, never too large."""
     edges = np.linspace(0.0, way.length, (STRETCHES if way.length else 1) + 1)
     bounds = np.array([obj.bounds for obj in objects]).reshape(-1, 2, 3)
     middles = way.at(0.5 * (edges[:-1] + edges[1:]))
@@ -134,5 +135,5 @@ def box_gaps(tool: MovingSurface, way: Way, objects: Sequence[Object]) -> tuple[
 
 
 def error_of(distance: float) -> float:
-    """Metres to which a least distance is found at least."""
+    """Tolerance of a least distance, metres."""
     return COARSE * max(1.0, 1e3 * distance)

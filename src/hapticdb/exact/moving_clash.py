@@ -1,7 +1,7 @@
-"""Clashes of parts that move: the intervals of a motion in which they meet each object.
+"""Clashes of moving parts: the intervals of a motion in collision with each object.
 
-Where they do not meet is proved by the search that sweeps have. Within a meeting, looks a step
-apart say where it ends, and a few poses say how deep it is.
+Free intervals are proved by the search of sweeps. Within a meeting, samples a step apart bound its
+end, and a few poses its depth.
 """
 
 from collections.abc import Iterator
@@ -14,7 +14,7 @@ from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
 from hapticdb.exact.clash import judge
 from hapticdb.exact.distance import Pair, box_gaps
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.sweep import center_of
 from hapticdb.ingest.geometry import parts_of
@@ -29,22 +29,22 @@ from hapticdb.verdicts import Kind
 Floats = NDArray[np.float64]
 
 STEP, MOST_STEPS = 1.5, 4096
-"""Contact tolerances from one look of a meeting to the next, or the motion's share if that is
-more. Longer steps: a parting between two of them is not seen."""
+"""Contact tolerances between two samples of a meeting, or the motion's share if more. Longer: a
+parting between two samples is missed."""
 HALVINGS = 12
-"""Halvings of a step that find where a meeting ends."""
+"""Halvings of a step for the end of a meeting."""
 POSES = 9
-"""Poses of a meeting at which it is measured how deep it is."""
+"""Poses of a meeting for its depth."""
 MOST_TURN, TURN_STEP = 360.0, 30.0
 """Degrees of a whole turn, and from one of its poses to the next: less than half of it."""
 
 
 class Meeting(NamedTuple):
-    """An interval of a motion in which what moves meets an object.
+    """An interval of a motion in collision with an object.
 
-    id, name : of the object; begin, end : numbers of poses, with the share of the way to the next
-    one; kind, at_least : the gravest at `POSES` poses of it, as of a pair; place : where, x, y, z,
-    world frame, metres.
+    id, name : of the object; begin, end : numbers of poses, with the share of the path to the next
+    one; kind, at_least : the gravest at `POSES` poses of it, as of a pair; place : x, y, z, world
+    frame, metres.
     """
 
     id: int
@@ -73,14 +73,14 @@ def find_meetings(
     env : Environment
         With the surfaces of its objects.
     of, against : iterable of int or str
-        What moves; what it may meet: all other objects unless given.
+        Moving objects; the others: all other objects unless given.
     poses : (M, 4, 4) array
         Displacements of the parts from their places, rigid, world frame, metres.
     about : (3,) array or None
-        The point that moves straight and that turns are about, world frame; the middle of the
-        parts' box unless given.
+        The centre of turns, in straight motion, world frame; the middle of the parts' box unless
+        given.
     contact : float
-        Metres: a meeting ends where the surfaces are farther apart.
+        Metres: the distance of the surfaces at the end of a meeting.
     progress : callable or None
         Called with the number of objects decided, and of all near the motion.
     """
@@ -88,7 +88,7 @@ def find_meetings(
         raise UsageError(f"contact {contact} m: give a length above 0")
     with env.store.snapshot():
         tool = MovingSurface(env.shell(*of, points=1, inset=0.0))
-        way = Way.of(poses, tool.corners, center_of(tool, about))
+        way = ToolPath.of(poses, tool.corners, center_of(tool, about))
         objects = env.felt(against, of)
         gaps = box_gaps(tool, way, objects)[1].min(axis=1, initial=np.inf)
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
@@ -108,8 +108,8 @@ def find_meetings(
 def hinge(axis: int, about: ArrayLike, begin: float, end: float) -> Floats:
     """Displacements (M, 4, 4) of a turn about a world axis through a point (3,), in equal steps.
 
-    begin, end : degrees, counterclockwise where the axis points at the eye; UsageError if they are
-    equal, or more than `MOST_TURN` apart.
+    begin, end : degrees, by the right-hand rule; UsageError if they are equal, or more than
+    `MOST_TURN` apart.
     """
     if not 0.0 < abs(end - begin) <= MOST_TURN:
         raise UsageError(
@@ -125,7 +125,7 @@ def hinge(axis: int, about: ArrayLike, begin: float, end: float) -> Floats:
 
 
 def _intervals(pair: Pair, contact: float) -> Iterator[tuple[float, float]]:
-    """Ways where meetings begin and end."""
+    """Path parameters of the begins and ends of meetings."""
     end = 0.0
     while True:
         first = pair.least(end, 2.0 * MEETING)[0]
@@ -138,7 +138,7 @@ def _intervals(pair: Pair, contact: float) -> Iterator[tuple[float, float]]:
 
 
 def _parted(pair: Pair, way: float, contact: float) -> float:
-    """Way from which on surfaces that meet are farther apart than `contact`, or the last one."""
+    """Path parameter of the parting by more than `contact` after a meeting, or the last one."""
     length = pair.way.length
     step = max(STEP * contact, length / MOST_STEPS)
     for start in np.arange(way, length, 64 * step):
@@ -162,7 +162,7 @@ def _gaps(pair: Pair, ways: Floats, contact: float) -> Floats:
 def _gravest(
     still: CollisionShape, moved: CollisionShape, poses: Floats, contact: float
 ) -> tuple[Kind, float, tuple[float, ...]]:
-    """The gravest of what a pair is at poses, how deep it is there, and where."""
+    """The gravest kind of a pair at poses, its depth, and its place."""
     judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]
     told = [one for one in judged if not one.kind.is_free or one.kind is Kind.TOUCHING] or judged
     worst = min(told, key=lambda one: (one.kind.gravity, -one.at_least))
@@ -171,7 +171,7 @@ def _gravest(
     return kind, depth, tuple(worst.on_a.tolist())
 
 
-def _numbers(way: Way, ways: tuple[float, float]) -> tuple[float, float]:
-    """Numbers of poses at ways, with the share of the way to the next one."""
+def _numbers(way: ToolPath, ways: tuple[float, float]) -> tuple[float, float]:
+    """Numbers of poses at path parameters, with the share of the path to the next one."""
     begin, end = np.interp(ways, way.ways, np.arange(len(way.ways))).tolist()
     return begin, end

@@ -1,4 +1,4 @@
-"""The motion along a path, told by the metres that no place of the tool exceeds."""
+"""Paths of rigid motion, parameterised by an upper bound on the motion of any tool point."""
 
 from dataclasses import dataclass
 
@@ -15,11 +15,11 @@ Ints = NDArray[np.int64]
 RIGID = 1e-6
 """Greatest deviation of a rotation's columns from orthonormal ones; the same as for a frame."""
 AT_ONCE = 64
-"""Segments whose turns are bounded together. Larger: more memory."""
+"""Segments of a batch of turns. Larger: more memory."""
 
 
 @dataclass(frozen=True, eq=False)
-class Way:
+class ToolPath:
     """M given poses and the motion between them.
 
     The tool's `center` moves on straight lines, and the tool turns about it evenly, about one axis
@@ -30,8 +30,8 @@ class Way:
     poses : (M, 4, 4)
         As given, `world_from_tool`.
     ways : (M,)
-        Metres at each given pose: from one to the next, no place of the tool moves more than the
-        difference.
+        Path parameter at each given pose, metres: no place of the tool moves more than the
+        difference from one to the next.
     motion : PathMotion
         The same for kernels.
     """
@@ -41,7 +41,7 @@ class Way:
     motion: PathMotion
 
     @classmethod
-    def of(cls, poses: ArrayLike, corners: Floats, center: Floats) -> "Way":
+    def of(cls, poses: ArrayLike, corners: Floats, center: Floats) -> "ToolPath":
         """Motion of a tool with corners (V, 3) through poses (M, 4, 4); center (3,), its frame.
 
         Raises `UsageError` if there is no pose, a pose is not rigid, or the path is too long for
@@ -73,16 +73,16 @@ class Way:
         return float(self.ways[-1])
 
     def segments(self, ways: Floats) -> Ints:
-        """Segments (n,) of ways (n,), 0 .. M - 2: index of the last given pose before each."""
+        """Segments (n,) of path parameters (n,), 0 .. M - 2: index of the last pose before each."""
         found = np.searchsorted(self.ways, ways, side="right") - 1
         return np.asarray(np.clip(found, 0, max(len(self.ways) - 2, 0)))
 
     def fraction(self, way: float) -> float:
-        """Share of the path's motion before a way, 0 .. 1."""
+        """Share of the path's motion before a path parameter, 0 .. 1."""
         return min(way / self.length, 1.0) if self.length > 0.0 else 0.0
 
     def at(self, ways: ArrayLike) -> Floats:
-        """Poses (n, 4, 4) at ways (n,); the first and the last one where a way is beyond them."""
+        """Poses (n, 4, 4) at path parameters (n,), clamped to the ends of the path."""
         ways = np.array(ways, dtype=np.float64)
         out = np.tile(np.eye(4), (len(ways), 1, 1))
         poses_kernel(self.motion, self.segments(ways), ways, out)
@@ -90,7 +90,7 @@ class Way:
 
 
 def checked_poses(poses: ArrayLike) -> Floats:
-    """Check that poses (M, 4, 4) are rigid transforms, and return them."""
+    """Check poses (M, 4, 4) for rigid transforms, and return them."""
     given = as_floats(poses, "a path")
     if given.ndim != 3 or given.shape[1:] != (4, 4) or not len(given):
         raise UsageError(f"a path of shape {given.shape}: give poses (M, 4, 4), one at least")
@@ -122,7 +122,7 @@ def _turns_between(quaternions: Floats) -> Floats:
 
 
 def _turned(corners: Floats, turns: Floats, rotations: Floats) -> Floats:
-    """Metres (M - 1,) that the farthest of corners (V, 3) about the centre moves in each turn."""
+    """Greatest motion (M - 1,) of corners (V, 3) about the centre in each turn, metres."""
     angles = np.linalg.norm(turns, axis=1)
     out = np.zeros(len(turns))
     turning = np.flatnonzero(angles > 0.0)

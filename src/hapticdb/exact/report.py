@@ -1,4 +1,4 @@
-"""A sweep told: in one line, and for JSON, in metres and fractions of the path, world frame."""
+"""Reports of a sweep: a line, and JSON in metres and fractions of the path, world frame."""
 
 import math
 from collections.abc import Iterable, Sequence
@@ -13,12 +13,12 @@ from hapticdb.units import length_text
 from hapticdb.verdicts import PathVerdict
 
 MOST_NAMED = 3
-"""Greatest number of objects that a line names; the others are only counted."""
+"""Objects with a name in a line; the others are only counted."""
 FOUND = (
     "comes_out", "hits", "touching", "enclosed", "undecided", "contact", "overlap", "objects",
     "looks", "revision", "elapsed", "is_stopped",
 )  # fmt: skip
-"""What is told of a `Swept` as it is."""
+"""Fields of a `Swept` in JSON."""
 
 
 def percent(fraction: float) -> str:
@@ -34,9 +34,9 @@ def names_of(objects: Sequence[Object]) -> str:
 
 
 def verdict_line(found: Swept, shell: PointShell) -> str:
-    """Say in one line what the sweep has found.
+    """Write the verdict in one line.
 
-    shell : the tool; its size tells whether it lies inside an object, or the object inside it.
+    shell : the tool; by its size it lies inside an object, or the object inside it.
     """
     if found.verdict is PathVerdict.HITS:
         late = "the time was over: what is hit before may be missing" if found.is_stopped else ""
@@ -56,7 +56,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
 
 
 def overlaps_text(found: Swept) -> str:
-    """Say what the part overlaps where it stands, the most first."""
+    """Write the overlaps of the part at the start, the greatest first."""
     overlaps = [f"{one.object.name} {length_text(one.start)}" for one in found.overlapping]
     more = len(overlaps) - MOST_NAMED
     said = ", ".join(overlaps[:MOST_NAMED]) + (f" and {more} more" if more > 0 else "")
@@ -83,7 +83,7 @@ def until_text(fraction: float) -> str:
 
 
 def hit_text(found: Swept, place: PathPlace) -> str:
-    """Say how and where an object is hit."""
+    """Write the kind and the place of a hit."""
     where, name = f"at {where_text(found, place)}", place.object.name
     depth = f": at least {length_text(place.at_least)}" if place.at_least else ""
     for one in found.touching:
@@ -124,9 +124,9 @@ def _hit_clauses(found: Swept) -> Iterable[str]:
 
 
 def _free_clause(found: Swept) -> str:
-    """Say that the tool slides, if it does, and how far it keeps from all that it does not touch.
+    """Write the sliding of the tool, if any, and its gap from all untouched objects.
 
-    The gap is that of the whole path, so also of other objects while the tool slides.
+    The gap is the least one of the whole path, so also of other objects during the sliding.
     """
     sliding = [one for one in found.touching if one.is_sliding]
     clear = _clear_clause(found)
@@ -146,7 +146,7 @@ def _clear_clause(found: Swept) -> str:
 
 
 def error_text(error: float) -> str:
-    """Say the chord errors that a length carries; empty without any."""
+    """Write the chord errors of a length; empty without any."""
     return f", ±{length_text(error)} by tessellation" if error else ""
 
 
@@ -166,8 +166,8 @@ def sweep_record(
 ) -> dict[str, Any]:
     """Convert a sweep's result to numbers and strings, as `hapticdb sweep --json` prints it.
 
-    shell : the tool; parts : ids of the objects that it was made of, empty for a tool from a file;
-    excluded : ids of the objects that the sweep left out.
+    shell : the tool; parts : ids of its objects, empty for a tool from a file; excluded : ids of
+    the objects outside the filter.
     """
     return {
         "verdict": found.verdict,
@@ -183,9 +183,9 @@ def sweep_record(
 
 
 def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
-    """Convert a part of a result; a number that is not known is None, since JSON has no infinity.
+    """Convert a part of a result; infinity and NaN, absent from JSON, are None.
 
-    An object is told by its id and name; the object of a part beside the part's own fields.
+    An object is its id and name, among the fields of the part with it.
     """
     if isinstance(value, Object):
         return {"id": value.id, "name": value.name}

@@ -1,6 +1,6 @@
-"""Sweep: moves a tool along a path, and says exactly what it hits, or how near it comes.
+"""Sweep: moves a tool along a path; its first collisions, or its least distance, proved.
 
-The objects' boxes say which of them may be near the path, never too few. Their surfaces decide.
+Broad phase: the objects' boxes, never too few of them. Narrow phase: their surfaces.
 """
 
 import time
@@ -14,7 +14,7 @@ from hapticdb.environment import Environment
 from hapticdb.errors import ConnectionLostError, UsageError
 from hapticdb.exact.contact import Contact
 from hapticdb.exact.distance import Least, OverTimeError, Pair, box_gaps, error_of
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.exact.separation import CONTACT, SAME, Separation
 from hapticdb.exact.swept import Gap, PathPlace, Swept, TouchedObject
 from hapticdb.ingest.geometry import parts_of
@@ -27,9 +27,9 @@ from hapticdb.store.base import Object, Progress
 from hapticdb.store.finding import Words
 
 FIRST_SHARE, LATER = 1 / 64, 4.0
-"""Share of the path on which contacts are followed first, and the factor of each later share."""
+"""First share of the path for contacts, and the factor of each later share."""
 BEYOND = 4.0
-"""Chord errors beyond a meeting at which it is looked whether the true surfaces overlap."""
+"""Chord errors beyond a collision for the proof of an overlap of the true surfaces."""
 
 Floats = NDArray[np.float64]
 
@@ -47,7 +47,7 @@ def sweep(
     until_hit: bool = False,
     progress: Progress | None = None,
 ) -> Swept:  # fmt: skip
-    """Move a tool along a path; say what it hits and where, or how near it comes.
+    """Move a tool along a path: its hits with their places, or its least distance.
 
     Parameters
     ----------
@@ -56,7 +56,7 @@ def sweep(
     shell : PointShell
         The tool. Its surface is what moves; its points do not matter.
     poses : (M, 4, 4) array
-        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `Way`.
+        `world_from_tool`, rigid, metres; at least one. Motion between two: as for `ToolPath`.
     where, exclude : iterable of int or str
         What can be met: the objects that `where` chooses, all if it is empty, without those of
         `exclude`. A part that is taken out must not hit itself. Words as for `Environment.find`.
@@ -86,14 +86,14 @@ def sweep(
     """
     asked = _Asked(contact, overlap, seated, until_hit, progress).begun(limit, seconds)
     tool = MovingSurface(shell)
-    way = Way.of(poses, tool.corners, center_of(tool, about))
+    way = ToolPath.of(poses, tool.corners, center_of(tool, about))
     with suppress(ConnectionLostError):
         return _Sweep(env, tool, way, asked).swept(where, exclude)
     return _Sweep(env, tool, way, asked).swept(where, exclude)
 
 
 class _Asked(NamedTuple):
-    """What is asked, as for `sweep`; until : time of `time.monotonic`."""
+    """Arguments as for `sweep`; until : end, `time.monotonic`."""
 
     contact: float
     overlap: float
@@ -117,7 +117,7 @@ class _Asked(NamedTuple):
 
 
 def center_of(tool: MovingSurface, about: ArrayLike | None) -> Floats:
-    """Centre (3,) of turns: as it is asked for, or the middle of the tool's box."""
+    """Centre (3,) of turns: as given, or the middle of the tool's box."""
     if about is None:
         return np.asarray(0.5 * (tool.corners.min(axis=0) + tool.corners.max(axis=0)))
     center = np.asarray(about, dtype=np.float64)
@@ -139,7 +139,7 @@ class _Touched(NamedTuple):
 class _Sweep:
     """State of one sweep."""
 
-    def __init__(self, env: Environment, tool: MovingSurface, way: Way, asked: _Asked) -> None:
+    def __init__(self, env: Environment, tool: MovingSurface, way: ToolPath, asked: _Asked) -> None:
         self._env, self._tool = env, tool
         self._way, self._asked = way, asked
         self._looks = 0
@@ -181,7 +181,7 @@ class _Sweep:
         )  # fmt: skip
 
     def _decide(self, objects: list[Object]) -> int:
-        """Look at objects, the nearest boxes first; returns how many were looked at."""
+        """Decide about objects, the nearest boxes first; returns their number."""
         edges, gaps = box_gaps(self._tool, self._way, objects)
         nearest = gaps.min(axis=1, initial=np.inf)
         order = np.argsort(nearest, kind="stable").tolist()
@@ -201,14 +201,14 @@ class _Sweep:
 
     @property
     def _end(self) -> float:
-        """Way up to which objects are looked at."""
+        """Last path parameter of interest."""
         if not (self._asked.until_hit and (self._hits or self._enclosed)):
             return self._way.length
         first = min((place.fraction for place in self._hits), default=0.0)
         return 0.0 if self._enclosed else first * self._way.length
 
     def _wanted(self) -> float:
-        """Distance below which something changes the result."""
+        """Greatest distance with an effect on the result."""
         if self._hits or self._enclosed:
             return 2.0 * MEETING
         return self._best - error_of(self._best) if np.isfinite(self._best) else np.inf
@@ -216,7 +216,7 @@ class _Sweep:
     def _look_at(self, obj: Object, part: Part, *, is_inside: bool) -> None:
         """Decide about one object; is_inside : whether its box meets the tool's at the start.
 
-        One that is touched is only followed a little: most of those that are hit, are hit there.
+        A contact is only followed a little at first: most hits are there.
         """
         shape = CollisionShape(part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord)
         error = shape.chord + self._tool.chord
@@ -239,7 +239,7 @@ class _Sweep:
         self._looks += pair.looks
 
     def _touch(self, obj: Object, pair: Pair, shape: CollisionShape, gap: float) -> None:
-        """Begin to follow a contact; gap : of the surfaces where the path starts."""
+        """Begin a contact; gap : of the surfaces at the start of the path."""
         is_fine = pair.error < self._asked.contact
         found = self._contact(pair, shape, gap, pair.error if is_fine else -pair.error)
         if not is_fine:
@@ -254,7 +254,7 @@ class _Sweep:
         return Contact(pair, shape, asked.contact, gap, seated=asked.seated, error=error)
 
     def _follow(self) -> None:
-        """Follow all contacts in the order of the path, then what is left again from there on."""
+        """Follow all contacts in the order of the path, then each object from its parting on."""
         share = FIRST_SHARE
         while share < 1.0:
             share = min(LATER * share, 1.0)
@@ -265,7 +265,7 @@ class _Sweep:
                 self._measure(obj, pair, shape, found.way)
 
     def _advance(self, n: int, end: float) -> None:
-        """Follow the n-th contact to a way, and note a hit."""
+        """Follow the n-th contact to a path parameter, and note a hit."""
         found = self._contacts[n].found
         if not found.is_over:
             found.advance(min(end, self._end))
@@ -273,7 +273,7 @@ class _Sweep:
                 self._note_hit(n)
 
     def _note_hit(self, n: int) -> None:
-        """Note where the n-th contact ends by a hit, unless it is within the chord error."""
+        """Note the hit at the end of the n-th contact, unless it is within the chord error."""
         obj, pair, shape, gap, found = self._contacts[n]
         if found.error > 0.0:
             found = self._contact(pair, shape, gap, -found.error)
@@ -297,9 +297,9 @@ class _Sweep:
         )  # fmt: skip
 
     def _measure(self, obj: Object, pair: Pair, shape: CollisionShape, begin: float) -> None:
-        """Find where an object is met first from a way on, or how near it comes.
+        """Find the first collision with an object from a path parameter on, or the least distance.
 
-        What was touched begins to be near, so it has no part in the gap: is it met again?
+        A former contact begins near, so it has no part in the gap.
         """
         is_counted = not (begin or self._hits or self._enclosed)
         best = self._best if is_counted else 2.0 * MEETING + pair.error
@@ -317,7 +317,7 @@ class _Sweep:
             self._nearest = self._place(obj, least.way, least.on_tool, least.on_object)
 
     def _is_met(self, pair: Pair, shape: CollisionShape, least: Least) -> bool:
-        """Whether the true surfaces meet: they overlap by more than the chord errors soon after."""
+        """Whether the true surfaces collide: an overlap beyond the chord errors soon after."""
         way = min(least.way + BEYOND * pair.error, self._way.length)
         found = Separation(shape, self._tool, pair.check_time)
         return found.depth(self._way.at([way])[0], pair.error)[0] > 0.0

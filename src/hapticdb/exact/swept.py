@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.store.base import Object
 from hapticdb.units import length_text, notebook_html
 from hapticdb.verdicts import PathVerdict
@@ -15,13 +15,13 @@ Floats = NDArray[np.float64]
 
 
 class PathPlace(NamedTuple):
-    """Where on the path an object is nearest, or is met.
+    """Place on the path of the least distance from an object, or of the collision with it.
 
-    fraction : share of the path's motion before it, 0 .. 1; segment : index of the given pose where
-    its segment starts, 0 .. M - 2; pose (4, 4) : `world_from_tool`; on_tool, on_object (3,) : the
-    nearest places of the two surfaces, world frame; where the surfaces meet, both are near the
-    meeting place, or the deepest; at_least : proved penetration depth shortly after it, metres, of
-    what is touched from the start; 0 if none is proved.
+    fraction : share of the path's motion before it, 0 .. 1; segment : index of the given pose at
+    the start of its segment, 0 .. M - 2; pose (4, 4) : `world_from_tool`; on_tool, on_object (3,) :
+    the nearest places of the two surfaces, world frame; in a collision, both near its place, or the
+    deepest; at_least : proved penetration depth shortly after it, metres, of a contact from the
+    start; 0 without a proof.
     """
 
     object: Object
@@ -37,8 +37,8 @@ class Gap(NamedTuple):
     """Least distance of the tool's surface from any other on the whole path.
 
     at_least : proved; at_most : the distance at `place`, never farther above `at_least` than
-    0.01 mm or 1 %, but for chord errors; place : None if nothing is nearer than the limit, which
-    both numbers are then; error : chord errors of both surfaces there, which `at_least` is less.
+    0.01 mm or 1 %, but for chord errors; place : None if nothing is nearer than the limit, then
+    equal to both numbers; error : chord errors of both surfaces there, deducted in `at_least`.
     """
 
     at_least: float
@@ -48,14 +48,13 @@ class Gap(NamedTuple):
 
 
 class TouchedObject(NamedTuple):
-    """An object within the contact tolerance of the tool where the path starts.
+    """An object within the contact tolerance of the tool at the start of the path.
 
-    start : overlap at the start, at most, metres: the least motion that frees it there, or the
-    contact tolerance if that frees it; infinite where none does; start_at_least : penetration depth
-    there, proved, 0 if none is; reach : by which no place of the tool or object is moved, so that
-    the path is free; by : the kind of that motion; until : fraction of the path up to which they
-    touch, or are followed, 1 if they still touch at its end; is_sliding : whether the tool moves on
-    by more than the tolerance while they touch.
+    start : overlap at the start, at most, metres: the least separating motion there, or the contact
+    tolerance if enough; infinite without any; start_at_least : proved penetration depth there, or
+    0; reach : greatest displacement by the motion with a free path; by : the kind of that motion;
+    until : fraction of the path at the end of the contact, 1 at the end of the path; is_sliding :
+    whether the tool moves on by more than the tolerance in contact.
     """
 
     object: Object
@@ -73,7 +72,7 @@ class Swept:
 
     Attributes
     ----------
-    path : Way
+    path : ToolPath
         The poses given, and the motion between them: `path.at(fractions * path.length)` gives
         poses, and no place of the tool moves more than `path.length` metres.
     gap : Gap
@@ -102,7 +101,7 @@ class Swept:
         Whether the time ended the sweep before all was decided.
     """
 
-    path: Way
+    path: ToolPath
     gap: Gap
     hits: tuple[PathPlace, ...]
     touching: tuple[TouchedObject, ...]
@@ -123,15 +122,15 @@ class Swept:
         return f"Swept({self.verdict}, {found}{more}, {self.objects} objects, {self.elapsed:.2f} s)"
 
     def _repr_html_(self) -> str:
-        """Table of what is hit, for notebooks."""
+        """Table of the hits, for notebooks."""
         rows = ((one.object.name, f"at {one.fraction:.2%} of the path") for one in self.hits)
         return notebook_html(self, rows)
 
     @property
     def verdict(self) -> PathVerdict:
-        """What is proved: a hit, the time over, an overlap at the start, sliding, or clear.
+        """Proved verdict: a hit, the time over, an overlap at the start, sliding, or clear.
 
-        It slides if it moves on in contact with what it touches at the start, and hits nothing.
+        A sliding tool moves on in contact with an object touched at the start, and hits nothing.
         """
         if self.hits or self.enclosed:
             return PathVerdict.HITS
@@ -144,14 +143,14 @@ class Swept:
 
     @property
     def overlapping(self) -> tuple[TouchedObject, ...]:
-        """Objects that the tool overlaps at the start by more than is allowed, the most first."""
+        """Objects in an overlap at the start beyond the allowed one, the deepest first."""
         allowed = max(self.contact, self.overlap)
         found = [one for one in self.touching if one.start > allowed]
         return tuple(sorted(found, key=lambda one: -one.start))
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing is hit on the whole path: clear, slides, or but for what it overlaps."""
+        """Whether nothing is hit on the whole path, but for overlaps at the start."""
         return self.verdict.is_free
 
     @property

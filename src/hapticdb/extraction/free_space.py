@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.closing import Closes
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.extraction.problem import Problem, guarded_shell
 from hapticdb.query.touches import Touch
 from hapticdb.resident.frames import ResidentFrames
@@ -42,7 +42,7 @@ class Room:
         self.n_poses = 0
         self._frames, self._problem = frames, problem
 
-    def ways(self, path: Way) -> Floats:
+    def ways(self, path: ToolPath) -> Floats:
         """Ways (n,) on a path, by `STEP` voxels at most from one to the next."""
         steps = path.length / (STEP * self._problem.voxel_size)
         return np.linspace(0.0, path.length, 1 + max(int(np.ceil(steps)), 1))

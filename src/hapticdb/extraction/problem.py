@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from hapticdb.environment import Environment
 from hapticdb.errors import UsageError
-from hapticdb.exact.path import Way
+from hapticdb.exact.path import ToolPath
 from hapticdb.grid import corners_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.attributes import scene_bounds
@@ -65,9 +65,9 @@ class Problem(NamedTuple):
         _, principal = np.linalg.eigh(np.cov(corners.T))
         return np.concatenate([self.parts[0].transform[:3, :3].T, principal.T])
 
-    def path(self, poses: Floats) -> Way:
+    def path(self, poses: Floats) -> ToolPath:
         """Motion through displacements (M, 4, 4), as in a sweep; it bounds that of each place."""
-        return Way.of(poses, self.corners, self.center)
+        return ToolPath.of(poses, self.corners, self.center)
 
 
 def problem_of(

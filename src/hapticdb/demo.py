@@ -18,7 +18,7 @@ from hapticdb.environment import Environment
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import GridError, UsageError
 from hapticdb.grid import GridOptions
-from hapticdb.ingest.files import FileReport, ImportCallback, ImportOptions, import_files
+from hapticdb.ingest.files import ImportCallback, ImportOptions, import_files
 from hapticdb.paper.strategies import Strategy
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.poses import read_poses
@@ -144,12 +144,10 @@ def _import(
     started = time.perf_counter()
     options = ImportOptions(grid=grid, layout=layout)
     try:
-        report: FileReport = import_files(url, [car], options, progress)[0]
+        report = import_files(url, [car], options, progress)[0]
     except GridError as error:
         raise UsageError(f"{url} is of another demo: give another folder ({error})") from error
     seconds = time.perf_counter() - started
-    if report.error is not None:
-        raise report.error
     with open_environment(url) as env:
         if env.store.size().rows:
             env.calibrate()

@@ -24,7 +24,7 @@ BRICK_BITS = 3
 CELL_BITS = 5
 """Bits on one axis of a voxel's place in its cell."""
 ROOM = 1.6
-"""Edge of a fitted grid, in longest sides of the first file's bounding box."""
+"""Edge of a fitted grid, in longest sides of the bounding box of all files."""
 
 
 @dataclass(frozen=True)
@@ -145,16 +145,16 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """Options of a user for a grid. All others are fitted to the first file."""
+    """Options of a user for a grid. All others are fitted to the files."""
 
     bits: int | None = None
     """Bits on each axis; 10 unless the other options determine them."""
     voxel_size: float | None = None
     """Edge of a voxel, metres."""
     extent: float | None = None
-    """Edge of the grid in longest sides of the first file's bounding box."""
+    """Edge of the grid in longest sides of the bounding box of all files."""
     origin: Sequence[float] | None = None
-    """Lower corner, metres; the grid is centred on the first file without it."""
+    """Lower corner, metres; the grid is centred on the files without it."""
     curve: CurveName | None = None
     """Z-order unless given."""
 
@@ -175,7 +175,7 @@ class GridOptions:
         """Grid for a scene of bounds (2, 3), metres: a cube, centred unless an origin is given."""
         longest = float((bounds[1] - bounds[0]).max())
         if longest <= 0 and self.voxel_size is None:
-            raise GridError("the first file is a single point: give --voxel-size")
+            raise GridError("all files are a single point: give --voxel-size")
         center = (bounds[0] + bounds[1]) / 2
         bits, size = self._resolve(longest)
         edge = size * (1 << bits)

@@ -203,9 +203,10 @@ def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
         tmp_path / "far.obj",
         {"near": ball((0, 0, 0), 0.05), "gone far": box((0.1, 0, 0), (0.2, 0.01, 0.01))},
     )
-    line = refusal(import_one(database, far), hapticdb.errors.OutsideGridError)
+    with pytest.raises(hapticdb.errors.OutsideGridError) as raised:
+        import_one(database, far)
     for words in ("far.obj", "'gone far'", "(0.1, 0, 0) to (0.2, 0.01, 0.01)", "--extent"):
-        assert words in line
+        assert words in str(raised.value)
     assert rows_of(database) == before
 
 
@@ -273,7 +274,8 @@ def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) 
     (tmp_path / "bad.stl").write_text("no facets here")
     other = write_obj(tmp_path / "other.obj", {"one more": ball((0, 0, 0), 0.02)})
     given = [tmp_path / "bad.stl", file, tmp_path / "gone.obj", other]
-    reports = hapticdb.import_files(tmp_path / "e.db", given, small_options())
+    options = replace(small_options(), skip_unusable=True)
+    reports = hapticdb.import_files(tmp_path / "e.db", given, options)
     assert [r.status for r in reports] == ["failed", "imported", "failed", "imported"]
     assert "bad.stl" in refusal(reports[0], hapticdb.errors.FileError)
     assert "there is no such file" in refusal(reports[2], hapticdb.errors.FileError)
@@ -282,18 +284,37 @@ def test_a_bad_file_is_skipped_and_the_others_go_in(tmp_path: Path, file: Path) 
         assert [o.id for o in reports[3].added] == [8]
 
 
+@pytest.mark.parametrize("ahead", [0, files.MOST_AHEAD])
+def test_a_new_grid_holds_all_files(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, ahead: int
+) -> None:
+    monkeypatch.setattr(files, "MOST_AHEAD", ahead)
+    (tmp_path / "bad.stl").write_text("no facets here")
+    near = write_obj(tmp_path / "near.obj", {"near": ball((0, 0, 0), 0.1)})
+    far = write_obj(tmp_path / "far.obj", {"far": ball((9, 0, 0), 0.1)})
+    given = [tmp_path / "bad.stl", near, tmp_path / "gone.obj", far]
+    options = ImportOptions(grid=GridOptions(bits=8, extent=1.5), skip_unusable=True)
+    reports = hapticdb.import_files(tmp_path / "e.db", given, options)
+    assert [r.status for r in reports] == ["failed", "imported", "failed", "imported"]
+    with hapticdb.open(tmp_path / "e.db") as env:
+        assert env.grid.edge == pytest.approx(1.5 * 9.2)
+    reports = hapticdb.import_files(tmp_path / "e.db", given, options)  # has the same extent
+    assert [r.status for r in reports] == ["failed", "complete", "failed", "complete"]
+
+
 @pytest.mark.parametrize("cause", ["unreadable", "outside", "interrupted"])
 def test_nothing_usable_leaves_no_database_behind(
     tmp_path: Path, file: Path, cause: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     (tmp_path / "bad.obj").write_text("v 0 0\n")
     if cause == "unreadable":
-        reports = hapticdb.import_files(tmp_path / "e.db", [tmp_path / "bad.obj"] * 2)
+        options = ImportOptions(skip_unusable=True)
+        reports = hapticdb.import_files(tmp_path / "e.db", [tmp_path / "bad.obj"] * 2, options)
         assert [r.status for r in reports] == ["failed", "failed"]
     elif cause == "outside":
         grid = GridOptions(bits=5, voxel_size=0.001, origin=(0, 0, 0))
-        report = import_one(tmp_path / "e.db", file, ImportOptions(grid=grid))
-        refusal(report, hapticdb.errors.OutsideGridError)
+        with pytest.raises(hapticdb.errors.OutsideGridError):
+            import_one(tmp_path / "e.db", file, ImportOptions(grid=grid))
     else:
 
         def interrupted(*_: object) -> FileReport:
@@ -346,10 +367,9 @@ def test_a_name_that_is_no_text_is_refused(
         return replace(read(path, unit=unit), link=name)
 
     monkeypatch.setattr(files, "read_file", named)
-    (report,) = hapticdb.import_files(tmp_path / "e.db", [str(file)])
-    assert report.status == "failed"
-    assert "is no text" in str(report.error)
-    str(report.error).encode()  # the message itself can be printed
+    with pytest.raises(hapticdb.errors.FileError, match="is no text") as raised:
+        hapticdb.import_files(tmp_path / "e.db", [str(file)])
+    str(raised.value).encode()  # the message itself can be printed
     assert not (tmp_path / "e.db").exists()
 
 

@@ -56,7 +56,6 @@ def test_a_surface_too_large_for_a_row_is_told_and_nothing_is_made(
 ) -> None:
     monkeypatch.setattr(geometry, "MOST_BYTES", 100)
     file = write_obj(tmp_path / "assembly.obj", assembly(2))
-    (report,) = hapticdb.import_files(tmp_path / "e.db", [file])
-    assert report.status == "failed"
-    assert "part 'ball 0': its surface takes" in str(report.error)
+    with pytest.raises(hapticdb.errors.FileError, match="part 'ball 0': its surface takes"):
+        hapticdb.import_files(tmp_path / "e.db", [file])
     assert not (tmp_path / "e.db").exists()

@@ -82,9 +82,8 @@ def test_a_part_that_does_not_fit_into_memory_is_refused_in_one_line(
         bricks_of_pieces(voxelize.voxelize_pieces(HUGE, BITS, 100), "a part")
     path = text(tmp_path / "a.obj", "v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3\n")
     options = ImportOptions(grid=GridOptions(bits=BITS), layout="voxel")
-    (report,) = import_files(tmp_path / "a.db", [path], options)
-    assert report.status == "failed"
-    assert str(path) in str(report.error)
+    with pytest.raises(FileError, match=str(path)):
+        import_files(tmp_path / "a.db", [path], options)
     assert not (tmp_path / "a.db").exists()
 
 

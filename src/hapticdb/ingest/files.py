@@ -85,6 +85,8 @@ class FileReport:
         return f"FileReport({self.link}: {self.status}, {self.error or what})"
 
 
+MOST_AHEAD = 1 << 29
+"""Bytes of geometry kept from files read ahead. Less: more files are read twice."""
 _READING = ("unit", "time_limit", "memory_limit", "chord")
 
 
@@ -113,6 +115,8 @@ class ImportOptions:
     replace: bool = False
     """Also replace objects, under their ids, whose geometry, placement or unit is another now, and
     remove those whose parts the file lacks."""
+    skip_unusable: bool = False
+    """Import the other files if one cannot be used; its report has the error."""
     distances: bool | None = None
     """Whether parts of a new environment get distances to their surfaces, which the force
     law needs. Unless given, they do in the layout brick. The layout voxel has none."""
@@ -144,48 +148,95 @@ def import_files(
 ) -> list[FileReport]:
     """Import files into an environment, which is made if it does not exist.
 
-    A file that cannot be used is reported and skipped; the others are imported. The first usable
-    one decides on the grid of a new environment, which is removed if nothing was written.
+    The grid of a new environment holds all of them; one without any object is removed again.
 
     Returns a report for each file, in order.
 
-    Raises `GridError` or `UsageError` if the options are invalid, or contradict an existing
-    environment; `DatabaseError` if the environment cannot be opened or written.
+    Raises `FileError` or `MissingExtraError` at the first unusable file, unless
+    `ImportOptions.skip_unusable`: the files before it stay imported. Raises `GridError` or
+    `UsageError` if the options are invalid, or contradict an existing environment; `DatabaseError`
+    if the environment cannot be opened or written.
     """
     chosen = options or ImportOptions()
     if isinstance(files, (str, bytes, os.PathLike)):
         raise UsageError(f"files {files!r}: give a list of files")
     if not files:
         raise UsageError("no files: name at least one to import")
-    reports: list[FileReport] = []
     with connected(chosen.on) as workers, _Target(url, chosen) as target:
+        sources = _Sources(files, chosen.reading)
         with target.loading:
-            for file in files:
-                reports.append(_import_file(target, file, chosen, progress, workers))
-                target.is_first_file = False
+            reports = [
+                _import_file(target, sources, n, chosen, progress, workers)
+                for n in range(len(files))
+            ]
         if target.store is not None and target.store.revision():
             target.store.analyze(DEFAULT_RESOLUTION)
     return reports
 
 
+class _Sources:
+    """Files of an import. Those read ahead, for their bounds, are kept up to `MOST_AHEAD` bytes."""
+
+    def __init__(self, files: Sequence[str | os.PathLike[str]], reading: dict[str, Any]) -> None:
+        self.files, self._reading = files, reading
+        self._ahead: dict[int, MeshFile | FileError | MissingExtraError] = {}
+        self._bytes = 0
+
+    def read(self, n: int) -> MeshFile:
+        """Read file n; FileError, MissingExtraError."""
+        found = self._ahead.pop(n, None)
+        if found is None:
+            return read_file(self.files[n], **self._reading)
+        if isinstance(found, MeshFile):
+            self._bytes -= _bytes_of(found)
+            return found
+        raise found
+
+    def bounds_from(self, n: int, first: MeshFile) -> NDArray[np.float64]:
+        """Bounds (2, 3) of file n, which is read, and of all usable files after it."""
+        boxes = [first.bounds]
+        for later in range(n + 1, len(self.files)):
+            try:
+                found = self.read(later)
+            except (FileError, MissingExtraError) as error:
+                self._ahead[later] = error
+                continue
+            boxes.append(found.bounds)
+            if self._bytes + _bytes_of(found) <= MOST_AHEAD:
+                self._ahead[later] = found
+                self._bytes += _bytes_of(found)
+        low, high = np.stack(boxes, axis=1)
+        return np.stack([low.min(axis=0), high.max(axis=0)])
+
+
+def _bytes_of(mesh_file: MeshFile) -> int:
+    return sum(
+        part.vertices.nbytes + (0 if part.faces is None else part.faces.nbytes)
+        for part in mesh_file.parts
+    )
+
+
 def _import_file(
     target: "_Target",
-    file: str | os.PathLike[str],
+    sources: _Sources,
+    n: int,
     options: ImportOptions,
     progress: ImportCallback | None,
     workers: Cluster | None,
 ) -> FileReport:
-    """Import one file; if it cannot be used, the report says why."""
+    """Import file n; if it cannot be used, the report says why."""
     try:
-        mesh_file = read_file(file, **options.reading)
-        store = target.store_for(mesh_file)
+        mesh_file = sources.read(n)
+        store = target.store_for(mesh_file, lambda: sources.bounds_from(n, mesh_file))
         return ingest_file(store, mesh_file, options, progress, workers)
     except (FileError, MissingExtraError) as error:
-        return FileReport(os.fspath(file), "failed", error=error)
+        if not options.skip_unusable:
+            raise
+        return FileReport(os.fspath(sources.files[n]), "failed", error=error)
 
 
 class _Target:
-    """The environment that files are imported into: opened, or made for the first usable file."""
+    """The environment of an import: opened, or made with a grid for all usable files."""
 
     def __init__(self, url: str | os.PathLike[str], options: ImportOptions) -> None:
         self._url, self._options = url, options
@@ -193,7 +244,7 @@ class _Target:
         self._is_new = self._is_loading = False
         self.loading = contextlib.ExitStack()
         """Keeps `Store.loading` active from the first usable file on."""
-        self.is_first_file = True
+        self._is_checked = False
         self.store: Store | None = None
         if exists(url):
             self._join(options.layout, options.grid)
@@ -213,15 +264,21 @@ class _Target:
         else:
             self.store.close()
 
-    def store_for(self, mesh_file: MeshFile) -> Store:
-        """Return the store, ready to load a file; the first usable file makes the environment."""
+    def store_for(self, mesh_file: MeshFile, bounds: Callable[[], NDArray[np.float64]]) -> Store:
+        """Return the store, ready to load a file; bounds : (2, 3) of this file and the later ones.
+
+        The first usable file makes the environment.
+        """
         grid_options = self._options.grid
         if self.store is None:
-            grid = grid_options.fit(mesh_file.bounds)
+            grid = grid_options.fit(bounds())
             check_inside(mesh_file.parts, mesh_file.link, grid)
             self._create_or_join(grid)
-        elif self.is_first_file and not self._is_new:
-            grid_options.check_matches(self.store.grid, _first_bounds(self.store, mesh_file))
+        elif grid_options.extent is not None and not (self._is_new or self._is_checked):
+            first = next(iter(self.store.objects()), None)  # --extent is meant for its command
+            if first is None or first.link == mesh_file.link:
+                grid_options.check_matches(self.store.grid, bounds())
+        self._is_checked = True
         assert self.store is not None  # noqa: S101 - opened or made above
         if not self._is_loading:
             self.loading.enter_context(self.store.loading())
@@ -340,11 +397,3 @@ def _check_options(store: Store, layout: Layout | None, distances: bool | None) 
     if distances:
         raise UsageError(f"{store.url} was made without distances: leave --distances out")
     raise UsageError(f"{store.url} was made with distances: leave --no-distances out")
-
-
-def _first_bounds(store: Store, mesh_file: MeshFile) -> NDArray[np.float64] | None:
-    """Bounds of a file if it decided on the grid, because `--extent` is meant for that file."""
-    first = next(iter(store.objects()), None)
-    if first is None or first.link == mesh_file.link:
-        return mesh_file.bounds
-    return None

@@ -57,7 +57,8 @@ def bounds_inside(
     if not np.isfinite(bounds).all() or (scaled[0] < -AT_BORDER).any() or over.any():
         raise OutsideGridError(
             f"{link}: part {part.name!r} spans {_box(bounds)} m, outside the grid's "
-            f"{_box(grid.bounds)} m; move it, or make an environment with a larger --extent"
+            f"{_box(grid.bounds)} m; move it, or import all files by one command into a new "
+            "environment, or with a larger --extent"
         )
     return placed.bounds
 

@@ -43,7 +43,7 @@ ExtentOption = Annotated[
     float | None,
     typer.Option(
         metavar="FACTOR",
-        help="Edge of the grid: so many times the longest side of the first file's bounding box.",
+        help="Edge of the grid: so many times the longest side of the bounding box of all files.",
         show_default="1.6",
     ),
 ]
@@ -51,7 +51,7 @@ OriginOption = Annotated[
     str | None,
     typer.Option(
         metavar="X,Y,Z",
-        help="Lower corner of the grid, metres; unless given, the first file is in its middle.",
+        help="Lower corner of the grid, metres; unless given, the files are in its middle.",
     ),
 ]
 JobsOption = Annotated[
@@ -156,7 +156,7 @@ def import_(
     options = ImportOptions(
         unit=unit, grid=grid, layout=layout, jobs=jobs, on=on, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
-        replace=replace, distances=distances,
+        replace=replace, distances=distances, skip_unusable=True,
         chord=None if chord is None else length_of(chord, "--chord"),
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)

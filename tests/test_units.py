@@ -1,5 +1,6 @@
 """Lengths are read in the given unit, and a user sees that unit and the scene's size."""
 
+import inspect
 import json
 from collections.abc import Callable
 from pathlib import Path
@@ -13,8 +14,10 @@ from laspy.vlrs.known import GeoKeyDirectoryVlr, GeoKeyEntryStruct, WktCoordinat
 import hapticdb
 from command_line import Run, boxes, refused
 from command_line import tool as stl
+from hapticdb.cli import VERBS
+from hapticdb.cli.values import point_of
 from hapticdb.mesh import parse_in_process, read_file
-from hapticdb.units import place_text
+from hapticdb.units import length_of, place_text
 from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
@@ -192,3 +195,71 @@ def test_places_are_told_as_fine_as_what_is_there() -> None:
     assert place_text((5e5, 4649776.123456, 1.7e-17), 3e-6) == "(500000, 4649776.123456, 0)"
     assert place_text((-0.25, 1000.0, 0.0), 10.0) == "(0, 1000, 0)"
     assert place_text((-0.25, 1.0, 0.0), 0.0) == "(-0.25, 1, 0)"
+
+
+@pytest.mark.parametrize(
+    ("text", "unit", "metres"),
+    [
+        *((text, "mm", 1e-4) for text in ("0.1", ".1mm", "100 um", "100µm", "1e-4m", " +0.1 mm ")),
+        *(("0.2in", unit, 0.00508) for unit in ("mm", "m")),
+        *(("-3", unit, -3 * size) for unit, size in (("mm", 1e-3), ("m", 1.0))),
+        ("0.07", "mm", 7e-5),
+        ("4649776.123456", "m", 4649776.123456),
+        ("1us-ft", "mm", FEET),
+        ("2 ft", "mm", 0.6096),
+        ("0", "mm", 0.0),
+    ],
+)  # fmt: skip
+def test_a_length_is_in_its_own_unit_or_that_of_the_option(
+    text: str, unit: str, metres: float
+) -> None:
+    assert length_of(text, unit) == metres
+
+
+@pytest.mark.parametrize(
+    "text", ["", "mm", "1 furlong", "1,5", "nan", "inf", "1e999", "1mm2", "5MM"]
+)
+def test_what_is_no_length_is_refused_with_the_forms_that_are_taken(text: str) -> None:
+    with pytest.raises(hapticdb.errors.UsageError, match=r"give millimetres, or such as 0\.2in \("):
+        length_of(text, "mm")
+
+
+def test_three_lengths_have_units_of_their_own_or_the_last_ones() -> None:
+    inch = 0.0254
+    assert point_of("1,-2 0.5", "m") == (1, -2, 0.5)
+    assert point_of("1e-3,2e1,3", "m") == (1e-3, 20, 3)
+    assert point_of("0, 5 in, 1 ft", "mm") == (0, 0.127, 0.3048)
+    assert point_of("1 2 3 µm", "m") == pytest.approx((1e-6, 2e-6, 3e-6), rel=1e-15)
+    assert point_of("1in,2,3", "mm") == (inch, 2e-3, 3e-3)
+    for text in ("", "1,2", "1,2,3,4", "1,2,nan", "1,2,3 furlongs", "a,b,c", "1 mm"):
+        with pytest.raises(hapticdb.errors.UsageError, match=r"give X,Y,Z in metres, or such as"):
+            point_of(text, "m")
+
+
+def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> None:
+    """Defaults of verbs are metres, those in the help are in the option's unit."""
+    found = set()
+    for verb in VERBS:
+        for name, one in inspect.signature(verb).parameters.items():
+            option = getattr(one.annotation, "__metadata__", [None])[0]
+            if not getattr(option, "parser", None):
+                continue
+            found.add(name)
+            text = "1,2,25.4" if option.metavar == "X,Y,Z" else "25.4"
+            assert option.parser(f"{text}mm") == option.parser(f"{text} mm")
+            assert one.default is None or option.parser(option.show_default) == one.default
+    assert found == {
+        *("within", "contact", "overlap", "out", "screw", "chord", "voxel_size"),
+        *("about", "origin", "translate", "at"),
+    }
+
+
+def test_a_bad_length_is_one_line_that_names_the_option(run: Run) -> None:
+    for given in (
+        ("clashes", "a.db", "--within", "wide"),
+        ("sweep", "a.db", "--overlap", "1 parsec"),
+        ("import", "a.db", "a.stl", "--voxel-size", "1e"),
+        ("move", "a.db", "1", "--translate", "1,2"),
+        ("extract", "a.db", "1", "--to", "1 2 wide 1 0 0 0"),
+    ):
+        refused(run(*given), given[-2], repr(given[-1]), ": give ")

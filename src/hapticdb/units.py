@@ -1,7 +1,9 @@
 """Units of length, by the words that options and parameters take."""
 
 import math
+import re
 from collections.abc import Iterable
+from decimal import Decimal
 from html import escape
 
 from hapticdb.errors import UsageError
@@ -30,6 +32,8 @@ NAMES = {
     "yd": "yards",
 }
 """Each unit in words."""
+_LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)\s*([a-zµ-]+)?", re.IGNORECASE)
+"""A number, and a unit where it has one."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
 
@@ -60,6 +64,20 @@ def readable_unit(length: float) -> tuple[float, str]:
         if length >= least * size:
             return size, sign
     return 1e-6, "µm"
+
+
+def length_of(text: str, unit: str) -> float:
+    """Metres of a length: a number in `unit`, or with a unit of its own, such as ``0.2 in``.
+
+    The product is rounded once, so that 0.1mm and 100um are equal; `UsageError`.
+    """
+    match = _LENGTH.fullmatch(text.strip())
+    own = UNITS.get((match[2] or unit).replace("µ", "u")) if match else None
+    if match is None or own is None:
+        raise UsageError(
+            f"{text[:80]!r} is no length: give {NAMES[unit]}, or such as 0.2in ({', '.join(UNITS)})"
+        )
+    return float(Decimal(match[1]) * Decimal(repr(own)))
 
 
 def metres_of(unit: str) -> float:

@@ -43,7 +43,7 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
 
 
 def test_a_pose_is_reached_by_numbers_and_by_a_file(run: Run, scene: Path) -> None:
-    out = succeeded(run("extract", scene, "box1", "--to", "0,0,300,1,0,0,0", "--path", "to.csv"))
+    out = succeeded(run("extract", scene, "box1", "--to", "0,0,30cm,1,0,0,0", "--path", "to.csv"))
     assert out.startswith("reaches the pose straight, 0.3 m, ")
     goal = hapticdb.read_poses("to.csv")[-1:]
     assert np.allclose(goal[0, :3, 3], [0.0, 0.0, 0.3])

@@ -134,7 +134,10 @@ def test_a_simulated_device_is_pushed_back(run: Run) -> None:
         (["--device", "nowhere.csv"], ["nowhere.csv"]),
         (["--device", "nowhere.hdbrec"], ["no recording at nowhere.hdbrec"]),
         (["--device", "random"], ["give --at"]),
-        (["--device", "random", "--at", "here"], ["--at 'here'", "0.5,0,1.2"]),
+        (
+            ["--device", "random", "--at", "here"],
+            ["'--at': 'here'", "metres, or such as 0,5,0.2in"],
+        ),
         (["--device", "path.csv", "--speed", 0], ["speed", "positive"]),
         (["--device", "haply", "--speed", 1], ["real hand"]),
         (["--device", "felt.hdbrec", "--speed", 1], ["--speed", "has its own"]),

@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
-from hapticdb.cli.values import numbers_of
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
+    from hapticdb.cli.values import Point
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.devices.protocol import Device
 
@@ -30,7 +30,7 @@ class HandOptions:
 
     word: str
     speed: float | None
-    place: str | None
+    place: "Point | None"
     seed: int
     loops: bool
     is_simulated: bool
@@ -66,9 +66,6 @@ class HandOptions:
                 f"--device {word} is a real hand: leave out --simulate, --loop, --speed"
             )
 
-    def _position(self) -> list[float]:
-        return numbers_of(self.place or "", 3, "--at", "metres, such as 0.5,0,1.2")
-
     def _vendor_device(self) -> "Device":
         from importlib import import_module
 
@@ -94,7 +91,8 @@ class HandOptions:
 
         if self.word == "random":
             greatest = RANDOM_SPEED if self.speed is None else self.speed
-            return scripted.RandomHand(self._position(), self.seed, greatest)
+            assert self.place is not None  # noqa: S101 - checked before
+            return scripted.RandomHand(self.place, self.seed, greatest)
         if self._ends_with(".hdbrec"):
             times, poses = Recording(self.word).poses()
             return scripted.Player(times, poses, loops=self.loops)

@@ -1,8 +1,11 @@
 """Arguments and options of the verbs that more than one verb takes, each declared once."""
 
-from typing import Annotated, Literal
+from collections.abc import Callable
+from typing import Annotated, Any, Literal
 
 import typer
+
+from hapticdb.units import NAMES, length_of
 
 StrategyName = Literal["auto", "statement", "array", "points", "maxgap", "cbgroup"]
 CurveName = Literal["z", "hilbert", "lexicographic"]
@@ -15,6 +18,29 @@ UnitName = Literal["um", "mm", "cm", "m", "km", "in", "ft", "us-ft", "yd"]
 _TOOL = typer.Option(metavar="FILE", help="Mesh of the tool, or a shell saved as .npz.")
 _LAYOUT = "Index table of a new environment."
 _CURVE = "Order of the keys of a new environment."
+
+
+def length_option(
+    text: str,
+    default: str | None = None,
+    *,
+    unit: str = "mm",
+    parse: Callable[[str, str], object] = length_of,
+) -> Any:  # noqa: ANN401 - as typer's own
+    """Option of a length, or three by `point_of`; metres in the verb, in `unit` if bare.
+
+    default : what the help shows; that of the verb is in metres.
+    """
+
+    def metres(given: object) -> object:
+        return parse(given, unit) if isinstance(given, str) else given
+
+    metavar, example = ("LENGTH", "0.2in") if parse is length_of else ("X,Y,Z", "0,5,0.2in")
+    start = f"{NAMES[unit].capitalize()}, or such as {example}"
+    return typer.Option(
+        metavar=metavar, help=f"{start}: {text}", show_default=default or True, parser=metres
+    )
+
 
 UrlArgument = Annotated[
     str,

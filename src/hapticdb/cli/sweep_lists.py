@@ -2,13 +2,13 @@
 
 import csv
 import io
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
 
 from hapticdb.errors import FileError, ObjectNotFoundError, UsageError
+from hapticdb.units import length_of
 
 COLUMNS = ("part", "tool", "path", "where", "exclude", "contact")
 BETWEEN = ";"
@@ -17,7 +17,7 @@ _HINT = "give a header with part or tool, and path; and if wanted where, exclude
 
 
 class Asked(NamedTuple):
-    """One sweep, as given; contact : millimetres; line : in a file of sweeps, or empty."""
+    """One sweep, as given; contact : metres; line : in a file of sweeps, or empty."""
 
     tool: str | None
     part: list[str]
@@ -85,10 +85,5 @@ def _words(cell: str | None) -> list[str]:
 
 
 def _contact(cell: str | None, given: float, line: str) -> float:
-    try:
-        contact = float(cell) if cell else given
-    except ValueError:
-        contact = math.nan
-    if not math.isfinite(contact):
-        raise FileError(f"--batch {line}: contact is {cell!r}: give millimetres")
-    return contact
+    with naming(f"--batch {line}: contact"):
+        return length_of(cell, "mm") if cell else given

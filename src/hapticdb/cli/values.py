@@ -2,9 +2,10 @@
 
 import re
 from math import isfinite
+from typing import NamedTuple
 
 from hapticdb.errors import UsageError
-from hapticdb.units import UNITS
+from hapticdb.units import NAMES, length_of
 
 MIB = 1 << 20
 LARGEST_MIB = 1e6
@@ -12,8 +13,13 @@ LARGEST_MIB = 1e6
 SIZE = re.compile(r"(\d+(?:\.\d*)?) ?(MiB|GiB|M|G)?", re.IGNORECASE)
 """A size as an option takes it; a number without a unit is MiB."""
 
-LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?) ?([a-z-]+)?", re.IGNORECASE)
-"""A number and a unit of length; a number without a unit is millimetres."""
+
+class Point(NamedTuple):
+    """Coordinates of an option, metres."""
+
+    x: float
+    y: float
+    z: float
 
 
 def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
@@ -27,13 +33,16 @@ def numbers_of(text: str, count: int, option: str, example: str) -> list[float]:
     return numbers
 
 
-def length_of(text: str, option: str) -> float:
-    """Metres of a length that is given in millimetres, or with its unit, such as ``0.01mm``."""
-    match = LENGTH.fullmatch(text.strip())
-    unit = (match[2] or "mm") if match else ""
-    if match is None or unit not in UNITS:
-        raise UsageError(f"{option} {text[:80]!r}: give millimetres, or a length such as 10um")
-    return float(f"{float(match[1]) * UNITS[unit]:.12g}")  # one number for 0.1mm and 100um
+def point_of(text: str, unit: str) -> Point:
+    """Three lengths, separated by commas or blanks; a bare number has the last one's unit."""
+    words = re.sub(r"\s+(?=[a-zµ])", "", text).replace(",", " ").split()
+    last = words[-1].lstrip("+-.0123456789eE") if words else ""
+    try:
+        return Point(*(length_of(w if w[-1].isalpha() else w + last, unit) for w in words))
+    except (TypeError, UsageError):
+        raise UsageError(
+            f"{text[:80]!r}: give X,Y,Z in {NAMES[unit]}, or such as 0,5,0.2in"
+        ) from None
 
 
 def budget_bytes(mib: float) -> int:

@@ -10,9 +10,14 @@ import typer
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
-from hapticdb.cli.options import ClusterOption, CsvOption, JsonOption, UrlArgument
-from hapticdb.cli.values import budget_bytes, numbers_of
-from hapticdb.cli.verbs.sweeping import MM
+from hapticdb.cli.options import (
+    ClusterOption,
+    CsvOption,
+    JsonOption,
+    UrlArgument,
+    length_option,
+)
+from hapticdb.cli.values import Point, budget_bytes, point_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 from hapticdb.verdicts import REPORTED, Kind
@@ -35,14 +40,10 @@ COLUMNS = (
 MEETING_COLUMNS = ("id", "name", "begin", "end", "kind", "at_least_m", "x_m", "y_m", "z_m")
 """Columns with --poses or --turn: a row for each meeting, in the order of the motion."""
 
-WithinOption = Annotated[
-    float, typer.Option(metavar="MM", help="Millimetres: pairs that are so near are told.")
-]
+WithinOption = Annotated[float, length_option("pairs that are so near are told.", "1")]
 ContactOption = Annotated[
     float,
-    typer.Option(
-        metavar="MM", help="Millimetres: surfaces so near, or so little one in the other, touch."
-    ),
+    length_option("surfaces so near, or so little one in the other, touch.", "0.05"),
 ]
 OfOption = Annotated[
     list[str] | None,
@@ -93,11 +94,11 @@ TurnOption = Annotated[
     typer.Option(metavar="AXIS", help="Instead: turn --of about x, y or z, as on a hinge."),
 ]
 AboutOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z",
-        help="Millimetres, scene's frame: a point of the hinge, or the centre of turns.",
-        show_default="middle of --of",
+    Point | None,
+    length_option(
+        "a point of the hinge, or the centre of turns, scene's frame.",
+        "middle of --of",
+        parse=point_of,
     ),
 ]
 FromOption = Annotated[
@@ -132,8 +133,8 @@ Example: hapticdb clashes car.db --of 'wheel*' --within 2
 def clashes(
     url: UrlArgument,
     *,
-    within: WithinOption = 1.0,
-    contact: ContactOption = 0.05,
+    within: WithinOption = 1e-3,
+    contact: ContactOption = 5e-5,
     of: OfOption = None,
     against: AgainstOption = None,
     kind: KindOption = None,
@@ -171,7 +172,7 @@ def clashes(
         render.bar("measuring", "pairs") as progress,
     ):
         found = find_clashes(
-                env, within=MM * within, contact=MM * contact, of=of or (), against=against or (),
+                env, within=within, contact=contact, of=of or (), against=against or (),
                 seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
             )  # fmt: skip
         told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
@@ -213,7 +214,7 @@ def _moved(
 
 
 def _meetings(
-    url: str, of: list[str], poses: str | None, turn: str | None, about: str | None,
+    url: str, of: list[str], poses: str | None, turn: str | None, about: Point | None,
     begin: float, end: float, against: list[str] | None, contact: float,
 ) -> "list[Meeting]":  # fmt: skip
     """When parts that move meet others: numbers of poses, or degrees."""
@@ -224,9 +225,6 @@ def _meetings(
 
     if (poses is None) == (turn is None) or turn not in {None, *AXES}:
         raise UsageError("give either --poses CSV, or --turn x, y or z")
-    center = None
-    if about is not None:
-        center = [MM * x for x in numbers_of(about, 3, "--about", "X,Y,Z in millimetres")]
     with (
         hapticdb.open(url, read_only=True) as env,
         render.bar("moving", "objects") as progress,
@@ -236,10 +234,10 @@ def _meetings(
         else:
             bounds = scene_bounds(env.find(*of))
             assert bounds is not None  # noqa: S101 - words choose something
-            center = bounds.mean(axis=0).tolist() if center is None else center
-            placed = hinge(AXES.index(turn or "x"), center, begin, end)
+            about = Point(*bounds.mean(axis=0).tolist()) if about is None else about
+            placed = hinge(AXES.index(turn or "x"), about, begin, end)
         found = find_meetings(
-                env, of, placed, about=center, against=against or (), contact=MM * contact,
+                env, of, placed, about=about, against=against or (), contact=contact,
                 progress=progress,
             )  # fmt: skip
     if turn is None:

@@ -6,9 +6,9 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import chosen
-from hapticdb.cli.options import JsonOption, ObjectsArgument, UrlArgument
+from hapticdb.cli.options import JsonOption, ObjectsArgument, UrlArgument, length_option
 from hapticdb.cli.root import left_at
-from hapticdb.cli.values import numbers_of
+from hapticdb.cli.values import Point, numbers_of, point_of
 
 
 def move(
@@ -16,8 +16,8 @@ def move(
     objects: ObjectsArgument,
     *,
     translate: Annotated[
-        str | None,
-        typer.Option(metavar="X,Y,Z", help="Shift from the present place, metres, world frame."),
+        Point | None,
+        length_option("shift from the present place, world frame.", parse=point_of, unit="m"),
     ] = None,
     matrix: Annotated[
         str | None,
@@ -46,7 +46,6 @@ def move(
 
     if (translate is None) == (matrix is None):
         raise UsageError("give one of --translate and --matrix")
-    shift = translate and numbers_of(translate, 3, "--translate", "X,Y,Z in metres")
     placed = matrix and numbers_of(matrix, 16, "--matrix", "16 numbers")
     with hapticdb.open(url) as env:
         found = chosen(env, objects, "WORDS")
@@ -57,8 +56,8 @@ def move(
         with left_at(
             f"all that was chosen has moved, or nothing: see 'hapticdb objects {env.url}'"
         ):
-            if shift:
-                moved = env.shift([obj.id for obj in found], shift)
+            if translate:
+                moved = env.shift([obj.id for obj in found], translate)
             else:
                 moved = [env.move(found[0].id, np.array(placed).reshape(4, 4))]
     for obj in moved:

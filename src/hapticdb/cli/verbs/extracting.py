@@ -16,9 +16,10 @@ from hapticdb.cli.options import (
     ObjectsArgument,
     UrlArgument,
     WhereOption,
+    length_option,
 )
-from hapticdb.cli.values import budget_bytes, numbers_of
-from hapticdb.cli.verbs.sweeping import MM, ContactOption, OverlapOption
+from hapticdb.cli.values import budget_bytes, numbers_of, point_of
+from hapticdb.cli.verbs.sweeping import ContactOption, OverlapOption
 from hapticdb.errors import UsageError
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
@@ -46,23 +47,18 @@ MotionsOption = Annotated[
 ]
 OutOption = Annotated[
     float | None,
-    typer.Option(
-        metavar="MM",
-        help="Millimetres from the start at which the part counts as out.",
-        show_default="clear of all that stands",
-    ),
+    length_option("so far from its start the part counts as out.", "clear of all that stands"),
 ]
 ToOption = Annotated[
     str | None,
     typer.Option(
         metavar="POSE",
-        help="Reach this displacement instead: x,y,z,qw,qx,qy,qz, millimetres; or a CSV file of "
-        "one pose, metres.",
+        help="Reach this displacement instead: x,y,z,qw,qx,qy,qz, millimetres, or "
+        "such as 0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.",
     ),
 ]
 ScrewOption = Annotated[
-    float | None,
-    typer.Option(metavar="MM", help="Millimetres a turn: the pitch of a thread, of either hand."),
+    float | None, length_option("the pitch of a thread, of either hand, a turn.")
 ]
 WayOption = Annotated[
     str | None, typer.Option("--path", metavar="CSV", help="Write the path that was found.")
@@ -136,7 +132,7 @@ def extract(
     out: OutOption = None,
     to: ToOption = None,
     screw: ScrewOption = None,
-    contact: ContactOption = 0.05,
+    contact: ContactOption = 5e-5,
     overlap: OverlapOption = 0.0,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
@@ -160,8 +156,8 @@ def extract(
     goal = _goal(to) if to else None
     asked = _Outputs(path, animation, up, json)
     options: dict[str, Any] = {
-        "seed": seed, "motions": motions, "out": _metres(out), "screw": _metres(screw),
-        "contact": MM * contact, "overlap": MM * overlap, "budget_bytes": budget_bytes(budget),
+        "seed": seed, "motions": motions, "out": out, "screw": screw,
+        "contact": contact, "overlap": overlap, "budget_bytes": budget_bytes(budget),
         **({} if seconds is None else {"seconds": seconds}),
     }  # fmt: skip
     with hapticdb.open(url, read_only=True) as env:
@@ -183,10 +179,6 @@ def extract(
     raise typer.Exit((order if disassemble else found).verdict.exit_status)
 
 
-def _metres(length: float | None) -> float | None:
-    return None if length is None else MM * length
-
-
 def _goal(to: str) -> "NDArray[np.float64]":
     """The pose (4, 4) that --to names: numbers in millimetres, or a file."""
     import numpy as np
@@ -198,8 +190,14 @@ def _goal(to: str) -> "NDArray[np.float64]":
         if len(poses) != 1:
             raise UsageError(f"--to {to}: it has {len(poses)} poses, give a file of one")
         return np.asarray(poses[0])
-    row = numbers_of(to, 7, "--to", "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv")
-    return pose_of_row([MM * x for x in row[:3]], row[3:])
+    words = to.replace(",", " ").split()
+    try:
+        place = point_of(" ".join(words[:3]), "mm")
+        turn = numbers_of(" ".join(words[3:]), 4, "--to", "qw,qx,qy,qz")
+    except UsageError:
+        form = "x,y,z,qw,qx,qy,qz, or a file whose name ends in .csv"
+        raise UsageError(f"--to {to[:80]!r}: give {form}") from None
+    return pose_of_row(place, turn)
 
 
 class _Outputs(NamedTuple):

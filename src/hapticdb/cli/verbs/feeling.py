@@ -28,10 +28,11 @@ from hapticdb.cli.options import (
     ToolUnitOption,
     UrlArgument,
     WhereOption,
+    length_option,
 )
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.cli.tools import tool_of, warn_of_size
-from hapticdb.cli.values import budget_bytes, size_bytes
+from hapticdb.cli.values import Point, budget_bytes, point_of, size_bytes
 from hapticdb.devices.profiles import profile_named
 from hapticdb.errors import UsageError
 
@@ -64,7 +65,7 @@ SpeedOption = Annotated[
     typer.Option(metavar="M/S", help="Speed along a path, or greatest speed of a random hand."),
 ]
 PlaceOption = Annotated[
-    str | None, typer.Option(metavar="X,Y,Z", help="Where the hand random is, metres.")
+    Point | None, length_option("where the hand random is.", parse=point_of, unit="m")
 ]
 SimulateOption = Annotated[
     bool, typer.Option("--simulate", help="Let the force push the hand, as a simulated device.")

@@ -14,9 +14,10 @@ from hapticdb.cli.options import (
     LayoutOption,
     UnitName,
     UrlArgument,
+    length_option,
 )
 from hapticdb.cli.root import left_at
-from hapticdb.cli.values import length_of, numbers_of
+from hapticdb.cli.values import Point, point_of
 
 if TYPE_CHECKING:
     import numpy as np
@@ -38,7 +39,7 @@ BitsOption = Annotated[
     int | None,
     typer.Option(metavar="1..21", help="Bits of each axis: 2^bits voxels.", show_default="10"),
 ]
-VoxelSizeOption = Annotated[float | None, typer.Option(metavar="METRES", help="Edge of a voxel.")]
+VoxelSizeOption = Annotated[float | None, length_option("edge of a voxel.", unit="m")]
 ExtentOption = Annotated[
     float | None,
     typer.Option(
@@ -48,10 +49,12 @@ ExtentOption = Annotated[
     ),
 ]
 OriginOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z",
-        help="Lower corner of the grid, metres; unless given, the files are in its middle.",
+    Point | None,
+    length_option(
+        "lower corner of the grid.",
+        "so that the files are in its middle",
+        parse=point_of,
+        unit="m",
     ),
 ]
 JobsOption = Annotated[
@@ -89,12 +92,9 @@ DistancesOption = Annotated[
     ),
 ]
 ChordOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LENGTH",
-        help="Chord error of STEP files: how far triangles may lie from the CAD surfaces; "
-        "millimetres, or such as 10um.",
-        show_default="0.01",
+    float | None,
+    length_option(
+        "chord error of STEP files, how far triangles may lie from the CAD surfaces.", "0.01"
     ),
 ]
 PartitionsOption = Annotated[
@@ -151,13 +151,11 @@ def import_(
 
     if partitions is not None:
         url = with_partitions(url, partitions)
-    corner = None if origin is None else numbers_of(origin, 3, "--origin", "X,Y,Z in metres")
-    grid = GridOptions(bits=bits, voxel_size=voxel_size, extent=extent, origin=corner, curve=curve)
+    grid = GridOptions(bits=bits, voxel_size=voxel_size, extent=extent, origin=origin, curve=curve)
     options = ImportOptions(
         unit=unit, grid=grid, layout=layout, jobs=jobs, on=on, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
-        replace=replace, distances=distances, skip_unusable=True,
-        chord=None if chord is None else length_of(chord, "--chord"),
+        replace=replace, distances=distances, skip_unusable=True, chord=chord,
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)
     _tell(url, files, reports, elapsed, json=json)

@@ -19,10 +19,11 @@ from hapticdb.cli.options import (
     ToolUnitOption,
     UrlArgument,
     WhereOption,
+    length_option,
 )
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
 from hapticdb.cli.tools import tool_of, warn_of_size
-from hapticdb.cli.values import numbers_of
+from hapticdb.cli.values import Point, point_of
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 from hapticdb.verdicts import SWEEP_VERDICTS, WORST, exit_codes
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
     from hapticdb.exact.swept import Swept
     from hapticdb.pointshell.shell import PointShell
 
-MM = 1e-3
-"""Metres of a millimetre: all lengths among the options are in millimetres."""
 MOST_OBJECTS = 20
 """Rows of the table of what is hit or touched; the other objects are counted below it."""
 
@@ -54,27 +53,22 @@ PathOption = Annotated[
 ]
 ContactOption = Annotated[
     float,
-    typer.Option(
-        metavar="MM",
-        help="Millimetres: what is so near where the path starts may be touched; a motion by so "
-        "much has to free the tool from it all along.",
+    length_option(
+        "what is so near where the path starts may be touched; a motion by so much has to free "
+        "the tool from it all along.",
+        "0.05",
     ),
 ]
 OverlapOption = Annotated[
-    float,
-    typer.Option(
-        metavar="MM", help="Millimetres by which a part may overlap others where it stands."
-    ),
+    float, length_option("by so much a part may overlap others where it stands.", "0")
 ]
 UntilHitOption = Annotated[
     bool, typer.Option("--until-hit", help="End at the first hit on the path: faster.")
 ]
 AboutOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="X,Y,Z",
-        help="Millimetres, tool's frame: the centre of the path's turns.",
-        show_default="middle of the tool's box",
+    Point | None,
+    length_option(
+        "the centre of the path's turns, tool's frame.", "middle of the tool's box", parse=point_of
     ),
 ]
 SweepSecondsOption = Annotated[
@@ -109,7 +103,8 @@ apart than that, to meet it again is a hit. A foreign tool has no seat: if that
 does not free it at the first pose, it starts inside.
 
 --batch reads a CSV file with the columns part or tool, and path; and if wanted
-where, exclude and contact (mm). Several words in a cell stand with ; between.
+where, exclude and contact (mm, or such as 0.2in). Several words in a cell stand
+with ; between.
 
 {exit_codes(SWEEP_VERDICTS)}
 A batch has the worst: 1 before 3 before 4 before 0.
@@ -122,7 +117,7 @@ class _Options(NamedTuple):
     """Options that all sweeps of a command share; about, overlap : metres."""
 
     tool_unit: str | None
-    about: "list[float] | None"
+    about: Point | None
     overlap: float
     seconds: float | None
     until_hit: bool
@@ -155,7 +150,7 @@ def sweep(
     path: PathOption = None,
     where: WhereOption = None,
     exclude: ExcludeOption = None,
-    contact: ContactOption = 0.05,
+    contact: ContactOption = 5e-5,
     overlap: OverlapOption = 0.0,
     about: AboutOption = None,
     tool_unit: ToolUnitOption = None,
@@ -173,11 +168,7 @@ def sweep(
     _check(one, tool_unit, batch, csv)
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
-    center = None if about is None else numbers_of(about, 3, "--about", "X,Y,Z in millimetres")
-    options = _Options(
-        tool_unit, center and [MM * x for x in center], MM * overlap, seconds,
-        until_hit,
-    )  # fmt: skip
+    options = _Options(tool_unit, about, overlap, seconds, until_hit)
     asked = [one] if batch is None else read_sweeps(batch, one)
     with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
         jobs = [_job(env, each, path_unit) for each in asked]
@@ -239,7 +230,7 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude,
-                contact=MM * asked.contact, overlap=options.overlap, seated=asked.tool is None,
+                contact=asked.contact, overlap=options.overlap, seated=asked.tool is None,
                 about=options.about, seconds=options.seconds,
                 until_hit=options.until_hit, progress=progress,
             )  # fmt: skip

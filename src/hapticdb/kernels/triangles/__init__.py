@@ -1,7 +1,7 @@
 """Kernels on pairs of surfaces: distances, on a path, too, and penetration depth.
 
-`pairs` measures two triangles, `nearest` two trees of them, `sweeping` on a path; `depth` finds the
-deepest place of one surface in the closed bodies of another.
+`pairs` measures two triangles, `nearest` two BVHs, `sweeping` two BVHs on a path; `depth` searches
+the deepest place of one surface in the closed bodies of another.
 """
 
 from hapticdb.kernels._later import later_modules

@@ -1,7 +1,7 @@
 """The motion of a tool along a path: straight, with even turns about its centre.
 
 On a part of the path the tool shifts by v and turns by the rotation vector w, both half before the
-middle of the part and half after it. A place that is at r from the centre in the middle is at most
+middle of the part and half after it. A place at r from the centre in the middle is at most
 
     |n . (v + w x r) / 2| + (t / 2 + t^2 / 6) |w x r| / 2,    t = |w| / 2,
 
@@ -39,7 +39,7 @@ MOTION = fields_of(PathMotion, FLOATS, FLOATS2, FLOATS3, FLOATS2, FLOATS)
 
 
 class Moved(NamedTuple):
-    """Where the tool is in the middle of a part of the path, and how it moves on it."""
+    """Pose of the tool in the middle of a part of the path, and its motion from there."""
 
     pose: Floats  # (4, 4)
     center: Floats  # (3,) of the turns
@@ -50,7 +50,7 @@ class Moved(NamedTuple):
 
 @leaf
 def move(motion, segment, low, high, moved):
-    """Write where the tool is on a segment between two ways, and how it moves."""
+    """Write pose and motion of the tool on a segment between two path parameters."""
     length = motion.ways[segment + 1] - motion.ways[segment]
     share, half = 0.0, 0.0
     if length > 0.0:
@@ -91,7 +91,7 @@ def _turn(rotation, turn, angle, share, pose):
 
 @leaf
 def velocity(moved, x, y, z):
-    """How a place moves from the middle to the end of the part, to first order, and by its turn.
+    """Motion of a place from the middle to the end of the part, to first order.
 
     Returns the shift along each axis, and the metres of the turn.
     """
@@ -103,13 +103,13 @@ def velocity(moved, x, y, z):
 
 @leaf
 def bend(moved):
-    """Share of a place's turn by which it leaves the motion to first order, at most."""
+    """Bound of the deviation from the motion to first order, as a share of a place's turn."""
     return moved.angle[0] * (0.5 + moved.angle[0] / 6.0)
 
 
 @entry(MOTION, INTS, FLOATS, FLOATS3)
 def poses_kernel(motion, segments, ways, poses):
-    """Write the poses (N, 4, 4) at ways (N,) on segments (N,); poses begin as identities."""
+    """Write the poses (N, 4, 4) at path parameters (N,) on segments (N,), over identities."""
     center, shift, turn, angle = np.empty(3), np.empty(3), np.empty(3), np.empty(1)
     for n in range(ways.shape[0]):
         move(motion, segments[n], ways[n], ways[n], Moved(poses[n], center, shift, turn, angle))

@@ -1,9 +1,8 @@
-"""Distance of two surfaces: a walk through both of their trees of boxes.
+"""Distance of two surfaces: a traversal of both BVHs of AABBs (`surfaces.sides`).
 
-The trees are those of `surfaces.sides`. A pair of nodes whose boxes are farther apart than the
-nearest triangles so far, along the axes of either, is not entered. The distance told from below is
-proved for each pair of triangles (`pairs`), and boxes are never told farther apart than they are,
-so it is never too large.
+A pair of nodes with boxes farther apart than the nearest triangles so far, along the axes of
+either, is pruned. The bound from below is proved for each pair of triangles (`pairs`), and
+distances of boxes are rounded down, so it is never too large.
 """
 
 import math
@@ -22,20 +21,20 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 WAITING = 256
-"""Pairs of nodes that wait to be visited: more than the height of two trees over 2^31 leaves."""
+"""Pairs of nodes on the stack: more than the height of two trees over 2^31 leaves."""
 
 
 FLAT = 1e-3
-"""Least area of a triangle, as twice a share of its longest edge squared, whose plane is asked: the
-normal of a thinner one is not exact enough."""
+"""Least area of a triangle with an exact enough normal, as twice a share of its longest edge
+squared."""
 PLANE = 1e-12
 """Greatest error of a distance from a plane, as a share of the largest coordinate: more than the
-rounding of a normal, 2e-16 / `FLAT`, moves what is as far as that."""
+effect of a normal's rounding, 2e-16 / `FLAT`."""
 TURNED = 0.98
-"""A tree is turned where one of its axes has no larger share than that along any axis of the other
-tree: 11 degrees. For less, its own axes tell too little more to be worth their time."""
+"""Greatest share of an axis of a turned tree along any axis of the other one: 11 degrees. Below
+that, its own axes prune too little for their time."""
 RIGID = 1e-6
-"""Greatest error of a rotation whose own axes are asked; a surface may be stretched, too."""
+"""Greatest error of a rotation for a test along its own axes; a surface may be stretched, too."""
 
 
 @leaf
@@ -74,10 +73,10 @@ def box_gap(boxes, node, others, other, pose, slack):
 
 @leaf
 def own_slack(pose, size):
-    """What `own_gap` takes off for rounding and an inexact rotation; infinite where not to ask it.
+    """Margin of `own_gap` for rounding and an inexact rotation; infinite without that test.
 
     Of vectors up to 6 sizes long, an error e of the products of the axes changes the length by
-    9 e sizes, and where the other box begins by 3 e sizes.
+    9 e sizes, and the origin of the other box by 3 e sizes.
     """
     error, is_turned = 0.0, False
     for i in range(3):
@@ -137,7 +136,7 @@ def triangle_gap(one, n, other, m):
 
 @leaf
 def plane_gap(one, n, other, m):
-    """How far triangle m keeps from the plane of triangle n, all of it on one side; else 0."""
+    """Distance of triangle m from the plane of triangle n, all of it on one side; else 0."""
     x, y, z, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides_of(one, n)
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     longest = max(ux * ux + uy * uy + uz * uz, vx * vx + vy * vy + vz * vz)
@@ -152,7 +151,7 @@ def plane_gap(one, n, other, m):
 
 @leaf
 def _end_along(corners, first, last, x, y, z, sign):
-    """Where triangles first .. last - 1 begin along a direction, or along its opposite: sign -1."""
+    """Begin of triangles first .. last - 1 along a direction, or along its opposite: sign -1."""
     end = math.inf
     for n in range(first, last):
         for i in range(3):
@@ -163,10 +162,10 @@ def _end_along(corners, first, last, x, y, z, sign):
 
 @leaf
 def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
-    """Measure the triangles of two leaves; notes what is nearer than out[0] from below.
+    """Measure the triangles of two leaves; notes pairs nearer than out[0] from below.
 
-    The nearest pair from above has its triangles in pair (2,) and its places in out[2:8]. Triangles
-    that keep apart along the direction of these places, as most do, are not measured.
+    The nearest pair from above has its triangles in pair (2,) and its places in out[2:8]. Most
+    triangles are apart along the direction of these places, and are not measured.
     """
     begin = (other - b.boxes.shape[0] // 2) * LEAF_SIZE
     end = min(begin + LEAF_SIZE, b.corners.shape[0])
@@ -198,7 +197,7 @@ def _measure_leaves(a, node, b, other, pose, size, placed, found, pair, out):
 
 @leaf
 def _keep(below, above, n, m, found, pair, out):
-    """Note a pair of triangles where it is nearer than what is known."""
+    """Note a pair of triangles if it is the nearest so far."""
     is_nearer = below < out[0]
     if is_nearer:
         out[0] = below
@@ -213,11 +212,10 @@ def _keep(below, above, n, m, found, pair, out):
 def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
     """Find the nearest triangles of tree a and of tree b, moved by a pose (4, 4) into a's frame.
 
-    out (8,): bounds of the distance from below and from above, which begin as the greatest distance
-    that is looked for and infinity, then the place on each; one from above of `enough` or less ends
-    it. pair (2,): triangles that are tried first, -1 where none is known; afterwards the nearest
-    ones, or -1. nodes (.., 2), squares,
-    placed, found are scratch.
+    out (8,): bounds of the distance from below and from above, at first the greatest distance of
+    interest and infinity, then the place on each; an upper bound of `enough` or less ends the
+    search. pair (2,): triangles for a first try, or -1; afterwards the nearest ones, or -1.
+    nodes (.., 2), squares, placed, found are scratch.
     """
     size = largest(a.boxes)
     reach = largest(b.boxes)
@@ -266,10 +264,10 @@ def nearest_pair(a, b, pose, enough, nodes, squares, placed, found, pair, out):
 
 @entry(TREE, TREE, FLOATS3, FLOATS, FLOAT, INTS2, FLOATS2)
 def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
-    """Find the nearest triangles at poses (N, 4, 4), which lead b into a's frame.
+    """Find the nearest triangles at poses (N, 4, 4) of b in a's frame.
 
-    farthest (N,): the greatest distance that is looked for; enough, pairs (N, 2), out (N, 8): as
-    for `nearest_pair`. The pair of a pose is tried first at the next one that has none.
+    farthest (N,): the greatest distance of interest; enough, pairs (N, 2), out (N, 8): as for
+    `nearest_pair`. The pair of a pose is tried first at the next one without any.
     """
     nodes = np.empty((WAITING, 2), dtype=np.int64)
     squares = np.empty(WAITING)
@@ -286,7 +284,7 @@ def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
 def any_near_kernel(one, other, poses, far, out):
     """Find whether any pair n of triangles, one and other (N, 3, 3), is within `far` metres.
 
-    out (P,): at each of poses (P, 4, 4), which lead the other ones into the frame of one.
+    out (P,): at each of poses (P, 4, 4) of the other ones in the frame of one.
     """
     placed, found = np.empty((1, 3, 3)), np.empty(7)
     for p in range(poses.shape[0]):
@@ -304,9 +302,9 @@ def any_near_kernel(one, other, poses, far, out):
 class Nearest(NamedTuple):
     """Distances of two surfaces at N poses, metres, in the frame of the first.
 
-    at_least, at_most (N,): bounds; where nothing is nearer than the greatest distance that was
-    looked for, that distance and infinity; on_a, on_b (N, 3): the nearest places, whose distance is
-    `at_most`; pairs (N, 2): numbers of the triangles in the trees, -1 where nothing is nearer.
+    at_least, at_most (N,): bounds; beyond the greatest distance of interest, that distance and
+    infinity; on_a, on_b (N, 3): the nearest places, at the distance `at_most`; pairs (N, 2):
+    numbers of the triangles in the trees, -1 beyond that distance.
     """
 
     at_least: Floats
@@ -321,8 +319,8 @@ def nearest(
 ) -> Nearest:
     """Measure two surfaces at poses (N, 4, 4) of the second in the frame of the first.
 
-    farthest (N,): the greatest distance that is looked for. Surfaces within `enough` are near: then
-    `at_most` is right, but not the least, and `at_least` has no meaning.
+    farthest (N,): the greatest distance of interest. Within `enough` the search ends early:
+    `at_most` is a distance, but not the least, and `at_least` has no meaning.
     """
     pairs = np.full((len(poses), 2), -1, dtype=np.int64)
     out = np.zeros((len(poses), 8))

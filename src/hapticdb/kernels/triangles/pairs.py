@@ -2,11 +2,11 @@
 
 Two triangles are nearest at a corner of one and an edge or the inside of the other, or at two
 edges. The least distance of all these pairs of places is a bound from above, since both places are
-on the triangles; rounding may miss the nearest ones, as it does for edges that are almost parallel.
-So the bound from below is proved by itself: along the direction from one of the found places to the
-other, the corners of the triangles keep apart by that much, and so does all between the corners
-(the separating axis of convex bodies). Where no direction keeps them apart, an edge goes through
-the other triangle and the distance is 0, or the bound from below is 0.
+on the triangles; rounding may miss the nearest ones, as with almost parallel edges. So the bound
+from below is proved by itself: along the direction between the two places the corners of the
+triangles are apart by so much, and so is all between the corners (separating axis of convex
+bodies). Without a separating axis, an edge goes through the other triangle and the distance is 0,
+or the bound from below is 0.
 """
 
 import math
@@ -18,12 +18,12 @@ ROUNDING = 2.0**-48
 """Greatest error of a separation, as a share of the largest coordinate. It is 16 units in the last
 place: each term is a sum of three products of rounded differences."""
 CERTAIN = 1e-9
-"""Relative difference of both bounds above which it is asked whether an edge goes through."""
+"""Relative difference of both bounds for the test of an edge through a triangle."""
 
 
 @leaf
 def _try_edge(found, px, py, pz, ax, ay, az, bx, by, bz, is_first):
-    """Note the place of the edge from a to b that is nearest to p, if it is nearer than `found`.
+    """Note the place of the edge from a to b nearest to p, if it is nearer than `found`.
 
     is_first: whether p is on the first triangle.
     """
@@ -93,7 +93,7 @@ def _try_edges(found, one, n, i, other, m, j):
 
 @leaf
 def _separation(found, one, n, other, m, distance):
-    """How far apart the triangles are along the direction between the found places."""
+    """Separation of the triangles along the direction between the nearest places."""
     nx = (found[1] - found[4]) / distance
     ny = (found[2] - found[5]) / distance
     nz = (found[3] - found[6]) / distance
@@ -108,11 +108,11 @@ def _separation(found, one, n, other, m, distance):
 
 @leaf
 def edge_goes_through(one, n, i, other, m, beside):
-    """Where edge i of triangle n goes through triangle m: share of the edge, or -1.
+    """Share of edge i of triangle n at its crossing of triangle m, or -1.
 
     The edge's ends lie on different sides of the plane, or one in it, and the place between is
-    inside the triangle, on its edge, or beside it by that share of its height at most. An edge in
-    the plane does not go through.
+    inside the triangle, on its edge, or outside by the share `beside` of its height at most. An
+    edge in the plane does not cross.
     """
     k = (i + 1) % 3
     sides = sides_of(other, m)

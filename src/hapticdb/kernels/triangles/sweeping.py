@@ -1,12 +1,12 @@
-"""Least distance of two surfaces along a path, and where they meet first: branch and bound.
+"""Least distance of two surfaces along a path, and their first collision: branch and bound.
 
-Both trees of boxes and the time are searched together. An entry of the search is a node of either
-tree and a part of the path. Its bound is a distance that all below both nodes keep on all of that
-part: along a direction in which the boxes or triangles are apart, only the motion in that direction
-counts (`motion`), so what slides past keeps its distance on a long part. An entry whose bound is
-not good enough is parted: at the larger box, or in time where the motion is more than the boxes'
-size, or both are leaves. Triangles are measured in the middle of a part, which bounds the least
-distance from above. Bounds have a margin for rounding, so none is too large.
+Both BVHs and the time are searched together. An entry of the search is a node of either tree and a
+part of the path. Its bound is a least distance of all below both nodes on all of that part: along a
+separating axis of the boxes or triangles only the motion along it counts (`motion`), so the bound
+of sliding surfaces is good on a long part. An entry with too low a bound is split: at the larger
+box, or in time if the motion is more than the boxes' size, or both are leaves. The distance of
+triangles in the middle of a part bounds the least distance from above. Bounds have a margin for
+rounding, so none is too large.
 """
 
 import math
@@ -28,35 +28,35 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 WAITING = 512
-"""Entries that wait: more than the height of two trees over 2^31 leaves and of halvings in time."""
+"""Entries on the stack: more than the heights of two trees over 2^31 leaves and of halvings."""
 MARGIN = 8.0 * ROUNDING
-"""Greatest error of a bound, as a share of the largest coordinate: a separation's, and that of the
-pose and the motion that it is computed for."""
+"""Greatest error of a bound, as a share of the largest coordinate: of a separation, its pose and
+its motion."""
 IN_TIME = 1.0
-"""Motion, in sizes of the larger box, above which an entry is parted in time. Larger: fewer parts
-of the path, and boxes that sweep more."""
+"""Motion, in sizes of the larger box, above which an entry is halved in time. Larger: fewer parts
+of the path, and larger swept boxes."""
 MEETING = 1e-5
-"""Metres: surfaces that come so near have met."""
+"""Distance of a collision, metres."""
 SMALLEST = 0.25 * MEETING
-"""Half of the motion below which a part of the path is not parted."""
+"""Half of the least motion of a part of the path."""
 
 
 class Waiting(NamedTuple):
-    """Entries that wait to be looked at, the next one last; they are kept from call to call."""
+    """Stack of entries, the next one last; it stays from call to call."""
 
     nodes: Ints  # (.., 3) node of either tree, segment
     parts: Floats  # (.., 3) ways where the part begins and ends, bound
-    state: Ints  # (3,) entries that wait; the next segment; how often triangles were looked at
+    state: Ints  # (3,) entries on the stack; the next segment; pairs of leaves measured
 
 
 WAIT = fields_of(Waiting, INTS2, FLOATS2, INTS)
 
 
 class Found(NamedTuple):
-    """What is known so far.
+    """Result so far.
 
-    distance (2,): the least that was measured, and what all else keeps; way (1,): where it is;
-    places (2, 3): there on either surface.
+    distance (2,): the least one measured, and a lower bound of all others; way (1,): its path
+    parameter; places (2, 3): there on either surface.
     """
 
     distance: Floats
@@ -69,16 +69,16 @@ FOUND = fields_of(Found, FLOATS, FLOATS, FLOATS2)
 
 @leaf
 def wanted(distance, fine):
-    """A bound from which on an entry can't change the result, if `distance` is known.
+    """Bound of the entries without effect on the result, for a measured distance.
 
-    fine: metres to which a least distance is found, and per mille of it if that is more.
+    fine: tolerance of a least distance, metres, and per mille of it if that is more.
     """
     return max(min(distance - fine, (1.0 - 1e3 * fine) * distance), 0.5 * MEETING)
 
 
 @leaf
 def _box_bound(boxes, node, others, other, moved, slack):
-    """Distance that two boxes keep on a part of the path, and how far the second one moves."""
+    """Least distance of two boxes on a part of the path, and the motion of the second one."""
     if boxes[node, 0, 0] > boxes[node, 1, 0] or others[other, 0, 0] > others[other, 1, 0]:
         return math.inf, 0.0
     pose = moved.pose
@@ -110,9 +110,9 @@ def _largest_edge(boxes, node):
 
 @leaf
 def _move_corners(moved, count, placed, speeds):
-    """Write how the corners of placed triangles (.., 3, 3) move: speeds (.., 3, 4).
+    """Write the motion of the corners of placed triangles (.., 3, 3): speeds (.., 3, 4).
 
-    They are the shift of each corner to first order, and by how much it leaves that at most.
+    They are the shift of each corner to first order, and a bound of its deviation.
     """
     share = bend(moved)
     for m in range(count):
@@ -124,7 +124,7 @@ def _move_corners(moved, count, placed, speeds):
 
 @leaf
 def _axis_bound(one, n, placed, m, speeds):
-    """Distance that two triangles keep on a part of the path, by their boxes."""
+    """Least distance of two triangles on a part of the path, by their boxes."""
     square = 0.0
     for axis in range(3):
         low = min(one[n, 0, axis], one[n, 1, axis], one[n, 2, axis])
@@ -141,7 +141,7 @@ def _axis_bound(one, n, placed, m, speeds):
 
 @leaf
 def _bound_along(nx, ny, nz, one, n, placed, m, speeds):
-    """Distance that two triangles keep on a part of the path along a direction, of any length."""
+    """Least distance of two triangles on a part of the path along a direction, of any length."""
     length = math.sqrt(nx * nx + ny * ny + nz * nz)
     if not length > 0.0:
         return 0.0
@@ -167,9 +167,9 @@ def _bound_by_plane(of, k, one, n, placed, m, speeds):
 
 @leaf
 def _look_at_leaves(a, node, b, other, moved, way, size, radius, fine, scratch, found):
-    """Measure the triangles of two leaves; returns a distance that they keep on the part.
+    """Measure the triangles of two leaves; returns their least distance on the part, from below.
 
-    Notes what is nearer than what is known; once surfaces have met, what has met before.
+    Notes nearer places; after a collision, earlier ones.
     """
     placed, speeds, pair = scratch
     begin = (other - b.boxes.shape[0] // 2) * LEAF_SIZE
@@ -200,7 +200,7 @@ def _look_at_leaves(a, node, b, other, moved, way, size, radius, fine, scratch, 
 
 @leaf
 def _note(above, radius, way, pair, found):
-    """Note a measured distance if it is nearer, or once surfaces have met, if it is before."""
+    """Note a measured distance if it is the least, or after a collision, the earliest."""
     distance = max(above - radius, 0.0)
     if found.distance[0] > MEETING:
         if distance >= found.distance[0]:
@@ -216,7 +216,7 @@ def _note(above, radius, way, pair, found):
 
 @leaf
 def _push(waiting, node, other, segment, low, high, bound):
-    """Add an entry."""
+    """Push an entry."""
     n = waiting.state[0]
     waiting.nodes[n, 0], waiting.nodes[n, 1], waiting.nodes[n, 2] = node, other, segment
     waiting.parts[n, 0], waiting.parts[n, 1], waiting.parts[n, 2] = low, high, bound
@@ -225,7 +225,7 @@ def _push(waiting, node, other, segment, low, high, bound):
 
 @leaf
 def _part_in_time(a, b, motion, moved, entry_, slack, waiting):
-    """Add both halves of an entry, the one to look at first last: the nearer one, or the first."""
+    """Push both halves of an entry, the next one last: the nearer one, or the first."""
     node, other, segment, low, high = entry_
     middle = 0.5 * (low + high)
     move(motion, segment, middle, high, moved)
@@ -242,7 +242,7 @@ def _part_in_time(a, b, motion, moved, entry_, slack, waiting):
 
 @leaf
 def _part_boxes(a, b, moved, entry_, slack, waiting):
-    """Add both children of the larger box of an entry, the nearer one last."""
+    """Push both children of the larger box of an entry, the nearer one last."""
     node, other, segment, low, high = entry_
     is_last, is_other_last = node >= a.boxes.shape[0] // 2, other >= b.boxes.shape[0] // 2
     if is_other_last or (
@@ -274,12 +274,11 @@ def _size_of(a, b, motion):
 
 @entry(TREE, TREE, MOTION, FLOAT, FLOAT, FLOAT, INT, WAIT, FOUND)
 def least_kernel(a, b, motion, radius, begin, fine, steps, waiting, found):
-    """Search the least distance of tree a and of tree b along its path, from a way on.
+    """Search the least distance of tree a and of tree b along its path, from `begin` on.
 
-    radius: of balls about the places of b; fine: as for `wanted`; steps: entries to look at. Where
-    the least distance is `MEETING` or less, the first place of the path at which it is is searched;
-    before that place, the surfaces keep half of `MEETING` apart. Returns whether the search is
-    over.
+    radius: of balls about the places of b; fine: as for `wanted`; steps: entries to visit. For a
+    least distance of `MEETING` or less, its first place on the path is searched; before that place,
+    the surfaces are half of `MEETING` apart. Returns whether the search is over.
     """
     moved = Moved(np.eye(4), np.empty(3), np.empty(3), np.empty(3), np.empty(1))
     scratch = np.empty((LEAF_SIZE, 3, 3)), np.empty((LEAF_SIZE, 3, 4)), np.empty(7)
@@ -339,14 +338,14 @@ class Search:
     Attributes
     ----------
     found : Found
-        What is known so far.
+        Result so far.
     """
 
     def __init__(
         self, a: TriangleTree, b: TriangleTree, motion: PathMotion, *, radius: float, begin: float,
         best: float, fine: float,
     ) -> None:  # fmt: skip
-        """Begin; arguments as for the kernel; only what is nearer than `best` is looked for."""
+        """Begin; arguments as for the kernel; best : greatest distance of interest."""
         self._given = a, b, motion, radius, begin, fine
         self._waiting = Waiting(
             np.empty((WAITING, 3), dtype=np.int64), np.empty((WAITING, 3)),
@@ -355,10 +354,10 @@ class Search:
         self.found = Found(np.array([best, best]), np.array([-1.0]), np.zeros((2, 3)))
 
     def go_on(self, steps: int) -> bool:
-        """Look at so many entries; returns whether the search is over."""
+        """Visit so many entries; returns whether the search is over."""
         return bool(least_kernel(*self._given, steps, self._waiting, self.found))
 
     @property
     def looks(self) -> int:
-        """How often triangles were looked at."""
+        """Number of pairs of leaves measured."""
         return int(self._waiting.state[2])

@@ -50,6 +50,21 @@ def test_a_mistake_is_one_line_and_starts_nothing(
     assert words in told.err
 
 
+@pytest.mark.parametrize("verb", ["view", "serve"])
+def test_a_coupling_is_refused_at_the_start_where_no_object_can_have_distances(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, verb: str
+) -> None:
+    started: list[str] = []
+    monkeypatch.setattr(fork_server, "prepare", lambda work, _: started.append(work))
+    path = tmp_path / "plain.db"
+    hapticdb.create(path, hapticdb.Grid(0.01, (0.0, 0.0, 0.0), 6), layout="voxel").close()
+    assert main([verb, str(path), "--rendering", "coupled", "--seconds", "1"]) == 2
+    told = capsys.readouterr()
+    assert (told.out, len(told.err.splitlines()), started) == ("", 1, [])
+    assert "plain.db has no distances" in told.err
+    assert "leave out --rendering coupled" in told.err
+
+
 @pytest.mark.parametrize("rendering", [None, "coupled", "direct"])
 def test_a_rendering_reaches_host_and_page(scene: Path, rendering: RenderingName | None) -> None:
     serving = _serving(str(scene), None, {}, None, None, rendering)

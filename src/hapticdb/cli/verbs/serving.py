@@ -181,7 +181,7 @@ def _serving(
     recordings: str | None,
     rendering: RenderingName | None,
 ) -> "Serving":
-    """What to serve; refuses an environment, a tool or a folder that is not there."""
+    """What to serve; refuses what is not there, and a coupling where there are no distances."""
     from contextlib import closing
 
     from hapticdb.server.access import Role
@@ -193,8 +193,11 @@ def _serving(
         role, other = _pair(text, "--role-url")
         urls[role] = other
     for other in dict.fromkeys(urls.values()):
-        with closing(open_store(other, read_only=True)):
-            pass
+        with closing(open_store(other, read_only=True)) as store:
+            if rendering == "coupled" and not store.wants_distances:
+                from hapticdb.realtime.resident_cells import without_distances
+
+                raise UsageError(without_distances(store.url, "leave out --rendering coupled"))
     for tool in tools or ():
         if not Path(tool).is_file():
             raise UsageError(f"--tool {tool}: no such file")

@@ -66,8 +66,13 @@ class Running:
 
 
 def browser_at(place: str, **headers: str) -> ClientConnection:
-    """Connect to the page at a host, port and prefix, as viser's client does."""
+    """Connect to the page at a host, port and prefix, as viser's client does.
+
+    Origin empty: without that header.
+    """
     shown = {"Origin": f"http://{place.partition('/')[0]}"} | headers
+    if not shown["Origin"]:
+        del shown["Origin"]
     return connect(
         f"ws://{place}", subprotocols=PROTOCOL, additional_headers=shown, proxy=None,
         compression=None, open_timeout=PATIENCE,

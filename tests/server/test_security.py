@@ -70,6 +70,15 @@ def test_another_site_opens_no_socket_and_sends_no_form(server: Running, origin:
     assert (answer.status, answer.getheader("set-cookie")) == (403, None)
 
 
+def test_a_socket_without_an_origin_is_a_programs_and_needs_a_token(server: Running) -> None:
+    """Browsers send the header with every WebSocket."""
+    with server.browser(Role.EDITOR, Origin="") as program:
+        sent(program, CAMERA)
+        assert "is a editor" in text_until(program, "is a editor")
+    with pytest.raises(InvalidStatus):
+        server.browser(None, Origin="")
+
+
 def test_a_form_needs_an_origin_and_a_small_body(server: Running) -> None:
     assert server.ask("/sign-in", "POST", b"token=x")[0].status == 403
     own = f"http://{server.place}"

@@ -2,7 +2,8 @@
 
 A page of another site can make a browser send requests to this server. It cannot choose the headers
 Host and Origin, so both are checked: Host against rebound names (DNS rebinding), Origin on every
-WebSocket and on every request that changes something.
+WebSocket and on every request that changes something. A WebSocket without Origin passes: browsers
+always send one there, so a program opens it, with the token of a role.
 """
 
 import logging

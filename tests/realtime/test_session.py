@@ -11,10 +11,12 @@ from typing import NamedTuple
 
 import numpy as np
 import pytest
+from numba import typeof
 
 from children import PATIENCE
 from hapticdb import Environment, PointShell
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
+from hapticdb.kernels.period.loop import _layout_of
 from hapticdb.query.law import LawName
 from hapticdb.realtime.report import Report
 from hapticdb.realtime.resident_cells import ResidentCells
@@ -23,6 +25,7 @@ from hapticdb.recording.file import Recorder, Recording
 from hapticdb.recording.frame import State
 from hapticdb.recording.header import Header
 from hapticdb.resident.table import is_alive
+from realtime import users_law
 from realtime.hands import Unplugged, still, stroking
 from realtime.sessions import NEVER_STALE, RATE, Recorded, recorded, until
 from recordings import motion, write
@@ -254,3 +257,23 @@ def test_what_makes_no_sense_is_refused(
 
 
 # -- processes that are killed -----------------------------------------------------------------
+
+
+@pytest.mark.long
+def test_a_users_law_with_an_array_behind_a_short_number_is_felt(
+    cells: ResidentCells, sphere: PointShell
+) -> None:
+    """A wrong address would end the session's process."""
+    with Session(
+        cells, sphere, still(0.010), law=users_law.Table(), rendering="direct", rate=RATE,
+        seconds=0.2, has_baseline=False,
+    ) as session:  # fmt: skip
+        report = session.wait(PATIENCE)
+    assert report is not None
+    assert report.contact_frames == report.loop.frames > 0
+
+
+def test_numbers_of_a_law_lie_as_a_compiler_lays_them() -> None:
+    layout = _layout_of(typeof(users_law.Table.for_kernels))
+    assert [layout.fields[name][1] for name in layout.names] == [0, 8, 16]
+    assert layout.itemsize == 72

@@ -140,7 +140,7 @@ def _layout_of(kind: Any) -> Any:  # noqa: ANN401 - of numba
         fields = [(str(n), _layout_of(each)) for n, each in enumerate(kind.types)]
         return np.dtype(fields, align=True)
     if isinstance(kind, types.Array):  # as `_packed` has it
-        return np.dtype([(str(n), np.int64) for n in range(5 + 2 * kind.ndim)])
+        return np.dtype([(str(n), np.int64) for n in range(5 + 2 * kind.ndim)], align=True)
     return as_dtype(kind)
 
 

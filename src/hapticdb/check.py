@@ -176,6 +176,7 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
                 report.add(fault.text)
                 report.lacks_pairs |= fault.row is None
                 report.pairs += [fault.row] if fault.row else []
+            store.rules()
         except DamagedError as error:
             report.add(_cause(error))
 

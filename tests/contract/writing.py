@@ -12,7 +12,7 @@ from contract.case import StoreCase
 from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows, Store
-from hapticdb.store.pairs import Mark, PairRow
+from hapticdb.store.pairs import Mark, PairRow, Rule
 from hapticdb.verdicts import Kind
 from voxels import EVERYWHERE, blob, kind, voxel_object, write_voxels
 
@@ -282,3 +282,16 @@ class WritingContract(StoreCase):
             assert list(reader.pairs()) == [FIRST]
         assert list(reader.pairs()) == [FIRST, SECOND]
         reader.close()
+
+    def test_rules_come_back_in_order_and_are_replaced_together(self, store: Store) -> None:
+        revision = store.revision()
+        assert store.rules() == ()
+        meant = Rule(
+            "bolts/*", "*", "meant", (Kind.OVERLAPPING, Kind.NOT_KNOWN), 3e-4, "thr\u00e9ads"
+        )
+        others = Rule("a", "b,c", "apart", (), 0.002), Rule("b", "x=1", "ignore", because="")
+        store.put_rules([meant, *others])
+        assert store.rules() == (meant, *others)
+        store.put_rules(others)
+        assert store.rules() == others
+        assert store.revision() == revision

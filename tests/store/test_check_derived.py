@@ -32,6 +32,8 @@ ALTERED: dict[str, tuple[str, np.ndarray | None]] = {
     "origin": ("UPDATE environment SET origin_y = origin_y + 0.5", None),
     "curve": ("UPDATE environment SET curve = 'hilbert'", None),
     "layout": ("UPDATE environment SET layout = 'voxel'", None),
+    "rule": ("INSERT INTO rule VALUES (1, 'a', '*', 'meant', 'no kind', NULL, '')", None),
+    "clearance": ("INSERT INTO rule VALUES (1, 'a', '*', 'apart', '', NULL, '')", None),
     "a": ("UPDATE pair SET a = 1 WHERE a = 2 AND b = 3", None),
     "b": ("UPDATE pair SET b = 9 WHERE a = 1 AND b = 2", None),
     "kind": ("UPDATE pair SET kind = 'touching' WHERE a = 1", None),

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.grid import BRICK_BITS, Grid
-from hapticdb.store.pairs import Ids, KeptPairs, MaybeMark, Outlines, PairRow
+from hapticdb.store.pairs import Ids, KeptPairs, MaybeMark, Outlines, PairRow, Rule
 from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
@@ -450,6 +450,12 @@ class Store(Protocol):
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
         """Note why a pair is accepted, and the shapes of both; nothing if it has no row."""
+
+    def rules(self) -> tuple[Rule, ...]:
+        """What is decided about pairs; the first rule that reaches a pair counts."""
+
+    def put_rules(self, rules: Sequence[Rule]) -> None:
+        """Replace all rules, in one transaction."""
 
     # -- statistics, cost figures, checks ----------------------------------------------------------
 

@@ -10,7 +10,9 @@ from numpy.typing import NDArray
 from hapticdb.verdicts import Kind
 
 Status = Literal["new", "gone", "changed", "same"]
+Says = Literal["meant", "apart", "ignore"]
 STATUSES: tuple[Status, ...] = get_args(Status)
+SAYS: tuple[Says, ...] = get_args(Says)
 
 COLUMNS = "a, b, kind, at_least, at_most, a_x, a_y, a_z, b_x, b_y, b_z, status, revision, setting"
 """Columns of the table `pair` that a measurement writes."""
@@ -61,6 +63,21 @@ class PairRow(NamedTuple):
     def columns(self) -> tuple[object, ...]:
         """Values of `COLUMNS`."""
         return (*self[:5], *self.place, *self[6:9])
+
+
+class Rule(NamedTuple):
+    """Decision about pairs, by the words of their objects (`store.finding`).
+
+    one, other : words, a comma between several; kinds : that are meant; length : metres, the
+    greatest depth that is meant, None for any, or the clearance; because : why, may be empty.
+    """
+
+    one: str
+    other: str
+    says: Says
+    kinds: tuple[Kind, ...] = ()
+    length: float | None = None
+    because: str = ""
 
 
 class Mark(NamedTuple):

@@ -29,7 +29,7 @@ from hapticdb.store.base import (
     Object,
     Rows,
 )
-from hapticdb.store.pairs import STATUSES, Outlines, PairRow
+from hapticdb.store.pairs import SAYS, STATUSES, Outlines, PairRow, Rule
 from hapticdb.store.refusals import made_before
 from hapticdb.verdicts import Kind
 
@@ -43,7 +43,7 @@ CHECKSUMS = (ROWS_CRC, DISTANCES_CRC)
 ACTIONS = ("add", "move", "remove")
 """Actions that a row of `change` may have."""
 TABLES = (
-    "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed",
+    "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed", "rule",
     "surface", "voxel",
 )  # fmt: skip
 """Tables that every environment has."""
@@ -284,6 +284,24 @@ def pair_of(url: str, row: Sequence[Any]) -> PairRow:
     return PairRow(
         a, b, kind, at_least, at_most, tuple(place), status, revision, setting, because, shapes
     )
+
+
+def rule_of(url: str, row: Sequence[Any]) -> Rule:
+    """Read a rule: one, other, says, kinds, length, because."""
+    one, other, says, kinds, length, because = row
+    try:
+        named = tuple(Kind(kind) for kind in kinds.split(",") if kind)
+        is_sound = says != "apart" if length is None else 0.0 < length < math.inf
+    except (AttributeError, TypeError, ValueError):
+        is_sound = False
+    if not (
+        is_sound
+        and says in SAYS
+        and all(isinstance(one, str) for one in row[:2])
+        and isinstance(because, str)
+    ):
+        raise damaged(url, f"rule {one!s:.40}, {other!s:.40}: it holds what no rule says")
+    return Rule(one, other, says, named, length, because)
 
 
 def digests_of(url: str, rows: Iterable[Sequence[Any]]) -> set[str]:

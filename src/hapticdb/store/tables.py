@@ -38,6 +38,7 @@ from hapticdb.store.pairs import (
     MaybeMark,
     Outlines,
     PairRow,
+    Rule,
 )
 from hapticdb.store.refusals import check_unwritten, no_object, present_already
 
@@ -62,6 +63,7 @@ KEEP_HISTOGRAM = """
 INSERT INTO quantile VALUES (%s, %s, %s, %s) ON CONFLICT (resolution) DO UPDATE
    SET revision = excluded.revision, n_rows = excluded.n_rows, bounds = excluded.bounds
  WHERE quantile.revision <= excluded.revision"""
+RULES = "SELECT one, other, says, kinds, length, because FROM rule ORDER BY number"
 KEEP_COSTS = """
 INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = excluded.figures"""
 
@@ -241,6 +243,9 @@ class Tables(ABC):
     def pairs(self) -> KeptPairs:
         return KeptPairs(self._rows(ALL, binary=True), partial(parsing.pair_of, self.url))
 
+    def rules(self) -> tuple[Rule, ...]:
+        return tuple(parsing.rule_of(self.url, row) for row in self._rows(RULES))
+
     def removed(self, link: str) -> set[str]:
         return {row[0] for row in self._rows("SELECT name FROM removed WHERE link = %s", (link,))}
 
@@ -332,6 +337,15 @@ class Tables(ABC):
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
         text = "UPDATE pair SET because = %s, shapes = %s WHERE (a, b) = (%s, %s)"
         self._save(text, (because, shapes, a, b))
+
+    def put_rules(self, rules: Sequence[Rule]) -> None:
+        def work() -> None:
+            self._do("DELETE FROM rule")
+            for n, rule in enumerate(rules, start=1):
+                values = (n, *rule[:3], ",".join(rule.kinds), *rule[4:])
+                self._do("INSERT INTO rule VALUES (%s, %s, %s, %s, %s, %s, %s)", values)
+
+        self._alone(work)
 
     def _contents(self, record: Object, rows: Rows) -> tuple[Any, ...]:
         """Values of an object's columns from digest to attributes."""

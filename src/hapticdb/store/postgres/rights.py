@@ -34,7 +34,7 @@ EDITOR = (
     *TOUCHER,
     (
         "GRANT INSERT, UPDATE, DELETE ON {schema}.object, {schema}.voxel, {schema}.brick,"
-        " {schema}.surface, {schema}.pair TO {role}"
+        " {schema}.surface, {schema}.pair, {schema}.rule TO {role}"
     ),
     "GRANT INSERT ON {schema}.change TO {role}",  # no UPDATE: rows of the log stay
     "GRANT INSERT, DELETE ON {schema}.removed TO {role}",

@@ -126,6 +126,18 @@ CREATE TABLE pair (
   PRIMARY KEY (a, b)
 );
 
+-- ## rule
+
+CREATE TABLE rule (
+  number  integer PRIMARY KEY,
+  one     text NOT NULL,
+  other   text NOT NULL,
+  says    text NOT NULL,
+  kinds   text NOT NULL,
+  length  double precision,
+  because text NOT NULL
+);
+
 -- ## quantile
 
 CREATE TABLE quantile (

@@ -121,6 +121,18 @@ CREATE TABLE pair (
   PRIMARY KEY (a, b)
 ) STRICT, WITHOUT ROWID;
 
+-- ## rule: what is decided about pairs by the words of their objects (docs/clashes.md)
+
+CREATE TABLE rule (
+  number  INTEGER PRIMARY KEY,  -- 1, 2, ...: the first rule that reaches a pair decides
+  one     TEXT NOT NULL,        -- words of `hapticdb objects` for one object of the pair
+  other   TEXT NOT NULL,        -- and for the other one
+  says    TEXT NOT NULL,        -- meant, apart or ignore
+  kinds   TEXT NOT NULL,        -- kinds that are meant, a comma between; else empty
+  length  REAL,                 -- greatest depth that is meant, or the clearance, m; NULL: none
+  because TEXT NOT NULL         -- why; may be empty
+) STRICT;
+
 -- ## quantile: equi-count histograms of the keys in `voxel` or `brick`
 -- SQLite's own statistics (sqlite_stat4) hold only 24 samples of an index.
 

@@ -6,9 +6,15 @@ from typing import Self
 
 
 class Kind(StrEnum):
-    """Relation of two surfaces, the gravest first; FAR: beyond the distance of the search."""
+    """Relation of two surfaces, the gravest first.
+
+    DUPLICATE: equal ones at one place; TOO_NEAR: nearer than a rule allows, never stored; FAR:
+    beyond the distance of the search.
+    """
 
     OVERLAPPING = "overlapping"
+    DUPLICATE = "duplicate"
+    TOO_NEAR = "too near"
     INSIDE = "inside"
     NOT_KNOWN = "not known"
     TOUCHING = "touching"

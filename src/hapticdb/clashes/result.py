@@ -1,19 +1,20 @@
 """Results of a search for clashes: metres, world frame."""
 
+import math
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Status
+from hapticdb.clashes.rules import Rules, rule_text
+from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Rule, Status
 from hapticdb.units import length_text, notebook_html
 from hapticdb.verdicts import REPORTED, Kind
 
-Shown = Literal[Status, "accepted", "not looked at"]
-ASKED = (Kind.OVERLAPPING,)
+Shown = Literal[Status, "accepted", "meant", "not looked at"]
+ASKED = REPORTED[:3]
 """Kinds that are looked for unless others are asked for."""
-
 
 MOST_SHOWN = 20
 """Pairs that a notebook shows; more are counted. Larger: a longer table."""
@@ -25,7 +26,8 @@ class Clash(NamedTuple):
     a, b : ids, the lesser one first; a_name, b_name : None of an object that is gone; kind : as
     docs/clashes.md says; at_least, at_most : metres, of the gap, or of the depth of an overlap;
     at_most is None where no bound is known; place : x, y, z on a, then on b; status : since the
-    last call; because : why it is accepted, or None.
+    last call; because : why it is accepted or meant, or None; rule : number, from 1, of the rule
+    that decides it.
     """
 
     a: int
@@ -38,11 +40,12 @@ class Clash(NamedTuple):
     place: tuple[float, ...] | None
     status: Shown
     because: str | None = None
+    rule: int | None = None
 
     @property
     def is_open(self) -> bool:
-        """Whether the pair is there, and nobody has accepted it."""
-        return self.status not in {"gone", "accepted"}
+        """Whether the pair is there, and neither accepted nor meant by a rule."""
+        return self.status not in {"gone", "accepted", "meant"}
 
     @property
     def is_left(self) -> bool:
@@ -89,13 +92,54 @@ def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
     )  # fmt: skip
 
 
+def reported(found: Sequence[Clash], rules: Rules) -> list[Clash]:
+    """Pairs as rules have them reported."""
+    if not rules.rules:
+        return [*found]
+    numbers = rules.first(one[:2] for one in found).tolist()
+    return [
+        one
+        if n < 0 or one.status == "gone" or one.is_left
+        else _reported(one._replace(rule=n + 1), rules.rules[n])
+        for one, n in zip(found, numbers, strict=True)
+    ]
+
+
+def _reported(one: Clash, rule: Rule) -> Clash:
+    if rule.says == "apart":
+        is_near = one.at_least < (rule.length or 0.0)
+        is_near &= one.kind not in {Kind.OVERLAPPING, Kind.DUPLICATE}
+        return one._replace(kind=Kind.TOO_NEAR) if is_near else one
+    depth = 0.0
+    if one.kind == Kind.OVERLAPPING:
+        depth = one.at_least or (math.inf if one.at_most is None else one.at_most)
+    is_meant = one.kind in rule.kinds and (rule.length is None or depth <= rule.length)
+    if not is_meant or one.status == "accepted":
+        return one
+    return one._replace(status="meant", because=rule.because or rule_text(rule))
+
+
+class Reach(NamedTuple):
+    """What a rule does.
+
+    n_pairs : it decides; n_changed : of them, meant, too near or ignored for it; missing : why its
+    words choose nothing, or empty.
+    """
+
+    rule: Rule
+    n_pairs: int
+    n_changed: int
+    missing: str
+
+
 @dataclass(frozen=True)
 class Clashes:
     """Result of a search.
 
     told : pairs of objects that were looked at; rest : rows of all other pairs, which are as the
     last call has told them; known : all objects; measured, kept : numbers of pairs of near boxes
-    that were measured now, or were known; left : not looked at, since the time was over or an
+    that were measured now, or were known; rules : of the environment; ignored : ids of the pairs of
+    near boxes that a rule ignores; left : not looked at, since the time was over or an
     object was written meanwhile; within, contact : metres; revision : of the database that was
     read; elapsed : seconds; is_kept : whether the database keeps what was found.
     """
@@ -103,6 +147,8 @@ class Clashes:
     told: tuple[Clash, ...]
     rest: KeptPairs
     known: Known
+    rules: Rules
+    ignored: tuple[tuple[int, int], ...]
     measured: int
     kept: int
     left: int
@@ -128,7 +174,21 @@ class Clashes:
         """All pairs, the gravest first, and the deepest or nearest of each kind."""
         # when they are asked for: that takes as long as a search after one change (make clashes)
         rest = (clash_of(row, "same", self.known) for row in self.rest if row.kind != Kind.FAR)
-        return tuple(sorted((*self.told, *rest), key=gravity))
+        return tuple(sorted(reported((*self.told, *rest), self.rules), key=gravity))
+
+    def reach(self) -> list[Reach]:
+        """How many pairs each rule decides."""
+        ignored = (self.rules.first(self.ignored) + 1).tolist()
+        reached, changed = Counter[int | None](ignored), Counter[int | None](ignored)
+        for one in self.pairs:
+            reached[one.rule] += 1
+            changed[one.rule] += one.status == "meant" or one.kind == Kind.TOO_NEAR
+        return [
+            Reach(rule, reached[n], changed[n], missing)
+            for n, (rule, missing) in enumerate(
+                zip(self.rules.rules, self.rules.missing, strict=True), start=1
+            )
+        ]
 
     def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
         """Pairs of some kinds, and what was not looked at; without accepted and gone ones."""
@@ -138,8 +198,10 @@ class Clashes:
 
     def counts(self) -> dict[str, int]:
         """How many pairs are of each kind, those that are gone left out."""
-        found = Counter[str](row[KIND] for row in self.rest.rows)
-        found.update(one.kind for one in self.told if one.status != "gone")
+        told = self.pairs if self.rules.rules else self.told
+        found = Counter[str](one.kind for one in told if one.status != "gone")
+        if not self.rules.rules:
+            found.update(row[KIND] for row in self.rest.rows)
         return {kind: found[kind] for kind in REPORTED}
 
     def statuses(self) -> dict[str, int]:

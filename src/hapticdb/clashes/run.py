@@ -7,9 +7,10 @@ measured, so a call that was stopped goes on where it was.
 """
 
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import closing
 from functools import partial
+from itertools import chain
 from typing import NamedTuple
 
 import numpy as np
@@ -17,13 +18,14 @@ from numpy.typing import NDArray
 
 from hapticdb.clashes.near import FEW, near_pairs
 from hapticdb.clashes.result import Clash, Clashes, Known, accepted, clash_of, shapes_of
+from hapticdb.clashes.rules import Rules, check_clearances
 from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
 from hapticdb.exact.clash import Judged, PlacedPair, judge_placed
 from hapticdb.exact.separation import CONTACT
-from hapticdb.exact.shapes import Shapes
+from hapticdb.exact.shapes import Shapes, relative_poses
 from hapticdb.store.base import Object, Progress, Store
 from hapticdb.store.finding import Words, find_objects
 from hapticdb.store.pairs import BECAUSE, KIND, KeptPairs, Mark, Outlines, PairRow, Status
@@ -39,6 +41,8 @@ SAME = 1e-9
 ROUNDING = 2.0**-40
 """Metres, and share of one in a rotation, to which the placement of two shapes is rounded. Coarser:
 more pairs are found to be placed alike, and lengths are less exact."""
+DUPLICATE = Judged(Kind.DUPLICATE, 0.0, 0.0, np.zeros(3), np.zeros(3))
+"""What equal shapes at one place are."""
 PIECE = 128
 """Pairs of one task of a worker, which reads the shapes anew. More: fewer reads, and a lost worker
 costs more."""
@@ -126,10 +130,16 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     ]
     if not rows:
         raise UsageError("no pair between these objects is known: run 'hapticdb clashes' first")
-    for row in rows:
-        shapes = None if because is None else shapes_of(known, row.a, row.b)
-        env.store.accept_pair(row.a, row.b, because, shapes)
+    accept_pairs(env.store, [(row.a, row.b) for row in rows], known, because)
     return rows
+
+
+def accept_pairs(
+    store: Store, pairs: Iterable[tuple[int, int]], known: Known, because: str | None
+) -> None:
+    """Accept pairs of ids, or take it back for None; known : names and digests of the objects."""
+    for a, b in pairs:
+        store.accept_pair(a, b, because, None if because is None else shapes_of(known, a, b))
 
 
 class PairQuery(NamedTuple):
@@ -174,12 +184,21 @@ class PairSearch:
                 {obj.id for obj in find_objects(store, words)} if words else None
                 for words in (asked.of, asked.against)
             )
-            self._mark, is_whole = kept.mark, of is None and against is None
+            given = store.rules()
+            rules = Rules(given, store.objects() if given else (), store.url)
+            check_clearances(given, asked.within)
+            # without rows of ignored pairs the table is not whole
+            self._mark = kept.mark
+            is_whole = of is None and against is None and not rules.ignores
             rest = kept.none()
             if is_whole and (of := self._changed(kept, revision)) is not None:
                 kept, rest = kept.parted(of)
             rows = {(row.a, row.b): row for row in kept}
             near = self.near(outlines, of, against)
+            ignored = rules.ignored({*rows, *near})
+            rows = {key: row for key, row in rows.items() if key not in ignored}
+            passed = tuple(key for key in near if key in ignored)
+            near = {key: newest for key, newest in near.items() if key not in ignored}
             looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
             keys = [key for key in near if key not in looked]
             by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}
@@ -201,8 +220,9 @@ class PairSearch:
         if not left:
             self._settle(shown, looked, Mark(self._setting, revision) if is_whole else None)
         return Clashes(
-            told, rest, self._known, len(keys) - len(left), n_kept, len(left), asked.within,
-            asked.contact, revision, time.monotonic() - began, self._is_kept,
+            told, rest, self._known, rules, passed, len(keys) - len(left), n_kept,
+            len(left), asked.within, asked.contact, revision, time.monotonic() - began,
+            self._is_kept,
         )  # fmt: skip
 
     def _changed(self, kept: KeptPairs, revision: int) -> set[int] | None:
@@ -236,15 +256,19 @@ class PairSearch:
     ) -> Iterator[PairRow]:
         """Measure pairs, and keep each; leaves out what was written meanwhile."""
         alike: dict[object, list[tuple[Object, Object]]] = {}
-        placed = []
+        placed, same = [], []
         for (one, other), pose in zip(stale, self._poses(stale), strict=True):
+            if _are_same(one, other):
+                same.append((one, other))
+                continue
             a, b = (self._shapes.placement(obj)[0] for obj in (one, other))
             group = alike.setdefault((a, b, pose.tobytes()), [])
             if not group:
                 placed.append(PlacedPair(one, other, pose))
             group.append((one, other))
         n_done = 0
-        for judged, pairs in zip(self._judged(placed), alike.values(), strict=False):
+        judged_pairs = zip(self._judged(placed), alike.values(), strict=False)
+        for judged, pairs in chain([(DUPLICATE, same)], judged_pairs):
             for one, other in pairs:
                 n_done += 1
                 if judged is not None:
@@ -267,11 +291,8 @@ class PairSearch:
             np.array([self._shapes.placement(pair[n])[1] for pair in pairs]).reshape(-1, 4, 4)
             for n in (0, 1)
         )
-        back = np.zeros_like(world_from_a)
-        back[:, 3, 3] = 1.0
-        back[:, :3, :3] = world_from_a[:, :3, :3].transpose(0, 2, 1)
-        back[:, :3, 3:] = -back[:, :3, :3] @ world_from_a[:, :3, 3:]
-        return np.asarray(np.round(back @ world_from_b / ROUNDING) * ROUNDING + 0.0)
+        poses = relative_poses(world_from_a, world_from_b)
+        return np.asarray(np.round(poses / ROUNDING) * ROUNDING + 0.0)
 
     def _row(self, one: Object, other: Object, judged: Judged, revision: int) -> PairRow:
         """What the table keeps of a pair."""
@@ -280,6 +301,8 @@ class PairSearch:
             world_from_a[:3, :3] @ place + world_from_a[:3, 3]
             for place in (judged.on_a, judged.on_b)
         )
+        if judged is DUPLICATE:
+            on_a = on_b = one.bounds.mean(axis=0)
         return PairRow(
             one.id, other.id, judged.kind, judged.at_least,
             judged.at_most if np.isfinite(judged.at_most) else None,
@@ -374,6 +397,13 @@ def _is_asked(a: int, b: int, of: set[int] | None, against: set[int] | None) -> 
     return any(
         (of is None or one in of) and (against is None or other in against)
         for one, other in ((a, b), (b, a))
+    )
+
+
+def _are_same(one: Object, other: Object) -> bool:
+    """Whether equal shapes are at one place, to `ROUNDING`."""
+    return one.digest == other.digest and bool(
+        (np.abs(one.transform - other.transform) <= ROUNDING).all()
     )
 
 

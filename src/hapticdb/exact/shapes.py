@@ -45,7 +45,7 @@ class Shapes:
     def placement(self, obj: Object) -> tuple[tuple[str, bytes], Floats]:
         """Key of an object's shape, equal for equal ones, and its rigid placement (4, 4)."""
         if obj.id not in self._placements:
-            linear, pose = _placement(obj.transform)
+            linear, pose = rigid_placement(obj.transform)
             self._placements[obj.id] = (obj.digest, linear.tobytes()), pose
         return self._placements[obj.id]
 
@@ -66,7 +66,7 @@ def _bytes_of(shape: CollisionShape) -> int:
     return BYTES_OF_CORNERS * int(shape.tree.corners.nbytes)
 
 
-def _placement(transform: Floats) -> tuple[Floats, Floats]:
+def rigid_placement(transform: Floats) -> tuple[Floats, Floats]:
     """A linear map (3, 3) to be built into the shape, and the rigid placement of the result."""
     linear, pose = transform[:3, :3], np.eye(4)
     pose[:3, 3] = transform[:3, 3]
@@ -78,3 +78,12 @@ def _placement(transform: Floats) -> tuple[Floats, Floats]:
             pose[:3, :3] = rotation
             return scale * np.eye(3), pose
     return linear, pose
+
+
+def relative_poses(world_from_a: Floats, world_from_b: Floats) -> Floats:
+    """Poses (P, 4, 4) of b in the frames of a, of rigid ones (P, 4, 4)."""
+    back = np.zeros_like(world_from_a)
+    back[:, 3, 3] = 1.0
+    back[:, :3, :3] = world_from_a[:, :3, :3].transpose(0, 2, 1)
+    back[:, :3, 3:] = -back[:, :3, :3] @ world_from_a[:, :3, 3:]
+    return np.asarray(back @ world_from_b)

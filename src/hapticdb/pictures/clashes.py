@@ -17,7 +17,7 @@ from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.units import length_text
-from hapticdb.verdicts import REPORTED, Kind
+from hapticdb.verdicts import Kind
 
 Floats = NDArray[np.float64]
 
@@ -149,7 +149,7 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
     up, drawn = up_axis(objects.values()), 0
     for one in sorted(told, key=lambda one: not one.is_open):
         a, b = objects.get(one.a), objects.get(one.b)
-        if one.kind not in REPORTED[:4] or one.place is None or a is None or b is None:
+        if one.kind == Kind.APART or one.place is None or a is None or b is None:
             continue
         surfaces = [part.surface() for _, part in parts_of(env.store, [a, b])]
         picture = io.BytesIO()

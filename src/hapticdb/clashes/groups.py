@@ -1,0 +1,153 @@
+"""Groups of pairs: copies of one pair, one part against many others, duplicates at one place.
+
+A group is one finding. Its id depends on shapes and placements, so it is the same in later
+searches. Acceptances are those of its pairs.
+"""
+
+import hashlib
+from collections import Counter
+from collections.abc import Iterator, Mapping, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.clashes.result import Clash, gravity
+from hapticdb.exact.shapes import relative_poses, rigid_placement
+from hapticdb.store.base import Object, Store
+from hapticdb.units import length_text
+from hapticdb.verdicts import Kind
+
+STEP = 1e-6
+"""Metres, and share of one in a rotation, to which relative placements are rounded. Coarser: pairs
+count as copies that differ more."""
+MANY = 3
+"""Least number of others that one part meets in a group of its own."""
+DIGITS = 10
+"""Hexadecimal digits of an id."""
+
+
+class Group(NamedTuple):
+    """Pairs that are one finding.
+
+    id : the same in later searches; part : name of the one part against many others, or None;
+    pairs : the gravest first.
+    """
+
+    id: str
+    kind: Kind
+    part: str | None
+    pairs: tuple[Clash, ...]
+
+    @property
+    def is_open(self) -> bool:
+        """Whether a pair is neither accepted nor meant."""
+        return any(one.is_open for one in self.pairs)
+
+    @property
+    def n_parts(self) -> int:
+        """Number of objects."""
+        return len({i for one in self.pairs for i in one[:2]})
+
+    def title(self) -> str:
+        """Names of the gravest pair, or of the part, and how many others."""
+        worst, more = self.pairs[0], len(self.pairs) - 1
+        if self.kind == Kind.DUPLICATE:
+            return f"{worst.a_name}, {self.n_parts} at one place"
+        if self.part is not None:
+            return f"{self.part} and {self.n_parts - 1} others"
+        return f"{worst.a_name}, {worst.b_name}" + (f" and {more} alike" if more else "")
+
+    def length_text(self) -> str:
+        """Gap or depth, from the least to the greatest of several."""
+        known = [one.at_least for one in self.pairs if one.at_least or one.kind != Kind.OVERLAPPING]
+        if len(self.pairs) == 1 or not known:
+            return self.pairs[0].length_text()
+        ends = dict.fromkeys(map(length_text, (min(known), max(known))))
+        return " ... ".join(ends) + ("" if len(known) == len(self.pairs) else ", or not known")
+
+    def status(self) -> str:
+        """Reason of a closed group; else how many pairs are settled, or their statuses."""
+        counts, n_pairs = Counter[str](one.status for one in self.pairs), len(self.pairs)
+        if not self.is_open:
+            return self.pairs[0].because or ", ".join(counts)
+        closed = [word for word in ("accepted", "meant") if counts[word]]
+        if closed:
+            return ", ".join(f"{counts[word]:,} of {n_pairs:,} {word}" for word in closed)
+        if len(counts) == 1:
+            return next(iter(counts))
+        return ", ".join(f"{n:,} {word}" for word, n in counts.most_common())
+
+
+def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
+    """Groups of pairs that are there and were measured: open ones first, then the gravest.
+
+    First copies: pairs of equal shapes in equal relative placement, of one kind. Of those left, the
+    object that meets most others in one kind takes its pairs, until none meets `MANY`. Each other
+    pair is a group. Duplicates at one place are a group.
+    """
+    there = [one for one in pairs if one.status != "gone" and not one.is_left]
+    objects = {obj.id: obj for obj in store.objects({i for one in there for i in one[:2]})}
+    there = [one for one in there if one.a in objects and one.b in objects]
+    alike: dict[str, list[Clash]] = {}
+    for one, key in zip(there, _keys(there, objects), strict=True):
+        alike.setdefault(key, []).append(one)
+    alone = {
+        (one.a, one.b): key
+        for key, (one, *others) in alike.items()
+        if not others and one.kind != Kind.DUPLICATE
+    }
+    found = {key: (None, members) for key, members in alike.items()}
+    taken: dict[str, tuple[str | None, list[Clash]]] = {}
+    for part, members in _one_against_many([alike[key][0] for key in alone.values()]):
+        for one in members:
+            del found[alone[one.a, one.b]]
+        obj = objects[part]
+        key = _id(members[0].kind, obj.digest, obj.name)
+        taken.setdefault(key, (obj.name, []))[1].extend(members)
+    groups = [
+        Group(key, members[0].kind, part, tuple(sorted(members, key=gravity)))
+        for key, (part, members) in (found | taken).items()
+    ]
+    return sorted(groups, key=lambda group: (not group.is_open, gravity(group.pairs[0])))
+
+
+def _one_against_many(pairs: Sequence[Clash]) -> Iterator[tuple[int, list[Clash]]]:
+    """Objects that meet `MANY` others in one kind, the one with most first, and these pairs."""
+    met: dict[tuple[Kind, int], dict[int, Clash]] = {}
+    for one in pairs:
+        met.setdefault((one.kind, one.a), {})[one.b] = one
+        met.setdefault((one.kind, one.b), {})[one.a] = one
+    while met:
+        kind, part = max(met, key=lambda key: (len(met[key]), -key[1]))
+        others = met.pop((kind, part))
+        if len(others) < MANY:
+            return
+        for other in others:
+            del met[kind, other][part]
+        yield part, list(others.values())
+
+
+def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str]:
+    """Ids of pairs, equal for copies, and for duplicates at one place."""
+    placed = {i: rigid_placement(obj.transform) for i, obj in objects.items()}
+    shapes = {
+        i: f"{objects[i].digest} {_rounded(linear).tolist()}" for i, (linear, _) in placed.items()
+    }
+    ends = zip(*((one.a, one.b) for one in pairs), strict=True) if pairs else ((), ())
+    poses = [np.array([placed[i][1] for i in end]).reshape(-1, 4, 4) for end in ends]
+    there, back = (_rounded(relative_poses(*way)) for way in (poses, poses[::-1]))
+    for n, one in enumerate(pairs):
+        if one.kind == Kind.DUPLICATE:
+            yield _id(one.kind, shapes[one.a], str(_rounded(poses[0][n]).tolist()))
+            continue
+        a, b = shapes[one.a], shapes[one.b]
+        yield _id(one.kind, *min((a, b, str(there[n].tolist())), (b, a, str(back[n].tolist()))))
+
+
+def _rounded(values: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.round(values / STEP).astype(np.int64)
+
+
+def _id(*parts: str) -> str:
+    return hashlib.sha256("\n".join(parts).encode()).hexdigest()[:DIGITS]

@@ -60,6 +60,60 @@ def test_rows_are_written_as_csv(run: Run, meeting: Path, tmp_path: Path) -> Non
     assert (row["a_name"], row["kind"], row["at_least_m"]) == ("box1", "touching", "0.0")
 
 
+def test_a_group_is_shown_and_accepted_by_its_id(run: Run, tmp_path: Path) -> None:
+    path = row_of_boxes(tmp_path / "row.db", 4, 0.098)
+    code, out, _ = run("clashes", path)
+    (line,) = (line for line in out.splitlines() if "and 2 alike" in line)
+    assert (code, line.split()[1:4]) == (1, ["overlapping", "3", "4"])
+    group = line.split()[0]
+    code, out, _ = run("clashes", path, "--group", group, "--json")
+    assert (code, {json.loads(line)["group"] for line in out.splitlines()}) == (1, {group})
+    assert run("clashes", path, "--all")[1].count("overlapping") == 3 + 1
+    code, out, _ = run("clashes", path, "--group", group, "--because", "glued")
+    assert (code, out.strip()) == (0, "3 pairs accepted until a part changes its shape")
+    code, out, _ = run("clashes", path)
+    assert (code, "glued" in out) == (0, True)
+    assert run("clashes", path, "--accept", "1", "2", "--because", "")[0] == 0
+    code, out, _ = run("clashes", path)
+    assert (code, "2 of 3 accepted" in out) == (1, True)
+    refused(run("clashes", path, "--group", "none"), "--group 'none'")
+
+
+def test_rules_are_kept_and_what_they_reach_is_told(
+    run: Run, meeting: Path, tmp_path: Path
+) -> None:
+    meant = "box0 in *: overlap up to 11 mm is meant because a fit"
+    code, out, _ = run("clashes", meeting, "--rule", meant)
+    assert code == 0
+    assert "box0 in *: overlap up to 11 mm is meant" in out
+    assert "1 meant" in out
+    assert "a fit" in out
+    code, out, _ = run("clashes", meeting, "--rule", meant, "--rule", "none and *: ignore")
+    assert (code, out.count("box0 in *")) == (0, 1)
+    code, out, err = run("clashes", meeting, "--json")
+    assert (code, [json.loads(line)["rule"] for line in out.splitlines()]) == (0, [1, None])
+    assert "rule 2 reaches no pair: no object 'none'" in err
+    rules = tmp_path / "rules.toml"
+    rules.write_text("[[rule]]\nof = 'box2'\nignore = true\n")
+    code, out, _ = run("clashes", meeting, "--rules", rules)
+    assert (code, "1 pair of near boxes" in out, "box0 in *" in out) == (1, True, False)
+    rules.write_text("[[rule]]\nof = 'box2'\napart = '5 mm'\n")
+    refused(run("clashes", meeting, "--rules", rules), "rule 1", "--within 5mm")
+    assert "box2 and *: ignore" in run("clashes", meeting)[1]
+    code, out, _ = run("clashes", meeting, "--rules", rules, "--within", "5mm", "--csv", "-")
+    kinds = [(row["kind"], row["rule"]) for row in csv.DictReader(out.splitlines())]
+    assert (code, kinds) == (1, [("overlapping", ""), ("too near", "1")])
+    rules.write_text("")
+    assert "rule" not in run("clashes", meeting, "--rules", rules)[1]
+
+
+def test_duplicates_give_exit_code_1(run: Run, tmp_path: Path) -> None:
+    path = row_of_boxes(tmp_path / "row.db", 40, 0.0)
+    code, out, _ = run("clashes", path)
+    assert (code, "cube0, 40 at one place" in out, "780 duplicate" in out) == (1, True, True)
+    assert run("clashes", path, "--kind", "inside")[0] == 0
+
+
 def test_a_page_needs_no_other_file_and_shows_names_as_they_are(run: Run, tmp_path: Path) -> None:
     name = "<script>alert('&')</script>"
     path = row_of_boxes(tmp_path / "row.db", 3, 0.099, names=("a/one", f"a/b/{name}", "a/b/two"))
@@ -109,3 +163,5 @@ def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
     refused(run("clashes", meeting, "--of", "wheel"), "wheel")
     refused(run("clashes", meeting, "--json", "--csv", "-"), "standard output")
     refused(run("clashes", "none.db"), "no environment")
+    refused(run("clashes", meeting, "--rule", "box0 is fine"), "ONE in OTHER")
+    refused(run("clashes", meeting, "--rules", "none.toml"), "none.toml")

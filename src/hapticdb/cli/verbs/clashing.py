@@ -3,13 +3,13 @@
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
-from hapticdb.cli.csv_files import AXES, STDOUT, new_file, open_csv, text_cell
+from hapticdb.cli.csv_files import AXES, STDOUT, CsvWriter, new_file, open_csv, text_cell
 from hapticdb.cli.options import (
     ClusterOption,
     CsvOption,
@@ -19,22 +19,24 @@ from hapticdb.cli.options import (
 )
 from hapticdb.cli.values import Point, budget_bytes, point_of
 from hapticdb.errors import UsageError
-from hapticdb.units import length_text
+from hapticdb.units import length_text, place_text
 from hapticdb.verdicts import REPORTED, Kind
 
 if TYPE_CHECKING:
     from collections.abc import Callable
 
+    from hapticdb.clashes.groups import Group
     from hapticdb.clashes.result import Clash, Clashes
+    from hapticdb.environment import Environment
     from hapticdb.exact.moving_clash import Meeting
 
 MOST_ROWS = 20
-"""Rows of the table; further pairs are counted below it."""
+"""Rows of the table; further ones are counted below it."""
 NOT_DECIDED = 3
 """Exit code where nothing was found, but not all pairs were looked at."""
 COLUMNS = (
     "a_id", "a_name", "b_id", "b_name", "kind", "at_least_m", "at_most_m", "a_x_m", "a_y_m",
-    "a_z_m", "b_x_m", "b_y_m", "b_z_m", "status", "because",
+    "a_z_m", "b_x_m", "b_y_m", "b_z_m", "status", "because", "rule", "group",
 )  # fmt: skip
 """Columns of `clashes --csv`: a row for each pair, the gravest first."""
 MEETING_COLUMNS = ("id", "name", "begin", "end", "kind", "at_least_m", "x_m", "y_m", "z_m")
@@ -58,7 +60,7 @@ KindOption = Annotated[
         "--kind",
         metavar="KIND",
         help="Kinds that are told, and that exit code 1 stands for. Give it again for more.",
-        show_default="all are told, overlapping gives exit code 1",
+        show_default="all are told; overlapping, duplicate and too near give exit code 1",
     ),
 ]
 SecondsOption = Annotated[
@@ -76,6 +78,21 @@ AcceptOption = Annotated[
 BecauseOption = Annotated[
     str | None, typer.Option(metavar="TEXT", help="Why --accept accepts; '' takes it back.")
 ]
+RulesOption = Annotated[
+    str | None,
+    typer.Option(metavar="TOML", help="Rules of the database from now on, instead of its own."),
+]
+RuleOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        metavar="TEXT", help="One more: 'bolts/* in *: overlap up to 0.3 mm is meant because ...'."
+    ),
+]
+GroupOption = Annotated[
+    str | None,
+    typer.Option(metavar="ID", help="Pairs of one group; with --because, accept them."),
+]
+AllOption = Annotated[bool, typer.Option("--all", help="A table of pairs, not of groups.")]
 HtmlOption = Annotated[
     str | None,
     typer.Option(
@@ -116,6 +133,11 @@ The database keeps what is found. The next call measures only pairs of objects
 that were added, moved or replaced since, and says what is new, changed, gone or the
 same. --accept marks pairs as intended, until either part changes its shape.
 
+Pairs are told in groups, each one finding: copies of a pair, one part against many,
+and duplicates, which are equal parts at one place. --all and --group tell pairs.
+--rules and --rule say what is meant, what to keep apart, and what to ignore; the
+database keeps them, and the first rule that reaches a pair decides.
+
 Ctrl-C and --seconds lose nothing: the next call goes on. What was not looked
 at is told as that.
 
@@ -123,8 +145,8 @@ at is told as that.
 motion they meet each other object, and how deep. Where they do not is proved, as by
 sweep. Numbers are those of poses, from 0, or degrees. Nothing of it is kept.
 
-The exit code is 1 when a pair of a --kind was found that nobody has accepted, 3 when
-there is none but not all pairs were looked at, and else 0.
+The exit code is 1 when a pair of a --kind was found that is neither accepted nor
+meant, 3 when there is none but not all pairs were looked at, and else 0.
 
 Example: hapticdb clashes car.db --of 'wheel*' --within 2
 """
@@ -143,6 +165,10 @@ def clashes(
     on: ClusterOption = None,
     accept: AcceptOption = None,
     because: BecauseOption = None,
+    rules: RulesOption = None,
+    rule: RuleOption = None,
+    group: GroupOption = None,
+    all_: AllOption = False,
     csv: CsvOption = None,
     html: HtmlOption = None,
     poses: PosesOption = None,
@@ -155,7 +181,7 @@ def clashes(
     """Find every pair of objects that are near; the help text is `HELP`."""
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
-    if accept is not None or because is not None:
+    if accept is not None or (because is not None and group is None):
         raise typer.Exit(_accept(url, accept, because, json=json))
     kinds = _checked(kind)
     if poses is not None or turn is not None:
@@ -171,24 +197,74 @@ def clashes(
         opened_to_keep(url) as env,
         render.bar("measuring", "pairs") as progress,
     ):
+        _put_rules(env, rules, rule or [], within)
         found = find_clashes(
                 env, within=within, contact=contact, of=of or (), against=against or (),
                 seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
             )  # fmt: skip
-        told = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
+        told = _Told.of(env, found, kinds, group)
+        if because is not None:
+            raise typer.Exit(told.accept(env, because, json=json))
+        told.write(env, table, page)
+    told.say(url, json=json, is_table=csv != STDOUT, is_grouped=group is None and not all_)
+    raise typer.Exit(_exit_code(found, kinds))
+
+
+class _Told(NamedTuple):
+    """What is said of a search; ids : of the groups of pairs of object ids."""
+
+    found: "Clashes"
+    pairs: "list[Clash]"
+    groups: "list[Group]"
+    ids: dict[tuple[int, int], str]
+
+    @classmethod
+    def of(
+        cls, env: "Environment", found: "Clashes", kinds: "tuple[Kind, ...]", group: str | None
+    ) -> "_Told":
+        """Pairs of some kinds, or of one group; UsageError where there is no such group."""
+        from hapticdb.clashes.groups import groups_of
+
+        pairs = [one for one in found.pairs if not kinds or one.kind in kinds or one.is_left]
+        groups = groups_of(env.store, pairs)
+        if group is not None:
+            groups = [one for one in groups if one.id == group]
+            pairs = [one for found in groups for one in found.pairs]
+            if not pairs:
+                raise UsageError(f"--group {group!r}: none; the table without --group lists them")
+        ids = {(one.a, one.b): found.id for found in groups for one in found.pairs}
+        return cls(found, pairs, groups, ids)
+
+    def accept(self, env: "Environment", because: str, *, json: bool) -> int:
+        """Accept the pairs, or take it back; returns the exit code."""
+        from hapticdb.clashes.run import accept_pairs
+
+        pairs = [(one.a, one.b) for one in self.pairs]
+        accept_pairs(env.store, pairs, self.found.known, because or None)
+        return _say_accepted(pairs, because, json=json)
+
+    def write(self, env: "Environment", table: CsvWriter | None, page: Path | None) -> None:
+        """Write the pairs as a table and a page, where files are given."""
         if table:
-            table.write(map(_row, told))
+            table.write(_row(one, self.ids.get((one.a, one.b))) for one in self.pairs)
         if page is not None:
             from hapticdb.pictures.clashes import clashes_page
 
-            page.write_text(clashes_page(env, found, told), encoding="utf-8")
-    for one in told if json else ():
-        render.say_json(one._asdict())
-    if not json and csv != STDOUT:
-        _show(found, told)
-    if not found.is_kept:
-        render.note(f"{url} can only be read by this user: what was found is not kept")
-    raise typer.Exit(_exit_code(found, kinds))
+            page.write_text(clashes_page(env, self.found, self.pairs), encoding="utf-8")
+
+    def say(self, url: str, *, json: bool, is_table: bool, is_grouped: bool) -> None:
+        """Print groups or pairs, and what rules reach."""
+        for one in self.pairs if json else ():
+            render.say_json(one._asdict() | {"group": self.ids.get((one.a, one.b))})
+        if is_table and not json:
+            _show_groups(self.groups) if is_grouped else _show_pairs(self.pairs)
+            _show_facts(self.found)
+        else:
+            for n, reach in enumerate(self.found.reach(), start=1):
+                if not reach.n_pairs:
+                    render.note(f"rule {n} reaches no pair{reach.missing and f': {reach.missing}'}")
+        if not self.found.is_kept:
+            render.note(f"{url} can only be read by this user: what was found is not kept")
 
 
 def _moved(
@@ -270,26 +346,61 @@ def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json
         raise UsageError("--accept A B and --because TEXT: give both, or neither")
     with hapticdb.open(url) as env:
         rows = accept_clash(env, [pair[0]], [pair[1]], because or None)
+    return _say_accepted([(row.a, row.b) for row in rows], because, json=json)
+
+
+def _say_accepted(pairs: list[tuple[int, int]], because: str, *, json: bool) -> int:
     if json:
-        for row in rows:
-            render.say_json({"a": row.a, "b": row.b, "because": because or None})
+        for a, b in pairs:
+            render.say_json({"a": a, "b": b, "because": because or None})
         return 0
     what = "accepted until a part changes its shape" if because else "no longer accepted"
-    render.say(f"{render.counted(len(rows), 'pair')} {what}")
+    render.say(f"{render.counted(len(pairs), 'pair')} {what}")
     return 0
 
 
-def _row(one: "Clash") -> list[object]:
+def _put_rules(env: "Environment", path: str | None, texts: list[str], within: float) -> None:
+    """Replace the rules by those of a file, and add others, each once."""
+    from hapticdb.clashes.rules import check_clearances, parse_rule, read_rules
+
+    if path is None and not texts:
+        return
+    rules = [*env.store.rules()] if path is None else read_rules(path)
+    rules = [*dict.fromkeys([*rules, *map(parse_rule, texts)])]
+    check_clearances(rules, within)
+    env.store.put_rules(rules)
+
+
+def _row(one: "Clash", group: str | None) -> list[object]:
     place = ("",) * 6 if one.place is None else one.place
     at_most = "" if one.at_most is None else one.at_most
     return [
         one.a, text_cell(one.a_name or ""), one.b, text_cell(one.b_name or ""), one.kind,
         one.at_least, at_most, *place, one.status, text_cell(one.because or ""),
+        one.rule or "", group or "",
     ]  # fmt: skip
 
 
-def _show(found: "Clashes", told: "list[Clash]") -> None:
-    """Print the gravest pairs, and how many there are of each kind and status."""
+def _show_groups(groups: "list[Group]") -> None:
+    """Print the gravest groups."""
+    rows = [
+        (one.id, one.kind, f"{len(one.pairs):,}", f"{one.n_parts:,}", one.length_text(),
+         _millimetres(one.pairs[0].place), one.status(), one.title())
+        for one in groups[:MOST_ROWS]
+    ]  # fmt: skip
+    if rows:
+        headings = ("group", "are", "pairs>", "parts>", "by>", "at, mm", "status", "which")
+        render.table(headings, rows)
+    if len(groups) > MOST_ROWS:
+        render.say(f"{len(groups):,} groups, {MOST_ROWS} of them shown; --csv writes all pairs")
+
+
+def _millimetres(place: tuple[float, ...] | None) -> str:
+    return "" if place is None else place_text((1e3 * x for x in place[:3]), 0.1)
+
+
+def _show_pairs(told: "list[Clash]") -> None:
+    """Print the gravest pairs."""
     rows = [
         (str(one.a), one.a_name or "(gone)", str(one.b), one.b_name or "(gone)", one.kind,
          one.length_text(), one.because or one.status)
@@ -299,6 +410,20 @@ def _show(found: "Clashes", told: "list[Clash]") -> None:
         render.table(("id>", "object", "id>", "and", "are", "by>", "status"), rows)
     if len(told) > MOST_ROWS:
         render.say(f"{len(told):,} pairs, {MOST_ROWS} of them shown; --csv writes all")
+
+
+def _show_facts(found: "Clashes") -> None:
+    """Print what each rule reaches, and how many pairs there are of each kind and status."""
+    from hapticdb.clashes.rules import rule_text
+
+    words = {"meant": "meant", "apart": "too near", "ignore": "ignored"}
+    reached = [
+        (str(n), rule_text(one.rule), f"{one.n_pairs:,}",
+         f"{one.n_changed:,} {words[one.rule.says]}" if one.n_pairs else one.missing)
+        for n, one in enumerate(found.reach(), start=1)
+    ]  # fmt: skip
+    if reached:
+        render.table(("rule>", "says", "pairs>", "of them"), reached)
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n)
     statuses = ", ".join(f"{n:,} {status}" for status, n in sorted(found.statuses().items()))
     facts = [(f"within {length_text(found.within)}", counts or "no pair")]
@@ -308,5 +433,8 @@ def _show(found: "Clashes", told: "list[Clash]") -> None:
     facts.append(("measured", f"{measured}, {found.kept:,} known before"))
     if found.left:
         facts.append(("not looked at", f"{left}: call again to go on"))
+    if found.ignored:
+        ignored = render.counted(len(found.ignored), "pair")
+        facts.append(("ignored", f"{ignored} of near boxes, by rules: not measured"))
     facts.append(("took", f"{found.elapsed:.2f} s"))
     render.facts(facts)

@@ -54,6 +54,7 @@ def reach(found: Clashes) -> list[tuple[int, int]]:
          Rule("a", "b", "meant", (Kind.INSIDE, Kind.TOUCHING))),
         ("a:0:x and b c,d: keep 2mm apart", Rule("a:0:x", "b c,d", "apart", (), 2 * MM)),
         ("a and material=steel: ignore", Rule("a", "material=steel", "ignore")),
+        ("'a and b: c' in d: overlap is meant", Rule("a and b: c", "d", "meant", MEANT)),
     ],
 )  # fmt: skip
 def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
@@ -70,7 +71,7 @@ def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
         ("a in b: overlaps is meant", "overlapping"),
         ("a in b: too near is meant", "touching"),
         ("a and b: keep away apart", "'away'"),
-        ("a and \x1b: ignore", "against"),
+        ("a and \x1b: ignore", "ONE in OTHER"),
     ],
 )
 def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
@@ -82,25 +83,16 @@ def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
 def test_read_rules_keeps_the_order_of_a_file(tmp_path: Path) -> None:
     file = tmp_path / "rules.toml"
     file.write_text("""
-        [[rule]]
-        of = "bolts/*"
-        meant = "0.3 mm"
-        because = "threads"
-        [[rule]]
-        of = "a"
-        against = "b"
-        kinds = ["inside"]
-        meant = true
-        [[rule]]
-        of = "a"
-        apart = "2 mm"
-        [[rule]]
-        of = "c"
-        ignore = true
+        rules = [
+            "bolts/* in *: overlap up to 0.3 mm is meant because threads",
+            "'a in b' in b: inside is meant",  # quotes where words are in the names
+            'a and *: keep 2 mm apart',
+            "c and *: ignore",
+        ]
     """)
     assert read_rules(file) == [
         Rule("bolts/*", "*", "meant", MEANT, 0.3 * MM, "threads"),
-        Rule("a", "b", "meant", (Kind.INSIDE,)),
+        Rule("a in b", "b", "meant", (Kind.INSIDE,)),
         Rule("a", "*", "apart", (), 2 * MM),
         Rule("c", "*", "ignore"),
     ]
@@ -111,22 +103,13 @@ def test_read_rules_keeps_the_order_of_a_file(tmp_path: Path) -> None:
 @pytest.mark.parametrize(
     ("content", "words"),
     [
-        ("[[rule]", "no TOML"),
-        ("[[rules]]\nof = 'a'", "'rules' is no list"),
-        ("[rule]\nof = 'a'", "begin each rule"),
-        ("rule = [3]", "rule 1: it is no table"),
-        ("[[rule]]\nof = 'a'\nignore = true\n[[rule]]\nignore = true", "rule 2: of = None"),
-        ("[[rule]]\nof = 'a'\nmean = '1 mm'", "rule 1: unknown key 'mean'"),
-        ("[[rule]]\nof = 'a'", "rule 1: give one of meant"),
-        ("[[rule]]\nof = 'a'\nmeant = true\nignore = true", "rule 1: give one of meant"),
-        ("[[rule]]\nof = 'a'\nmeant = 0.3", "meant = 0.3"),
-        ("[[rule]]\nof = 'a'\napart = true", "apart = True"),
-        ("[[rule]]\nof = 'a'\napart = '1e999 mm'", "1e999"),
-        ("[[rule]]\nof = 'a'\nmeant = true\nkinds = ['overlap']", "kinds"),
-        ("[[rule]]\nof = 'a'\nmeant = true\nkinds = [['touching']]", "kinds"),
-        ("[[rule]]\nof = 'a'\nmeant = true\nkinds = []", "kinds"),
-        ("[[rule]]\nof = 'a'\nignore = true\nkinds = ['touching']", "kinds"),
-        ("[[rule]]\nof = ''\nignore = true", "of = ''"),
+        ("rules = [", "no TOML"),
+        ("[[rule]]\nof = 'a'", "unknown key 'rule'"),
+        ("rules = 'a and b: ignore'", "no list"),
+        ("rules = [3]", "no list"),
+        ("rules = ['a and b: ignore', 'a is fine']", "rule 2: give 'ONE in OTHER"),
+        ("rules = ['a and b: keep 2 parsec apart']", "rule 1: '2 parsec'"),
+        ("rules = ['a in b: fits is meant']", "rule 1: 'fits'"),
     ],
 )
 def test_read_rules_names_the_file_and_the_rule(tmp_path: Path, content: str, words: str) -> None:

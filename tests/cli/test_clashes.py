@@ -94,10 +94,10 @@ def test_rules_are_kept_and_what_they_reach_is_told(
     assert (code, [json.loads(line)["rule"] for line in out.splitlines()]) == (0, [1, None])
     assert "rule 2 reaches no pair: no object 'none'" in err
     rules = tmp_path / "rules.toml"
-    rules.write_text("[[rule]]\nof = 'box2'\nignore = true\n")
+    rules.write_text("rules = ['box2 and *: ignore']")
     code, out, _ = run("clashes", meeting, "--rules", rules)
     assert (code, "1 pair of near boxes" in out, "box0 in *" in out) == (1, True, False)
-    rules.write_text("[[rule]]\nof = 'box2'\napart = '5 mm'\n")
+    rules.write_text("rules = ['box2 and *: keep 5mm apart']")
     refused(run("clashes", meeting, "--rules", rules), "rule 1", "--within 5mm")
     assert "box2 and *: ignore" in run("clashes", meeting)[1]
     code, out, _ = run("clashes", meeting, "--rules", rules, "--within", "5mm", "--csv", "-")

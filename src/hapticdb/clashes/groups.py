@@ -68,15 +68,14 @@ class Group(NamedTuple):
 
     def status(self) -> str:
         """Reason of a closed group; else how many pairs are settled, or their statuses."""
-        counts, n_pairs = Counter[str](one.status for one in self.pairs), len(self.pairs)
         if not self.is_open:
-            return self.pairs[0].because or ", ".join(counts)
-        closed = [word for word in ("accepted", "meant") if counts[word]]
-        if closed:
-            return ", ".join(f"{counts[word]:,} of {n_pairs:,} {word}" for word in closed)
-        if len(counts) == 1:
-            return next(iter(counts))
-        return ", ".join(f"{n:,} {word}" for word, n in counts.most_common())
+            return self.pairs[0].because or ""
+        counts, n_pairs = Counter[str](one.status for one in self.pairs), len(self.pairs)
+        settled = {word: counts[word] for word in ("accepted", "meant") if counts[word]}
+        return ", ".join(
+            word if n == n_pairs else f"{n:,} of {n_pairs:,} {word}"
+            for word, n in (settled or counts).items()
+        )
 
 
 def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
@@ -92,22 +91,23 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
     alike: dict[str, list[Clash]] = {}
     for one, key in zip(there, _keys(there, objects), strict=True):
         alike.setdefault(key, []).append(one)
-    alone = {
-        (one.a, one.b): key
-        for key, (one, *others) in alike.items()
-        if not others and one.kind != Kind.DUPLICATE
+    found: dict[str, tuple[str | None, list[Clash]]] = {
+        key: (None, members) for key, members in alike.items()
     }
-    found = {key: (None, members) for key, members in alike.items()}
-    taken: dict[str, tuple[str | None, list[Clash]]] = {}
-    for part, members in _one_against_many([alike[key][0] for key in alone.values()]):
+    alone = {
+        members[0]: key
+        for key, members in alike.items()
+        if len(members) == 1 and members[0].kind != Kind.DUPLICATE
+    }
+    for part, members in _one_against_many([*alone]):
         for one in members:
-            del found[alone[one.a, one.b]]
+            del found[alone[one]]
         obj = objects[part]
         key = _id(members[0].kind, obj.digest, obj.name)
-        taken.setdefault(key, (obj.name, []))[1].extend(members)
+        found.setdefault(key, (obj.name, []))[1].extend(members)
     groups = [
         Group(key, members[0].kind, part, tuple(sorted(members, key=gravity)))
-        for key, (part, members) in (found | taken).items()
+        for key, (part, members) in found.items()
     ]
     return sorted(groups, key=lambda group: (not group.is_open, gravity(group.pairs[0])))
 

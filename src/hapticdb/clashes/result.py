@@ -94,27 +94,25 @@ def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
 
 def reported(found: Sequence[Clash], rules: Rules) -> list[Clash]:
     """Pairs as rules have them reported."""
-    if not rules.rules:
-        return [*found]
-    numbers = rules.first(one[:2] for one in found).tolist()
+    numbers = rules.first(one[:2] for one in found).tolist() if rules.rules else [-1] * len(found)
     return [
         one
         if n < 0 or one.status == "gone" or one.is_left
-        else _reported(one._replace(rule=n + 1), rules.rules[n])
+        else _decided(one._replace(rule=n + 1), rules.rules[n])
         for one, n in zip(found, numbers, strict=True)
     ]
 
 
-def _reported(one: Clash, rule: Rule) -> Clash:
+def _decided(one: Clash, rule: Rule) -> Clash:
+    """Pair as a rule has it reported."""
+    length = math.inf if rule.length is None else rule.length
     if rule.says == "apart":
-        is_near = one.at_least < (rule.length or 0.0)
-        is_near &= one.kind not in {Kind.OVERLAPPING, Kind.DUPLICATE}
+        is_near = one.at_least < length and one.kind not in {Kind.OVERLAPPING, Kind.DUPLICATE}
         return one._replace(kind=Kind.TOO_NEAR) if is_near else one
     depth = 0.0
     if one.kind == Kind.OVERLAPPING:
         depth = one.at_least or (math.inf if one.at_most is None else one.at_most)
-    is_meant = one.kind in rule.kinds and (rule.length is None or depth <= rule.length)
-    if not is_meant or one.status == "accepted":
+    if one.kind not in rule.kinds or depth > length or one.status == "accepted":
         return one
     return one._replace(status="meant", because=rule.because or rule_text(rule))
 

@@ -6,7 +6,7 @@ phase. The first rule that reaches a pair decides.
 
 import re
 import tomllib
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -28,90 +28,63 @@ FORM = (
     "'ONE and OTHER: ignore', and if wanted 'because REASON' after it"
 )
 GRAMMAR = re.compile(
-    r"(?P<of>.+?) (?:in|and) (?P<against>.+?): *(?:"
-    r"(?P<kinds>[^:]+?)(?: up to (?P<meant>[^:]+?))? is meant|"
-    r"keep (?P<apart>[^:]+?) apart|(?P<ignore>ignore))(?: because (?P<because>.+))?"
+    r"('[^']+'|.+?) (?:in|and) ('[^']+'|.+?): *(?:(?P<kinds>[^:]+?)(?: up to (?P<depth>[^:]+?))?"
+    r" is meant|keep (?P<apart>[^:]+?) apart|ignore)(?: because (?P<because>.+))?"
 )
-KEYS = ("of", "against", "meant", "apart", "ignore", "kinds", "because")
-"""Keys of a rule in a file."""
 
 
-def parse_rule(text: str) -> Rule:
-    """Rule of a text in one of the forms of `FORM`; UsageError."""
+def parse_rule(text: str, place: str = "") -> Rule:
+    """Rule of a text in one of the forms of `FORM`; UsageError, which names the place."""
+    place = place or f"rule {text[:200]!r}"
     found = GRAMMAR.fullmatch(text.strip())
-    if found is None:
-        raise UsageError(f"rule {text[:200]!r}: {FORM}")
-    said: dict[str, object] = {key: value for key, value in found.groupdict().items() if value}
-    said["ignore"] = "ignore" in said
-    if "kinds" in said:
-        said.setdefault("meant", True)
-        kinds = [kind.strip() for kind in found["kinds"].split(",")]
-        said["kinds"] = list(MEANT) if kinds == ["overlap"] else kinds
-    return _rule(f"rule {text[:200]!r}", said)
+    if found is None or not text.isprintable():
+        raise UsageError(f"{place}: {FORM}")
+    one, other = (found[n].strip("'") for n in (1, 2))
+    kinds = [kind.strip() for kind in (found["kinds"] or "").split(",") if kind]
+    if kinds == ["overlap"]:
+        kinds = [*MEANT]
+    if unknown := [kind for kind in kinds if kind not in MEASURED]:
+        known = ", ".join(sorted(MEASURED))
+        raise UsageError(f"{place}: {unknown[0]!r}: give 'overlap', or kinds: {known}")
+    says: Says = "meant" if kinds else "apart" if found["apart"] else "ignore"
+    length = None
+    if said := found["depth"] or found["apart"]:
+        try:
+            length = length_of(said, "mm")
+        except UsageError as error:
+            raise UsageError(f"{place}: {error}") from None
+        if not length > 0.0:
+            raise UsageError(f"{place}: {said!r}: give a length above 0")
+    return Rule(one, other, says, tuple(map(Kind, kinds)), length, found["because"] or "")
 
 
 def read_rules(path: str | Path) -> list[Rule]:
-    """Rules of a TOML file, in its order; none of an empty one. docs/clashes.md has the form."""
+    """Rules of a TOML file, ``rules = ['...', '...']``, in their order."""
     try:
         content = tomllib.loads(Path(path).read_text(encoding="utf-8"))
     except OSError as error:
         raise FileError(f"cannot read {path}: {error.strerror}") from error
     except (ValueError, RecursionError) as error:
         raise FileError(f"{path} is no TOML: {error}") from error
-    tables = content.pop("rule", [])
-    if content or not isinstance(tables, list):
-        key = next(iter(content), "rule")
-        raise UsageError(f"{path}: {key!r} is no list of rules: begin each rule with [[rule]]")
-    return [_rule(f"{path}, rule {n}", table) for n, table in enumerate(tables, start=1)]
-
-
-def _rule(place: str, said: object) -> Rule:
-    """Rule of what a text or a table says; errors name the place."""
-
-    def refuse(why: str) -> UsageError:
-        return UsageError(f"{place}: {why}")
-
-    if not isinstance(said, Mapping):
-        raise refuse("it is no table: begin each rule with [[rule]]")
-    if unknown := [key for key in said if key not in KEYS]:
-        raise refuse(f"unknown key {unknown[0]!r}: give {', '.join(KEYS)}")
-    texts = {"against": "*", "because": "", **said}
-    for key in ("of", "against", "because"):
-        text = texts.get(key)
-        if not isinstance(text, str) or not text.isprintable() or not (text or key == "because"):
-            raise refuse(f"{key} = {text!r}: give a text, such as {key} = 'bolts/*'")
-    decisions = [key for key in ("meant", "apart", "ignore") if said.get(key, False) is not False]
-    if len(decisions) != 1:
-        raise refuse("give one of meant = '0.3 mm', apart = '2 mm' and ignore = true")
-    says: Says = decisions[0]  # type: ignore[assignment]
-    value, kinds = said[says], said.get("kinds", list(MEANT) if says == "meant" else [])
-    if not isinstance(kinds, list) or not set(map(str, kinds)) <= set(MEASURED):
-        raise refuse(f"kinds = {kinds!r}: give some of {', '.join(sorted(MEASURED))}")
-    if (says == "meant") != bool(kinds):
-        raise refuse("kinds are of rules with meant, and at least one")
-    length = None
-    if isinstance(value, str) and says != "ignore":
-        try:
-            length = length_of(value, "mm")
-        except UsageError as error:
-            raise refuse(f"{says} = {value!r}: {error}") from None
-    elif value is not True or says == "apart":
-        raise refuse(f"{says} = {value!r}: give " + ("true" if says == "ignore" else "'0.3 mm'"))
-    if length is not None and not 0.0 < length < np.inf:
-        raise refuse(f"{says} = {value!r}: give a length above 0")
-    named = tuple(Kind(kind) for kind in kinds)
-    return Rule(texts["of"], texts["against"], says, named, length, texts["because"])
+    texts = content.pop("rules", [])
+    if content or not isinstance(texts, list) or not all(isinstance(one, str) for one in texts):
+        wrong = f"unknown key {next(iter(content))!r}" if content else "rules is no list of texts"
+        raise UsageError(f"{path}: {wrong}: give rules = ['...', '...']")
+    return [parse_rule(text, f"{path}, rule {n}") for n, text in enumerate(texts, start=1)]
 
 
 def rule_text(rule: Rule) -> str:
     """Rule as `parse_rule` reads it, without its reason."""
+    one, other = (
+        f"'{words}'" if re.search(" in | and |: ", words) else words for words in rule[:2]
+    )
     if rule.says == "ignore":
-        return f"{rule.one} and {rule.other}: ignore"
+        return f"{one} and {other}: ignore"
     length = "" if rule.length is None else length_text(rule.length)
     if rule.says == "apart":
-        return f"{rule.one} and {rule.other}: keep {length} apart"
+        return f"{one} and {other}: keep {length} apart"
     kinds = "overlap" if rule.kinds == MEANT else ", ".join(rule.kinds)
-    return f"{rule.one} in {rule.other}: {kinds}{length and f' up to {length}'} is meant"
+    return f"{one} in {other}: {kinds}{length and f' up to {length}'} is meant"
 
 
 def check_clearances(rules: Iterable[Rule], within: float) -> None:
@@ -127,11 +100,12 @@ def check_clearances(rules: Iterable[Rule], within: float) -> None:
 class Rules:
     """Rules, and the objects that their words choose.
 
-    missing : for each rule, why its words choose nothing, or empty.
+    missing : for each rule, why its words choose nothing, or empty; ignores : whether one does.
     """
 
     def __init__(self, rules: Sequence[Rule], objects: Sequence[Object], url: str) -> None:
         self.rules = tuple(rules)
+        self.ignores = any(rule.says == "ignore" for rule in rules)
         self._ids = np.array([obj.id for obj in objects], dtype=np.int64)
         self.missing: list[str] = []
         self._sides: list[list[NDArray[np.bool_]]] = []
@@ -144,11 +118,6 @@ class Rules:
             ]
             self._sides.append([np.isin(self._ids, side) for side in sides])
             self.missing.append(str(errors[0]) if errors else "")
-
-    @property
-    def ignores(self) -> bool:
-        """Whether a rule ignores pairs."""
-        return any(rule.says == "ignore" for rule in self.rules)
 
     def first(self, pairs: Iterable[tuple[int, int]]) -> NDArray[np.int64]:
         """Index (P,) of the rule that decides each pair of ids; -1 without one."""

@@ -195,10 +195,11 @@ class PairSearch:
                 kept, rest = kept.parted(of)
             rows = {(row.a, row.b): row for row in kept}
             near = self.near(outlines, of, against)
-            ignored = rules.ignored({*rows, *near})
-            rows = {key: row for key, row in rows.items() if key not in ignored}
+            ignored = rules.ignored(chain(rows, near))
             passed = tuple(key for key in near if key in ignored)
-            near = {key: newest for key, newest in near.items() if key not in ignored}
+            for key in ignored:
+                rows.pop(key, None)
+                near.pop(key, None)
             looked = {key for key, later in near.items() if self._is_fresh(rows.get(key), later)}
             keys = [key for key in near if key not in looked]
             by_id = {obj.id: obj for obj in store.objects({i for key in keys for i in key})}

@@ -31,7 +31,7 @@ class Group(NamedTuple):
     """Pairs that are one finding.
 
     id : the same in later searches; part : name of the one part against many others, or None;
-    pairs : the gravest first.
+    pairs : open ones first, then the gravest.
     """
 
     id: str
@@ -50,7 +50,7 @@ class Group(NamedTuple):
         return len({i for one in self.pairs for i in one[:2]})
 
     def title(self) -> str:
-        """Names of the gravest pair, or of the part, and how many others."""
+        """Names of the first pair, or of the part, and how many others."""
         worst, more = self.pairs[0], len(self.pairs) - 1
         if self.kind == Kind.DUPLICATE:
             return f"{worst.a_name}, {self.n_parts} at one place"
@@ -83,7 +83,7 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
 
     First copies: pairs of equal shapes in equal relative placement, of one kind. Of those left, the
     object that meets most others in one kind takes its pairs, until none meets `MANY`. Each other
-    pair is a group. Duplicates at one place are a group.
+    pair is a group. Duplicates at one place are a group. pairs : the gravest first.
     """
     there = [one for one in pairs if one.status != "gone" and not one.is_left]
     objects = {obj.id: obj for obj in store.objects({i for one in there for i in one[:2]})}
@@ -106,7 +106,7 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
         key = _id(members[0].kind, obj.digest, obj.name)
         found.setdefault(key, (obj.name, []))[1].extend(members)
     groups = [
-        Group(key, members[0].kind, part, tuple(sorted(members, key=gravity)))
+        Group(key, members[0].kind, part, tuple(sorted(members, key=lambda one: not one.is_open)))
         for key, (part, members) in found.items()
     ]
     return sorted(groups, key=lambda group: (not group.is_open, gravity(group.pairs[0])))
@@ -132,21 +132,23 @@ def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str
     """Ids of pairs, equal for copies, and for duplicates at one place."""
     placed = {i: rigid_placement(obj.transform) for i, obj in objects.items()}
     shapes = {
-        i: f"{objects[i].digest} {_rounded(linear).tolist()}" for i, (linear, _) in placed.items()
+        i: f"{objects[i].digest} {_rounded(linear).tobytes().hex()}"
+        for i, (linear, _) in placed.items()
     }
     ends = zip(*((one.a, one.b) for one in pairs), strict=True) if pairs else ((), ())
     poses = [np.array([placed[i][1] for i in end]).reshape(-1, 4, 4) for end in ends]
     there, back = (_rounded(relative_poses(*way)) for way in (poses, poses[::-1]))
     for n, one in enumerate(pairs):
         if one.kind == Kind.DUPLICATE:
-            yield _id(one.kind, shapes[one.a], str(_rounded(poses[0][n]).tolist()))
+            yield _id(one.kind, shapes[one.a], _rounded(poses[0][n]).tobytes().hex())
             continue
         a, b = shapes[one.a], shapes[one.b]
-        yield _id(one.kind, *min((a, b, str(there[n].tolist())), (b, a, str(back[n].tolist()))))
+        ways = (a, b, there[n].tobytes().hex()), (b, a, back[n].tobytes().hex())
+        yield _id(one.kind, *min(ways))
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.round(values / STEP).astype(np.int64)
+    return np.round(values / STEP).astype("<i8")
 
 
 def _id(*parts: str) -> str:

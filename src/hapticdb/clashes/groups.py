@@ -52,11 +52,12 @@ class Group(NamedTuple):
     def title(self) -> str:
         """Names of the first pair, or of the part, and how many others."""
         worst, more = self.pairs[0], len(self.pairs) - 1
-        if self.kind == Kind.DUPLICATE:
-            return f"{worst.a_name}, {self.n_parts} at one place"
+        a, b = (name or "(gone)" for name in (worst.a_name, worst.b_name))
+        if self.kind == Kind.DUPLICATE and more:
+            return f"{a}, {self.n_parts} at one place"
         if self.part is not None:
             return f"{self.part} and {self.n_parts - 1} others"
-        return f"{worst.a_name}, {worst.b_name}" + (f" and {more} alike" if more else "")
+        return f"{a}, {b}" + (f" and {more} alike" if more else "")
 
     def length_text(self) -> str:
         """Gap or depth, from the least to the greatest of several."""

@@ -7,7 +7,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from hapticdb.clashes.rules import Rules, rule_text
+from hapticdb.clashes.rules import MEANT, Rules, rule_text
 from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Rule, Status
 from hapticdb.units import length_text, notebook_html
 from hapticdb.verdicts import REPORTED, Kind
@@ -65,6 +65,15 @@ class Clash(NamedTuple):
         if self.at_most is None:
             return f"{at_least} or more"
         return f"{at_least} to {length_text(self.at_most)}"
+
+
+def rule_for(one: Clash) -> str:
+    """Rule that means a pair, up to a tenth more than its depth; empty for one that is too near."""
+    if one.kind == Kind.TOO_NEAR or not one.a_name or not one.b_name:
+        return ""
+    depth = (one.at_least or one.at_most) if one.kind == Kind.OVERLAPPING else None
+    kinds = MEANT if one.kind in MEANT else (one.kind,)
+    return rule_text(Rule(one.a_name, one.b_name, "meant", kinds, depth and 1.1 * depth))
 
 
 Known = Mapping[int, tuple[str, str]]
@@ -128,6 +137,13 @@ class Reach(NamedTuple):
     n_pairs: int
     n_changed: int
     missing: str
+
+    def __str__(self) -> str:
+        """Counts, or why no pair is reached."""
+        if not self.n_pairs:
+            return f"no pair{self.missing and f': {self.missing}'}"
+        word = {"meant": "meant", "apart": "too near", "ignore": "ignored"}[self.rule.says]
+        return f"{self.n_pairs:,} pair{'s' * (self.n_pairs > 1)}, {self.n_changed:,} {word}"
 
 
 @dataclass(frozen=True)

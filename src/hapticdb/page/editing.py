@@ -8,7 +8,10 @@ from typing import Any, Literal, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.clashes.run import accept_clash
+from hapticdb.clashes.groups import Group
+from hapticdb.clashes.result import Known
+from hapticdb.clashes.rules import parse_rule
+from hapticdb.clashes.run import accept_pairs
 from hapticdb.environment import Environment
 from hapticdb.errors import (
     AccessError,
@@ -110,10 +113,15 @@ class PersonsEdits:
         self._done.pop()
         return f"undid: {step.describe()}"
 
-    def accept(self, a: int, b: int, because: str | None) -> str:
-        """Accept a pair of objects that are near, or no longer without a reason."""
-        accept_clash(self._env, [a], [b], because)
-        return "the pair is no longer accepted" if because is None else "the pair is accepted"
+    def accept(self, group: Group, known: Known, because: str | None) -> str:
+        """Accept the pairs of a group, or no longer without a reason."""
+        accept_pairs(self._env.store, [(one.a, one.b) for one in group.pairs], known, because)
+        return "the pairs are " + ("no longer accepted" if because is None else "accepted")
+
+    def add_rule(self, text: str) -> str:
+        """Add a rule about pairs after the others."""
+        self._env.store.put_rules([*self._env.store.rules(), parse_rule(text)])
+        return "the rule is kept: look again"
 
     def _move(self, obj: Object, place: Floats, revision: int) -> Object:
         with _conflicts_named(obj):

@@ -262,7 +262,7 @@ class _Told(NamedTuple):
         else:
             for n, reach in enumerate(self.found.reach(), start=1):
                 if not reach.n_pairs:
-                    render.note(f"rule {n} reaches no pair{reach.missing and f': {reach.missing}'}")
+                    render.note(f"rule {n} reaches {reach}")
         if not self.found.is_kept:
             render.note(f"{url} can only be read by this user: what was found is not kept")
 
@@ -416,14 +416,11 @@ def _show_facts(found: "Clashes") -> None:
     """Print what each rule reaches, and how many pairs there are of each kind and status."""
     from hapticdb.clashes.rules import rule_text
 
-    words = {"meant": "meant", "apart": "too near", "ignore": "ignored"}
     reached = [
-        (str(n), rule_text(one.rule), f"{one.n_pairs:,}",
-         f"{one.n_changed:,} {words[one.rule.says]}" if one.n_pairs else one.missing)
-        for n, one in enumerate(found.reach(), start=1)
-    ]  # fmt: skip
+        (str(n), rule_text(one.rule), str(one)) for n, one in enumerate(found.reach(), start=1)
+    ]
     if reached:
-        render.table(("rule>", "says", "pairs>", "of them"), reached)
+        render.table(("rule>", "says", "reaches"), reached)
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n)
     statuses = ", ".join(f"{n:,} {status}" for status, n in sorted(found.statuses().items()))
     facts = [(f"within {length_text(found.within)}", counts or "no pair")]

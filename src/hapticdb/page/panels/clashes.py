@@ -1,11 +1,12 @@
-"""The tab Clashes: pairs that meet or are near, shown one at a time, and accepted by editors."""
+"""The tab Clashes: groups of pairs, shown one pair at a time; editors accept them and add rules."""
 
-from dataclasses import replace
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from hapticdb.clashes.result import Clash, Clashes
+from hapticdb.clashes.groups import Group, groups_of
+from hapticdb.clashes.result import Clash, Clashes, Shown, rule_for
+from hapticdb.clashes.rules import rule_text
 from hapticdb.clashes.run import WITHIN, find_clashes
 from hapticdb.environment import open as open_environment
 from hapticdb.errors import UsageError
@@ -22,24 +23,28 @@ from hapticdb.verdicts import REPORTED
 if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent
 
-ALL, OPEN = "all", "all but accepted and gone"
-STATUSES = (OPEN, ALL, "new", "changed", "same", "gone", "accepted", "not looked at")
+ALL, OPEN = "all", "all but accepted, meant and gone"
+STATUSES = (OPEN, ALL, "new", "changed", "same", "gone", "accepted", "meant", "not looked at")
 """Statuses by which the list is filtered."""
 NOTHING = "choose from the list"
+SEE = ("Show", "Next", "End")
+"""Steps: the chosen pair, the next one of its group, and everything."""
 MOST_LISTED = 500
 """Lines of the list; the filters find the others. Larger: a browser opens it more slowly."""
-LONGEST_TEXT = 200
+LONGEST_TEXT = 400
 """Letters of a reason, and of words that are looked for."""
 
 
 class ClashPanel:
-    """Looks for clashes, lists and shows them; editors accept them."""
+    """Looks for clashes, lists and shows them; editors decide about them."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
         self._found: Clashes | None = None
-        self._lines: dict[str, Clash] = {}
-        self._one: Clash | None = None  # the chosen pair
+        self._groups: list[Group] = []
+        self._lines: dict[str, Group] = {}
+        self._group: Group | None = None  # the chosen one
+        self._number = 0  # of its pair that is chosen
         self._drawn: list[Any] = []
         guard = browser.guarded
         self._within, self._contact = (
@@ -55,16 +60,19 @@ class ClashPanel:
         for one in (self._kind, self._status, self._words):
             one.on_update(guard("viewer", self._filter))
         self._where = gui.add_html("")
-        self._list = gui.add_dropdown("Pairs", (NOTHING,), initial_value=NOTHING)
+        self._list = gui.add_dropdown("Groups", (NOTHING,), initial_value=NOTHING)
         self._list.on_update(guard("viewer", self._pick))
         self._what = gui.add_html("")
-        self._act = gui.add_button_group("See", ("Show", "End"))
-        self._act.on_click(guard("viewer", self._show_or_end))
+        self._act = gui.add_button_group("See", SEE)
+        self._act.on_click(guard("viewer", self._see))
         may_edit = browser.visitor.may("editor") and browser.site.edits is not None
         with gui.add_folder("Meant to be so", visible=may_edit):
             self._because = gui.add_text("Because", "", hint="Why it is meant to be so.")
-            self._accept = gui.add_button_group("Pair", ("Accept", "Take back"))
+            self._accept = gui.add_button_group("Group", ("Accept", "Take back"))
             self._accept.on_click(guard("editor", self._accept_or_not))
+            self._rule = gui.add_text("Rule", "", hint="Written for the chosen pair: widen it.")
+            gui.add_button("Add rule").on_click(guard("editor", self._add_rule))
+        self._rules = gui.add_html("")
 
     def _look(self, _: object) -> None:
         within, contact = (
@@ -74,15 +82,20 @@ class ClashPanel:
         site, may_write = self._browser.site, self._browser.visitor.may("editor")
         url = site.request.urls.get("editor", site.url) if may_write else site.url
 
-        def search(progress: Progress) -> Clashes:
+        def search(progress: Progress) -> tuple[Clashes, list[Group]]:
             may_keep = may_write and site.edits is not None
             with open_environment(url, read_only=not may_keep) as env:
-                return find_clashes(env, within=within, contact=contact, progress=progress)
+                found = find_clashes(env, within=within, contact=contact, progress=progress)
+                return found, groups_of(env.store, found.pairs)
 
         self._work.begin(search, self._show_found)
 
-    def _show_found(self, found: Clashes) -> None:
+    def _show_found(self, answer: tuple[Clashes, list[Group]]) -> None:
+        found, groups = answer
+        gone = [one for one in found.pairs if one.status == "gone" or one.is_left]
         self._found = found
+        self._groups = [*groups, *(Group("", one.kind, None, (one,)) for one in gone)]
+        self._rules.content = rows_html((rule_text(one.rule), str(one)) for one in found.reach())
         counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n)
         kept = "" if found.is_kept else " They are not kept: that takes an editor."
         within = length_text(found.within)
@@ -99,53 +112,64 @@ class ClashPanel:
             self._fill()
 
     def _fill(self) -> None:
-        """List the pairs that the filters let pass, the gravest first."""
+        """List the groups that the filters let pass."""
         kind = checks.choice_of(self._kind.value, (ALL, *REPORTED), "a kind")
         status = checks.choice_of(self._status.value, STATUSES, "a status")
         words = checks.text_of(self._words.value, LONGEST_TEXT, "words").casefold().split()
-        pairs = self._found.pairs if self._found else ()
         chosen = [
-            one
-            for one in pairs
-            if kind in {ALL, one.kind}
-            and (status in {ALL, one.status} or (status == OPEN and one.is_open))
-            and all(word in f"{one.a_name}\n{one.b_name}".casefold() for word in words)
+            group
+            for group in self._groups
+            if kind in {ALL, group.kind}
+            and any(
+                (status in {ALL, one.status} or (status == OPEN and one.is_open))
+                and all(word in f"{one.a_name}\n{one.b_name}".casefold() for word in words)
+                for one in group.pairs
+            )
         ]
         self._lines = {}
-        for one in chosen[:MOST_LISTED]:
-            names = " · ".join(short_name(name or "(gone)", 22) for name in one[2:4])
-            said = one.status if one.is_left else f"{one.kind} {one.length_text()}"
-            self._lines[f"{said}: {names} [{one.a}, {one.b}]"] = one
+        for group in chosen[:MOST_LISTED]:
+            (a, b), title = group.pairs[0][:2], short_name(group.title(), 44)
+            said = f"{group.kind} {group.length_text()}"
+            self._lines[f"{said}: {title} [{group.id or f'{a}, {b}'}]"] = group
         listed = f", {MOST_LISTED:,} listed" if len(chosen) > MOST_LISTED else ""
-        self._where.content = note_html(f"{len(chosen):,} of {len(pairs):,} pairs{listed}")
+        self._where.content = note_html(f"{len(chosen):,} of {len(self._groups):,} groups{listed}")
         self._list.options = (NOTHING, *self._lines)
         put(self._list, NOTHING)
-        self._what.content, self._one = "", None
+        self._what.content, self._group = "", None
 
     def _pick(self, event: "GuiEvent[Any]") -> None:
         if event.client is not None and event.target.value != NOTHING:
-            label = checks.choice_of(event.target.value, tuple(self._lines), "a pair")
-            self._choose(self._lines[label])
+            label = checks.choice_of(event.target.value, tuple(self._lines), "a group")
+            self._choose(self._lines[label], 0)
 
-    def _chosen(self) -> Clash:
-        if self._one is None:
-            raise UsageError("choose a pair first: look for clashes, then take one from the list")
-        return self._one
+    def _chosen(self) -> Group:
+        if self._group is None:
+            raise UsageError("choose a group first: look for clashes, then take one from the list")
+        return self._group
 
-    def _choose(self, one: Clash) -> None:
-        self._one = one
+    def _choose(self, group: Group, number: int) -> None:
+        """Choose a pair of a group, and write what it is."""
+        self._group, self._number = group, number % len(group.pairs)
+        one = group.pairs[self._number]
         names = [short_name(name or "(gone)", 80) for name in one[2:4]]
         rows = [("Orange", names[0]), ("Blue", names[1]), ("Are", one.kind)]
         rows += [("By", one.length_text()), ("Status", one.status)]
+        if len(group.pairs) > 1:
+            rows += [("Pair", f"{self._number + 1} of {len(group.pairs):,}: {group.status()}")]
         self._what.content = rows_html(rows + ([("Because", one.because)] if one.because else []))
+        put(self._rule, rule_for(one))
 
-    def _show_or_end(self, event: "GuiEvent[Any]") -> None:
-        if checks.choice_of(event.target.value, ("Show", "End"), "what to see") == "End":
+    def _see(self, event: "GuiEvent[Any]") -> None:
+        step = checks.choice_of(event.target.value, SEE, "what to see")
+        if step == "End":
             self._end()
             facts = self._browser.site.facts
             self._browser.scene.fly_to(facts.bounds.mean(axis=0), 0.5 * facts.diagonal)
-        else:
-            self._show(self._chosen())
+            return
+        group = self._chosen()
+        if step == "Next":
+            self._choose(group, self._number + 1)
+        self._show(group.pairs[self._number])
 
     def _show(self, one: Clash) -> None:
         """Bring the eye to a pair, and see through everything else."""
@@ -178,20 +202,30 @@ class ClashPanel:
         because = checks.text_of(self._because.value, LONGEST_TEXT, "a reason").strip()
         if word == "Accept" and not because:
             raise UsageError("say why the pair is accepted")
-        one, edits = self._chosen(), self._browser.site.edits
+        group, edits, found = self._chosen(), self._browser.site.edits, self._found
         reason = because if word == "Accept" else None
 
         def done(said: str) -> None:
             self._browser.tell("Done", said, is_good=True)
-            if self._found is not None:
-                now = one._replace(status="accepted" if reason else "same", because=reason)
-                told = tuple(now if old is one else old for old in self._found.pairs)
-                self._found = replace(self._found, told=told, rest=self._found.rest.none())
-                self._fill()
-                self._choose(now)
+            status: Shown = "accepted" if reason else "same"
+            pairs = [one._replace(status=status, because=reason) for one in group.pairs]
+            now = group._replace(pairs=tuple(pairs))
+            self._groups = [now if old is group else old for old in self._groups]
+            self._fill()
+            self._choose(now, 0)
 
+        if edits is not None and found is not None:
+            edits.ask(
+                self._browser.client.client_id,
+                lambda own: own.accept(group, found.known, reason), done, self._browser.failed,
+            )  # fmt: skip
+
+    def _add_rule(self, _: object) -> None:
+        text = checks.text_of(self._rule.value, LONGEST_TEXT, "a rule")
+        edits = self._browser.site.edits
         if edits is not None:
             edits.ask(
                 self._browser.client.client_id,
-                lambda own: own.accept(one.a, one.b, reason), done, self._browser.failed,
+                lambda own: own.add_rule(text),
+                lambda said: self._browser.tell("Done", said, is_good=True), self._browser.failed,
             )  # fmt: skip

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageDraw
 
+from hapticdb.clashes.groups import Group
 from hapticdb.clashes.result import Clash, Clashes
 from hapticdb.environment import Environment
 from hapticdb.ingest.geometry import parts_of
@@ -22,7 +23,7 @@ from hapticdb.verdicts import Kind
 Floats = NDArray[np.float64]
 
 PICTURES = 10
-"""Pairs that are drawn, the gravest ones."""
+"""Groups of which a pair is drawn, open ones first, then the gravest."""
 MOST_ROWS = 5_000
 """Rows of the table. More: a browser opens the page more slowly."""
 MOST_UNITS = 24
@@ -48,10 +49,12 @@ figcaption{overflow-wrap:anywhere}img{width:100%;border-radius:6px}
 """
 
 
-def clashes_page(env: Environment, found: Clashes, told: Sequence[Clash]) -> str:
+def clashes_page(
+    env: Environment, found: Clashes, told: Sequence[Clash], groups: Sequence[Group]
+) -> str:
     """Write the page of pairs, the gravest first: HTML that needs no other file.
 
-    env : with the surfaces of its objects, as they were searched; told : of the found ones.
+    env : with the surfaces of its objects, as they were searched; told, groups : of found pairs.
     """
     objects = env.objects()
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n) or "no pair"
@@ -64,7 +67,7 @@ def clashes_page(env: Environment, found: Clashes, told: Sequence[Clash]) -> str
         f"<h1>{html.escape(counts)}</h1><p>{html.escape(facts)}</p>",
         f"<p>{found.left:,} pairs were not looked at.</p>" if found.left else "",
         "<h2>The gravest</h2>",
-        *_figures(env, told, {obj.id: obj for obj in objects}),
+        *_figures(env, groups, {obj.id: obj for obj in objects}),
         "<h2>Sub-assemblies</h2><p>Pairs that overlap, of all that are near.</p>",
         _matrix(told),
         "<h2>Pairs</h2>",
@@ -145,9 +148,12 @@ def _cell(deep: int, near: int) -> str:
     return f"<td{shade}>{deep:,}/{near:,}"
 
 
-def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]) -> Iterator[str]:
+def _figures(
+    env: Environment, groups: Sequence[Group], objects: dict[int, Object]
+) -> Iterator[str]:
     up, drawn = up_axis(objects.values()), 0
-    for one in sorted(told, key=lambda one: not one.is_open):
+    for group in groups:
+        one = group.pairs[0]
         a, b = objects.get(one.a), objects.get(one.b)
         if one.kind == Kind.APART or one.place is None or a is None or b is None:
             continue
@@ -158,7 +164,8 @@ def _figures(env: Environment, told: Sequence[Clash], objects: dict[int, Object]
         yield (
             f'<figure><img alt="" src="data:image/png;base64,{data}"><figcaption>'
             f"<b class=o>{_text(one.a_name)}</b>, <b class=b>{_text(one.b_name)}</b>: "
-            f"{one.kind} {one.length_text()}, {one.status}</figcaption></figure>"
+            f"{one.kind} {one.length_text()}, {_text(group.status())}"
+            f"{f', {len(group.pairs):,} pairs' * (len(group.pairs) > 1)}</figcaption></figure>"
         )
         drawn += 1
         if drawn == PICTURES:

@@ -185,8 +185,10 @@ def clashes(
         raise typer.Exit(_accept(url, accept, because, json=json))
     kinds = _checked(kind)
     if poses is not None or turn is not None:
-        if html or seconds or on or not of:
-            raise UsageError("--poses and --turn take --of, and no --html, --seconds, --on")
+        if html or seconds or on or rules or rule or group or not of:
+            raise UsageError(
+                "--poses and --turn take --of; no --html, --seconds, --on, rules, --group"
+            )
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
     from hapticdb.clashes.run import find_clashes
@@ -250,7 +252,8 @@ class _Told(NamedTuple):
         if page is not None:
             from hapticdb.pictures.clashes import clashes_page
 
-            page.write_text(clashes_page(env, self.found, self.pairs), encoding="utf-8")
+            made = clashes_page(env, self.found, self.pairs, self.groups)
+            page.write_text(made, encoding="utf-8")
 
     def say(self, url: str, *, json: bool, is_table: bool, is_grouped: bool) -> None:
         """Print groups or pairs, and what rules reach."""

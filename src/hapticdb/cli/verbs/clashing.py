@@ -1,5 +1,6 @@
 """The verb clashes."""
 
+from collections import Counter
 from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
@@ -261,7 +262,7 @@ class _Told(NamedTuple):
             render.say_json(one._asdict() | {"group": self.ids.get((one.a, one.b))})
         if is_table and not json:
             _show_groups(self.groups) if is_grouped else _show_pairs(self.pairs)
-            _show_facts(self.found)
+            _show_facts(self.found, self.groups)
         else:
             for n, reach in enumerate(self.found.reach(), start=1):
                 if not reach.n_pairs:
@@ -415,8 +416,8 @@ def _show_pairs(told: "list[Clash]") -> None:
         render.say(f"{len(told):,} pairs, {MOST_ROWS} of them shown; --csv writes all")
 
 
-def _show_facts(found: "Clashes") -> None:
-    """Print what each rule reaches, and how many pairs there are of each kind and status."""
+def _show_facts(found: "Clashes", groups: "list[Group]") -> None:
+    """Print what each rule reaches, and how many groups and pairs there are of each kind."""
     from hapticdb.clashes.rules import rule_text
 
     reached = [
@@ -426,7 +427,10 @@ def _show_facts(found: "Clashes") -> None:
         render.table(("rule>", "says", "reaches"), reached)
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n)
     statuses = ", ".join(f"{n:,} {status}" for status, n in sorted(found.statuses().items()))
-    facts = [(f"within {length_text(found.within)}", counts or "no pair")]
+    kinds = Counter[str](group.kind for group in groups if group.is_open)
+    open_ones = ", ".join(f"{kinds[kind]:,} {kind}" for kind in REPORTED if kinds[kind])
+    facts = [("open groups", open_ones or "none")]
+    facts.append((f"pairs within {length_text(found.within)}", counts or "none"))
     if statuses:
         facts.append(("since the last call", statuses))
     measured, left = (render.counted(n, "pair") for n in (found.measured, found.left))

@@ -6,7 +6,6 @@ As in `same_bits`, only public names of hapticdb and its command line are used.
 import contextlib
 import hashlib
 import json
-import os
 import sqlite3
 import tempfile
 import time
@@ -23,30 +22,7 @@ Strategy = Literal["statement", "array", "points", "maxgap", "cbgroup", "auto"]
 STRATEGIES: tuple[Strategy, ...] = ("statement", "array", "points", "maxgap", "cbgroup", "auto")
 MEASURED = ("cbgroup", "auto")
 """Strategies whose statements depend on measured costs, and so differ between runs."""
-SESSION = "--rate 512 --speed 0.1 --simulate --no-baseline --replace --record"
-CLOCK = '''"""A clock that counts its calls: whole ticks, of which 625 are a frame of 1/512 s.
-
-What is read in seconds stands still within a frame. Each frame takes 2 ms, in which the cells that
-the hand heads for are fetched: its own time goes on more slowly.
-"""
-import itertools, time
-calls, now = itertools.count(1), 0
-def perf_counter_ns():
-    global now
-    call = next(calls)
-    if call % 625 == 0:
-        time.sleep(2e-3)
-    now = 3125 * call
-    return now
-def perf_counter():
-    return now // 1953125 / 512
-time.perf_counter_ns, time.perf_counter = perf_counter_ns, perf_counter
-'''
-COLUMNS = (
-    *("time", "dt", "hand", "hand_velocity", "tool", "applied"),
-    *("hits", "contacts", "unknown", "deepest", "revision", "state"),
-)
-"""Columns of a recorded frame that are compared: all but measured times."""
+SESSION = "--rate 512 --speed 0.1 --simulate --no-baseline --seconds 2 --record"
 
 
 class Digest:
@@ -67,14 +43,19 @@ class Digest:
 
 
 class Results(dict[str, dict[str, Any]]):
-    """Entries by name; each is printed when it is added, with the seconds it took."""
+    """Entries by name; each is printed, with the seconds it took, and written when it is added.
 
-    def __init__(self) -> None:
+    file : JSON to write; versions : of the code, as written there.
+    """
+
+    def __init__(self, file: Path, versions: dict[str, str]) -> None:
         super().__init__()
-        self._since = time.perf_counter()
+        self._file, self._versions, self._since = file, versions, time.perf_counter()
 
     def __setitem__(self, name: str, entry: dict[str, Any]) -> None:
         super().__setitem__(name, entry)
+        record = {"versions": self._versions, "entries": self}
+        self._file.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
         now = time.perf_counter()
         wrong = f", {entry['differing']} DIFFER" if entry["differing"] else ""
         print(f"{now - self._since:6.1f} s  {name}: {entry['n']} {entry['of']}{wrong}", flush=True)
@@ -126,19 +107,12 @@ def touched(place: Place, env: hapticdb.Environment, tool: Tool, results: Result
     results[f"{place.name}/at once"] = digest.entry(n_hit, f"of {len(many)} poses hit")
 
 
-def recorded(place: Place, tool: Tool, file: Path, results: Results) -> None:
-    """Record and digest a session on `CLOCK`: a hand on the path, which the force pushes back."""
-    with tempfile.TemporaryDirectory() as folder:
-        Path(folder, "sitecustomize.py").write_text(CLOCK, encoding="utf-8")
-        modules = os.pathsep.join(filter(None, [folder, os.environ.get("PYTHONPATH")]))
-        words = ["--tool", tool.mesh, "--device", tool.hand, *SESSION.split(), file]
-        command("feel", place.url, "--law", "plane", *words, PYTHONPATH=modules)
-    frames = hapticdb.Recording(file).frames()
-    (digest := Digest()).feed(*(frames[name] for name in COLUMNS))
-    hits = frames["hits"]
-    results[f"{place.name}/session"] = digest.entry(
-        int(np.count_nonzero(hits)), f"of {len(hits)} frames hit"
-    )
+def recorded(place: Place, tool: Tool, file: Path) -> Path:
+    """Record a session anew: a hand on the path, which the force pushes back."""
+    file.unlink(missing_ok=True)
+    words = ["--tool", tool.mesh, "--device", tool.hand, *SESSION.split(), file]
+    command("feel", place.url, "--law", "plane", *words)
+    return file
 
 
 def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Results) -> None:

@@ -61,30 +61,32 @@ def command(*words: object, **variables: str) -> dict[str, Any]:
     return answer
 
 
-def import_car(folder: Path, servers: contextlib.ExitStack) -> list[Place]:
-    """Import the car into each environment, unless the folder has all of them already.
+def import_car(folder: Path, servers: contextlib.ExitStack, *, is_quick: bool) -> list[Place]:
+    """Import the car into each environment, unless the folder has it already.
 
-    servers : gets the servers, which run until it is closed.
+    servers : gets the servers, which run until it is closed; is_quick : bricks on SQLite alone.
     """
-    done = folder / "imported"
 
-    def place_of(url: str, layout: Layout) -> Place:
+    def place_of(word: str, url: str, layout: Layout) -> Place:
+        done = folder / f"{word}.imported"
         if not done.exists():
             file = Path(os.environ["HAPTICDB_TEST_DATA"]) / CAR
             options = hapticdb.ImportOptions(grid=GRID, layout=layout, distances=False)
             (report,) = hapticdb.import_files(url, [file], options)
             if report.error is not None:
                 raise report.error
+            done.touch()
         with hapticdb.open(url, read_only=True) as env:
             engine, version = env.engine.split()[:2]
         major = "" if engine == "SQLite" else version.partition(".")[0]
         return Place(f"{engine.lower()}{major}-{layout}", url, layout)
 
-    places = [place_of(str(folder / f"{layout}.db"), layout) for layout in ("brick", "voxel")]
-    for found in find_binaries():
-        server = servers.enter_context(serving(folder / f"server{found.major}", found, {}))
-        places.append(place_of(server.conninfo(), "brick"))
-    done.touch()
+    layouts: tuple[Layout, ...] = ("brick",) if is_quick else ("brick", "voxel")
+    places = [place_of(layout, str(folder / f"{layout}.db"), layout) for layout in layouts]
+    for found in () if is_quick else find_binaries():
+        word = f"server{found.major}"
+        server = servers.enter_context(serving(folder / word, found, {}))
+        places.append(place_of(word, server.conninfo(), "brick"))
     return places
 
 

@@ -10,13 +10,15 @@ Each commit runs this script once, on the same machine, and writes digests into 
 
 The folder's databases are imported unless they are there: a copy of one commit's folder shows
 whether the other commit reads it equally. A run records a session for each environment beside the
-folder (``before-sqlite-brick.rec``); ``--replay`` replays those of another commit instead.
+folder (``before-sqlite-brick.rec``); ``--replay`` replays those of another commit instead. A
+session's times are measured, so two recordings differ: only ``--replay`` compares commits.
 
-The environments hold the vintage car at 2048 voxels an axis, on SQLite in both layouts and on every
-PostgreSQL found. Compared are the stored rows; force, torque, hits, depths and objects at 10,000
-poses, for each strategy and for all poses at once; the statements of a strategy, unless they depend
-on measured costs; the verdict of ``sweep``; and all frames of a simulated hand that the force
-pushes back, on a clock that counts its calls. Only public names and the command line are used.
+Each digest is written when it is found. The environments hold the vintage car at 2048 voxels an
+axis, on SQLite in both layouts and on every PostgreSQL found. Compared are the stored rows; force,
+torque, hits, depths and objects at 1,000 poses, for each strategy and for all poses at once; the
+statements of a strategy, unless they depend on measured costs; the verdict of ``sweep``; and, by
+replays, all frames of a session whose simulated hand the force pushes back. Only public names and
+the command line are used.
 """
 
 import argparse
@@ -46,17 +48,10 @@ def recordings_of(places: Sequence[Place], given: Sequence[Path]) -> dict[str, P
     return found
 
 
-def measure(folder: Path, given: list[Path], n_poses: int) -> Results:
-    """Compute all entries on the databases of a folder."""
-    folder = folder.resolve()
-    folder.mkdir(parents=True, exist_ok=True)
-    with contextlib.ExitStack() as servers:
-        return measure_all(folder, import_car(folder, servers), given, n_poses)
-
-
-def measure_all(folder: Path, places: list[Place], given: list[Path], n_poses: int) -> Results:
+def measure(
+    folder: Path, places: list[Place], given: list[Path], n_poses: int, results: Results
+) -> None:
     """Compute all entries on these environments."""
-    results = Results()
     tool = sample_tool(folder, places[0], n_poses)
     (digest := Digest()).feed(tool.shell.points, tool.shell.normals, tool.shell.center, tool.poses)
     results["tool and poses"] = digest.entry(len(tool.poses), "poses")
@@ -66,17 +61,16 @@ def measure_all(folder: Path, places: list[Place], given: list[Path], n_poses: i
         with hapticdb.open(place.url, read_only=True) as env:
             stored(place, env, results)
             touched(place, env, tool, results)
-            recorded(place, tool, own, results)
             if not given or place.name in recordings:
-                replayed(place, env, recordings.get(place.name, own), results)
+                file = recordings.get(place.name) or recorded(place, tool, own)
+                replayed(place, env, file, results)
             swept(place, tool, results)
         if place != places[0]:
             found = command("diff", places[0].url, place.url)
-            (digest := Digest()).feed(json.dumps(found["totals"]))
+            (digest := Digest()).feed(found["objects_compared"], found["voxels_compared"])
             results[f"{place.name}/diff"] = digest.entry(
                 found["voxels_compared"], "voxels", int(not found["equal"])
             )
-    return results
 
 
 def versions() -> dict[str, str]:
@@ -122,16 +116,19 @@ def main() -> int:
     parser.add_argument("folder", type=Path, nargs="?", help="for databases; kept")
     parser.add_argument("--out", type=Path, help="JSON to write")
     parser.add_argument("--replay", type=Path, nargs="+", default=[], help="recordings to feel")
-    parser.add_argument("--poses", type=int, default=10_000, help="fewer, for a quick try")
+    parser.add_argument("--poses", type=int, default=1000, help="poses of a touch")
+    parser.add_argument("--quick", action="store_true", help="bricks on SQLite alone: a minute")
     parser.add_argument("--compare", type=Path, nargs=2, metavar="JSON", help="of two commits")
     chosen = parser.parse_args()
     if chosen.compare:
         return compare(chosen.compare)
     if chosen.folder is None or chosen.out is None:
         parser.error("give a folder and --out, or --compare")
-    results = measure(chosen.folder, chosen.replay, chosen.poses)
-    record = {"versions": versions(), "entries": results}
-    chosen.out.write_text(json.dumps(record, indent=1) + "\n", encoding="utf-8")
+    folder, results = chosen.folder.resolve(), Results(chosen.out, versions())
+    folder.mkdir(parents=True, exist_ok=True)
+    with contextlib.ExitStack() as servers:
+        places = import_car(folder, servers, is_quick=chosen.quick)
+        measure(folder, places, chosen.replay, chosen.poses, results)
     return int(any(entry["differing"] or not entry["n"] for entry in results.values()))
 
 

@@ -130,9 +130,10 @@ def replayed(place: Place, env: hapticdb.Environment, file: Path, results: Resul
 
 
 def swept(place: Place, tool: Tool, results: Results) -> None:
-    """Digest the result of ``sweep`` on the wrench's path, without the elapsed time."""
+    """Digest the result of ``sweep`` on the wrench's path, without time and names of files."""
     verdict = command("sweep", place.url, "--tool", tool.mesh, "--path", tool.path)
-    del verdict["elapsed"]
+    for name in ("elapsed", "moved", "path"):
+        del verdict[name]
     (digest := Digest()).feed(json.dumps(verdict, sort_keys=True))
     results[f"{place.name}/sweep"] = digest.entry(
         len(verdict["hits"]), f"objects hit: {verdict['line']}"

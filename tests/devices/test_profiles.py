@@ -66,7 +66,7 @@ def test_a_simulated_device_states_its_caps_its_delay_and_its_hand() -> None:
     assert (profile.cap, profile.torque_cap, profile.delay) == (5.0, 0.2, 0.002)
     assert profile.first_stiffness == 1000.0
     assert stability.hand_damping(profile) == pytest.approx(2.0 * math.sqrt(450.0 * 0.2))
-    assert profile_of(SimulatedDevice(hand, max_force=0.0, max_torque=0.0)).cap > 0.0
+    assert profile_of(SimulatedDevice(hand, max_force=0.0)).cap > 0.0
 
 
 def test_a_number_that_no_device_has_is_refused() -> None:

@@ -103,7 +103,7 @@ def test_a_wrench_pushes_after_the_latency_and_not_before() -> None:
 
 def test_wrenches_push_in_turn() -> None:
     clock, hand = SetClock(), Still()
-    device = SimulatedDevice(hand, latency=0.002, grip=0.0, turn_grip=0.0, clock=clock)
+    device = SimulatedDevice(hand, latency=0.002, grip=0.0, clock=clock)
     device.read()
     for force in (1.0, -1.0, 0.0):
         device.apply(np.array([force, 0, 0, 0, 0, 0]))
@@ -127,7 +127,7 @@ def test_the_motors_are_capped() -> None:
 
 def test_a_long_pause_is_skipped_but_for_its_end() -> None:
     clock, hand = SetClock(), Still()
-    device = SimulatedDevice(hand, grip=0.0, turn_grip=0.0, latency=0.0, clock=clock)
+    device = SimulatedDevice(hand, grip=0.0, latency=0.0, clock=clock)
     device.read()
     device.apply(np.array([1.0, 0, 0, 0, 0, 0]))
     clock.now = 100.0

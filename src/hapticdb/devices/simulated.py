@@ -25,8 +25,10 @@ from hapticdb.poses import quaternion_of
 STEP = 1e-4
 """Seconds of one step of the integration. Larger: less work a read, but only softer grips."""
 
+INERTIA, TURN_GRIP, MAX_TORQUE = 1e-4, 1e-3, 0.2
+"""Moment of inertia, kg m^2; stiffness of a grip for rotations, N m/rad for each N/m; N m."""
 LEAST_CAP = 1e-6
-"""Cap (N, N m) that the profile of a device without motors has. Smaller: contacts become softer."""
+"""Cap (N) that the profile of a device without motors has. Smaller: contacts become softer."""
 LONGEST = 0.05
 """Greatest time (s) that one read integrates; after a longer pause the time before is skipped."""
 
@@ -42,12 +44,12 @@ class SimulatedDevice:
     ----------
     hand : Device
         Gives the pose that the person wants the device to have.
-    mass, inertia : float
-        Mass and moment of inertia of the device, kg and kg m^2; the same about every axis.
-    grip, turn_grip : float
-        Stiffness of the hand, N/m and N m/rad.
-    max_force, max_torque : float
-        Greatest force and torque of the motors, N and N m; longer wrenches are shortened.
+    mass : float
+        Mass of the device, kg. Its moment of inertia is 1e-4 kg m^2 about every axis.
+    grip : float
+        Stiffness of the hand, N/m; for rotations a thousandth of it, N m/rad.
+    max_force : float
+        Greatest force of the motors, N, beside a torque of 0.2 N m; longer wrenches are shortened.
     latency : float
         Seconds from `apply` until the motors push.
     clock : callable
@@ -65,27 +67,23 @@ class SimulatedDevice:
         hand: Device,
         *,
         mass: float = 0.1,
-        inertia: float = 1e-4,
         grip: float = 300.0,
-        turn_grip: float = 0.3,
         max_force: float = HAND_CAP,
-        max_torque: float = 0.2,
         latency: float = 1e-3,
         clock: Clock = time.perf_counter,
     ) -> None:
-        numbers = (mass, inertia, grip, turn_grip, max_force, max_torque, latency)
-        if not all(math.isfinite(n) and n >= 0.0 for n in numbers) or mass * inertia <= 0.0:
+        numbers = (mass, grip, max_force, latency)
+        if not all(math.isfinite(n) and n >= 0.0 for n in numbers) or mass <= 0.0:
             raise UsageError("a simulated device takes numbers that are not negative, and a mass")
-        stiffest = max(grip / mass, turn_grip / inertia)
+        stiffest = max(grip / mass, TURN_GRIP * grip / INERTIA)
         if STEP * math.sqrt(stiffest) > 0.5:
             raise UsageError("the grip is too stiff for so light a device; soften it or add mass")
         check_device(hand)
         self.hand = hand
         self._reader = Reader(hand)
         self.clock = clock
-        self.max_force, self.max_torque, self.latency = max_force, max_torque, latency
-        self._inertias = (float(mass), float(inertia))
-        self._grips = (float(grip), float(turn_grip))
+        self.max_force, self.latency = max_force, latency
+        self._inertias, self._grips = (float(mass), INERTIA), (float(grip), TURN_GRIP * grip)
         self._pending: deque[tuple[float, NDArray[np.float64]]] = deque()
         self._pushing = np.zeros(6)
         self._time: float | None = None
@@ -104,7 +102,7 @@ class SimulatedDevice:
             mass=mass,
             hand_damping=2.0 * math.sqrt(grip * mass),
             usual_stiffness=HAND_STIFFNESS,
-            torque_cap=max(self.max_torque, LEAST_CAP),
+            torque_cap=MAX_TORQUE,
             delay=self.latency,
         )
 
@@ -123,7 +121,7 @@ class SimulatedDevice:
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push with a wrench (6,), N and N m, capped; it acts after the latency."""
-        push = capped(wrench, self.max_force, self.max_torque)
+        push = capped(wrench, self.max_force, MAX_TORQUE)
         self._pending.append((self.clock() + self.latency, push))
 
     def read(self) -> Reading:

@@ -100,7 +100,7 @@ class GoalsOutside:
             center = turn @ self._problem.center + place[:3, 3]
             way = float((center - self._problem.center) @ direction)
             out = self._placed(turn, center - self._problem.center + (length - way) * direction)
-            if way >= length or not self._leaving.is_out(_shift_of(out, self._problem)[None])[0]:
+            if way >= length or not self._leaving.is_out(self._problem.shift(out)[None])[0]:
                 continue  # the hull reaches as far as everything else
             if room.is_motion_free(np.stack([place, out])):
                 deepest = place.copy()
@@ -183,8 +183,3 @@ def _led_on(pose: Floats, ways: list[tuple[Floats, Floats]]) -> Floats:
         if np.allclose(place, pose, atol=SAME):
             return rest
     return np.empty((0, 4, 4))
-
-
-def _shift_of(pose: Floats, problem: Problem) -> Floats:
-    """How far (3,) a displacement shifts the part's middle."""
-    return np.asarray(pose[:3, :3] @ problem.center + pose[:3, 3] - problem.center)

@@ -81,9 +81,8 @@ class Legs(NamedTuple):
 
     def _end(self, here: Floats, axis: Floats) -> Floats:
         """Displacement (4, 4) straight on along an axis to where the part is out."""
-        center = self.problem.center
-        moved = here[:3, :3] @ center + here[:3, 3] - center
-        way = float(self.leaving.distances(axis[None])[0]) - float(moved @ axis)
+        shift = self.problem.shift(here)
+        way = float(self.leaving.distances(axis[None])[0]) - float(shift @ axis)
         out = here.copy()
         out[:3, 3] += max(way, 0.0) * axis
         return out

@@ -65,6 +65,10 @@ class Problem(NamedTuple):
         _, principal = np.linalg.eigh(np.cov(corners.T))
         return np.concatenate([self.parts[0].transform[:3, :3].T, principal.T])
 
+    def shift(self, pose: Floats) -> Floats:
+        """How far (3,) a displacement (4, 4) shifts the part's middle."""
+        return np.asarray(pose[:3, :3] @ self.center + pose[:3, 3] - self.center)
+
     def path(self, poses: Floats) -> ToolPath:
         """Motion through displacements (M, 4, 4), as in a sweep; it bounds that of each place."""
         return ToolPath.of(poses, self.corners, self.center)

@@ -9,7 +9,7 @@ from collections.abc import Callable
 from random import Random
 from typing import Any
 
-TEXTS = {".obj", ".off", ".stl", ".ply", ".dae", ".step", ".stp", ".csv", ".gltf"}
+TEXTS = {".obj", ".off", ".stl", ".ply", ".dae", ".ifc", ".step", ".stp", ".csv", ".gltf"}
 WORDS = (  # noqa: SIM905 - longer as a list
     "0 -1 1e308 -1e308 nan inf 4294967295 2147483648 -2147483649 9223372036854775808 1e-320 0x10 x "
     "99999999999999999999999 1e400 1_0 # ; 1,5 \u0661 1e5 65536 3.5"

@@ -113,12 +113,23 @@ def _meshes(folder: Path) -> list[tuple[str, bytes]]:
         ),
         (".dae", COLLADA.encode()),
         (".step", STEP.encode()),
+        (".ifc", _building(folder / "seed.ifc")),
         (".gltf", tree.read_bytes()),
         (".gltf", json.dumps(beside).encode()),
         (".glb", glb_of(tree, folder / "seed.glb").read_bytes()),
         (".glb", glb + struct.pack("<I4s", len(triangle), b"BIN\0") + triangle),
         (".3mf", packed.read_bytes()),
     ]
+
+
+def _building(path: Path) -> bytes:
+    from ifc_files import Building  # noqa: PLC0415
+
+    one = Building()
+    wall = one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)), (0.0, 0.0, 3.0))
+    one.opening(wall, one.shape(one.cylinder(500, 1000)))
+    one.add("IfcSpace", "room", one.shape(one.box(3000, 3000, 2500)))
+    return one.written(path).read_bytes()
 
 
 def _clouds(folder: Path) -> list[tuple[str, bytes]]:

@@ -143,8 +143,8 @@ def test_what_takes_too_long_says_that_a_larger_chord_is_faster(
         raise UnreadableError(f"it took long; {reader_module._MORE_TIME}")
 
     monkeypatch.setattr(reader_module, "_ask_child", late)
-    path = step_files.sphere(tmp_path / "a.step", 1.0)
-    for chord, is_told in ((1e-6, True), (None, False)):
+    step = step_files.sphere(tmp_path / "a.step", 1.0)
+    for path, is_told in ((step, True), (text(tmp_path / "a.off", "OFF"), False)):
         with pytest.raises(FileError) as refused:
-            read_file(path, chord=chord)
+            read_file(path)
         assert str(refused.value).endswith("larger --chord") == is_told

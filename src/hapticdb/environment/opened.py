@@ -179,8 +179,8 @@ class Environment(Queries, Closes):
             again
         replace : replace objects whose parts have changed in the file, and remove objects whose
             parts it no longer has
-        chord : greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 unless
-            given
+        chord : greatest chord error wanted of a STEP or IFC file's tessellation, metres; unless
+            given as for `hapticdb.mesh.read_file`
         progress : called after each part with a `hapticdb.ingest.files.ImportProgress`
 
         Raises `FileError` if the file cannot be used, or a part lies outside the grid; then nothing

@@ -45,7 +45,7 @@ def verdict_line(found: Swept, shell: PointShell) -> str:
     if found.undecided:
         return (
             f"not decided: {names_of(found.undecided)} within the chord error of the triangles; "
-            "import the STEP file with a finer --chord, such as 0.001"
+            "import the STEP or IFC file with a finer --chord, such as 0.001"
         )
     if found.verdict is PathVerdict.NOT_DECIDED:
         return (

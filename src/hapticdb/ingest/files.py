@@ -33,7 +33,7 @@ from hapticdb.ingest.planning import (
 )
 from hapticdb.ingest.voxelizing import voxelize_parts
 from hapticdb.mesh import Defects, MeshFile, read_file
-from hapticdb.mesh.chord import checked_chord
+from hapticdb.mesh.chord import check_chord
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION
 from hapticdb.store.base import Layout, Object, Store
 from hapticdb.store.connect import check_curve, create_store, exists, open_store
@@ -110,8 +110,8 @@ class ImportOptions:
     memory_limit: int | None = None
     """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
     chord: float | None = None
-    """Greatest chord error wanted of the tessellations of STEP files, metres; 0.00001 unless given.
-    Chord errors are stored with the surfaces (`hapticdb.mesh.Part.chord`)."""
+    """Greatest chord error wanted of the tessellations of STEP and IFC files, metres; unless given
+    as for `hapticdb.mesh.read_file`. They are stored with the surfaces, see `Part.chord`."""
     replace: bool = False
     """Also replace objects, under their ids, whose geometry, placement or unit is another now, and
     remove those whose parts the file lacks."""
@@ -125,7 +125,7 @@ class ImportOptions:
         for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
             if limit is not None and not 0 < limit < np.inf:
                 raise UsageError(f"a limit of {limit} {name}: give a number above 0")
-        checked_chord(self.chord)
+        check_chord(self.chord)
         if self.jobs is not None and self.jobs < 1:
             raise UsageError(f"{self.jobs} jobs: give 1 or more")
         if self.jobs is not None and self.on is not None:

@@ -179,9 +179,10 @@ def planned(
 
 
 def _differs(part: Part, obj: Object, unit: str | None) -> bool:
-    """Whether geometry, placement, or the unit that the file was read in are others."""
+    """Whether geometry, placement, attributes, or the unit that the file was read in are others."""
     return (
         obj.digest != part.digest
         or obj.attributes.get("unit") != unit
+        or not part.attributes.items() <= obj.attributes.items()
         or not np.array_equal(obj.transform, part.world_from_part)
     )

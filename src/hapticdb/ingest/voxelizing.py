@@ -189,7 +189,8 @@ class Recipe(NamedTuple):
             raise FileError(f"{self.link}: {error}") from None
         made = Object(
             name=part.name, link=self.link, digest=part.digest, transform=part.world_from_part,
-            voxels=n_voxels, bounds=part.bounds, attributes=self.attributes,
+            voxels=n_voxels, bounds=part.bounds,
+            attributes=self.attributes | part.attributes,
         )  # fmt: skip
         return made, rows, surface
 

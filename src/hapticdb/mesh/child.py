@@ -36,7 +36,7 @@ Measured at a mesh of 327,680 triangles, bytes of resident memory per byte of th
 OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 if all points
 differ only in their positions; STEP 114 (0.2 MB).
 """
-_PACKED = {".3mf", ".laz", ".step", ".stp"}
+_PACKED = {".3mf", ".ifc", ".laz", ".step", ".stp"}
 
 
 def main() -> None:
@@ -94,7 +94,12 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
         ],
         "chords": [part.chord for part in first.values()],
         "parts": [
-            [part.name, number[id(part.shared)], vars(part.defects) if part.defects else {}]
+            [
+                part.name,
+                number[id(part.shared)],
+                vars(part.defects) if part.defects else {},
+                part.attributes,
+            ]
             for part in file.parts
         ],
         "defects": vars(file.defects),

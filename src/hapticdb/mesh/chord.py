@@ -12,25 +12,30 @@ takes longer than the first, and shows nothing where it refines nothing.
 """
 
 import math
+from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
+from hapticdb.mesh.raw import Shape, told
 from hapticdb.units import length_text
 
 Floats = NDArray[np.float64]
 
 DEFAULT = 1e-5
-"""Greatest chord error wanted unless given, metres. A smaller value: more triangles, and more time
-where surfaces are curved both ways."""
+"""Greatest chord error wanted of a STEP file unless given, metres. A smaller value: more triangles,
+and more time where surfaces are curved both ways."""
 LEAST, MOST = 1e-7, 1.0
 """Range of the chord error that may be asked for, metres. Below it a part of a few centimetres has
 millions of triangles, whose 32-bit positions are as coarse."""
 MARGIN = 1.25
 """Factor on the height that the patches have: for what a cubic patch misses."""
 
+_OVER = 1.05
+"""Times the wanted chord error from which on a larger one is told."""
 _STEPS = 6
 """Steps of the lattice over a triangle where heights are sampled: halves and thirds are in it."""
 _STEEP = math.sin(math.pi / 3)
@@ -47,15 +52,29 @@ _MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9],
 """Odd numbers that spread the bits of a position over a hash."""
 
 
-def checked_chord(metres: float | None) -> float:
-    """Chord error to ask for, metres: `DEFAULT` for None; UsageError if it is out of range."""
-    if metres is None:
-        return DEFAULT
-    if not LEAST <= metres <= MOST:
+def check_chord(metres: float | None) -> None:
+    """Raise UsageError if a chord error to ask for, metres, is out of range."""
+    if metres is not None and not LEAST <= metres <= MOST:
         raise UsageError(
             f"a chord error of {metres * 1e3:g} mm: give {LEAST * 1e3:g} mm to {length_text(MOST)}"
         )
-    return metres
+
+
+def measured(shape: Shape, wanted: float) -> Shape:
+    """Shape with its chord error, without its normals; `wanted` as for `chord_error`."""
+    if shape.faces is None:
+        return shape
+    faces = np.asarray(shape.faces, dtype=np.int64)
+    error = chord_error(shape.vertices, shape.normals, faces, wanted)
+    return replace(shape, chord=error, normals=None)
+
+
+def told_coarser(shapes: Sequence[Shape], wanted: float) -> list[str]:
+    """Note of how far tessellations are from the chord error that was wanted, metres."""
+    over = [one.chord for one in shapes if one.chord > _OVER * wanted]
+    worst = length_text(max(over, default=0.0))
+    words = "shape{s} {are} tessellated with a chord error of up to {worst}, not {wanted} as wanted"
+    return told(len(over), words, worst=worst, wanted=length_text(wanted))
 
 
 def chord_error(

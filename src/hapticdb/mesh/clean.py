@@ -28,8 +28,8 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
     """
     if parsed.not_lengths is not None and metres is None:
         raise UnreadableError(parsed.not_lengths)
-    said = (parsed.metres, metres, parsed.likely_metres)
-    scale = next((length for length in said if length is not None), 1.0)
+    lengths = (parsed.metres, metres, parsed.likely_metres)
+    scale = next((length for length in lengths if length is not None), 1.0)
     if not (np.isfinite(scale) and scale > 0):
         raise UnreadableError(f"its unit of length is {scale} metres")
     checked = [_checked(shape, scale) for shape in parsed.shapes]
@@ -49,7 +49,9 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
             name = names.unique(_printable(placement.name))
             known = shared[placement.shape]
             chord = parsed.shapes[placement.shape].chord * scale
-            parts.append(Part(name, vertices, faces, worlds[n], defects, known, colours, chord))
+            said = {key: _printable(value) for key, value in placement.attributes.items()}
+            shape = (vertices, faces, worlds[n], defects, known, colours, chord)
+            parts.append(Part(name, *shape, said))
             if defects:
                 total += defects
         elif n_found:

@@ -11,7 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from hapticdb.mesh.chord import DEFAULT
 from hapticdb.mesh.clean import clean
 from hapticdb.mesh.part import MeshFile
 from hapticdb.mesh.raw import Parsed, UnreadableError
@@ -21,6 +20,7 @@ READERS = {
     ".dae": "dae",
     ".glb": "gltf",
     ".gltf": "gltf",
+    ".ifc": "ifc",
     ".las": "las",
     ".laz": "las",
     ".obj": "wavefront",
@@ -35,24 +35,25 @@ READERS = {
 
 def is_tessellated(path: str | os.PathLike[str]) -> bool:
     """Whether a file's triangles stand for CAD surfaces, by its suffix."""
-    return READERS.get(Path(path).suffix.lower()) == "step"
+    return READERS.get(Path(path).suffix.lower()) in {"ifc", "step"}
 
 
-def reader_of(path: Path, chord: float = DEFAULT) -> Callable[[Path], Parsed]:
+def reader_of(path: Path, chord: float | None = None) -> Callable[[Path], Parsed]:
     """Reader of a format. Its import loads only the libraries of this format.
 
-    chord : greatest chord error wanted of a tessellation, metres.
+    chord : greatest chord error wanted of a tessellation, metres; None for the format's own.
     """
     module = importlib.import_module(f"hapticdb.mesh.formats.{READERS[path.suffix.lower()]}")
     reader: Callable[..., Parsed] = module.read
-    return functools.partial(reader, chord=chord) if is_tessellated(path) else reader
+    is_wanted = chord is not None and is_tessellated(path)
+    return functools.partial(reader, chord=chord) if is_wanted else reader
 
 
-def parse(path: Path, metres: float | None, chord: float = DEFAULT) -> MeshFile:
+def parse(path: Path, metres: float | None, chord: float | None = None) -> MeshFile:
     """Sound parts of a file, read in this process; every failure is an `UnreadableError`.
 
     metres : length of the unit of a file without a unit of its own; None if none was given; chord :
-    greatest chord error wanted of a tessellation, metres.
+    as for `reader_of`.
     """
     read = reader_of(path, chord)
     try:

@@ -72,6 +72,8 @@ class Part:
     chord: float = 0.0
     """Chord error, metres, part frame: greatest distance between the triangles and the CAD surface
     that they stand for; 0.0 where the triangles are the shape."""
+    attributes: dict[str, str] = field(default_factory=dict)
+    """What the file says of the part beside its name: class, identifier, storey."""
 
     @property
     def placed_chord(self) -> float:

@@ -56,11 +56,12 @@ class Shape:
 
 @dataclass(frozen=True, slots=True)
 class Placement:
-    """One instance of a shape: its node path and its (4, 4) transform in the file's unit."""
+    """One instance of a shape: its node path, (4, 4) transform in the file's unit, attributes."""
 
     name: str
     shape: int
     world_from_part: NDArray[np.float64]
+    attributes: dict[str, str] = field(default_factory=dict)
 
 
 @dataclass

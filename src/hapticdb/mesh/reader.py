@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, MissingExtraError, pip_line
-from hapticdb.mesh.chord import DEFAULT, checked_chord
+from hapticdb.mesh.chord import check_chord
 from hapticdb.mesh.clean import read_only
 from hapticdb.mesh.parse import READERS, is_tessellated, parse
 from hapticdb.mesh.part import Defects, MeshFile, Part
@@ -27,19 +27,24 @@ from hapticdb.mesh.raw import UnreadableError
 from hapticdb.mesh.scratch import scratch_folder
 from hapticdb.units import metres_of
 
-_EXTRAS = {"las": ("pointcloud", ("laspy", "lazrs")), "step": ("step", ("cascadio",))}
+_EXTRAS = {
+    "ifc": ("ifc", ("ifcopenshell",)),
+    "las": ("pointcloud", ("laspy", "lazrs")),
+    "step": ("step", ("cascadio",)),
+}
 _CHILD = Path(__file__).with_name("child.py")
 _SECONDS = 20.0
 _SECONDS_PER_MIB = 5.0
-_SECONDS_PER_MIB_OF = {"step": 20.0, "threemf": 10.0}
+_SECONDS_PER_MIB_OF = {"ifc": 20.0, "step": 20.0, "threemf": 10.0}
 """Limit of a file's processor time, seconds: a base, plus a number for each MiB. It is at least ten
-times the time of sound files. STEP files are tessellated, and 3MF files unpack to a multiple of
-their size. Larger values let a damaged file take longer before it is refused."""
+times the time of sound files. STEP and IFC files are tessellated, and 3MF files unpack to a
+multiple of their size. Larger values let a damaged file take longer before it is refused."""
 _WAITING = 10.0
 """Times the limit of processor time after which a parser is ended by the clock: it waits for
 something that does not come. Smaller: a busy machine may refuse a sound file."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
+    "ifc": ("IfcOpenShell", "save it anew as IFC4, or as glTF"),
     "las": ("lazrs, its decompressor,", "unpack it to LAS with another program, or save it anew"),
 }
 """Libraries that may crash on a damaged file, by reader: name, and advice for the user."""
@@ -64,8 +69,8 @@ def read_file(
     Parameters
     ----------
     path : str or path
-        GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); LAS, LAZ (extra
-        `pointcloud`). The suffix says which.
+        GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); IFC (extra `ifc`); LAS, LAZ
+        (extra `pointcloud`). The suffix says which.
     unit : str, optional
         One of `hapticdb.mesh.UNITS`: the unit of a file that has none of its own (OBJ, STL, PLY,
         OFF, LAS, LAZ). By default that of the reference system of a LAS or LAZ file, or the one
@@ -76,8 +81,8 @@ def read_file(
         Seconds of processor time that parsing may take; by default in proportion to the file. A
         parser that waits is ended after ten times as long.
     chord : float, optional
-        Greatest chord error wanted of a STEP file's tessellation, metres; 0.00001 by default. What
-        it is became `Part.chord`. Other files have none.
+        Greatest chord error wanted of the tessellation of a STEP file, 0.00001 m by default, or of
+        an IFC file, 0.0001 m. What it is became `Part.chord`. Other files have none.
 
     Raises
     ------
@@ -89,13 +94,13 @@ def read_file(
     UsageError
         If the unit is unknown, or the chord error out of range.
     """
-    wanted = checked_chord(chord)
+    check_chord(chord)
     metres, file = _checked(path, unit)
     seconds = _seconds_for(file) if time_limit is None else time_limit
     request = {
         "path": str(file),
         "metres": metres,
-        "chord": wanted,
+        "chord": chord,
         "memory_limit": memory_limit,
         "time_limit": seconds,
         "parent": os.getpid(),
@@ -104,8 +109,8 @@ def read_file(
     try:
         return _ask_child(request, seconds)
     except UnreadableError as error:
-        is_fine = wanted < DEFAULT and is_tessellated(file) and _MORE_TIME in str(error)
-        cause = f"{error}, or a larger --chord" if is_fine else error
+        is_slow = is_tessellated(file) and _MORE_TIME in str(error)
+        cause = f"{error}, or a larger --chord" if is_slow else error
         raise FileError(_one_line(path, cause)) from None
 
 
@@ -113,10 +118,10 @@ def parse_in_process(
     path: str | os.PathLike[str], *, unit: str | None = None, chord: float | None = None
 ) -> MeshFile:
     """`read_file` without a child process and without limits, for files known to be sound."""
-    wanted = checked_chord(chord)
+    check_chord(chord)
     metres, file = _checked(path, unit)
     try:
-        return parse(file, metres, wanted)
+        return parse(file, metres, chord)
     except UnreadableError as error:
         raise FileError(_one_line(path, error)) from None
 
@@ -245,12 +250,12 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
     ]
     shared: list[dict[str, str]] = [{} for _ in geometries]
     parts = []
-    for (name, n, found), placed in zip(head["parts"], worlds, strict=True):
+    for (name, n, found, said), placed in zip(head["parts"], worlds, strict=True):
         vertices, faces, colours = geometries[n]
         shape = (vertices, faces, placed.copy(), Defects(**found), shared[n], colours)
-        parts.append(Part(name, *shape, head["chords"][n]))
-    said = (head["names_unit"], head["up"], tuple(head["notes"]), tuple(head["named"]))
-    return MeshFile(link, parts, Defects(**head["defects"]), *said)
+        parts.append(Part(name, *shape, head["chords"][n], said))
+    rest = (head["names_unit"], head["up"], tuple(head["notes"]), tuple(head["named"]))
+    return MeshFile(link, parts, Defects(**head["defects"]), *rest)
 
 
 def _filled(described: tuple[tuple[int, ...], str], stream: IO[bytes]) -> NDArray[Any]:

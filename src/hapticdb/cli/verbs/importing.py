@@ -29,7 +29,7 @@ FilesArgument = Annotated[
     list[str],
     typer.Argument(
         metavar="FILE...",
-        help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, LAS and LAZ with their extras.",
+        help="GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP, IFC, LAS and LAZ with their extras.",
     ),
 ]
 UnitOption = Annotated[
@@ -94,7 +94,8 @@ DistancesOption = Annotated[
 ChordOption = Annotated[
     float | None,
     length_option(
-        "chord error of STEP files, how far triangles may lie from the CAD surfaces.", "0.01"
+        "chord error of STEP and IFC files, how far triangles may lie from the surfaces.",
+        "0.01, IFC 0.1",
     ),
 ]
 PartitionsOption = Annotated[
@@ -191,7 +192,7 @@ def _imported(
 
     if options.chord is not None and not any(map(is_tessellated, files)):
         render.note(
-            "--chord changes nothing: it is for STEP files, and the triangles of others are kept"
+            "--chord changes nothing: it is for STEP and IFC, and the triangles of others are kept"
         )
     with left_at("what went in is whole, and the same command goes on from there"):
         started = time.perf_counter()

@@ -8,11 +8,11 @@ import cascadio
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.mesh.chord import DEFAULT, MARGIN, chord_error
+from hapticdb.mesh.chord import DEFAULT, MARGIN, measured, told_coarser
 from hapticdb.mesh.formats import gltf
-from hapticdb.mesh.raw import Parsed, Placement, Shape, UnreadableError, told
+from hapticdb.mesh.raw import Parsed, Placement, UnreadableError, told
 from hapticdb.mesh.text import text_of
-from hapticdb.units import UNITS, length_text
+from hapticdb.units import UNITS
 
 _POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
 _WORDS = re.compile(r"('(?:[^']++|'')*+')|/\*.*?(?:\*/|\Z)", re.DOTALL)
@@ -23,8 +23,6 @@ _END = "END-ISO-10303-21"
 _NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
 """Steps between positions of 32 bits that do no harm, as a share of the extent."""
-_OVER = 1.05
-"""Times the wanted chord error from which on a larger one is told."""
 _SAME = 1e-5
 """Relative difference up to which a length is that of a known unit."""
 
@@ -50,29 +48,12 @@ def read(path: Path, chord: float = DEFAULT) -> Parsed:
         raise UnreadableError("it is no STEP file: 'ISO-10303-21' does not stand at its start")
     found = _tessellated(text, path, chord)
     found = _nearer(found, text, path, chord) if _is_coarse(found) else found
-    shapes = [_measured(shape, chord) for shape in found.shapes]
+    shapes = [measured(shape, chord) for shape in found.shapes]
     others = len(re.findall(r"\bDOCUMENT_FILE\s*\(", text))
     notes = told(others, "other file{s} {are} named in it, and {are} not read")
     notes += told(len(cut), f"string{{s}} of more than {_LONGEST:,} characters {{are}} cut")
     notes += [] if _END in text else [_NO_END]
-    return replace(found, shapes=shapes, notes=[*found.notes, *notes, *_coarser(shapes, chord)])
-
-
-def _measured(shape: Shape, chord: float) -> Shape:
-    """Shape with its chord error, without its normals."""
-    if shape.faces is None:
-        return shape
-    faces = np.asarray(shape.faces, dtype=np.int64)
-    error = chord_error(shape.vertices, shape.normals, faces, chord)
-    return replace(shape, chord=error, normals=None)
-
-
-def _coarser(shapes: list[Shape], chord: float) -> list[str]:
-    """Say how far tessellations are from the chord error that was wanted, if they are."""
-    over = [one.chord for one in shapes if one.chord > _OVER * chord]
-    worst = length_text(max(over, default=0.0))
-    words = "shape{s} {are} tessellated with a chord error of up to {worst}, not {wanted} as wanted"
-    return told(len(over), words, worst=worst, wanted=length_text(chord))
+    return replace(found, shapes=shapes, notes=[*found.notes, *notes, *told_coarser(shapes, chord)])
 
 
 def _tessellated(text: str, path: Path, chord: float) -> Parsed:

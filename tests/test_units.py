@@ -16,8 +16,9 @@ from command_line import Run, boxes, refused
 from command_line import tool as stl
 from hapticdb.cli import VERBS
 from hapticdb.cli.values import point_of
+from hapticdb.errors import UsageError
 from hapticdb.mesh import parse_in_process, read_file
-from hapticdb.units import length_of, place_text
+from hapticdb.units import length_of, place_text, volume_of, volume_text
 from mesh_files import COLLADA
 
 FEET = 1200.0 / 3937.0
@@ -242,7 +243,7 @@ def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> 
     for verb in VERBS:
         for name, one in inspect.signature(verb).parameters.items():
             option = getattr(one.annotation, "__metadata__", [None])[0]
-            if not getattr(option, "parser", None):
+            if not getattr(option, "parser", None) or option.metavar == "VOLUME":
                 continue
             found.add(name)
             text = "1,2,25.4" if option.metavar == "X,Y,Z" else "25.4"
@@ -263,3 +264,21 @@ def test_a_bad_length_is_one_line_that_names_the_option(run: Run) -> None:
         ("extract", "a.db", "1", "--to", "1 2 wide 1 0 0 0"),
     ):
         refused(run(*given), given[-2], repr(given[-1]), ": give ")
+
+
+@pytest.mark.parametrize(
+    ("text", "volume"), [("1", 1e-6), ("5mm3", 5e-9), (".2 m³", 0.2), ("2in^3", 2 * 0.0254**3)]
+)
+def test_volume_of(text: str, volume: float) -> None:
+    assert volume_of(text) == pytest.approx(volume, rel=1e-15)
+
+
+@pytest.mark.parametrize("text", ["1mm", "mm3", "1 l", "", "3 3"])
+def test_volume_of_refuses(text: str) -> None:
+    with pytest.raises(UsageError, match="is no volume"):
+        volume_of(text)
+
+
+def test_volume_text() -> None:
+    told = {7.2e-2: "0.072 m³", 7.2e-4: "720 cm³", 1.2e-9: "1.2 mm³", 0.0: "0 mm³"}
+    assert {volume: volume_text(volume) for volume in told} == told

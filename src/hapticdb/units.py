@@ -36,6 +36,7 @@ _LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)\s*([a-zµ-]+
 """A number, and a unit where it has one."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
+_VOLUMES = ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³"))
 
 
 def length_text(length: float) -> str:
@@ -78,6 +79,22 @@ def length_of(text: str, unit: str) -> float:
             f"{text[:80]!r} is no length: give {NAMES[unit]}, or such as 0.2in ({', '.join(UNITS)})"
         )
     return float(Decimal(match[1]) * Decimal(repr(own)))
+
+
+def volume_of(text: str) -> float:
+    """Cubic metres of a volume: cubic centimetres, or with a unit, as ``5mm3``; `UsageError`."""
+    bare = re.sub(r"(?<=[a-zµ])(\^?3|³)$", "", text.strip(), flags=re.IGNORECASE)
+    match = _LENGTH.fullmatch(bare)
+    own = UNITS.get((match[2] or "cm").replace("µ", "u")) if match else None
+    if match is None or own is None or (match[2] and bare == text.strip()):
+        raise UsageError(f"{text[:80]!r} is no volume: give cubic centimetres, or such as 5mm3")
+    return float(Decimal(match[1]) * Decimal(repr(own)) ** 3)
+
+
+def volume_text(volume: float) -> str:
+    """Put a volume, cubic metres, in the unit that reads best: ``72.7 cm³``."""
+    size, word = next(pair for pair in _VOLUMES if volume >= 0.01 * pair[0] or pair[1] == "mm³")
+    return f"{volume / size:.4g} {word}"
 
 
 def metres_of(unit: str) -> float:

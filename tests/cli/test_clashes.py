@@ -166,3 +166,16 @@ def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
     refused(run("clashes", "none.db"), "no environment")
     refused(run("clashes", meeting, "--rule", "box0 is fine"), "ONE in OTHER")
     refused(run("clashes", meeting, "--rules", "none.toml"), "none.toml")
+
+
+def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path: Path) -> None:
+    code, out, _ = run("clashes", meeting, "--least-volume", "99cm3", "--csv", tmp_path / "a.csv")
+    assert code == 1
+    assert "100 cm³" in out
+    first, second = csv.DictReader((tmp_path / "a.csv").open())
+    assert float(first["volume_m3"]) == pytest.approx(0.01 * 0.1 * 0.1, rel=1e-5)
+    assert second["volume_m3"] == ""
+    code, out, _ = run("clashes", meeting, "--least-volume", "101", "--json")
+    assert code == 0
+    assert [json.loads(line)["volume"] for line in out.splitlines()] == [None]
+    refused(run("clashes", meeting, "--least-volume", "1mm"), "no volume")

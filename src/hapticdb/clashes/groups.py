@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from hapticdb.clashes.result import Clash, gravity
 from hapticdb.exact.shapes import relative_poses, rigid_placement
 from hapticdb.store.base import Object, Store
-from hapticdb.units import length_text
+from hapticdb.units import length_text, volume_text
 from hapticdb.verdicts import Kind
 
 STEP = 1e-6
@@ -60,12 +60,14 @@ class Group(NamedTuple):
         return f"{a}, {b}" + (f" and {more} alike" if more else "")
 
     def length_text(self) -> str:
-        """Gap or depth, from the least to the greatest of several."""
+        """Gap or depth, from the least to the greatest of several, and the sum of known volumes."""
         known = [one.at_least for one in self.pairs if one.at_least or one.kind != Kind.OVERLAPPING]
         if len(self.pairs) == 1 or not known:
             return self.pairs[0].length_text()
         ends = dict.fromkeys(map(length_text, (min(known), max(known))))
-        return " ... ".join(ends) + ("" if len(known) == len(self.pairs) else ", or not known")
+        words = " ... ".join(ends) + ("" if len(known) == len(self.pairs) else ", or not known")
+        volumes = [one.volume for one in self.pairs if one.volume is not None]
+        return words + (f", {volume_text(sum(volumes))} in all" if volumes else "")
 
     def status(self) -> str:
         """Reason of a closed group; else how many pairs are settled, or their statuses."""

@@ -9,7 +9,7 @@ from typing import Literal, NamedTuple
 
 from hapticdb.clashes.rules import MEANT, Rules, rule_text
 from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Rule, Status
-from hapticdb.units import length_text, notebook_html
+from hapticdb.units import length_text, notebook_html, volume_text
 from hapticdb.verdicts import REPORTED, Kind
 
 Shown = Literal[Status, "accepted", "meant", "not looked at"]
@@ -27,7 +27,7 @@ class Clash(NamedTuple):
     docs/clashes.md says; at_least, at_most : metres, of the gap, or of the depth of an overlap;
     at_most is None where no bound is known; place : x, y, z on a, then on b; status : since the
     last call; because : why it is accepted or meant, or None; rule : number, from 1, of the rule
-    that decides it.
+    that decides it; volume : of an overlap, cubic metres, None where not known or not asked for.
     """
 
     a: int
@@ -41,6 +41,7 @@ class Clash(NamedTuple):
     status: Shown
     because: str | None = None
     rule: int | None = None
+    volume: float | None = None
 
     @property
     def is_open(self) -> bool:
@@ -53,7 +54,9 @@ class Clash(NamedTuple):
         return self.status == "not looked at"
 
     def length_text(self) -> str:
-        """Write the gap or the depth: exact, or with the bound that is known."""
+        """Write the gap, or the depth and the volume: exact, or with the bound that is known."""
+        if self.volume is not None:
+            return f"{self._replace(volume=None).length_text()}, {volume_text(self.volume)}"
         if self.is_left:
             return "-"
         at_least = length_text(self.at_least)

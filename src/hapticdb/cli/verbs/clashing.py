@@ -20,7 +20,7 @@ from hapticdb.cli.options import (
 )
 from hapticdb.cli.values import Point, budget_bytes, point_of
 from hapticdb.errors import UsageError
-from hapticdb.units import length_text, place_text
+from hapticdb.units import length_text, place_text, volume_of
 from hapticdb.verdicts import REPORTED, Kind
 
 if TYPE_CHECKING:
@@ -37,7 +37,7 @@ NOT_DECIDED = 3
 """Exit code where nothing was found, but not all pairs were looked at."""
 COLUMNS = (
     "a_id", "a_name", "b_id", "b_name", "kind", "at_least_m", "at_most_m", "a_x_m", "a_y_m",
-    "a_z_m", "b_x_m", "b_y_m", "b_z_m", "status", "because", "rule", "group",
+    "a_z_m", "b_x_m", "b_y_m", "b_z_m", "status", "because", "rule", "volume_m3", "group",
 )  # fmt: skip
 """Columns of `clashes --csv`: a row for each pair, the gravest first."""
 MEETING_COLUMNS = ("id", "name", "begin", "end", "kind", "at_least_m", "x_m", "y_m", "z_m")
@@ -93,6 +93,14 @@ GroupOption = Annotated[
     str | None,
     typer.Option(metavar="ID", help="Pairs of one group; with --because, accept them."),
 ]
+LeastVolumeOption = Annotated[
+    float | None,
+    typer.Option(
+        metavar="VOLUME", parser=volume_of,
+        help="Cubic centimetres, or such as 5mm3: volumes of overlaps, without smaller ones.",
+        show_default="none is computed",
+    ),
+]  # fmt: skip
 AllOption = Annotated[bool, typer.Option("--all", help="A table of pairs, not of groups.")]
 HtmlOption = Annotated[
     str | None,
@@ -139,6 +147,9 @@ and duplicates, which are equal parts at one place. --all and --group tell pairs
 --rules and --rule say what is meant, what to keep apart, and what to ignore; the
 database keeps them, and the first rule that reaches a pair decides.
 
+--least-volume tells the volume that two closed parts have in common, and leaves out
+smaller ones. Of open surfaces it is not known; such pairs stay.
+
 Ctrl-C and --seconds lose nothing: the next call goes on. What was not looked
 at is told as that.
 
@@ -170,6 +181,7 @@ def clashes(
     rule: RuleOption = None,
     group: GroupOption = None,
     all_: AllOption = False,
+    least_volume: LeastVolumeOption = None,
     csv: CsvOption = None,
     html: HtmlOption = None,
     poses: PosesOption = None,
@@ -205,12 +217,21 @@ def clashes(
                 env, within=within, contact=contact, of=of or (), against=against or (),
                 seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
             )  # fmt: skip
+        found = _with_volumes(env, found, least_volume)
         told = _Told.of(env, found, kinds, group)
         if because is not None:
             raise typer.Exit(told.accept(env, because, json=json))
         told.write(env, table, page)
     told.say(url, json=json, is_table=csv != STDOUT, is_grouped=group is None and not all_)
     raise typer.Exit(_exit_code(found, kinds))
+
+
+def _with_volumes(env: "Environment", found: "Clashes", least: float | None) -> "Clashes":
+    if least is None:
+        return found
+    from hapticdb.clashes.volumes import with_volumes
+
+    return with_volumes(env.store, found, least)
 
 
 class _Told(NamedTuple):
@@ -381,7 +402,7 @@ def _row(one: "Clash", group: str | None) -> list[object]:
     return [
         one.a, text_cell(one.a_name or ""), one.b, text_cell(one.b_name or ""), one.kind,
         one.at_least, at_most, *place, one.status, text_cell(one.because or ""),
-        one.rule or "", group or "",
+        one.rule or "", "" if one.volume is None else one.volume, group or "",
     ]  # fmt: skip
 
 

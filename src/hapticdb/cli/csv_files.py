@@ -9,7 +9,7 @@ import math
 import os
 import sys
 from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
@@ -133,6 +133,17 @@ def new_file(target: Path, option: str) -> Iterator[Path]:
     finally:
         with suppress(OSError):
             part.unlink(missing_ok=True)
+
+
+@contextmanager
+def new_files(**named: str | None) -> Iterator[dict[str, Path]]:
+    """Paths to write to, as `new_file` has them, of the files that are given, by option."""
+    with ExitStack() as stack:
+        yield {
+            name: stack.enter_context(new_file(Path(file), f"--{name}"))
+            for name, file in named.items()
+            if file is not None
+        }
 
 
 def text_cell(text: str) -> str:

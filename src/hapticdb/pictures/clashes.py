@@ -8,7 +8,7 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw
+from PIL import ImageDraw
 
 from hapticdb.clashes.groups import Group
 from hapticdb.clashes.result import Clash, Clashes
@@ -16,7 +16,7 @@ from hapticdb.environment import Environment
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.pictures.canvas import Canvas
 from hapticdb.store.attributes import up_axis
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Store
 from hapticdb.units import length_text
 from hapticdb.verdicts import Kind
 
@@ -157,10 +157,7 @@ def _figures(
         a, b = objects.get(one.a), objects.get(one.b)
         if one.kind == Kind.APART or one.place is None or a is None or b is None:
             continue
-        surfaces = [part.surface() for _, part in parts_of(env.store, [a, b])]
-        picture = io.BytesIO()
-        _drawn(one, (a, b), surfaces, up).save(picture, "PNG")
-        data = base64.b64encode(picture.getvalue()).decode()
+        data = base64.b64encode(snapshot(env.store, one, (a, b), up)).decode()
         yield (
             f'<figure><img alt="" src="data:image/png;base64,{data}"><figcaption>'
             f"<b class=o>{_text(one.a_name)}</b>, <b class=b>{_text(one.b_name)}</b>: "
@@ -172,20 +169,25 @@ def _figures(
             return
 
 
-def _drawn(
-    one: Clash, pair: tuple[Object, Object], surfaces: Sequence[Floats], up: int
-) -> Image.Image:
-    """Draw both surfaces around the place where they meet."""
+def sight(one: Clash, pair: tuple[Object, Object]) -> tuple[Floats, float]:
+    """Middle (3,) of the place where a pair meets, and half the edge of the view, metres."""
     places = np.array(one.place).reshape(2, 3)
-    middle = places.mean(axis=0)
     edge = min(float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) for obj in pair)
     radius = max(0.4 * edge, 2.0 * float(np.linalg.norm(places[1] - places[0])), 1e-6)
+    return places.mean(axis=0), radius
+
+
+def snapshot(store: Store, one: Clash, pair: tuple[Object, Object], up: int) -> bytes:
+    """PNG of both surfaces around the place where they meet; up : axis that points up."""
+    middle, radius = sight(one, pair)
     box = np.stack([middle - radius, middle + radius])[None]
     canvas = Canvas(box, SIZE, np.array([[0.0, 0.0], SIZE]), np.array(PAPER), up)
-    for triangles, tint in zip(surfaces, TINTS, strict=False):
-        canvas.fill(triangles, np.array(tint))
+    for (_, part), tint in zip(parts_of(store, pair), TINTS, strict=True):
+        canvas.fill(part.surface(), np.array(tint))
     picture = canvas.picture()
     draw = ImageDraw.Draw(picture)
-    for x, y, _ in canvas.project(places).tolist():
+    for x, y, _ in canvas.project(np.array(one.place).reshape(2, 3)).tolist():
         draw.circle((x, y), 9.0, outline=MARK)
-    return picture
+    content = io.BytesIO()
+    picture.save(content, "PNG")
+    return content.getvalue()

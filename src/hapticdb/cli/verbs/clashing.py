@@ -1,7 +1,6 @@
 """The verb clashes."""
 
 from collections import Counter
-from contextlib import nullcontext
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, NamedTuple
@@ -10,7 +9,7 @@ import typer
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
-from hapticdb.cli.csv_files import AXES, STDOUT, CsvWriter, new_file, open_csv, text_cell
+from hapticdb.cli.csv_files import AXES, STDOUT, CsvWriter, new_files, open_csv, text_cell
 from hapticdb.cli.options import (
     ClusterOption,
     CsvOption,
@@ -108,6 +107,14 @@ HtmlOption = Annotated[
         metavar="FILE", help="Write a page with pictures, a matrix and the table to a new file."
     ),
 ]
+JunitOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Write findings and rules as JUnit test cases, for CI."),
+]
+BcfOption = Annotated[
+    str | None,
+    typer.Option(metavar="FILE", help="Write findings as topics of BCF 2.1, such as hall.bcfzip."),
+]
 PosesOption = Annotated[
     str | None,
     typer.Option(
@@ -157,6 +164,9 @@ at is told as that.
 motion they meet each other object, and how deep. Where they do not is proved, as by
 sweep. Numbers are those of poses, from 0, or degrees. Nothing of it is kept.
 
+--html, --junit and --bcf write reports: a page, test cases for CI, and topics for
+the tools that made an IFC file, whose GlobalIds they carry.
+
 The exit code is 1 when a pair of a --kind was found that is neither accepted nor
 meant, 3 when there is none but not all pairs were looked at, and else 0.
 
@@ -184,6 +194,8 @@ def clashes(
     least_volume: LeastVolumeOption = None,
     csv: CsvOption = None,
     html: HtmlOption = None,
+    junit: JunitOption = None,
+    bcf: BcfOption = None,
     poses: PosesOption = None,
     turn: TurnOption = None,
     about: AboutOption = None,
@@ -198,9 +210,9 @@ def clashes(
         raise typer.Exit(_accept(url, accept, because, json=json))
     kinds = _checked(kind)
     if poses is not None or turn is not None:
-        if html or seconds or on or rules or rule or group or not of:
+        if html or junit or bcf or seconds or on or rules or rule or group or not of:
             raise UsageError(
-                "--poses and --turn take --of; no --html, --seconds, --on, rules, --group"
+                "--poses and --turn take --of, of files --csv; no --seconds, --on, rules, --group"
             )
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
@@ -208,7 +220,7 @@ def clashes(
 
     with (
         open_csv(csv, "--csv", COLUMNS) as table,
-        nullcontext() if html is None else new_file(Path(html), "--html") as page,
+        new_files(html=html, junit=junit, bcf=bcf) as files,
         opened_to_keep(url) as env,
         render.bar("measuring", "pairs") as progress,
     ):
@@ -221,7 +233,7 @@ def clashes(
         told = _Told.of(env, found, kinds, group)
         if because is not None:
             raise typer.Exit(told.accept(env, because, json=json))
-        told.write(env, table, page)
+        told.write(env, kinds, table, files)
     told.say(url, json=json, is_table=csv != STDOUT, is_grouped=group is None and not all_)
     raise typer.Exit(_exit_code(found, kinds))
 
@@ -267,15 +279,27 @@ class _Told(NamedTuple):
         accept_pairs(env.store, pairs, self.found.known, because or None)
         return _say_accepted(pairs, because, json=json)
 
-    def write(self, env: "Environment", table: CsvWriter | None, page: Path | None) -> None:
-        """Write the pairs as a table and a page, where files are given."""
+    def write(
+        self, env: "Environment", kinds: "tuple[Kind, ...]", table: CsvWriter | None,
+        files: dict[str, Path],
+    ) -> None:  # fmt: skip
+        """Write the pairs as a table, a page and reports, where files are given."""
         if table:
             table.write(_row(one, self.ids.get((one.a, one.b))) for one in self.pairs)
-        if page is not None:
-            from hapticdb.pictures.clashes import clashes_page
+        if not files:
+            return
+        from hapticdb.clashes.result import ASKED
+        from hapticdb.pictures.clashes import clashes_page
+        from hapticdb.pictures.reports import junit, write_bcf
 
+        asked = kinds or ASKED
+        if page := files.get("html"):
             made = clashes_page(env, self.found, self.pairs, self.groups)
             page.write_text(made, encoding="utf-8")
+        if report := files.get("junit"):
+            report.write_bytes(junit(self.found, self.groups, asked))
+        if topics := files.get("bcf"):
+            write_bcf(topics, env, [group for group in self.groups if group.kind in asked])
 
     def say(self, url: str, *, json: bool, is_table: bool, is_grouped: bool) -> None:
         """Print groups or pairs, and what rules reach."""

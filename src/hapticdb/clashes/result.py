@@ -74,7 +74,7 @@ def rule_for(one: Clash) -> str:
     """Rule that means a pair, up to a tenth more than its depth; empty for one that is too near."""
     if one.kind == Kind.TOO_NEAR or not one.a_name or not one.b_name:
         return ""
-    depth = (one.at_least or one.at_most) if one.kind == Kind.OVERLAPPING else None
+    depth = one.at_most if one.kind == Kind.OVERLAPPING else None
     kinds = MEANT if one.kind in MEANT else (one.kind,)
     return rule_text(Rule(one.a_name, one.b_name, "meant", kinds, depth and 1.1 * depth))
 
@@ -121,9 +121,8 @@ def _decided(one: Clash, rule: Rule) -> Clash:
     if rule.says == "apart":
         is_near = one.at_least < length and one.kind not in {Kind.OVERLAPPING, Kind.DUPLICATE}
         return one._replace(kind=Kind.TOO_NEAR) if is_near else one
-    depth = 0.0
-    if one.kind == Kind.OVERLAPPING:
-        depth = one.at_least or (math.inf if one.at_most is None else one.at_most)
+    depth = one.at_most if one.kind == Kind.OVERLAPPING else 0.0
+    depth = math.inf if depth is None else depth  # a foil across a foil is shallow everywhere
     if one.kind not in rule.kinds or depth > length or one.status == "accepted":
         return one
     return one._replace(status="meant", because=rule.because or rule_text(rule))

@@ -137,7 +137,7 @@ def test_a_meant_overlap_is_no_finding_up_to_its_depth(place: Place, path: Path)
             assert found.measured == 0  # nothing is measured again
             assert [one[:2] for one in found.of()] == [(1, 2), (2, 3)]
             assert reach(found) == [(1, 0)]
-            assert all(1.9 * MM < one.at_least <= 2.0 * MM for one in found.of())
+            assert [round(1e6 * one.at_least) for one in found.of()] == [2000, 2000]
             found = decided(env, "* in *: overlap up to 2.01 mm is meant")  # at most is more
             assert len(found.of()) == 2
             found = decided(env, "* in bolts/*: overlap up to 2.2 mm is meant because a thread")

@@ -3,7 +3,7 @@
 import re
 import uuid
 from collections import Counter
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
@@ -14,11 +14,11 @@ from zipfile import ZIP_DEFLATED, ZipFile
 import numpy as np
 
 from hapticdb.clashes.groups import Group
-from hapticdb.clashes.result import Clash, Clashes
+from hapticdb.clashes.result import ASKED, Clash, Clashes
 from hapticdb.clashes.rules import rule_text
 from hapticdb.environment import Environment
 from hapticdb.pictures.canvas import TOWARDS, turned
-from hapticdb.pictures.clashes import sight, snapshot
+from hapticdb.pictures.clashes import clashes_page, sight, snapshot
 from hapticdb.store.attributes import up_axis
 from hapticdb.store.base import Object
 from hapticdb.units import place_text
@@ -42,6 +42,28 @@ class _Case(NamedTuple):
     outcome: str = ""
     message: str = ""
     text: str = ""
+
+
+def write_reports(
+    files: Mapping[str, Path],
+    env: Environment,
+    found: Clashes,
+    told: Sequence[Clash],
+    groups: Sequence[Group],
+    kinds: Sequence[Kind],
+) -> None:
+    """Write the page `html`, `junit` and `bcf`, as far as files are given.
+
+    told, groups : pairs of the page and their groups; kinds : asked for, or none.
+    """
+    asked = kinds or ASKED
+    if "html" in files:
+        page = clashes_page(env, found, told, groups)
+        files["html"].write_text(page, encoding="utf-8")
+    if "junit" in files:
+        files["junit"].write_bytes(junit(found, groups, asked))
+    if "bcf" in files:
+        write_bcf(files["bcf"], env, [group for group in groups if group.kind in asked])
 
 
 def junit(found: Clashes, groups: Iterable[Group], asked: Sequence[Kind]) -> bytes:
@@ -107,8 +129,7 @@ def _rules(found: Clashes, asked: Sequence[Kind]) -> Iterator[_Case]:
             message = f"{len(broken):,} of {reach.n_pairs:,} pairs do not keep it"
             yield _Case("clashes.rules", name, "failure", message, _lines(broken))
         elif not reach.n_pairs:
-            message = reach.missing or "it reaches no pair"
-            yield _Case("clashes.rules", name, "skipped", message)
+            yield _Case("clashes.rules", name, "skipped", f"it reaches {reach}")
         else:
             yield _Case("clashes.rules", name)
 

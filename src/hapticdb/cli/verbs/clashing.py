@@ -210,10 +210,8 @@ def clashes(
         raise typer.Exit(_accept(url, accept, because, json=json))
     kinds = _checked(kind)
     if poses is not None or turn is not None:
-        if html or junit or bcf or seconds or on or rules or rule or group or not of:
-            raise UsageError(
-                "--poses and --turn take --of, of files --csv; no --seconds, --on, rules, --group"
-            )
+        if any((html, junit, bcf, seconds, on, rules, rule, group)) or not of:
+            raise UsageError("--poses and --turn take --of, --csv; no report, rule, --seconds")
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
     from hapticdb.clashes.run import find_clashes
@@ -225,11 +223,10 @@ def clashes(
         render.bar("measuring", "pairs") as progress,
     ):
         _put_rules(env, rules, rule or [], within)
-        found = find_clashes(
+        found = _with_volumes(env, least_volume, find_clashes(
                 env, within=within, contact=contact, of=of or (), against=against or (),
                 seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
-            )  # fmt: skip
-        found = _with_volumes(env, found, least_volume)
+            ))  # fmt: skip
         told = _Told.of(env, found, kinds, group)
         if because is not None:
             raise typer.Exit(told.accept(env, because, json=json))
@@ -238,7 +235,7 @@ def clashes(
     raise typer.Exit(_exit_code(found, kinds))
 
 
-def _with_volumes(env: "Environment", found: "Clashes", least: float | None) -> "Clashes":
+def _with_volumes(env: "Environment", least: float | None, found: "Clashes") -> "Clashes":
     if least is None:
         return found
     from hapticdb.clashes.volumes import with_volumes
@@ -286,20 +283,10 @@ class _Told(NamedTuple):
         """Write the pairs as a table, a page and reports, where files are given."""
         if table:
             table.write(_row(one, self.ids.get((one.a, one.b))) for one in self.pairs)
-        if not files:
-            return
-        from hapticdb.clashes.result import ASKED
-        from hapticdb.pictures.clashes import clashes_page
-        from hapticdb.pictures.reports import junit, write_bcf
+        if files:
+            from hapticdb.pictures.reports import write_reports
 
-        asked = kinds or ASKED
-        if page := files.get("html"):
-            made = clashes_page(env, self.found, self.pairs, self.groups)
-            page.write_text(made, encoding="utf-8")
-        if report := files.get("junit"):
-            report.write_bytes(junit(self.found, self.groups, asked))
-        if topics := files.get("bcf"):
-            write_bcf(topics, env, [group for group in self.groups if group.kind in asked])
+            write_reports(files, env, self.found, self.pairs, self.groups, kinds)
 
     def say(self, url: str, *, json: bool, is_table: bool, is_grouped: bool) -> None:
         """Print groups or pairs, and what rules reach."""

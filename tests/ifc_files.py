@@ -21,8 +21,8 @@ api = ifcopenshell.api
 class Building:
     """A project with a site, a building and a storey at 3 m."""
 
-    def __init__(self) -> None:
-        self.model = api.project.create_file()
+    def __init__(self, version: str = "IFC4") -> None:
+        self.model = api.project.create_file(version=version)
         project = self.entity("IfcProject", "project")
         api.unit.assign_unit(self.model)
         model = api.context.add_context(self.model, context_type="Model")
@@ -49,12 +49,18 @@ class Building:
     def point(self, *at: float) -> entity_instance:
         return self.make("IfcCartesianPoint", Coordinates=[float(x) for x in at])
 
+    def flat_axes(self) -> entity_instance:
+        return self.make("IfcAxis2Placement2D", Location=self.point(0, 0))
+
     def axes(self) -> entity_instance:
         return self.make("IfcAxis2Placement3D", Location=self.point(0, 0, 0))
 
     def box(self, *size: float) -> entity_instance:
         """Edges along x, y and z; the middle of the base at the origin."""
-        area = self.make("IfcRectangleProfileDef", ProfileType="AREA", XDim=size[0], YDim=size[1])
+        area = self.make(
+            "IfcRectangleProfileDef", ProfileType="AREA", Position=self.flat_axes(), XDim=size[0],
+            YDim=size[1],
+        )  # fmt: skip
         return self._raised(area, size[2])
 
     def cylinder(self, radius: float, height: float) -> entity_instance:

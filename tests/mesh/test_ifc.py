@@ -2,6 +2,7 @@
 
 from pathlib import Path
 
+import ifcopenshell.api.owner.settings
 import numpy as np
 import pytest
 from ifcopenshell import entity_instance
@@ -48,6 +49,30 @@ def test_read_file_openings_are_cut_and_spaces_left_out(tmp_path: Path) -> None:
     assert [part.name for part in file.parts] == ["site/house/ground/wall"]
     assert volume(file.parts[0]) == pytest.approx(2.0 - 0.2)
     assert file.notes == ("1 opening is left out", "2 spaces are left out")
+
+
+@pytest.mark.parametrize("version", ["IFC2X3", "IFC4X3"])
+def test_read_file_other_schemas(
+    tmp_path: Path, version: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def user(model: ifcopenshell.file) -> entity_instance:  # which IFC2X3 requires
+        person = model.create_entity("IfcPerson", FamilyName="p")
+        firm = model.create_entity("IfcOrganization", Name="o")
+        return model.create_entity("IfcPersonAndOrganization", person, firm)
+
+    def program(model: ifcopenshell.file) -> entity_instance:
+        firm = model.create_entity("IfcOrganization", Name="o")
+        return model.create_entity("IfcApplication", firm, "1", "a", "a")
+
+    monkeypatch.setattr(ifcopenshell.api.owner.settings, "get_user", user)
+    monkeypatch.setattr(ifcopenshell.api.owner.settings, "get_application", program)
+    one = Building(version)
+    one.add("IfcWall", "wall", one.shape(one.box(4000, 200, 2500)), (0.0, 0.0, 3.0))
+    one.add("IfcSpace", "room", one.shape(one.box(3000, 3000, 2500)))
+    file = read_file(one.written(tmp_path / "a.ifc"))
+    assert [part.name for part in file.parts] == ["site/house/ground/wall"]
+    assert volume(file.parts[0]) == pytest.approx(2.0)
+    assert file.notes == ("1 space is left out",)
 
 
 def test_read_file_instances_share_a_shape(tmp_path: Path) -> None:

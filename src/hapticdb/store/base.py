@@ -160,7 +160,7 @@ class Object:
     transform (4, 4) float64 : world_from_part, metres
     voxels : how many voxels its surface touches
     bounds (2, 3) float64 : lower and upper corner, metres, world frame
-    attributes : JSON: ``unit`` of its file; ``up``, its axis x, y or z
+    attributes : JSON: ``unit`` of its file; ``up``, its axis x, y or z; what an IFC file says
     revision : revision of the environment that last wrote the object
     rows_crc, distances_crc : checksums of its rows and distances as they were written, or None
     surface : its packed surface, from `Environment.remove` alone, for `restore`

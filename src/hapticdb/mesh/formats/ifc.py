@@ -80,7 +80,7 @@ def _named(products: Iterable[entity_instance]) -> Iterator[tuple[int, str, dict
             if last not in parents:
                 parents[last] = get_parent(chain[-1])
             parent = parents[last]
-            if parent is None or parent in chain or parent.is_a("IfcContext"):
+            if parent is None or parent in chain or parent.is_a("IfcProject"):
                 break
             chain.append(parent)
         name = budget.joined([one.Name or one.is_a() for one in reversed(chain)])

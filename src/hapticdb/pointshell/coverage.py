@@ -80,11 +80,9 @@ class Interior:
     def solid(self) -> Solid:
         """The closed bodies for `kernels.triangles.depth`, about `origin`."""
         numbers = np.array(self._bodies, dtype=np.int64).reshape(-1, 2)
-        low, high = (
-            np.array([box[n] for box in self.boxes.values()]).reshape(-1, 3) for n in (0, 1)
-        )
-        box = np.stack([low.min(axis=0), high.max(axis=0)])
-        return Solid(self.tree, numbers[:, 0].copy(), numbers[:, 1].copy(), box)
+        boxes = np.array([self.boxes[body] for body, _ in self._bodies]).reshape(-1, 2, 3)
+        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
+        return Solid(self.tree, numbers[:, 0].copy(), numbers[:, 1].copy(), boxes, box)
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
         """Whether each of the positions (Q, 3), metres, surface's frame, is inside: (Q,).

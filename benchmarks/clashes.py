@@ -25,11 +25,11 @@ import scipy.spatial  # noqa: F401 - a quarter of a second that is no part of a 
 import hapticdb
 import records
 from hapticdb.clashes import run
-from hapticdb.exact.clash import Judged, PlacedPair
-from hapticdb.exact.shapes import Shapes
+from hapticdb.exact.clash import Floats, Judged
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.kernels._jit import load_entries
 from hapticdb.kernels.triangles.nearest import nearest
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.base import NO_ROWS
 from hapticdb.verdicts import Kind
 
@@ -66,7 +66,7 @@ def measured(what: str, url: str) -> dict[str, Any]:
     load_entries()
     is_alone = what == "distances alone"
     if is_alone:
-        vars(run)["judge_placed"] = distance
+        vars(run)["judge"] = distance
     with hapticdb.open(url, read_only=is_alone) as env:
         if what == "one changed":
             env.shift([env.objects()[100].id], (0.0, 0.0, 1e-4))
@@ -88,13 +88,12 @@ def measured(what: str, url: str) -> dict[str, Any]:
     }
 
 
-def distance(shapes: Shapes, pair: PlacedPair, within: float, contact: float) -> Judged | None:
-    """Measure the distance of a pair and leave out its kind: in the place of `judge_placed`."""
+def distance(
+    a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
+) -> Judged:
+    """Measure the distance of a pair and leave out its kind: in the place of `judge`."""
     del contact
-    a, b = shapes.shape(pair.one), shapes.shape(pair.other)
-    if a is None or b is None:
-        return None
-    near = nearest(a.tree, b.tree, pair.pose[None], np.full(1, within))
+    near = nearest(a.tree, b.tree, pose[None], np.full(1, within))
     at_least, at_most = float(near.at_least[0]), float(near.at_most[0])
     kind = Kind.APART if np.isfinite(at_most) else Kind.FAR
     return Judged(kind, at_least, at_most, near.on_a[0], near.on_b[0])

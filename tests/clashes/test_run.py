@@ -21,8 +21,11 @@ import hapticdb
 from assemblies import row_of_boxes
 from children import finished, joined
 from hapticdb import Environment, accept_clash, find_clashes
+from hapticdb.clashes import run
 from hapticdb.clashes.result import Clashes
 from hapticdb.errors import UsageError
+from hapticdb.exact.clash import Floats, Judged, judge
+from hapticdb.pointshell.shape import CollisionShape
 from hapticdb.store.connect import grant
 from hapticdb.store.pairs import PairRow
 from hapticdb.store.postgres.address import parse
@@ -154,6 +157,36 @@ def test_a_stopped_search_goes_on_and_says_all_that_is_new(path: Path) -> None:
         assert (found.measured, found.kept) == (1, 2)
         assert {one.status for one in found.pairs} == {"new"}
         assert {one.status for one in find_clashes(env).pairs} == {"same"}
+
+
+def test_threads_find_the_same_and_raise_what_a_pair_raises(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    path, found = row_of_boxes(tmp_path / "long.db", 9), []
+    monkeypatch.setattr(run, "IN_FLIGHT", 1)
+    with hapticdb.open(path) as env:
+        for n in range(2, 10):
+            shifted(env, n, (n % 3 - 1) * n * 0.01 * MM)  # no two pairs are placed alike
+    with hapticdb.open(path, read_only=True) as env:
+        for threads in (1, 4):
+            monkeypatch.setattr(run, "THREADS", threads)
+            found.append(find_clashes(env).pairs)
+    assert found[0] == found[1]
+    assert {one.kind for one in found[0]} == {Kind.APART, Kind.OVERLAPPING, Kind.TOUCHING}
+    judged = iter(range(9))
+
+    def raising(
+        a: CollisionShape, b: CollisionShape, pose: Floats, within: float, contact: float
+    ) -> Judged:
+        if next(judged) == 4:
+            raise RuntimeError("the fifth")
+        return judge(a, b, pose, within, contact)
+
+    monkeypatch.setattr(run, "judge", raising)
+    with hapticdb.open(path) as env:
+        with pytest.raises(RuntimeError, match="the fifth"):
+            find_clashes(env)
+        assert 0 < len(list(env.store.pairs())) < 8
 
 
 def test_what_the_time_leaves_is_told_as_not_looked_at(path: Path) -> None:

@@ -6,8 +6,11 @@ measures only pairs of objects that were written since. Each row is written soon
 measured, so a call that was stopped goes on where it was.
 """
 
+import os
 import time
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
 from itertools import chain
@@ -23,7 +26,7 @@ from hapticdb.cluster.place import Whereabouts
 from hapticdb.cluster.workers import Cluster, connected
 from hapticdb.environment import Environment
 from hapticdb.errors import ReadOnlyError, UsageError
-from hapticdb.exact.clash import Judged, PlacedPair, judge_placed
+from hapticdb.exact.clash import Judged, PlacedPair, judge, judge_placed
 from hapticdb.exact.separation import CONTACT
 from hapticdb.exact.shapes import Shapes, relative_poses
 from hapticdb.store.base import Object, Progress, Store
@@ -46,6 +49,10 @@ DUPLICATE = Judged(Kind.DUPLICATE, 0.0, 0.0, np.zeros(3), np.zeros(3))
 PIECE = 128
 """Pairs of one task of a worker, which reads the shapes anew. More: fewer reads, and a lost worker
 costs more."""
+THREADS = min(os.cpu_count() or 1, 8)
+"""Threads that judge pairs. Kernels run without the interpreter's lock, the rest does not."""
+IN_FLIGHT = 32
+"""Pairs that are judged or wait for it: a slow one keeps the threads busy, and holds few shapes."""
 SECONDS_BETWEEN = 2.0
 """Seconds of work that an end without warning loses at most, but for the pair under way."""
 
@@ -312,15 +319,11 @@ class PairSearch:
 
     def _judged(self, placed: Sequence[PlacedPair]) -> Iterator[Judged | None]:
         """Judge pairs, here or by workers, as long as there is time."""
-        # threads on two processors gained a tenth: most of the time holds the interpreter's lock
         asked = self._asked
-        work = partial(judge_placed, within=asked.within, contact=asked.contact)
         if self._workers is None:
-            for one in placed:
-                if time.monotonic() > asked.until:
-                    return
-                yield work(self._shapes, one)
+            yield from self._judged_here(placed)
             return
+        work = partial(judge_placed, within=asked.within, contact=asked.contact)
         there = Whereabouts.of(self._store, self._address)
         pieces = [placed[first : first + PIECE] for first in range(0, len(placed), PIECE)]
         with closing(
@@ -330,6 +333,24 @@ class PairSearch:
                 yield from judged
                 if time.monotonic() > asked.until:
                     return
+
+    def _judged_here(self, placed: Sequence[PlacedPair]) -> Iterator[Judged | None]:
+        """Judge pairs in threads, which share the shapes; only this one reads the database."""
+        work = partial(judge, within=self._asked.within, contact=self._asked.contact)
+        waiting: deque[Future[Judged] | None] = deque()
+        pool = ThreadPoolExecutor(THREADS, "clashes")
+        try:
+            for one in placed:
+                if time.monotonic() > self._asked.until:
+                    break
+                a, b = self._shapes.shape(one.one), self._shapes.shape(one.other)
+                waiting.append(pool.submit(work, a, b, one.pose) if a and b else None)
+                if len(waiting) > IN_FLIGHT:
+                    yield first.result() if (first := waiting.popleft()) else None
+            while waiting:
+                yield first.result() if (first := waiting.popleft()) else None
+        finally:
+            pool.shutdown(cancel_futures=True)
 
     def _write(self, gone: Sequence[tuple[int, int]] = (), mark: Mark | None = None) -> None:
         """Write the rows that wait, and the mark of a table with all pairs, if this user may."""

@@ -1,1 +1,1 @@
-"""Clashes: pairs of objects that are near, touch, overlap, or lie one in the other."""
+"""Clashes: near, touching, overlapping and nested pairs of objects, and decisions about them."""

@@ -19,16 +19,16 @@ from hapticdb.units import length_text, volume_text
 from hapticdb.verdicts import Kind
 
 STEP = 1e-6
-"""Metres, and share of one in a rotation, to which relative placements are rounded. Coarser: pairs
-count as copies that differ more."""
+"""Rounding of relative placements, metres, and share of one in a rotation. Coarser: more pairs
+count as copies."""
 MANY = 3
-"""Least number of others that one part meets in a group of its own."""
+"""Least number of others in the group of one part."""
 DIGITS = 10
 """Hexadecimal digits of an id."""
 
 
 class Group(NamedTuple):
-    """Pairs that are one finding.
+    """Pairs of one finding.
 
     id : the same in later searches; part : name of the one part against many others, or None;
     pairs : open ones first, then the gravest.
@@ -50,7 +50,7 @@ class Group(NamedTuple):
         return len({i for one in self.pairs for i in one[:2]})
 
     def title(self) -> str:
-        """Names of the first pair, or of the part, and how many others."""
+        """Names of the first pair, or of the part, and the number of others."""
         worst, more = self.pairs[0], len(self.pairs) - 1
         a, b = (name or "(gone)" for name in (worst.a_name, worst.b_name))
         if self.kind == Kind.DUPLICATE and more:
@@ -70,7 +70,7 @@ class Group(NamedTuple):
         return words + (f", {volume_text(sum(volumes))} in all" if volumes else "")
 
     def status(self) -> str:
-        """Reason of a closed group; else how many pairs are settled, or their statuses."""
+        """Reason of a closed group; else the numbers of settled pairs, or their statuses."""
         if not self.is_open:
             return self.pairs[0].because or ""
         counts, n_pairs = Counter[str](one.status for one in self.pairs), len(self.pairs)
@@ -82,11 +82,11 @@ class Group(NamedTuple):
 
 
 def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
-    """Groups of pairs that are there and were measured: open ones first, then the gravest.
+    """Groups of present, measured pairs: open ones first, then the gravest.
 
-    First copies: pairs of equal shapes in equal relative placement, of one kind. Of those left, the
-    object that meets most others in one kind takes its pairs, until none meets `MANY`. Each other
-    pair is a group. Duplicates at one place are a group. pairs : the gravest first.
+    First copies: pairs of equal shapes in equal relative placement, of one kind. Of the rest, the
+    object with most others in one kind takes its pairs, down to `MANY`. Each other pair is a group.
+    Duplicates at one place are a group. pairs : the gravest first.
     """
     there = [one for one in pairs if one.status != "gone" and not one.is_left]
     objects = {obj.id: obj for obj in store.objects({i for one in there for i in one[:2]})}
@@ -116,7 +116,7 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
 
 
 def _one_against_many(pairs: Sequence[Clash]) -> Iterator[tuple[int, list[Clash]]]:
-    """Objects that meet `MANY` others in one kind, the one with most first, and these pairs."""
+    """Objects with `MANY` others in one kind, the one with most first, and these pairs."""
     met: dict[tuple[Kind, int], dict[int, Clash]] = {}
     for one in pairs:
         met.setdefault((one.kind, one.a), {})[one.b] = one

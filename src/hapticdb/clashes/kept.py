@@ -1,4 +1,4 @@
-"""Checks the table of pairs against the surfaces that it was measured from."""
+"""Checks the table of pairs against the surfaces."""
 
 import re
 from collections.abc import Iterator, Mapping, Sequence
@@ -15,23 +15,23 @@ from hapticdb.verdicts import Kind
 SETTING = re.compile(r"within (\S+) contact (\S+) by motions")
 """`PairQuery.setting`, read back."""
 SHARE = 1e-4
-"""Share by which a length may differ from the one that is measured again, on another machine."""
+"""Tolerance of a length on another machine, a share."""
 NEAR = 1e-6
-"""Metres by which places may be off."""
+"""Tolerance of places, metres."""
 
 
 class PairFault(NamedTuple):
-    """What is wrong, and the row; None where one is missing."""
+    """A fault, and the row; None of a missing one."""
 
     text: str
     row: PairRow | None
 
 
 def pair_faults(store: Store, objects: Mapping[int, Object]) -> Iterator[PairFault]:
-    """Rows of the table `pair` that no search has written, or that are missing.
+    """Foreign rows of the table `pair`, and missing ones.
 
-    Each row that `find_clashes` would believe is judged again, with its own setting. After a search
-    of everything there is a row for each pair of near boxes.
+    Each row valid for `find_clashes` is judged again, with its own setting. After a search of
+    everything there is a row for each pair of near boxes.
     """
     kept, revision = store.pairs(), store.revision()
     known = {change.id for change in store.changes()} if kept.rows else set()
@@ -72,9 +72,9 @@ def _written(pair: tuple[int, int], objects: Mapping[int, Object]) -> float:
 
 
 def _misfit(row: PairRow, known: set[int], bare: set[int], revision: int) -> str | None:
-    """What a row contradicts without its surfaces; None if nothing.
+    """Contradiction of a row, without its surfaces; None if none.
 
-    known : ids of all objects that there were; bare : of those that have no surface.
+    known : ids of all objects ever; bare : of those without a surface.
     """
     if not {row.a, row.b} <= known:
         return "there was never such an object"

@@ -1,4 +1,4 @@
-"""Pairs of objects whose boxes are near one another: never too few."""
+"""Broad phase: pairs of objects with near boxes, never too few."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,11 +9,11 @@ Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 Bools = NDArray[np.bool_]
 AT_ONCE = 1 << 20
-"""Pairs of boxes that are compared together. Larger: more memory."""
+"""Pairs of boxes of a batch. Larger: more memory."""
 BITS = 10
-"""Bits an axis of the curve along which pairs are ordered."""
+"""Bits an axis of the curve for the order of pairs."""
 FEW = 1000
-"""Boxes that are compared with each other one. More: that takes longer than to sort all boxes."""
+"""Boxes to compare with all others. More: slower than to sort all boxes."""
 
 
 def near_pairs(boxes: Floats, within: float, is_of: Bools, is_against: Bools) -> Ints:
@@ -35,7 +35,7 @@ def near_pairs(boxes: Floats, within: float, is_of: Bools, is_against: Bools) ->
 
 
 def _near_pairs(boxes: Floats, reach: float) -> Ints:
-    """Pairs (P, 2), lesser first, of boxes (O, 2, 3) that are `reach` metres from one another."""
+    """Pairs (P, 2), lesser first, of boxes (O, 2, 3) within `reach` metres."""
     sweeps = [_sweep(boxes[:, :, axis], reach) for axis in range(3)]
     order, counts = min(sweeps, key=lambda sweep: int(sweep[1].sum()))
     low, high = boxes[order, 0], boxes[order, 1] + reach
@@ -62,7 +62,7 @@ def _are_near(low: Floats, high: Floats, other_low: Floats, other_high: Floats) 
 
 
 def _sweep(edges: Floats, reach: float) -> tuple[Ints, Ints]:
-    """Order of boxes by their lower ends (O, 2), and how many after each begin before it ends."""
+    """Order of boxes by their lower ends (O, 2), and the number after each that overlap it."""
     order = np.argsort(edges[:, 0], kind="stable")
     low, high = edges[order, 0], edges[order, 1] + reach
     return order, np.searchsorted(low, high, side="right") - np.arange(1, len(order) + 1)

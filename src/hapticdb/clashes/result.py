@@ -14,20 +14,20 @@ from hapticdb.verdicts import REPORTED, Kind
 
 Shown = Literal[Status, "accepted", "meant", "not looked at"]
 ASKED = REPORTED[:3]
-"""Kinds that are looked for unless others are asked for."""
+"""Default kinds of findings."""
 
 MOST_SHOWN = 20
-"""Pairs that a notebook shows; more are counted. Larger: a longer table."""
+"""Pairs in a notebook; more are counted. Larger: a longer table."""
 
 
 class Clash(NamedTuple):
-    """Two objects that are near one another.
+    """Two objects near one another.
 
-    a, b : ids, the lesser one first; a_name, b_name : None of an object that is gone; kind : as
-    docs/clashes.md says; at_least, at_most : metres, of the gap, or of the depth of an overlap;
-    at_most is None where no bound is known; place : x, y, z on a, then on b; status : since the
-    last call; because : why it is accepted or meant, or None; rule : number, from 1, of the rule
-    that decides it; volume : of an overlap, cubic metres, None where not known or not asked for.
+    a, b : ids, the lesser one first; a_name, b_name : None of a removed object; kind : as in
+    docs/clashes.md; at_least, at_most : metres, of the gap, or of the depth of an overlap, at_most
+    None without a bound; place : x, y, z on a, then on b; status : since the last call; because :
+    reason of an acceptance or a rule, or None; rule : number, from 1, of the deciding rule;
+    volume : of an overlap, cubic metres, or None.
     """
 
     a: int
@@ -45,16 +45,16 @@ class Clash(NamedTuple):
 
     @property
     def is_open(self) -> bool:
-        """Whether the pair is there, and neither accepted nor meant by a rule."""
+        """Whether the pair is present, and neither accepted nor meant by a rule."""
         return self.status not in {"gone", "accepted", "meant"}
 
     @property
     def is_left(self) -> bool:
-        """Whether the pair was not looked at."""
+        """Whether the pair was not measured."""
         return self.status == "not looked at"
 
     def length_text(self) -> str:
-        """Write the gap, or the depth and the volume: exact, or with the bound that is known."""
+        """Write the gap, or the depth and the volume: exact, or a bound."""
         if self.volume is not None:
             return f"{self._replace(volume=None).length_text()}, {volume_text(self.volume)}"
         if self.is_left:
@@ -71,7 +71,7 @@ class Clash(NamedTuple):
 
 
 def rule_for(one: Clash) -> str:
-    """Rule that means a pair, up to a tenth more than its depth; empty for one that is too near."""
+    """Rule to mean a pair, up to a tenth more than its depth; empty for one too near."""
     if one.kind == Kind.TOO_NEAR or not one.a_name or not one.b_name:
         return ""
     depth = one.at_most if one.kind == Kind.OVERLAPPING else None
@@ -84,17 +84,17 @@ Known = Mapping[int, tuple[str, str]]
 
 
 def shapes_of(known: Known, a: int, b: int) -> str | None:
-    """Both shapes, as an acceptance notes them; None if an object is gone."""
+    """Both shapes, as in an acceptance; None if an object is gone."""
     return f"{known[a][1]} {known[b][1]}" if a in known and b in known else None
 
 
 def accepted(row: PairRow, known: Known) -> str | None:
-    """Why a pair is accepted; None where it is not, or a shape has changed since."""
+    """Reason of an acceptance; None without one, or after a change of a shape."""
     return row.because if row.shapes == shapes_of(known, row.a, row.b) else None
 
 
 def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
-    """A kept pair as it is told."""
+    """Clash of a row."""
     because = accepted(row, known)
     a_name, b_name = (known[i][0] if i in known else None for i in (row.a, row.b))
     return Clash(
@@ -105,7 +105,7 @@ def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
 
 
 def reported(found: Sequence[Clash], rules: Rules) -> list[Clash]:
-    """Pairs as rules have them reported."""
+    """Pairs by the rules."""
     numbers = rules.first(one[:2] for one in found).tolist() if rules.rules else [-1] * len(found)
     return [
         one
@@ -116,7 +116,7 @@ def reported(found: Sequence[Clash], rules: Rules) -> list[Clash]:
 
 
 def _decided(one: Clash, rule: Rule) -> Clash:
-    """Pair as a rule has it reported."""
+    """Pair by a rule."""
     length = math.inf if rule.length is None else rule.length
     if rule.says == "apart":
         is_near = one.at_least < length and one.kind not in {Kind.OVERLAPPING, Kind.DUPLICATE}
@@ -129,10 +129,10 @@ def _decided(one: Clash, rule: Rule) -> Clash:
 
 
 class Reach(NamedTuple):
-    """What a rule does.
+    """Reach of a rule.
 
-    n_pairs : it decides; n_changed : of them, meant, too near or ignored for it; missing : why its
-    words choose nothing, or empty.
+    n_pairs : decided by it; n_changed : of them, meant, too near or ignored; missing : error of
+    words without an object, or empty.
     """
 
     rule: Rule
@@ -141,7 +141,7 @@ class Reach(NamedTuple):
     missing: str
 
     def __str__(self) -> str:
-        """Counts, or why no pair is reached."""
+        """Counts, or the reason of an empty reach."""
         if not self.n_pairs:
             return f"no pair{self.missing and f': {self.missing}'}"
         word = {"meant": "meant", "apart": "too near", "ignore": "ignored"}[self.rule.says]
@@ -152,12 +152,11 @@ class Reach(NamedTuple):
 class Clashes:
     """Result of a search.
 
-    told : pairs of objects that were looked at; rest : rows of all other pairs, which are as the
-    last call has told them; known : all objects; measured, kept : numbers of pairs of near boxes
-    that were measured now, or were known; rules : of the environment; ignored : ids of the pairs of
-    near boxes that a rule ignores; left : not looked at, since the time was over or an
-    object was written meanwhile; within, contact : metres; revision : of the database that was
-    read; elapsed : seconds; is_kept : whether the database keeps what was found.
+    told : pairs of this search; rest : rows of all other pairs, unchanged since the last call;
+    known : all objects; measured, kept : numbers of pairs of near boxes measured now or before;
+    rules : of the environment; ignored : ids of the pairs of near boxes ignored by a rule; left :
+    not measured, for want of time or after a write to an object; within, contact : metres;
+    revision : of the database; elapsed : seconds; is_kept : whether the database has the result.
     """
 
     told: tuple[Clash, ...]
@@ -193,7 +192,7 @@ class Clashes:
         return tuple(sorted(reported((*self.told, *rest), self.rules), key=gravity))
 
     def reach(self) -> list[Reach]:
-        """How many pairs each rule decides."""
+        """Reach of each rule."""
         ignored = (self.rules.first(self.ignored) + 1).tolist()
         reached, changed = Counter[int | None](ignored), Counter[int | None](ignored)
         for one in self.pairs:
@@ -207,13 +206,13 @@ class Clashes:
         ]
 
     def of(self, kinds: tuple[Kind, ...] = ASKED) -> tuple[Clash, ...]:
-        """Pairs of some kinds, and what was not looked at; without accepted and gone ones."""
+        """Open pairs of some kinds, and unmeasured ones."""
         return tuple(
             one for one in self.pairs if one.is_open and (one.kind in kinds or one.is_left)
         )
 
     def counts(self) -> dict[str, int]:
-        """How many pairs are of each kind, those that are gone left out."""
+        """Numbers of present pairs by kind."""
         told = self.pairs if self.rules.rules else self.told
         found = Counter[str](one.kind for one in told if one.status != "gone")
         if not self.rules.rules:
@@ -221,7 +220,7 @@ class Clashes:
         return {kind: found[kind] for kind in REPORTED}
 
     def statuses(self) -> dict[str, int]:
-        """How many pairs have each status."""
+        """Numbers of pairs by status."""
         return dict(Counter(one.status for one in self.pairs))
 
 

@@ -1,7 +1,7 @@
-"""Rules: which pairs are meant, kept apart or ignored, by the words of their objects.
+"""Rules: meant, separate and ignored pairs, by the words of their objects.
 
-Rules change what is reported, not what is measured; only ignored pairs are left out of the narrow
-phase. The first rule that reaches a pair decides.
+Rules change the report, not the measurement; only ignored pairs skip the narrow phase. The first
+rule to reach a pair decides.
 """
 
 import re
@@ -20,9 +20,9 @@ from hapticdb.units import length_of, length_text
 from hapticdb.verdicts import REPORTED, Kind
 
 MEANT = (Kind.OVERLAPPING, Kind.TOUCHING)
-"""Kinds that a rule means unless it names others."""
+"""Default kinds of a rule."""
 MEASURED = tuple(kind for kind in REPORTED if kind != Kind.TOO_NEAR)
-"""Kinds that a rule may name."""
+"""Kinds for rules."""
 FORM = (
     "give 'ONE in OTHER: overlap up to 0.3 mm is meant', 'ONE and OTHER: keep 2 mm apart' or "
     "'ONE and OTHER: ignore', and if wanted 'because REASON' after it"
@@ -34,7 +34,7 @@ GRAMMAR = re.compile(
 
 
 def parse_rule(text: str, place: str = "") -> Rule:
-    """Rule of a text in one of the forms of `FORM`; UsageError, which names the place."""
+    """Rule of a text in one of the forms of `FORM`; UsageError with the place."""
     place = place or f"rule {text[:200]!r}"
     found = GRAMMAR.fullmatch(text.strip())
     if found is None or not text.isprintable():
@@ -98,9 +98,10 @@ def check_clearances(rules: Iterable[Rule], within: float) -> None:
 
 
 class Rules:
-    """Rules, and the objects that their words choose.
+    """Rules, and the objects of their words.
 
-    missing : for each rule, why its words choose nothing, or empty; ignores : whether one does.
+    missing : for each rule, the error of words without an object, or empty; ignores : whether one
+    ignores pairs.
     """
 
     def __init__(self, rules: Sequence[Rule], objects: Sequence[Object], url: str) -> None:
@@ -120,7 +121,7 @@ class Rules:
             self.missing.append(str(errors[0]) if errors else "")
 
     def first(self, pairs: Iterable[tuple[int, int]]) -> NDArray[np.int64]:
-        """Index (P,) of the rule that decides each pair of ids; -1 without one."""
+        """Index (P,) of the deciding rule of each pair of ids; -1 without one."""
         keys = np.array([*pairs], dtype=np.int64).reshape(-1, 2)
         found = np.full(len(keys), -1, dtype=np.int64)
         if not len(self._ids):
@@ -134,7 +135,7 @@ class Rules:
         return found
 
     def ignored(self, pairs: Iterable[tuple[int, int]]) -> set[tuple[int, int]]:
-        """Pairs of ids, those that a rule ignores."""
+        """Ignored ones of pairs of ids."""
         keys = [*pairs] if self.ignores else []
         return {
             key

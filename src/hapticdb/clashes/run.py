@@ -1,9 +1,8 @@
-"""Clashes: every pair of objects nearer than a length, and what they are.
+"""Search for clashes: every pair of objects nearer than a length, with its kind.
 
-Boxes say which pairs may be near, never too few; their surfaces decide. The table `pair` keeps a
-row for each pair of near boxes, also of those that turned out to be far, so that a later call
-measures only pairs of objects that were written since. Each row is written soon after it was
-measured, so a call that was stopped goes on where it was.
+Broad phase by boxes, never too few of them; narrow phase by surfaces. The table `pair` has a row
+for each pair of near boxes, also for far surfaces, so a later call measures only pairs of objects
+written since. Each row is written soon after its measurement, so a stopped call goes on from there.
 """
 
 import os
@@ -40,21 +39,20 @@ WITHIN = 1e-3
 BUDGET = 256 << 20
 """Default of the memory for shapes, bytes."""
 SAME = 1e-9
-"""Metres by which a pair's figures may differ and are still the same: rounding of placements."""
+"""Tolerance of the figures of an unchanged pair, metres: rounding of placements."""
 ROUNDING = 2.0**-40
-"""Metres, and share of one in a rotation, to which the placement of two shapes is rounded. Coarser:
-more pairs are found to be placed alike, and lengths are less exact."""
+"""Rounding of the relative placement of two shapes, metres, and share of one in a rotation.
+Coarser: more pairs are placed alike, and lengths are less exact."""
 DUPLICATE = Judged(Kind.DUPLICATE, 0.0, 0.0, np.zeros(3), np.zeros(3))
-"""What equal shapes at one place are."""
+"""Judgement of equal shapes at one place."""
 PIECE = 128
-"""Pairs of one task of a worker, which reads the shapes anew. More: fewer reads, and a lost worker
-costs more."""
+"""Pairs of one task of a worker. More: fewer reads of shapes, and a lost worker costs more."""
 THREADS = min(os.cpu_count() or 1, 8)
-"""Threads that judge pairs. Kernels run without the interpreter's lock, the rest does not."""
+"""Threads of the narrow phase. Kernels run without the interpreter's lock, the rest does not."""
 IN_FLIGHT = 32
-"""Pairs that are judged or wait for it: a slow one keeps the threads busy, and holds few shapes."""
+"""Pairs in the threads or before them: enough beside a slow one, with few shapes in memory."""
 SECONDS_BETWEEN = 2.0
-"""Seconds of work that an end without warning loses at most, but for the pair under way."""
+"""Greatest loss of work at an end without warning, seconds, but for the pair under way."""
 
 
 def find_clashes(
@@ -69,7 +67,7 @@ def find_clashes(
     progress: Progress | None = None,
     on: str | None = None,
 ) -> Clashes:
-    """Find every pair of objects that are near one another, and what they are.
+    """Find every pair of objects near one another, and its kind.
 
     Parameters
     ----------
@@ -77,9 +75,9 @@ def find_clashes(
         With the surfaces of its objects. Opened to write, it keeps what is found, and a later call
         measures only pairs of objects that were written since.
     within : float
-        Metres: pairs that are farther apart are not told, unless one lies inside the other.
+        Greatest distance of a pair, metres, unless one lies inside the other.
     contact : float
-        Metres: surfaces that near touch, and so do those that a motion by so much frees.
+        Contact tolerance, metres: for distances, and for separating motions.
     of, against : iterable of int or str
         One object of each pair is of the first, the other of the second; all unless given. Words as
         for `Environment.find`.
@@ -150,7 +148,7 @@ def accept_pairs(
 
 
 class PairQuery(NamedTuple):
-    """What is asked, as for `find_clashes`; until : time of `time.monotonic`."""
+    """Arguments as for `find_clashes`; until : end, `time.monotonic`."""
 
     within: float
     contact: float
@@ -162,7 +160,7 @@ class PairQuery(NamedTuple):
 
     @property
     def setting(self) -> str:
-        """What a row depends on beside its objects."""
+        """Dependencies of a row, apart from its objects."""
         return f"within {self.within!r} contact {self.contact!r} by motions"
 
 
@@ -234,7 +232,7 @@ class PairSearch:
         )  # fmt: skip
 
     def _changed(self, kept: KeptPairs, revision: int) -> set[int] | None:
-        """Objects written since the table had all pairs; None where anything may be missing."""
+        """Objects written since the table had all pairs; None if anything may be missing."""
         setting, since = kept.mark
         if setting != self._setting or not 0 <= revision - since <= FEW or not kept.fit(setting):
             return None
@@ -243,7 +241,7 @@ class PairSearch:
     def near(
         self, outlines: Outlines, of: set[int] | None, against: set[int] | None
     ) -> dict[tuple[int, int], int]:
-        """Keys of pairs of near boxes that are asked for, and the later revision of both."""
+        """Keys of pairs of near boxes of the filter, and the later revision of both."""
         ids, written = outlines.ids, outlines.revisions
         is_of, is_against = (
             np.ones(len(ids), dtype=np.bool_) if some is None else np.isin(ids, list(some))
@@ -262,7 +260,7 @@ class PairSearch:
         rows: dict[tuple[int, int], PairRow],
         revision: int,
     ) -> Iterator[PairRow]:
-        """Measure pairs, and keep each; leaves out what was written meanwhile."""
+        """Measure pairs and write their rows, but for objects written meanwhile."""
         alike: dict[object, list[tuple[Object, Object]]] = {}
         placed, same = [], []
         for (one, other), pose in zip(stale, self._poses(stale), strict=True):
@@ -293,7 +291,7 @@ class PairSearch:
     def _poses(self, pairs: Sequence[tuple[Object, Object]]) -> Floats:
         """Poses (P, 4, 4) of second shapes in the frames of the first, rounded to `ROUNDING`.
 
-        So equal shapes that are placed alike are the same pair everywhere.
+        So equal shapes in equal relative placement are the same pair everywhere.
         """
         world_from_a, world_from_b = (
             np.array([self._shapes.placement(pair[n])[1] for pair in pairs]).reshape(-1, 4, 4)
@@ -303,7 +301,7 @@ class PairSearch:
         return np.asarray(np.round(poses / ROUNDING) * ROUNDING + 0.0)
 
     def _row(self, one: Object, other: Object, judged: Judged, revision: int) -> PairRow:
-        """What the table keeps of a pair."""
+        """Row of a pair."""
         world_from_a = self._shapes.placement(one)[1]
         on_a, on_b = (
             world_from_a[:3, :3] @ place + world_from_a[:3, 3]
@@ -335,7 +333,7 @@ class PairSearch:
                     return
 
     def _judged_here(self, placed: Sequence[PlacedPair]) -> Iterator[Judged | None]:
-        """Judge pairs in threads, which share the shapes; only this one reads the database."""
+        """Judge pairs in threads over shared shapes; only this thread reads the database."""
         work = partial(judge, within=self._asked.within, contact=self._asked.contact)
         waiting: deque[Future[Judged] | None] = deque()
         pool = ThreadPoolExecutor(THREADS, "clashes")
@@ -369,7 +367,7 @@ class PairSearch:
         looked: set[tuple[int, int]],
         left: Sequence[tuple[int, int]],
     ) -> Iterator[Clash]:
-        """Pairs as they are told: looked at, gone since the last call, and not looked at."""
+        """Clashes: present ones, gone ones since the last call, and unmeasured ones."""
         waiting = set(left)
         for key, row in shown.items():
             status: Status = row.status
@@ -387,7 +385,7 @@ class PairSearch:
     def _settle(
         self, shown: dict[tuple[int, int], PairRow], looked: set[tuple[int, int]], mark: Mark | None
     ) -> None:
-        """Note that statuses were told: what is new now is the same next time."""
+        """Write statuses for the next call: a new pair is the same then."""
         self._waiting = [
             shown[key]._replace(status="same") for key in looked if shown[key].status != "same"
         ]
@@ -430,7 +428,7 @@ def _are_same(one: Object, other: Object) -> bool:
 
 
 def _compared(row: PairRow, old: PairRow | None) -> PairRow:
-    """A row with its status, and what the former one says of acceptance."""
+    """A row with its status, and the acceptance of the former one."""
     if old is None:
         return row._replace(status="same" if row.kind == Kind.FAR else "new")
     # an earlier call that came to no end has left what it would have told

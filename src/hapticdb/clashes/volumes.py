@@ -19,13 +19,13 @@ if TYPE_CHECKING:
     from manifold3d import Manifold
 
 MOST_SOLIDS = 64
-"""Shapes that are kept at once. More: fewer are read again, and more memory."""
+"""Shapes in memory. More: fewer are read again."""
 
 
 def with_volumes(store: Store, found: Clashes, least: float = 0.0) -> Clashes:
     """Give each overlap its volume, cubic metres, where both surfaces are closed.
 
-    least : overlaps of a smaller known volume are left out.
+    least : overlaps of a smaller known volume are dropped.
 
     Raises
     ------
@@ -60,7 +60,7 @@ def with_volumes(store: Store, found: Clashes, least: float = 0.0) -> Clashes:
 
 
 def _common(a: Object, b: Object, one: "Manifold | None", other: "Manifold | None") -> float | None:
-    """Volume that two objects have in common, cubic metres; None where it is not known."""
+    """Common volume of two objects, cubic metres; None if unknown."""
     if one is None or other is None or not (size := abs(np.linalg.det(a.transform[:3, :3]))):
         return None
     a_from_b = np.linalg.solve(a.transform, b.transform)  # near the origin: digits are kept

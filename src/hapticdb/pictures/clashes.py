@@ -170,7 +170,7 @@ def _figures(
 
 
 def sight(one: Clash, pair: tuple[Object, Object]) -> tuple[Floats, float]:
-    """Middle (3,) of the place where a pair meets, and half the edge of the view, metres."""
+    """Middle (3,) of a pair's two places, and half the edge of the view, metres."""
     places = np.array(one.place).reshape(2, 3)
     edge = min(float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) for obj in pair)
     radius = max(0.4 * edge, 2.0 * float(np.linalg.norm(places[1] - places[0])), 1e-6)
@@ -178,7 +178,7 @@ def sight(one: Clash, pair: tuple[Object, Object]) -> tuple[Floats, float]:
 
 
 def snapshot(store: Store, one: Clash, pair: tuple[Object, Object], up: int) -> bytes:
-    """PNG of both surfaces around the place where they meet; up : axis that points up."""
+    """PNG of both surfaces around their places; up : axis, 0 to 2."""
     middle, radius = sight(one, pair)
     box = np.stack([middle - radius, middle + radius])[None]
     canvas = Canvas(box, SIZE, np.array([[0.0, 0.0], SIZE]), np.array(PAPER), up)

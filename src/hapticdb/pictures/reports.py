@@ -25,7 +25,7 @@ from hapticdb.units import place_text
 from hapticdb.verdicts import Kind
 
 MOST_LINES = 100
-"""Pairs of a group that a report lists; more are counted."""
+"""Pairs of a group in a report; more are counted."""
 MOST_SNAPSHOTS = 100
 """Topics of a BCF file with a picture, the gravest. More: a larger file, and a tenth of a second
 each."""
@@ -35,7 +35,7 @@ GLOBAL_ID = re.compile(r"[0-9A-Za-z_$]{22}")
 
 
 class _Case(NamedTuple):
-    """A test case; outcome : element that says why it does not pass, or empty."""
+    """A test case; outcome : failure, error, skipped, or empty."""
 
     classname: str
     name: str
@@ -69,8 +69,8 @@ def write_reports(
 def junit(found: Clashes, groups: Iterable[Group], asked: Sequence[Kind]) -> bytes:
     """JUnit's XML: a test case for each group of the kinds asked for, and for each rule.
 
-    A group fails while a pair of it is open, and so does a rule that decides an open pair. A rule
-    that reaches no pair is skipped; pairs that were not looked at are an error.
+    A group fails while a pair of it is open, and so does the first rule about an open pair. A rule
+    without pairs is skipped; unmeasured pairs are an error.
     """
     findings = [_finding(group) for group in groups if group.kind in asked]
     if found.left:
@@ -153,7 +153,7 @@ def _counts(cases: Iterable[_Case]) -> dict[str, str]:
 
 
 def _markup(group: Group, topic: uuid.UUID, now: str, *, has_picture: bool) -> Element:
-    """What is said of a topic; the schema fixes the order of elements."""
+    """Topic with its text and view; the schema fixes the order of elements."""
     root, status = Element("Markup"), "Open" if group.is_open else "Closed"
     about = _child(root, "Topic", Guid=str(topic), TopicType="Clash", TopicStatus=status)
     _child(about, "Title", group.title())
@@ -170,7 +170,7 @@ def _markup(group: Group, topic: uuid.UUID, now: str, *, has_picture: bool) -> E
 
 
 def _viewpoint(topic: uuid.UUID, one: Clash, pair: tuple[Object, Object], up: int) -> Element:
-    """Parallel view of the place where a pair meets, both objects selected."""
+    """Parallel view of a pair's place, both objects selected."""
     root = Element("VisualizationInfo", Guid=str(uuid.uuid5(topic, "viewpoint")))
     components = _child(root, "Components")
     selection = _child(components, "Selection")
@@ -198,7 +198,7 @@ def _viewpoint(topic: uuid.UUID, one: Clash, pair: tuple[Object, Object], up: in
 
 
 def _child(parent: Element, tag: str, text: str = "", **attributes: str) -> Element:
-    """Append an element; what XML cannot hold is left out."""
+    """Append an element; unprintable characters become question marks."""
     said = {name: _printable(value) for name, value in attributes.items()}
     child = SubElement(parent, tag, said)
     child.text = _printable(text) or None

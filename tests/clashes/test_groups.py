@@ -49,6 +49,34 @@ def test_copies_of_a_pair_are_one_finding_wherever_they_are(tmp_path: Path) -> N
         assert (fewer.id, len(fewer.pairs)) == (group.id, 2)
 
 
+def test_the_id_of_a_pair_stays_where_lengths_are_halves_of_the_step(tmp_path: Path) -> None:
+    inch = 0.0254  # a sixteenth: 1587.5 times the step
+    place = (0.09, inch / 16, 3 * inch / 16)
+    boxes = {"a": (0.1, 0.1, 0.1, 0.0, 0.0, 0.0), "b": (0.1, 0.05, 0.07, *place)}
+    with made(tmp_path / "pair.db", boxes) as env:
+        found = {grouped(env)[0].id}
+        for angle in (0.3, 1.1, 2.7):
+            turn = trimesh.transformations.rotation_matrix(angle, (1.0, 2.0, 3.0))
+            for obj in env.objects():
+                env.move(obj.id, turn @ obj.transform)
+            found.add(grouped(env)[0].id)
+    assert len(found) == 1
+
+
+def test_groups_are_the_same_in_any_order_of_import(tmp_path: Path) -> None:
+    boxes: dict[str, tuple[float, ...]] = {}
+    for n in range(3):
+        boxes[f"bar{n}"] = (0.02, 0.02, 0.5 + 0.01 * n, 0.15 * n, 0.0, 0.0)
+        boxes[f"plate{n}"] = (0.8, 0.5 + 0.01 * n, 0.02, 0.0, 0.0, 0.1 * n)
+    with (
+        made(tmp_path / "one.db", boxes) as env,
+        made(tmp_path / "other.db", dict(reversed(boxes.items()))) as other,
+    ):
+        one, same = ({(group.id, group.part) for group in grouped(of)} for of in (env, other))
+    assert len(one) == 3
+    assert one == same
+
+
 def test_a_new_member_opens_an_accepted_group(tmp_path: Path) -> None:
     with hapticdb.open(row_of_boxes(tmp_path / "row.db", 5, 0.098)) as env:
         there = env.object(5).transform

@@ -7,6 +7,7 @@ searches. Acceptances are those of its pairs.
 import hashlib
 from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
+from heapq import heapify, heappop, heappush
 from typing import NamedTuple
 
 import numpy as np
@@ -21,6 +22,8 @@ from hapticdb.verdicts import Kind
 STEP = 1e-6
 """Rounding of relative placements, metres, and share of one in a rotation. Coarser: more pairs
 count as copies."""
+UNEVEN = 0.2718
+"""Share of a step by which rounding is off a half, where lengths in inches fall."""
 MANY = 3
 """Least number of others in the group of one part."""
 DIGITS = 10
@@ -102,7 +105,7 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
         for key, members in alike.items()
         if len(members) == 1 and members[0].kind != Kind.DUPLICATE
     }
-    for part, members in _one_against_many([*alone]):
+    for part, members in _one_against_many([*alone], objects):
         for one in members:
             del found[alone[one]]
         obj = objects[part]
@@ -115,20 +118,32 @@ def groups_of(store: Store, pairs: Sequence[Clash]) -> list[Group]:
     return sorted(groups, key=lambda group: (not group.is_open, gravity(group.pairs[0])))
 
 
-def _one_against_many(pairs: Sequence[Clash]) -> Iterator[tuple[int, list[Clash]]]:
-    """Objects with `MANY` others in one kind, the one with most first, and these pairs."""
+def _one_against_many(
+    pairs: Sequence[Clash], objects: Mapping[int, Object]
+) -> Iterator[tuple[int, list[Clash]]]:
+    """Objects with `MANY` others in one kind, the one with most first, and these pairs.
+
+    Of equally many the one first by its shape and name, whatever the ids.
+    """
+    shapes = sorted(objects.values(), key=lambda obj: (obj.digest, obj.name, obj.id))
+    rank = {obj.id: n for n, obj in enumerate(shapes)}
     met: dict[tuple[Kind, int], dict[int, Clash]] = {}
     for one in pairs:
         met.setdefault((one.kind, one.a), {})[one.b] = one
         met.setdefault((one.kind, one.b), {})[one.a] = one
-    while met:
-        kind, part = max(met, key=lambda key: (len(met[key]), -key[1]))
-        others = met.pop((kind, part))
+    most = [(-len(others), rank[key[1]], key) for key, others in met.items()]
+    heapify(most)
+    while most:
+        n, rank_of, key = heappop(most)
+        others = met[key]
         if len(others) < MANY:
-            return
+            continue
+        if len(others) < -n:  # others have taken pairs since
+            heappush(most, (-len(others), rank_of, key))
+            continue
         for other in others:
-            del met[kind, other][part]
-        yield part, list(others.values())
+            del met[key[0], other][key[1]]
+        yield key[1], list(others.values())
 
 
 def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str]:
@@ -151,7 +166,7 @@ def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.int64]:
-    return np.round(values / STEP).astype("<i8")
+    return np.floor(values / STEP + UNEVEN).astype("<i8")
 
 
 def _id(*parts: str) -> str:

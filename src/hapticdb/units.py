@@ -32,8 +32,10 @@ NAMES = {
     "yd": "yards",
 }
 """Each unit in words."""
-_LENGTH = re.compile(r"([-+]?(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d{1,2})?)\s*([a-zµ-]+)?", re.IGNORECASE)
-"""A number, and a unit where it has one."""
+_LENGTH = re.compile(
+    r"([-+]?(?:\d{1,99}(?:\.\d*)?|\.\d+)(?:e[-+]?\d{1,2})?)\s*([a-zµ-]+)?", re.IGNORECASE
+)
+"""A number below infinity, and a unit where it has one."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
 """Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
 _VOLUMES = ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³"))

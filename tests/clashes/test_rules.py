@@ -2,14 +2,16 @@
 
 from pathlib import Path
 
+import numpy as np
 import pytest
 
 import hapticdb
 from assemblies import row_of_boxes
 from hapticdb import Environment, accept_clash, find_clashes
-from hapticdb.clashes.result import Clashes
-from hapticdb.clashes.rules import parse_rule, read_rules, rule_text
+from hapticdb.clashes.result import Clash, Clashes, rule_for
+from hapticdb.clashes.rules import Rules, parse_rule, read_rules, rule_text
 from hapticdb.errors import FileError, UsageError
+from hapticdb.store.base import Object
 from hapticdb.store.pairs import Rule
 from hapticdb.transfer import copy_environment
 from hapticdb.verdicts import Kind
@@ -68,7 +70,9 @@ def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
         ("a is meant", "ONE in OTHER: overlap up to 0.3 mm is meant"),
         ("a in b: overlap up to 3 parsec is meant", "parsec"),
         ("a in b: overlap up to -1 mm is meant", "above 0"),
+        ("a in b: overlap up to " + "9" * 400 + " mm is meant", "no length"),
         ("a in b: overlaps is meant", "overlapping"),
+        ("a in b: , is meant", "''"),
         ("a in b: too near is meant", "touching"),
         ("a and b: keep away apart", "'away'"),
         ("a and \x1b: ignore", "ONE in OTHER"),
@@ -78,6 +82,25 @@ def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
     with pytest.raises(UsageError, match=word) as refusal:
         parse_rule(text)
     assert "\n" not in str(refusal.value)
+
+
+@pytest.mark.parametrize(
+    "name", ["12", "3,4", "a in b", "in b", "b and", "x:", "x: y", "it's", "[a]*", "a=b"]
+)
+def test_rule_for_reaches_the_pair(name: str) -> None:
+    objects = [
+        Object(other, "f", "d", np.eye(4), 1, np.zeros((2, 3)), {}, id=n)
+        for n, other in enumerate((name, "other", "else"), start=10)
+    ]
+    one = Clash(10, 11, name, "other", Kind.OVERLAPPING, MM, 2 * MM, (0.0,) * 6, "new")
+    rules = Rules([parse_rule(rule_for(one))], objects, "url")
+    assert rules.first([(10, 11), (10, 12), (11, 12)]).tolist() == [0, -1, -1]
+
+
+@pytest.mark.parametrize("name", ["'a'", "a\nb", "it's in b", "and b in c: ignore because it"])
+def test_rule_for_is_empty_where_no_rule_can_hold_a_name(name: str) -> None:
+    one = Clash(1, 2, name, "'b' in c", Kind.TOUCHING, 0.0, 0.0, (0.0,) * 6, "new")
+    assert rule_for(one) == ""
 
 
 def test_read_rules_keeps_the_order_of_a_file(tmp_path: Path) -> None:

@@ -1,13 +1,16 @@
 """Results of a search for clashes: metres, world frame."""
 
 import math
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Literal, NamedTuple
 
-from hapticdb.clashes.rules import MEANT, Rules, rule_text
+from hapticdb.clashes.rules import MEANT, Rules, parse_rule, rule_text
+from hapticdb.errors import UsageError
+from hapticdb.store.finding import NAME
 from hapticdb.store.pairs import KIND, KeptPairs, PairRow, Rule, Status
 from hapticdb.units import length_text, notebook_html, volume_text
 from hapticdb.verdicts import REPORTED, Kind
@@ -71,12 +74,21 @@ class Clash(NamedTuple):
 
 
 def rule_for(one: Clash) -> str:
-    """Rule to mean a pair, up to a tenth more than its depth; empty for one too near."""
+    """Rule to mean a pair, up to a tenth more than its depth.
+
+    Empty for a pair that is too near, and for names that a rule cannot hold.
+    """
     if one.kind == Kind.TOO_NEAR or not one.a_name or not one.b_name:
         return ""
     depth = one.at_most if one.kind == Kind.OVERLAPPING else None
     kinds = MEANT if one.kind in MEANT else (one.kind,)
-    return rule_text(Rule(one.a_name, one.b_name, "meant", kinds, depth and 1.1 * depth))
+    names = (one.a_name, one.b_name)
+    a, b = (NAME + name if re.fullmatch(r"[\d, ]+", name) else name for name in names)
+    text = rule_text(Rule(a, b, "meant", kinds, depth and 1.1 * depth))
+    try:
+        return text if parse_rule(text)[:4] == (a, b, "meant", kinds) else ""
+    except UsageError:
+        return ""
 
 
 Known = Mapping[int, tuple[str, str]]

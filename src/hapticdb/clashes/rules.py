@@ -39,8 +39,8 @@ def parse_rule(text: str, place: str = "") -> Rule:
     found = GRAMMAR.fullmatch(text.strip())
     if found is None or not text.isprintable():
         raise UsageError(f"{place}: {FORM}")
-    one, other = (found[n].strip("'") for n in (1, 2))
-    kinds = [kind.strip() for kind in (found["kinds"] or "").split(",") if kind]
+    one, other = (re.sub("^'([^']+)'$", r"\1", found[n]) for n in (1, 2))
+    kinds = [kind.strip() for kind in found["kinds"].split(",")] if found["kinds"] else []
     if kinds == ["overlap"]:
         kinds = [*MEANT]
     if unknown := [kind for kind in kinds if kind not in MEASURED]:
@@ -76,7 +76,8 @@ def read_rules(path: str | Path) -> list[Rule]:
 def rule_text(rule: Rule) -> str:
     """Rule as `parse_rule` reads it, without its reason."""
     one, other = (
-        f"'{words}'" if re.search(" in | and |: ", words) else words for words in rule[:2]
+        f"'{words}'" if re.search("^in |^and | in | and | in$| and$|:$|: ", words) else words
+        for words in rule[:2]
     )
     if rule.says == "ignore":
         return f"{one} and {other}: ignore"

@@ -168,6 +168,33 @@ def test_what_cannot_be_is_refused_in_one_line(run: Run, meeting: Path) -> None:
     refused(run("clashes", meeting, "--rules", "none.toml"), "none.toml")
 
 
+def test_files_are_refused_before_the_search_and_leave_nothing(
+    run: Run, meeting: Path, tmp_path: Path
+) -> None:
+    nowhere = ("--junit", tmp_path / "a.xml", "--bcf", tmp_path / "none" / "a.bcfzip")
+    refused(run("clashes", meeting, *nowhere), "--bcf: cannot write", "No such file")
+    assert "2 new" in run("clashes", meeting)[1]
+    refused(run("clashes", meeting, "--junit", "one.xml", "--bcf", "one.xml"), "File exists")
+    refused(run("clashes", meeting, "--csv", "one.xml", "--junit", "one.xml"), "File exists")
+    refused(run("clashes", tmp_path / "no.db", "--junit", "one.xml"), "no environment")
+    assert not [*tmp_path.rglob("*.xml"), *tmp_path.rglob("*.part")]
+
+
+def test_accepting_needs_a_reason_and_takes_no_other_work(
+    run: Run, meeting: Path, tmp_path: Path
+) -> None:
+    (group,) = {
+        row["group"]
+        for row in map(json.loads, run("clashes", meeting, "--json")[1].splitlines())
+        if row["kind"] == "overlapping"
+    }
+    refused(run("clashes", meeting, "--group", group, "--because", " "), "an empty reason")
+    given = ("--accept", "1", "2", "--because", "a press fit")
+    refused(run("clashes", meeting, *given, "--rule", "1 and 2: ignore"), "takes no rules")
+    refused(run("clashes", meeting, *given, "--csv", tmp_path / "a.csv"), "writes no report")
+    assert run("clashes", meeting)[0] == 1
+
+
 def test_volumes_are_told_and_a_floor_decides(run: Run, meeting: Path, tmp_path: Path) -> None:
     code, out, _ = run("clashes", meeting, "--least-volume", "99cm3", "--csv", tmp_path / "a.csv")
     assert code == 1

@@ -123,8 +123,6 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     UsageError
         If no such pair is known, or the reason is empty.
     """
-    if because is not None and not because.strip():
-        raise UsageError("an empty reason: say why the pair is accepted")
     ones, others = ({obj.id: obj for obj in find_objects(env.store, words)} for words in (a, b))
     known = {obj.id: (obj.name, obj.digest) for obj in (ones | others).values()}
     rows = [
@@ -143,6 +141,8 @@ def accept_pairs(
     store: Store, pairs: Iterable[tuple[int, int]], known: Known, because: str | None
 ) -> None:
     """Accept pairs of ids, or take it back for None; known : names and digests of the objects."""
+    if because is not None and not because.strip():
+        raise UsageError("an empty reason: say why the pair is accepted")
     for a, b in pairs:
         store.accept_pair(a, b, because, None if because is None else shapes_of(known, a, b))
 

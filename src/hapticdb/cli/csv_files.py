@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, TextIO
 
 from hapticdb.cli import render
-from hapticdb.errors import FileError, UsageError
+from hapticdb.errors import FileError, HapticDBError, UsageError
 
 if TYPE_CHECKING:
     import numpy as np
@@ -108,7 +108,7 @@ def open_csv(target: str | None, option: str, columns: Sequence[str]) -> Iterato
     else:
         with (
             new_file(Path(target), option) as part,
-            part.open("x", encoding="utf-8", newline="") as stream,
+            part.open("w", encoding="utf-8", newline="") as stream,
         ):
             made = CsvWriter(stream, columns)
             yield made
@@ -122,9 +122,10 @@ def new_file(target: Path, option: str) -> Iterator[Path]:
         raise UsageError(f"{option} '{target}': give the name of a file that is not there yet")
     part = target.with_name(f".{target.name}.{os.getpid()}.part")
     try:
+        part.touch(exist_ok=False)  # before the work: a folder may be missing
         yield part
         part.replace(target)
-    except BrokenPipeError:  # of standard output
+    except (BrokenPipeError, HapticDBError):  # of standard output, or of no file
         raise
     except OSError as error:
         if error.filename not in {None, str(part)}:

@@ -73,5 +73,5 @@ def _arrays(path: Path) -> "Iterator[Callable[[Columns], None]]":
     pieces: list[Columns] = []
     yield pieces.append
     whole = {name: np.concatenate([one[name] for one in pieces]) for name in pieces[0]}
-    with path.open("xb") as file:
+    with path.open("wb") as file:
         np.savez(file, **whole)  # type: ignore[arg-type]

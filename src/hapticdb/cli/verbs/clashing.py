@@ -206,6 +206,8 @@ def clashes(
     """Find every pair of objects that are near; the help text is `HELP`."""
     if csv == STDOUT and json:
         raise UsageError("--csv - and --json: only one may be standard output")
+    if because is not None and (csv or html or junit or bcf or (accept and (rules or rule))):
+        raise UsageError("--because writes no report, and --accept takes no rules: leave them out")
     if accept is not None or (because is not None and group is None):
         raise typer.Exit(_accept(url, accept, because, json=json))
     kinds = _checked(kind)

@@ -72,6 +72,7 @@ def judge(
         if gap + error <= contact or not error:
             return _told(Kind.TOUCHING, near, error)
         return _told(Kind.NOT_KNOWN, near, error)
+    separation.note_nearest(pose, near.pairs)
     freed = _freed(separation, pose, contact - error)
     if freed == Kind.TOUCHING or (freed == Kind.INSIDE and not error):
         return _told(freed, near, error)

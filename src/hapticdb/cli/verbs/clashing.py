@@ -226,9 +226,8 @@ def clashes(
     ):
         _put_rules(env, rules, rule or [], within)
         found = _with_volumes(env, least_volume, find_clashes(
-                env, within=within, contact=contact, of=of or (), against=against or (),
-                seconds=seconds, budget=budget_bytes(budget), progress=progress, on=on,
-            ))  # fmt: skip
+                env, within=within, contact=contact, of=of or (), against=against or (), on=on,
+                seconds=seconds, budget=budget_bytes(budget), progress=progress))  # fmt: skip
         told = _Told.of(env, found, kinds, group)
         if because is not None:
             raise typer.Exit(told.accept(env, because, json=json))

@@ -238,6 +238,8 @@ class Separation:
         far = clearance + base.radius
         first, second = self._blocking.T
         is_open = ~any_near(base.object.corners[first], base.tool.corners[second], poses, far)
+        if not is_open.any():
+            return
         poses, shifts = poses[is_open], shifts[is_open]
         found = nearest(base.object, base.tool, poses, np.full(len(poses), far), far)
         is_free = found.pairs[:, 0] < 0

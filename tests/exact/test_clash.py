@@ -110,3 +110,16 @@ def test_open_sheets() -> None:
     found = judged(flat, block((2, 2, 2)), (0, 0, 0.7))
     assert found.kind == "overlapping"
     assert found.at_least == pytest.approx(0.3 * MM, abs=0.01 * MM)
+
+
+@pytest.mark.parametrize("turn", TURNS)
+def test_the_deepest_place_of_equal_shapes_is_in_both(turn: Floats) -> None:
+    one, same = block((100, 20, 20)), block((100, 20, 20))
+    pose = np.eye(4)
+    pose[:3, :3], pose[:3, 3] = turn, MM * np.array([30.0, 8.0, 5.0])
+    found, apart = (judge(one, other, pose, WITHIN, CONTACT) for other in (one, same))
+    assert found.kind == "overlapping"
+    np.testing.assert_array_equal(found.on_a, apart.on_a)
+    half = MM * np.array([50.0, 10.0, 10.0]) + 1e-9
+    assert (np.abs(found.on_a) <= half).all()
+    assert (np.abs(pose[:3, :3].T @ (found.on_a - pose[:3, 3])) <= half).all()

@@ -158,7 +158,7 @@ class Separation:
             )
             if found:
                 place = place + other.interior.origin
-                place = place if other is self._object else pose[:3, :3] @ place + pose[:3, 3]
+                place = place if to is pose else pose[:3, :3] @ place + pose[:3, 3]
                 deepest = found, place
         return deepest
 

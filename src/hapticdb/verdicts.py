@@ -24,7 +24,7 @@ class Kind(StrEnum):
     @property
     def gravity(self) -> int:
         """Rank, 0 of the gravest."""
-        return list(Kind).index(self)
+        return _GRAVITY[self]
 
     @property
     def is_free(self) -> bool:
@@ -32,6 +32,7 @@ class Kind(StrEnum):
         return self in {Kind.TOUCHING, Kind.APART, Kind.FAR}
 
 
+_GRAVITY = {kind: n for n, kind in enumerate(Kind)}
 REPORTED = tuple(Kind)[:-1]
 """Kinds of pairs within the distance of a search."""
 

@@ -81,7 +81,7 @@ class PointShell:
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
     """(N,) how far each point was drawn inward from the surface, metres; zeros unless given."""
     chord: float = field(default=0.0, repr=False)
-    """Chord error of the surface, metres: of the tessellations of STEP files; not saved."""
+    """Chord error of the surface, metres: of the tessellations of STEP and IFC files; not saved."""
     has_unit: bool = field(default=False, repr=False)
     """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
     named: tuple[str, ...] = field(default=(), repr=False)

@@ -86,7 +86,7 @@ Clear by a gap: no surface meets the tool's. Slides: it moves along what it
 touches where the path starts, and hits nothing. Overlaps: it hits nothing, but
 the part overlaps others by more than --contact and --overlap where it stands.
 Hits: a surface is met, what is touched is gone into, or one lies inside the
-other. Not decided: --seconds were over, or the chord error of a STEP file leaves
+other. Not decided: --seconds were over, or chord errors (STEP, IFC) leave
 it open. The triangles decide, between the poses, too; the gap is right to 0.01 mm
 or 1 %.
 

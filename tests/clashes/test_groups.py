@@ -130,3 +130,17 @@ def test_duplicates_are_one_finding_that_is_not_measured(place: Place, tmp_path:
         find_clashes(env)
         (row,) = (row for row in env.store.pairs() if (row.a, row.b) == (1, 2))
         assert row.kind != "duplicate"
+
+
+def test_duplicates_may_be_a_micrometre_apart_and_not_more(tmp_path: Path) -> None:
+    boxes = {f"copy{n}": (0.1, 0.1, 0.1, 0.2, 0.3, 0.4) for n in range(5)}
+    with made(tmp_path / "dup.db", boxes) as env:
+        for n in range(1, 5):
+            env.shift([n], (n * 1e-7, 0.0, 0.0))
+        (group,) = grouped(env)
+        assert (group.kind, group.n_parts, len(group.pairs)) == ("duplicate", 5, 10)
+        env.shift([5], (0.0, 2e-6, 0.0))
+        turn = trimesh.transformations.rotation_matrix(1e-4, (0.0, 0.0, 1.0), (0.2, 0.3, 0.4))
+        env.move(4, turn @ env.object(4).transform)  # corners move by 7 um
+        (group,) = (one for one in grouped(env) if one.kind == "duplicate")
+        assert {i for one in group.pairs for i in one[:2]} == {1, 2, 3}

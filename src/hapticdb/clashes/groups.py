@@ -156,9 +156,11 @@ def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str
     ends = zip(*((one.a, one.b) for one in pairs), strict=True) if pairs else ((), ())
     poses = [np.array([placed[i][1] for i in end]).reshape(-1, 4, 4) for end in ends]
     there, back = (_rounded(relative_poses(*way)) for way in (poses, poses[::-1]))
+    first: dict[int, int] = {}  # duplicates, by the least id of their place
     for n, one in enumerate(pairs):
         if one.kind == Kind.DUPLICATE:
-            yield _id(one.kind, shapes[one.a], _rounded(poses[0][n]).tobytes().hex())
+            at = first.setdefault(one.b, first.get(one.a, one.a))
+            yield _id(one.kind, shapes[at], _rounded(placed[at][1]).tobytes().hex())
             continue
         a, b = shapes[one.a], shapes[one.b]
         ways = (a, b, there[n].tobytes().hex()), (b, a, back[n].tobytes().hex())

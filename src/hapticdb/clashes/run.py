@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import closing
 from functools import partial
-from itertools import chain
+from itertools import chain, product
 from typing import NamedTuple
 
 import numpy as np
@@ -43,6 +43,9 @@ SAME = 1e-9
 ROUNDING = 2.0**-40
 """Rounding of the relative placement of two shapes, metres, and share of one in a rotation.
 Coarser: more pairs are placed alike, and lengths are less exact."""
+ONE_PLACE = 1e-6
+"""Greatest distance of any place of a part from that of its duplicate, metres: exports in single
+precision. Larger: thin sheets in a stack are duplicates."""
 DUPLICATE = Judged(Kind.DUPLICATE, 0.0, 0.0, np.zeros(3), np.zeros(3))
 """Judgement of equal shapes at one place."""
 PIECE = 128
@@ -421,10 +424,12 @@ def _is_asked(a: int, b: int, of: set[int] | None, against: set[int] | None) -> 
 
 
 def _are_same(one: Object, other: Object) -> bool:
-    """Whether equal shapes are at one place, to `ROUNDING`."""
-    return one.digest == other.digest and bool(
-        (np.abs(one.transform - other.transform) <= ROUNDING).all()
-    )
+    """Whether equal shapes are at one place, to `ONE_PLACE`."""
+    if one.digest != other.digest or (np.abs(one.bounds - other.bounds) > ONE_PLACE).any():
+        return False
+    change = other.transform @ np.linalg.pinv(one.transform) - np.eye(4)
+    corners = np.array([*product(*one.bounds.T, (1.0,))])
+    return bool(np.linalg.norm(corners @ change[:3].T, axis=1).max() <= ONE_PLACE)
 
 
 def _compared(row: PairRow, old: PairRow | None) -> PairRow:

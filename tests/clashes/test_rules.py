@@ -54,6 +54,8 @@ def reach(found: Clashes) -> list[tuple[int, int]]:
         ),
         ("a in b: inside, touching is meant",
          Rule("a", "b", "meant", (Kind.INSIDE, Kind.TOUCHING))),
+        ("a in b: overlap, duplicate is meant",
+         Rule("a", "b", "meant", (*MEANT, Kind.DUPLICATE))),
         ("a:0:x and b c,d: keep 2mm apart", Rule("a:0:x", "b c,d", "apart", (), 2 * MM)),
         ("a and material=steel: ignore", Rule("a", "material=steel", "ignore")),
         ("'a and b: c' in d: overlap is meant", Rule("a and b: c", "d", "meant", MEANT)),

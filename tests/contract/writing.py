@@ -9,7 +9,12 @@ import numpy as np
 import pytest
 
 from contract.case import StoreCase
-from hapticdb.errors import ConflictError, EnvironmentExistsError, ObjectNotFoundError
+from hapticdb.errors import (
+    ConflictError,
+    EnvironmentExistsError,
+    ObjectNotFoundError,
+    UsageError,
+)
 from hapticdb.ingest.layout import rows_of_voxels
 from hapticdb.store.base import Object, Rows, Store
 from hapticdb.store.pairs import Mark, PairRow, Rule
@@ -293,5 +298,11 @@ class WritingContract(StoreCase):
         store.put_rules([meant, *others])
         assert store.rules() == (meant, *others)
         store.put_rules(others)
+        for wrong in (
+            meant._replace(length=float("inf")), meant._replace(kinds=()),
+            others[0]._replace(length=None), others[0]._replace(kinds=(Kind.INSIDE,)),
+        ):  # fmt: skip
+            with pytest.raises(UsageError, match="rule 2"):
+                store.put_rules([meant, wrong])
         assert store.rules() == others
         assert store.revision() == revision

@@ -40,9 +40,8 @@ def parse_rule(text: str, place: str = "") -> Rule:
     if found is None or not text.isprintable():
         raise UsageError(f"{place}: {FORM}")
     one, other = (re.sub("^'([^']+)'$", r"\1", found[n]) for n in (1, 2))
-    kinds = [kind.strip() for kind in found["kinds"].split(",")] if found["kinds"] else []
-    if kinds == ["overlap"]:
-        kinds = [*MEANT]
+    named = [kind.strip() for kind in found["kinds"].split(",")] if found["kinds"] else []
+    kinds = [one for kind in named for one in (MEANT if kind == "overlap" else (kind,))]
     if unknown := [kind for kind in kinds if kind not in MEASURED]:
         known = ", ".join(sorted(MEASURED))
         raise UsageError(f"{place}: {unknown[0]!r}: give 'overlap', or kinds: {known}")

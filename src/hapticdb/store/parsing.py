@@ -297,6 +297,7 @@ def rule_of(url: str, row: Sequence[Any]) -> Rule:
     if not (
         is_sound
         and says in SAYS
+        and bool(named) == (says == "meant")
         and all(isinstance(one, str) for one in row[:2])
         and isinstance(because, str)
     ):

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Literal, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from hapticdb.errors import DamagedError, UsageError
 from hapticdb.grid import Grid
 from hapticdb.store import parsing
 from hapticdb.store.base import (
@@ -339,11 +340,17 @@ class Tables(ABC):
         self._save(text, (because, shapes, a, b))
 
     def put_rules(self, rules: Sequence[Rule]) -> None:
+        rows = [(*rule[:3], ",".join(rule.kinds), *rule[4:]) for rule in rules]
+        for n, row in enumerate(rows, start=1):
+            try:
+                parsing.rule_of(self.url, row)
+            except DamagedError:
+                raise UsageError(f"rule {n}, {row}: give what parse_rule returns") from None
+
         def work() -> None:
             self._do("DELETE FROM rule")
-            for n, rule in enumerate(rules, start=1):
-                values = (n, *rule[:3], ",".join(rule.kinds), *rule[4:])
-                self._do("INSERT INTO rule VALUES (%s, %s, %s, %s, %s, %s, %s)", values)
+            for n, row in enumerate(rows, start=1):
+                self._do("INSERT INTO rule VALUES (%s, %s, %s, %s, %s, %s, %s)", (n, *row))
 
         self._alone(work)
 

@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from pathlib import Path
 
 import numpy as np
+import pytest
 import trimesh
 
 import hapticdb
@@ -61,6 +62,23 @@ def test_the_id_of_a_pair_stays_where_lengths_are_halves_of_the_step(tmp_path: P
                 env.move(obj.id, turn @ obj.transform)
             found.add(grouped(env)[0].id)
     assert len(found) == 1
+
+
+@pytest.mark.parametrize("scale", [(1.0, 2.0, 0.5), (-1.0, 1.0, 1.0), (-2.0, 1.5, 1.0)])
+def test_the_id_of_a_stretched_pair_stays_where_it_is_turned(
+    tmp_path: Path, scale: tuple[float, float, float]
+) -> None:
+    boxes = {"a": (0.1, 0.1, 0.1, 0.0, 0.0, 0.0), "b": (0.1, 0.05, 0.07, 0.05, 0.01, 0.02)}
+    with made(tmp_path / "pair.db", boxes) as env:
+        env.move(1, np.diag([*scale, 1.0]))
+        (group,) = grouped(env)
+        turn = trimesh.transformations.rotation_matrix(0.7, (1.0, 2.0, 3.0))
+        for obj in env.objects():
+            env.move(obj.id, turn @ obj.transform)
+        (again,) = grouped(env)
+        assert again.id == group.id
+        env.move(1, turn @ np.diag([*scale[::-1], 1.0]))
+        assert group.id not in {one.id for one in grouped(env)}
 
 
 def test_groups_are_the_same_in_any_order_of_import(tmp_path: Path) -> None:

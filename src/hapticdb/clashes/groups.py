@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.clashes.result import Clash, gravity
-from hapticdb.exact.shapes import relative_poses, rigid_placement
+from hapticdb.exact.shapes import relative_poses
 from hapticdb.store.base import Object, Store
 from hapticdb.units import length_text, volume_text
 from hapticdb.verdicts import Kind
@@ -148,7 +148,7 @@ def _one_against_many(
 
 def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str]:
     """Ids of pairs, equal for copies, and for duplicates at one place."""
-    placed = {i: rigid_placement(obj.transform) for i, obj in objects.items()}
+    placed = {i: _parted(obj.transform) for i, obj in objects.items()}
     shapes = {
         i: f"{objects[i].digest} {_rounded(linear).tobytes().hex()}"
         for i, (linear, _) in placed.items()
@@ -165,6 +165,14 @@ def _keys(pairs: Sequence[Clash], objects: Mapping[int, Object]) -> Iterator[str
         a, b = shapes[one.a], shapes[one.b]
         ways = (a, b, there[n].tobytes().hex()), (b, a, back[n].tobytes().hex())
         yield _id(one.kind, *min(ways))
+
+
+def _parted(transform: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Stretch (3, 3) and rigid placement (4, 4): a turn of the world leaves the stretch."""
+    left, sizes, right = np.linalg.svd(transform[:3, :3])
+    sign, pose = np.sign(np.linalg.det(left @ right)), np.eye(4)
+    pose[:3, :3], pose[:3, 3] = sign * (left @ right), transform[:3, 3]
+    return sign * (right.T * sizes) @ right, pose
 
 
 def _rounded(values: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -5,7 +5,9 @@ import csv
 import html
 import json
 import re
+import zipfile
 from pathlib import Path
+from typing import Any
 
 import imageio.v3 as iio
 import numpy as np
@@ -15,6 +17,8 @@ import hapticdb
 from assemblies import row_of_boxes
 from command_line import Run, refused
 from hapticdb.cli.verbs.clashing import COLUMNS
+from hapticdb.pictures import reports
+from hapticdb.pictures.clashes import snapshot
 
 
 @pytest.fixture
@@ -178,6 +182,20 @@ def test_files_are_refused_before_the_search_and_leave_nothing(
     refused(run("clashes", meeting, "--csv", "one.xml", "--junit", "one.xml"), "File exists")
     refused(run("clashes", tmp_path / "no.db", "--junit", "one.xml"), "no environment")
     assert not [*tmp_path.rglob("*.xml"), *tmp_path.rglob("*.part")]
+
+
+def test_reports_are_of_one_revision_while_others_remove_objects(
+    run: Run, meeting: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def removing(*given: Any) -> bytes:  # noqa: ANN401 - passed on
+        with hapticdb.open(meeting) as other:
+            other.remove(2)
+        return snapshot(*given)
+
+    monkeypatch.setattr(reports, "snapshot", removing)
+    assert run("clashes", meeting, "--kind", "overlapping", "--bcf", "meet.bcf")[0] == 1
+    assert len(zipfile.ZipFile("meet.bcf").namelist()) == 4
+    assert "2 gone" in run("clashes", meeting)[1]
 
 
 def test_accepting_needs_a_reason_and_takes_no_other_work(

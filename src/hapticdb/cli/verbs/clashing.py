@@ -204,8 +204,7 @@ def clashes(
     json: JsonOption = False,
 ) -> None:
     """Find every pair of objects that are near; the help text is `HELP`."""
-    if csv == STDOUT and json:
-        raise UsageError("--csv - and --json: only one may be standard output")
+    _check_outputs(csv, json=json)
     if because is not None and (csv or html or junit or bcf or (accept and (rules or rule))):
         raise UsageError("--because writes no report, and --accept takes no rules: leave them out")
     if accept is not None or (because is not None and group is None):
@@ -225,15 +224,21 @@ def clashes(
         render.bar("measuring", "pairs") as progress,
     ):
         _put_rules(env, rules, rule or [], within)
-        found = _with_volumes(env, least_volume, find_clashes(
+        found = find_clashes(
                 env, within=within, contact=contact, of=of or (), against=against or (), on=on,
-                seconds=seconds, budget=budget_bytes(budget), progress=progress))  # fmt: skip
-        told = _Told.of(env, found, kinds, group)
+                seconds=seconds, budget=budget_bytes(budget), progress=progress)  # fmt: skip
+        with env.store.snapshot():  # others may remove objects meanwhile
+            told = _Told.of(env, _with_volumes(env, least_volume, found), kinds, group)
+            told.write(env, kinds, table, files)
         if because is not None:
             raise typer.Exit(told.accept(env, because, json=json))
-        told.write(env, kinds, table, files)
     told.say(url, json=json, is_table=csv != STDOUT, is_grouped=group is None and not all_)
-    raise typer.Exit(_exit_code(found, kinds))
+    raise typer.Exit(_exit_code(told.found, kinds))
+
+
+def _check_outputs(csv: str | None, *, json: bool) -> None:
+    if csv == STDOUT and json:
+        raise UsageError("--csv - and --json: only one may be standard output")
 
 
 def _with_volumes(env: "Environment", least: float | None, found: "Clashes") -> "Clashes":

@@ -55,6 +55,11 @@ def test_an_accepted_pair_gives_exit_code_0(run: Run, meeting: Path) -> None:
     assert run("clashes", meeting, "--kind", "touching")[0] == 1
     assert run("clashes", meeting, "--accept", "1", "2", "--because", "")[0] == 0
     assert run("clashes", meeting)[0] == 1
+    assert run("clashes", meeting, "--accept", "1", "2", "--because", "a press fit")[0] == 0
+    with hapticdb.open(meeting) as env:
+        env.shift([1], (0.0, 0.0, 0.2))
+    (line,) = (line for line in run("clashes", meeting, "--all")[1].splitlines() if "box0" in line)
+    assert line.rstrip().endswith("gone")
 
 
 def test_rows_are_written_as_csv(run: Run, meeting: Path, tmp_path: Path) -> None:

@@ -107,12 +107,12 @@ def accepted(row: PairRow, known: Known) -> str | None:
 
 def clash_of(row: PairRow, status: Status, known: Known) -> Clash:
     """Clash of a row."""
-    because = accepted(row, known)
+    because = None if status == "gone" else accepted(row, known)
     a_name, b_name = (known[i][0] if i in known else None for i in (row.a, row.b))
     return Clash(
         row.a, row.b, a_name, b_name, Kind.APART if status == "gone" else row.kind, row.at_least,
         row.at_most, row.place,
-        "accepted" if because is not None and status != "gone" else status, because,
+        status if because is None else "accepted", because,
     )  # fmt: skip
 
 

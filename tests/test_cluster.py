@@ -196,7 +196,7 @@ def test_a_scheduler_that_is_not_there_is_told_in_a_line(
     refused(run(*asked, "--on", "tcp://127.0.0.1:1"), "give --out, too")
     refused(run(*asked, "--on", "gpu", "--out", "a.npz"), "device 'gpu'")
     refused(run("extract", scene, "box1", "--on", "tcp://127.0.0.1:1"), "--disassemble")
-    refused(run("clashes", scene, "--of", "1", "--turn", "z", "--on", "tcp://x:1"), "no --html")
+    refused(run("clashes", scene, "--of", "1", "--turn", "z", "--on", "tcp://x:1"), "--on")
     with pytest.raises(UsageError, match="threads of their own"):
         ImportOptions(jobs=2, on=address)
     monkeypatch.setitem(sys.modules, "distributed", None)

@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 
 import hapticdb
-from assemblies import row_of_boxes
+from assemblies import ball, box, row_of_boxes, write_obj
 from command_line import Run, refused
 from hapticdb.cli.verbs.clashing import COLUMNS
 from hapticdb.pictures import reports
@@ -122,6 +122,13 @@ def test_duplicates_give_exit_code_1(run: Run, tmp_path: Path) -> None:
     assert (code, "cube0, 40 at one place" in out, "780 duplicate" in out) == (1, True, True)
     assert out.count(" 1 duplicate") == 1
     assert run("clashes", path, "--kind", "inside")[0] == 0
+
+
+def test_a_buried_part_gives_exit_code_1(run: Run, tmp_path: Path) -> None:
+    parts = {"wall": box((0, 0, 0), (1, 1, 1)), "pipe": ball((0.5, 0.5, 0.5), 0.1)}
+    hapticdb.import_files(tmp_path / "a.db", [write_obj(tmp_path / "a.obj", parts)])
+    code, out, _ = run("clashes", tmp_path / "a.db")
+    assert (code, "inside" in out) == (1, True)
 
 
 def test_a_page_needs_no_other_file_and_shows_names_as_they_are(run: Run, tmp_path: Path) -> None:

@@ -16,8 +16,8 @@ from hapticdb.units import length_text, notebook_html, volume_text
 from hapticdb.verdicts import REPORTED, Kind
 
 Shown = Literal[Status, "accepted", "meant", "not looked at"]
-ASKED = REPORTED[:3]
-"""Default kinds of findings."""
+ASKED = REPORTED[:4]
+"""Default kinds of findings: what shares material with something else, or is too near it."""
 
 MOST_SHOWN = 20
 """Pairs in a notebook; more are counted. Larger: a longer table."""

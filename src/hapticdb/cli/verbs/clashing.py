@@ -60,7 +60,7 @@ KindOption = Annotated[
         "--kind",
         metavar="KIND",
         help="Kinds that are told, and that exit code 1 stands for. Give it again for more.",
-        show_default="all are told; overlapping, duplicate and too near give exit code 1",
+        show_default="all are told; overlapping, duplicate, too near and inside give exit code 1",
     ),
 ]
 SecondsOption = Annotated[
@@ -212,7 +212,7 @@ def clashes(
     kinds = _checked(kind)
     if poses is not None or turn is not None:
         if any((html, junit, bcf, seconds, on, rules, rule, group)) or not of:
-            raise UsageError("--poses and --turn take --of, --csv; no report, rule, --seconds")
+            raise UsageError("--poses and --turn: give --of; no report, rule, --seconds, --on")
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
     from hapticdb.clashes.run import find_clashes
@@ -314,6 +314,8 @@ def _moved(
     csv: str | None, *, json: bool,
 ) -> int:  # fmt: skip
     """Print when parts that move meet others; returns the exit code."""
+    from hapticdb.clashes.result import ASKED
+
     with open_csv(csv, "--csv", MEETING_COLUMNS) as table:
         told = [one for one in motion() if not kinds or one.kind in kinds]
         if table:
@@ -328,7 +330,7 @@ def _moved(
         if rows:
             render.table(("id>", "object", f"from {unit}>", "to>", "are", "by at least>"), rows)
         render.say(f"{render.counted(len(told), 'meeting')} on the way")
-    return int(any(one.kind in (kinds or (Kind.OVERLAPPING,)) for one in told))
+    return int(any(one.kind in (kinds or ASKED) for one in told))
 
 
 def _meetings(

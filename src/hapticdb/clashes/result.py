@@ -60,7 +60,7 @@ class Clash(NamedTuple):
         """Write the gap, or the depth and the volume: exact, or a bound."""
         if self.volume is not None:
             return f"{self._replace(volume=None).length_text()}, {volume_text(self.volume)}"
-        if self.is_left:
+        if self.is_left or self.status == "gone":
             return "-"
         at_least = length_text(self.at_least)
         if self.kind != Kind.OVERLAPPING:

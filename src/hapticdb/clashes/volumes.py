@@ -11,7 +11,7 @@ from hapticdb.clashes.result import Clashes
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 from hapticdb.ingest.geometry import parts_of
 from hapticdb.mesh.part import Part
-from hapticdb.pointshell.orientation import join_corners, orient
+from hapticdb.pointshell.orientation import faces_of, orient
 from hapticdb.store.base import Object, Store
 from hapticdb.verdicts import Kind
 
@@ -76,9 +76,9 @@ def _solid(part: Part) -> "Manifold | None":
         surface = orient(triangles)
     except UsageError:  # no triangle, or no area
         return None
+    corners = faces_of(triangles)
     first, second, third = np.moveaxis(surface.triangles, 1, 0)
     inward = np.einsum("fk,fk->f", np.cross(second - first, third - first), surface.normals)
-    corners = join_corners(triangles - triangles.min(axis=(0, 1)))
     at = np.unique(corners, return_index=True)[1]
     turned = surface.faces[inward > 0.0]
     corners[turned] = corners[turned, ::-1]

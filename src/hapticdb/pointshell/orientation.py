@@ -54,8 +54,10 @@ class _Sides(NamedTuple):
     is_flipped: NDArray[np.bool_]  # (F,) whether the file winds the face the other way
 
 
-def orient(triangles: Floats) -> Surface:
+def orient(triangles: Floats, faces: Ints | None = None) -> Surface:
     """Find the inner side of each triangle (F, 3, 3), for any winding.
+
+    faces (F, 3) : as of `faces_of`, if they are known.
 
     Faces that share edges get one winding, and lines through them vote on the side: if a line
     crosses a body an odd number of times ahead, it starts inside the body. Each closed body votes
@@ -67,10 +69,9 @@ def orient(triangles: Floats) -> Surface:
         raise UsageError(f"{n_bad} triangles have a corner that is not finite: repair the mesh")
     if len(triangles) == 0:
         raise UsageError("no triangles: a tool needs a surface")
-    corners = triangles.reshape(-1, 3)
-    origin = corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0
+    origin = _middle_of(triangles)
     local = triangles - origin
-    faces = join_corners(local)
+    faces = join_corners(local) if faces is None else faces
     kept, walls = _drop_repeated(faces)
     sides, is_even = _sides_of(faces[kept], local[kept])
     outer = walls[~_are_within(sides, faces[kept], faces[walls], local[walls])]
@@ -124,6 +125,16 @@ def _edges_of(faces: Ints) -> _Edges:
     keys = np.minimum(tail, head) * (faces.max(initial=0) + 1) + np.maximum(tail, head)
     _, number, uses = np.unique(keys, return_inverse=True, return_counts=True)
     return _Edges(number.astype(np.int64), tail < head, uses.astype(np.int64))
+
+
+def _middle_of(triangles: Floats) -> Floats:
+    corners = triangles.reshape(-1, 3)
+    return np.asarray(corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0)
+
+
+def faces_of(triangles: Floats) -> Ints:
+    """Numbers (F, 3) of the corners of triangles (F, 3, 3), joined near their middle."""
+    return join_corners(triangles - _middle_of(triangles))
 
 
 def join_corners(triangles: Floats) -> Ints:

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces.sides import TriangleTree, normals_of, triangle_tree
 from hapticdb.pointshell.coverage import Interior
-from hapticdb.pointshell.orientation import components, join_corners, orient
+from hapticdb.pointshell.orientation import components, faces_of, orient
 
 if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
@@ -54,7 +54,7 @@ class CollisionShape:
         if self.is_cloud or self.radius:
             return None
         try:
-            surface = orient(self.tree.corners)
+            surface = orient(self.tree.corners, self._corners)
         except UsageError:  # no area
             return None
         return surface, surface.faces
@@ -73,7 +73,7 @@ class CollisionShape:
     @cached_property
     def _corners(self) -> Ints:
         """Number (T, 3) of each corner; corners that coincide have the same."""
-        return join_corners(self.tree.corners - self.box[0])
+        return faces_of(self.tree.corners)
 
     @cached_property
     def points(self) -> Ints:

@@ -20,6 +20,9 @@ from hapticdb.query.law import LawName
 from hapticdb.realtime import coupling, fork_server
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
+from hapticdb.transfer import copy_environment
+from postgres_servers import serving
+from servers import FOUND, SETTINGS
 
 ABOVE = "0,0,0.3"
 LEXICOGRAPHIC = ("--curve", "lexicographic", "--layout", "voxel")
@@ -219,6 +222,31 @@ def test_a_database_that_is_gone_is_told_while_the_session_runs(scene: Path) -> 
         process.send_signal(signal.SIGTERM)
         process.communicate(timeout=PATIENCE)
     assert process.returncode == 128 + signal.SIGTERM
+
+
+@pytest.mark.long
+def test_a_session_whose_server_hangs_says_so_and_ends(scene: Path, tmp_path: Path) -> None:
+    """The server is stopped with a session's connection open, until the session has ended."""
+    with serving(tmp_path / "pg", FOUND[0], SETTINGS) as server:
+        url = server.conninfo() + "&environment=scene"
+        copy_environment(str(scene), url)
+        device = ("--device", "random", "--at", ABOVE, "--seconds", 4, "--record", "s.hdbrec")
+        words = ("feel", url, "--tool", "tool.npz", *device, "--json")
+        with child(command(*words), cwd=scene.parent) as process:
+            until(lambda: frames_in(scene.with_name("s.hdbrec")))
+            family = [server.pid, *descendants(server.pid)]
+            for member in family:
+                os.kill(member, signal.SIGSTOP)
+            try:
+                out, err = process.communicate(timeout=PATIENCE)
+            finally:
+                for member in family:
+                    os.kill(member, signal.SIGCONT)
+    report = json.loads(out)
+    assert process.returncode == 1
+    assert "did not answer a new client" in report["database_lost"]
+    assert 0 < report["stale_frames"] <= report["held_frames"] < report["loop"]["frames"]
+    assert err == f"hapticdb: {report['database_lost']}; until then no force is felt\n"
 
 
 def test_a_session_that_ends_without_its_database_fails(scene: Path) -> None:

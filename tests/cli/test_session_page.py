@@ -7,7 +7,7 @@ import pytest
 
 from hapticdb.cli import session_page
 
-AWAY = SimpleNamespace(is_lost=True, url="gone.db")
+AWAY = SimpleNamespace(is_lost=True, url="gone.db", first_objects=())
 """Cells whose database does not answer: ids stand in place of names."""
 
 
@@ -26,12 +26,12 @@ def test_a_tool_in_an_object_is_told_once_and_so_is_its_freedom(
 ) -> None:
     notes = session_page.Notes()
     for _ in range(3):
-        notes.look(session(is_loose=True, ids=(3,)))
+        notes.look_for_objects(session(is_loose=True, ids=(3,)))
     said = capsys.readouterr().err
     assert said.count("nothing is felt until it is free") == 1
     assert "the tool is inside object 3" in said
     for _ in range(2):
-        notes.look(session(is_loose=False, ids=(3,)))
+        notes.look_for_objects(session(is_loose=False, ids=(3,)))
     assert capsys.readouterr().err.count("the tool is free") == 1
 
 
@@ -39,9 +39,9 @@ def test_a_name_may_come_a_look_later_and_none_may_come_at_all(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     notes = session_page.Notes()
-    notes.look(session(is_loose=True))
+    notes.look_for_objects(session(is_loose=True))
     assert capsys.readouterr().err == ""
-    notes.look(session(is_loose=True))
+    notes.look_for_objects(session(is_loose=True))
     assert "the tool is inside an object: nothing is felt" in capsys.readouterr().err
 
 

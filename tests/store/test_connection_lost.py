@@ -19,7 +19,7 @@ from children import PATIENCE, child, descendants, joined, until
 from command_line import command, tool
 from crashes import EDITS, N_PARTS, PLACE, After, felt, small
 from hapticdb import Environment, PointShell
-from hapticdb.errors import StuckError
+from hapticdb.errors import ConnectionLostError, StuckError
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.postgres.connecting import link
 from hapticdb.store.postgres.connecting.connection import ServerConnection
@@ -165,6 +165,28 @@ def test_a_write_to_a_server_that_hangs_ends_and_can_be_done_again(
         env.move(7, PLACE)
         np.testing.assert_array_equal(env.object(7).transform, PLACE)
         assert_valid(env)
+
+
+@pytest.mark.parametrize("is_killed", [False, True], ids=["hung", "ended"])
+def test_a_prompt_watch_reports_a_lost_server_and_does_not_wait(
+    server: Server, url: str, file: Path, *, is_killed: bool
+) -> None:
+    with small(url, file) as env, hapticdb.open(env.url, read_only=True) as reading:
+        reading.store.watch(is_prompt=True)
+        pid = reading.store._connection.driver.info.backend_pid  # type: ignore[attr-defined]
+        family = [pid] if is_killed else [server.pid, *descendants(server.pid)]
+        try:
+            for member in family:
+                os.kill(member, signal.SIGTERM if is_killed else signal.SIGSTOP)
+            error = ConnectionLostError if is_killed else StuckError
+            words = "went away" if is_killed else "did not answer a new client within 0.15 s"
+            with pytest.raises(error, match=words):
+                until(lambda: reading.store.revision() < 0)
+        finally:
+            for member in family if not is_killed else ():
+                os.kill(member, signal.SIGCONT)
+        with hapticdb.open(env.url, read_only=True) as again:
+            assert again.store.revision() == reading.store.revision()  # connects again
 
 
 @pytest.fixture

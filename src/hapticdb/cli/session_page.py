@@ -101,7 +101,7 @@ def _frame_facts(report: "Report") -> Facts:
     return [
         ("touching", f"{hit} hit, {report.contact_frames:,} in contact"),
         ("not known", f"{unknown} with cells that were not in memory yet"),
-        ("force held", f"{held}, {report.stale_frames:,} while the database was silent"),
+        ("force held", f"{held}, {report.stale_frames:,} of them without a database"),
     ]
 
 
@@ -153,10 +153,8 @@ class Notes:
         self._is_lost = self._is_cut = False
 
     def look(self, session: "Session") -> None:
-        """Tell what has changed since the last look."""
+        """Report a database that is lost or back, and a recording that has ended."""
         lost = session.database_lost
-        if lost is None:  # without it the tool lies in nothing that is known
-            self._look_for_objects(session)
         if lost is not None and not self._is_lost:
             render.note(f"{lost}; until then no force is felt")
         elif lost is None and self._is_lost:
@@ -166,8 +164,10 @@ class Notes:
             render.note(f"{session.recording_ended}; the session goes on without it")
             self._is_cut = True
 
-    def _look_for_objects(self, session: "Session") -> None:
-        """Tell whether the tool lies in an object; names may come a look later than the fact."""
+    def look_for_objects(self, session: "Session") -> None:
+        """Report that the tool lies in an object; names may come a look later than the fact."""
+        if self._is_lost:  # nothing is known
+            return
         if session.is_loose:
             self._loose_looks += 1
             if self._loose_looks <= 2 and (self._loose_looks == 2 or session.loose_objects):
@@ -215,13 +215,13 @@ def _in_objects(cells: "ResidentCells", ids: Sequence[int]) -> str:
 
 
 def _names_after(cells: "ResidentCells", ids: Sequence[int]) -> str:
-    """A colon and names of objects; their ids where the database does not answer; '' for none."""
+    """A colon and names of objects, '' for none; ids of new ones while the database is lost."""
     import hapticdb
     from hapticdb.errors import DatabaseError
 
-    names: dict[int, str] = {}
+    names = {obj.id: obj.name for obj in cells.first_objects}
     with suppress(DatabaseError):
-        if ids and not cells.is_lost:
+        if not set(ids) <= set(names) and not cells.is_lost:
             with hapticdb.open(cells.url, read_only=True) as env:
                 names = {obj.id: obj.name for obj in env.objects()}
     listed = [names.get(i, f"object {i}") for i in ids]

@@ -50,9 +50,9 @@ MOST_IDLE = 1e-2
 sessions more of the processor is left to loops, and a moving hand is noticed later."""
 ASK_EVERY = 5e-3
 """Seconds between queries for the objects that a tool touches. Larger: names come later."""
-CONFIRM_EVERY = 0.1
+CONFIRM_EVERY = 0.05
 """Seconds between queries for the revision. A store reports commits without a round trip, so only a
-query shows that the database still answers."""
+query shows that the database still answers. Larger: its loss is reported later."""
 RELEASE_EVERY = 1.0
 """Seconds between checks for sessions whose processes have ended, and between questions to a
 standby for its lag. Larger: rows stay longer, the lag that is told is older."""
@@ -135,7 +135,7 @@ class Fetcher:
         if self.request.wrap:
             store = self.request.wrap(store)
         try:
-            store.watch()
+            store.watch(is_prompt=True)
         except BaseException:
             store.close()
             raise

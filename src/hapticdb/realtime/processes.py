@@ -131,10 +131,10 @@ class Process:
         ended.register(self._standing, select.POLLIN)
         return bool(ended.poll(1000.0 * seconds))
 
-    def end(self) -> None:
-        """End the process: close its channel, and kill it if it does not end then."""
+    def end(self, patience: float = END_PATIENCE) -> None:
+        """End the process: close its channel, and kill it if it runs `patience` s later."""
         self._channel.close()
-        if not self.wait(END_PATIENCE):
+        if not self.wait(patience):
             with contextlib.suppress(ProcessLookupError):
                 signal.pidfd_send_signal(self._standing, signal.SIGKILL)
             self.wait(END_PATIENCE)

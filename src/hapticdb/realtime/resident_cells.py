@@ -31,6 +31,9 @@ FETCH = "hapticdb.realtime.fetching:fetch"
 START_PATIENCE = 60.0
 """Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
 caller waits longer for a process that hangs."""
+END_PATIENCE = 0.5
+"""Seconds that a fetching process has to end by itself; a database that hangs may hold it up. It
+only reads, so it may be killed at any time."""
 RESTART_EVERY = 1.0
 """Least time (s) between two starts of the process. Smaller: more attempts if each one fails."""
 SILENCE_NS = 1_000_000_000
@@ -190,14 +193,17 @@ class ResidentCells(Closes):
     @property
     def is_lost(self) -> bool:
         """Whether the database does not answer now."""
-        control = self.table.cells.control
-        return bool(control[LOST]) or time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS
+        return self.database_lost is not None
 
     @property
     def database_lost(self) -> str | None:
         """One line: why the database cannot be read now; None while it can. As of `supervise`."""
-        is_lost = bool(self.table.cells.control[LOST])
-        return (self._lost_by or f"{redact(self.url)} does not answer") if is_lost else None
+        control = self.table.cells.control
+        if control[LOST]:
+            return self._lost_by or f"{redact(self.url)} does not answer"
+        if time.monotonic_ns() - int(control[HEARTBEAT]) > SILENCE_NS:
+            return f"{redact(self.url)} has not answered for {1e-9 * SILENCE_NS:g} s"
+        return None
 
     def supervise(self) -> None:
         """Start the fetching process again if it has ended. Sessions call it in `wait`.
@@ -275,5 +281,5 @@ class ResidentCells(Closes):
             return
         self.table.cells.control[STOP] = 1
         with self._supervising:
-            self._process.end()
+            self._process.end(END_PATIENCE)
             self.table.close()

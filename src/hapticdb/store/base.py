@@ -362,8 +362,12 @@ class Store(Protocol):
         A server's notification of a commit takes a moment. Inside a snapshot the server is asked.
         """
 
-    def watch(self) -> None:
-        """Begin to notice commits from now on; may be called again."""
+    def watch(self, *, is_prompt: bool = False) -> None:
+        """Begin to notice commits from now on; may be called again.
+
+        is_prompt : whether reads report a lost or silent server within 0.4 s, and do not wait for
+        it to come back. The loss of a file is always reported at once.
+        """
 
     def has_changed(self) -> bool:
         """Whether something was committed since `watch` or the last call. Never waits.

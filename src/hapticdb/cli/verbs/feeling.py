@@ -43,9 +43,9 @@ if TYPE_CHECKING:
     from hapticdb.realtime.report import Report
     from hapticdb.realtime.session import Session
 
-LOOK_EVERY = 0.25
-"""Seconds between two looks at the session: how late is told that its recording has ended, or that
-the tool lies in an object."""
+LOOK_EVERY, OBJECTS_EVERY = 0.1, 3
+"""Seconds between two looks at the session: how late a lost database is reported, or the end of its
+recording; and looks between two whether the tool lies in an object, which may last a moment."""
 
 DeviceOption = Annotated[
     str,
@@ -304,13 +304,16 @@ def _begin_loop(
 
 
 def _exit_after(signals: Sequence[int], report: "Report") -> None:
-    """Leave with the exit code of the signal that ended the session, or 1 without a database."""
+    """Leave with the exit code of the signal that ended the session.
+
+    1 if the database was lost at its end, or so long that frames had no force.
+    """
     if signal.SIGTERM in signals:
         render.note(f"ended by SIGTERM after {report.loop.seconds:.3g} s")
         raise typer.Exit(TERMINATED)
     if signals:
         raise Interrupted(f"ended by Ctrl-C after {report.loop.seconds:.3g} s")
-    if report.database_lost is not None:
+    if report.database_lost is not None or report.stale_frames:
         raise typer.Exit(1)
 
 
@@ -319,11 +322,14 @@ def _waited_for(session: "Session", stiffness: float | None, seconds: float | No
     lowered = getattr(session.coupling, "lowered", None)
     if stiffness is not None and lowered is not None:
         render.note(lowered)
-    report, notes = None, session_page.Notes()
+    report, notes, n_looks = None, session_page.Notes(), 0
     with render.bar("feeling; Ctrl-C ends it", "s") as progress:
         while report is None:
             report = session.wait(LOOK_EVERY)
             notes.look(session)
+            n_looks += 1
+            if n_looks % OBJECTS_EVERY == 0 or report is not None:
+                notes.look_for_objects(session)
             if progress is not None:
                 progress(session.n_frames / session.timing.rate, round(seconds or 0.0))
     return report

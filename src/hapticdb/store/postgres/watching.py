@@ -54,9 +54,10 @@ class Watch:
         self._is_deaf = True
         self._due = self._asked = 0.0
 
-    def begin(self) -> None:
-        """Notice commits from now on."""
+    def begin(self, *, is_prompt: bool = False) -> None:
+        """Notice commits from now on; see `Store.watch`."""
         self._connection.check_outside()
+        self._connection.is_prompt = is_prompt
         self._connection.again(self._listen)
         self._ask()
         self._told = self.revision

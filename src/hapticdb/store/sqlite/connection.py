@@ -110,7 +110,7 @@ class FileConnection:
         self.fetch("PRAGMA data_version")
         return self.version()
 
-    def watch(self) -> None:
+    def watch(self, *, is_prompt: bool = False) -> None:  # noqa: ARG002 - a file's loss always is
         """Begin to notice commits from now on; may be called again."""
         self.has_changed()
 

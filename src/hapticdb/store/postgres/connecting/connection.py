@@ -82,7 +82,8 @@ class ServerConnection(Link, Closes):
     def again(self, read: Callable[[], Result]) -> Result:
         """Run a read; when the connection is lost, connect again and run it once more.
 
-        Not inside a snapshot: its earlier reads saw the revision of the lost connection.
+        Not inside a snapshot: its earlier reads saw the revision of the lost connection; nor where
+        a loss shall be reported promptly.
         """
         self.check_thread()
         if self.is_closed:
@@ -93,7 +94,7 @@ class ServerConnection(Link, Closes):
             with failures.named_errors(self.shown):
                 return read()
         except ConnectionLostError:
-            if self._depth:
+            if self._depth or self.is_prompt:
                 raise
         self._reconnect()
         with failures.named_errors(self.shown):

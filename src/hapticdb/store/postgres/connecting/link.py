@@ -54,12 +54,14 @@ CONNECT_SECONDS = 10
 """Seconds that a server may take to accept a connection, unless the URL says otherwise."""
 GRACE_MS = 3000
 """Milliseconds that the network and a busy server may add to the server's own time limit."""
-STEP_S = 0.1
+STEP_S = 0.05
 """Seconds between two looks at the limit of a wait. A larger value exceeds it by more."""
-SILENCE_S = 5.0
-"""Seconds without a byte from a server, after which its answer to a new client is tested."""
-ANSWER_S = 5.0
-"""Seconds that a server has to accept such a test, and again to answer it."""
+SILENCE_S, PROMPT_SILENCE_S = 5.0, 0.1
+"""Seconds without a byte from a server, after which its answer to a new client is tested; the
+second where a loss shall be reported promptly. Smaller: slow statements cause more such tests."""
+ANSWER_S, PROMPT_ANSWER_S = 5.0, 0.15
+"""Seconds that a server has to accept such a test, and again to answer it; likewise. Smaller: a
+busy server is taken for one that hangs."""
 SSL_REQUEST = struct.pack("!ii", 8, 80877103)
 
 
@@ -88,11 +90,11 @@ class Peer(NamedTuple):
         path = f"{folder}/.s.PGSQL.{port}"
         return cls(family, "\0" + path[1:] if path.startswith("@") else path)
 
-    def answers(self) -> bool:
-        """Whether the server answers a new client."""
+    def answers(self, seconds: float) -> bool:
+        """Whether the server answers a new client within so many seconds."""
         try:
             with socket.socket(self.family) as asking:
-                asking.settimeout(ANSWER_S)
+                asking.settimeout(seconds)
                 asking.connect(self.address)
                 asking.sendall(SSL_REQUEST)
                 return bool(asking.recv(1))
@@ -121,8 +123,11 @@ class Link:
     """Holds one psycopg connection at a time; `connect` makes a new one.
 
     shown : the redacted URL; driver : psycopg's connection, autocommit, for statements outside
-    frames; given_up : the error for which psycopg's wait was given up, else None.
+    frames; given_up : the error for which psycopg's wait was given up, else None; is_prompt :
+    whether a lost or silent server is reported within 0.4 s, and not waited for.
     """
+
+    is_prompt = False
 
     def __init__(self, address: Address, *, read_only: bool) -> None:
         self.address = address
@@ -293,19 +298,19 @@ class Link:
                     heard = now
                 elif most is not None and 1000 * (now - started) > most:
                     raise self._stuck()
-                elif now - heard > SILENCE_S:
-                    self._check_answers()
+                elif now - heard > (PROMPT_SILENCE_S if self.is_prompt else SILENCE_S):
+                    self._check_answers(PROMPT_ANSWER_S if self.is_prompt else ANSWER_S)
                     heard = time.monotonic()
                 wanted = answer.send(ready)
         except StopIteration as end:
             return cast("Result", end.value)
 
-    def _check_answers(self) -> None:
-        """Give the statement up if the server does not answer a new client either."""
-        if self._peer is not None and not self._peer.answers():
+    def _check_answers(self, seconds: float) -> None:
+        """Give the statement up if the server does not answer a new client in `seconds` either."""
+        if self._peer is not None and not self._peer.answers(seconds):
             raise SilentServerError(
                 f"{self.shown} sends nothing and did not answer a new client within "
-                f"{ANSWER_S:.3g} s: the server, or the way to it, hangs; try again when "
+                f"{seconds:.3g} s: the server, or the way to it, hangs; try again when "
                 "it answers"
             )
 

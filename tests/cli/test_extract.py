@@ -33,7 +33,7 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     found = json.loads(out)
     assert list(found) == [
         "verdict", "line", "parts", "way", "to", "near", "blockers", "pulls", "motions", "poses",
-        "is_planned", "seconds", "seed",
+        "is_planned", "is_out_of_time", "seconds", "seed",
     ]  # fmt: skip
     assert set(found["way"]) == {"how", "poses", "length", "gap", "proof"}
     assert (found["verdict"], found["way"]["how"]) == ("comes out", "pull")

@@ -89,6 +89,7 @@ def test_chains_end_at_the_depth(tmp_path: Path) -> None:
 def test_the_time_ends_the_search(tmp_path: Path) -> None:
     found = found_in(made(tmp_path, STACK), "content", seconds=1e-6)
     assert (found.is_found, found.is_out_of_time) == (False, True)
+    assert found.verdict == "not decided"
     assert len(found.failed) == 1
     assert "the time is over" in disassembly_line(found)
 

@@ -172,6 +172,9 @@ def test_the_time_ends_the_planner(tmp_path: Path) -> None:
     """Without its end, ten million motions would take hours."""
     found = found_in(enclosed(tmp_path), "block", motions=10_000_000, seconds=1.0)
     assert found.way is None
+    assert (found.verdict, found.verdict.exit_status) == ("not decided", 3)
+    assert extraction_line(found).startswith("not decided: the time was over; no way found in")
+    assert "give more --seconds" in extraction_line(found)
 
 
 def test_its_sweeps_end_with_the_search(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -109,7 +109,7 @@ class Disassembly:
         "no order found" proves nothing.
         """
         if not self.is_found:
-            return PathVerdict.NO_ORDER
+            return PathVerdict.NOT_DECIDED if self.is_out_of_time else PathVerdict.NO_ORDER
         overlaps = any(step.found.verdict is PathVerdict.OVERLAPS for step in self.steps)
         return PathVerdict.OVERLAPS if overlaps else PathVerdict.COMES_OUT
 

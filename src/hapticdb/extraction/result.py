@@ -104,6 +104,8 @@ class Extraction:
         Poses looked at.
     is_planned : bool
         Whether the planner was used.
+    is_out_of_time : bool
+        Whether the time ended the search before it found a path.
     seconds : float
         Time of the search with its proofs.
     seed : int
@@ -119,6 +121,7 @@ class Extraction:
     motions: int
     poses: int
     is_planned: bool
+    is_out_of_time: bool
     seconds: float
     seed: int
 
@@ -137,7 +140,9 @@ class Extraction:
     @property
     def verdict(self) -> PathVerdict:
         """Proved result, or that no way was found: which is no proof that there is none."""
-        return PathVerdict.NO_PATH if self.way is None else self.way.verdict
+        if self.way is not None:
+            return self.way.verdict
+        return PathVerdict.NOT_DECIDED if self.is_out_of_time else PathVerdict.NO_PATH
 
     @property
     def is_free(self) -> bool:

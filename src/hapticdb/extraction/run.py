@@ -106,6 +106,7 @@ def extract(
     began = time.monotonic()
     problem = problem_of(env, words, where, exclude, seed=seed, contact=contact, overlap=overlap)
     goal = None if to is None else _checked_goal(problem, to, asked)
+    problem = problem._replace(until=began + seconds)
     found = _searched(problem, asked._replace(to=goal), progress)
     return replace(found, seconds=time.monotonic() - began)
 
@@ -157,7 +158,6 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
         problem.radius + problem.voxel_size,
         asked.out,
     )
-    problem = problem._replace(until=time.monotonic() + asked.seconds)
     until = problem.until - SHARE_OF_PROOF * asked.seconds
     n_motions, is_planned = 0, False
     way = None if asked.to is None else judge(problem, np.stack([np.eye(4), asked.to]), "pull")
@@ -173,7 +173,8 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
             way = pulled if asked.to is None else way
             if asked.screw is not None and (way is None or way.verdict is PathVerdict.NOT_DECIDED):
                 way = unscrewed(problem, leaving, asked.screw, until) or way
-        if asked.motions and (way is None or way.verdict is PathVerdict.NOT_DECIDED):
+        is_open = way is None or way.verdict is PathVerdict.NOT_DECIDED
+        if asked.motions and is_open and time.monotonic() <= until:
             goals: Goals = (
                 GoalsOutside(problem, leaving, pulls, asked.seed)
                 if asked.to is None
@@ -199,6 +200,7 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
         motions=n_motions,
         poses=n_poses,
         is_planned=is_planned,
+        is_out_of_time=way is None and time.monotonic() > until,
         seconds=0.0,
         seed=asked.seed,
     )

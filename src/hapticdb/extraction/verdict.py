@@ -48,11 +48,14 @@ def _no_way(found: Extraction) -> str:
     tried = f"{pulls} and {found.motions:,} motions" if found.is_planned else pulls
     if found.is_planned and not found.motions:
         tried = f"{pulls}, none of which gets free of what is near"
+    said = f"no way found in {tried}"
+    if found.is_out_of_time:
+        said = f"not decided: the time was over; {said}; give more --seconds"
     if not found.blockers:
-        return f"no way found in {tried}"
+        return said
     first = found.blockers[0]
     others = names_of([one.object for one in found.blockers[1:]])
-    return f"no way found in {tried}: {first.object.name} blocks {first.pulls} of the pulls" + (
+    return f"{said}: {first.object.name} blocks {first.pulls} of the pulls" + (
         f", then {others}" if others else ""
     )
 
@@ -95,7 +98,10 @@ def extraction_record(found: Extraction, excluded: list[int]) -> dict[str, Any]:
     excluded : ids of the objects that were left out, those of the parts among them.
     """
     parts = [obj.id for obj in found.parts]
-    told = ("to", "near", "blockers", "pulls", "motions", "poses", "is_planned", "seconds", "seed")
+    told = (
+        "to", "near", "blockers", "pulls", "motions", "poses", "is_planned", "is_out_of_time",
+        "seconds", "seed",
+    )  # fmt: skip
     return {
         "verdict": found.verdict,
         "line": extraction_line(found),

@@ -210,6 +210,20 @@ def test_what_lies_outside_the_grid_is_named_and_nothing_of_its_file_goes_in(
     assert rows_of(database) == before
 
 
+def test_a_file_that_meets_too_many_voxels_is_refused(tmp_path: Path) -> None:
+    """A cube of 0.1 m has 600 voxels of 1 cm by its area, and 6e4 voxels of 1 mm."""
+    file = write_obj(tmp_path / "a.obj", {"cube": box((0, 0, 0), (0.1, 0.1, 0.1))})
+    fine = ImportOptions(grid=GridOptions(voxel_size=1e-3, bits=8), voxel_limit=59_000)
+    database = tmp_path / "e.db"
+    with pytest.raises(hapticdb.errors.FileError, match="about 60,000 voxels of 1 mm") as raised:
+        hapticdb.import_files(database, [file], fine)
+    assert "more than 59,000" in str(raised.value)
+    assert not database.exists()
+    assert import_one(database, file, replace(fine, voxel_limit=61_000)).added
+    with pytest.raises(hapticdb.errors.UsageError, match="a limit of 0 voxels"):
+        ImportOptions(voxel_limit=0)
+
+
 def test_a_surface_on_the_border_of_the_grid_is_inside(tmp_path: Path) -> None:
     whole = write_obj(tmp_path / "whole.obj", {"whole": box([-0.16] * 3, [0.16] * 3)})
     (obj,) = import_one(tmp_path / "e.db", whole, small_options()).added

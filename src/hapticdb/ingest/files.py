@@ -87,6 +87,9 @@ class FileReport:
 
 MOST_AHEAD = 1 << 29
 """Bytes of geometry kept from files read ahead. Less: more files are read twice."""
+VOXEL_LIMIT = 1e9
+"""Default of `ImportOptions.voxel_limit`: a minute of one processor with distances, a quarter of
+that without. Larger: a file that was meant for larger voxels keeps a person waiting."""
 _READING = ("unit", "time_limit", "memory_limit", "chord")
 
 
@@ -109,6 +112,8 @@ class ImportOptions:
     time_limit: float | None = None
     memory_limit: int | None = None
     """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
+    voxel_limit: float = VOXEL_LIMIT
+    """Voxels that the surfaces of one file may meet, estimated by their area."""
     chord: float | None = None
     """Greatest chord error wanted of the tessellations of STEP and IFC files, metres; unless given
     as for `hapticdb.mesh.read_file`. They are stored with the surfaces, see `Part.chord`."""
@@ -122,7 +127,10 @@ class ImportOptions:
     law needs. Unless given, they do in the layout brick. The layout voxel has none."""
 
     def __post_init__(self) -> None:
-        for name, limit in (("seconds", self.time_limit), ("bytes", self.memory_limit)):
+        limits = {
+            "seconds": self.time_limit, "bytes": self.memory_limit, "voxels": self.voxel_limit
+        }  # fmt: skip
+        for name, limit in limits.items():
             if limit is not None and not 0 < limit < np.inf:
                 raise UsageError(f"a limit of {limit} {name}: give a number above 0")
         check_chord(self.chord)
@@ -324,6 +332,7 @@ def ingest_file(
     plan = planned(
         mesh_file, options.unit, store.grid, known.by_name, store.removed(mesh_file.link),
         replace=options.replace, keep_removed=options.keep_removed,
+        voxel_limit=options.voxel_limit,
     )  # fmt: skip
     jobs = workers or options.jobs or os.cpu_count() or 1
     added, n_replaced = _write_parts(store, mesh_file, plan, known, (options.unit, jobs), progress)

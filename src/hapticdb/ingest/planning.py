@@ -18,9 +18,12 @@ from hapticdb.errors import (
 from hapticdb.grid import Grid
 from hapticdb.mesh import MeshFile, Part
 from hapticdb.store.base import Object, Rows, Store
+from hapticdb.units import length_text
 
 MOST_ATTEMPTS = 100
 """Attempts to add a part that other processes add and remove meanwhile; then an error is raised."""
+FACES_AT_ONCE = 1 << 20
+"""Triangles whose area is computed at once. A larger value takes more memory."""
 AT_BORDER = 1e-6
 """Voxels by which a part may lie beyond the grid's border: rounding."""
 
@@ -42,6 +45,34 @@ def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
     """Refuse a part of the file `link` that leaves the grid at its placement in the file."""
     for part in parts:
         bounds_inside(part, link, grid)
+
+
+def check_cost(parts: Iterable[Part], link: str, grid: Grid, most: float) -> None:
+    """Refuse parts of the file `link` that meet more than `most` voxels, estimated by their area.
+
+    A triangle soup of 5 MB may meet 10^10 voxels, which takes ten minutes.
+    """
+    size = grid.voxel_size
+    met = sum(_area(part) for part in parts) / size**2
+    if met > most:
+        shown = float(f"{met:.2g}")
+        raise FileError(
+            f"{link}: its surfaces meet about {shown:,.0f} voxels of {length_text(size)}, more "
+            f"than {most:,.0f}, which takes long: give larger voxels, of "
+            f"{length_text(1.01 * size * (met / most) ** 0.5)}, fewer --bits, or a larger "
+            "--voxel-limit"
+        )
+
+
+def _area(part: Part) -> float:
+    """Area of the placed triangles, m^2."""
+    if part.faces is None:
+        return 0.0
+    points, area = part.world_points(), 0.0
+    for first in range(0, len(part.faces), FACES_AT_ONCE):
+        a, b, c = np.moveaxis(points[part.faces[first : first + FACES_AT_ONCE]], 1, 0)
+        area += 0.5 * float(np.linalg.norm(np.cross(b - a, c - a), axis=1).sum())
+    return area
 
 
 def bounds_inside(
@@ -148,6 +179,7 @@ def planned(
     *,
     replace: bool,
     keep_removed: bool,
+    voxel_limit: float,
 ) -> Plan:
     """Compare a file with an environment; nothing is read or written.
 
@@ -155,9 +187,10 @@ def planned(
     grid : the environment's
     known : the environment's objects of this file, by the names of their parts
     removed : names of parts that were removed from the environment
-    replace, keep_removed : as in `hapticdb.ingest.files.ImportOptions`
+    replace, keep_removed, voxel_limit : as in `hapticdb.ingest.files.ImportOptions`
 
-    Raises `OutsideGridError` if a part that is to be written leaves the grid;
+    Raises `OutsideGridError` if a part that is to be written leaves the grid; `FileError` if they
+    meet too many voxels;
     `GeometryChangedError` if a part has another geometry than the object of its name, which is not
     to be replaced.
     """
@@ -172,7 +205,9 @@ def planned(
     removed = {part.name for part in missing} & removed
     added = [part for part in missing if not (keep_removed and part.name in removed)]
     replaced = [(part, obj.id) for part, obj in there if replace and _differs(part, obj, unit)]
-    check_inside([*added, *(part for part, _ in replaced)], file.link, grid)
+    written = [*added, *(part for part, _ in replaced)]
+    check_inside(written, file.link, grid)
+    check_cost(written, file.link, grid, voxel_limit)
     names = {part.name for part in file.parts}
     dropped = [obj.id for obj in known.values() if replace and obj.name not in names]
     return Plan(replaced, added, dropped, removed)

@@ -79,6 +79,10 @@ MemoryLimitOption = Annotated[
         show_default="512 and more by its size",
     ),
 ]
+VoxelLimitOption = Annotated[
+    float,
+    typer.Option(metavar="N", help="Voxels that the surfaces of one file may meet, by their area."),
+]
 ReplaceOption = Annotated[
     bool,
     typer.Option("--replace", help="Replace objects of these files by what the files hold now."),
@@ -124,6 +128,7 @@ def import_(
     keep_removed: KeepRemovedOption = False,
     time_limit: TimeLimitOption = None,
     memory_limit: MemoryLimitOption = None,
+    voxel_limit: VoxelLimitOption = 1e9,
     replace: ReplaceOption = False,
     distances: DistancesOption = None,
     chord: ChordOption = None,
@@ -157,6 +162,7 @@ def import_(
         unit=unit, grid=grid, layout=layout, jobs=jobs, on=on, keep_removed=keep_removed,
         time_limit=time_limit, memory_limit=None if memory_limit is None else memory_limit << 20,
         replace=replace, distances=distances, skip_unusable=True, chord=chord,
+        voxel_limit=voxel_limit,
     )  # fmt: skip
     reports, elapsed = _imported(url, files, options)
     _tell(url, files, reports, elapsed, json=json)

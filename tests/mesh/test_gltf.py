@@ -1,5 +1,7 @@
 """glTF files as programs write them: read rightly, or told what is not read."""
 
+import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -87,6 +89,22 @@ def test_damage_beside_a_glb_files_geometry_does_not_lose_it(tmp_path: Path) -> 
         file = parse_in_process(gltf(tree, tmp_path / f"{n}.gltf"))
         assert area_and_volume(file)[0] == pytest.approx(0.5)
         assert file.defects.unsupported == (2 if n == 0 else 0)
+
+
+def test_whole_numbers_may_be_written_with_a_point_and_accessors_may_be_zeros(
+    tmp_path: Path,
+) -> None:
+    path = gltf({"nodes": [{"mesh": 0}]}, tmp_path / "a.gltf")
+    text = re.sub(r'("(?:count|bufferView|mesh)": \d+)', r"\1.0", path.read_text())
+    assert text.count(".0") >= 3
+    path.write_text(text)
+    assert area_and_volume(parse_in_process(path))[0] == pytest.approx(0.5)
+    tree = json.loads(text)
+    del tree["accessors"][1]["bufferView"]  # three indices 0
+    path.write_text(json.dumps(tree))
+    assert parse_in_process(path).defects.degenerate == 1
+    path.write_text(json.dumps(tree | {"extensionsUsed": ["KHR_draco_mesh_compression"]}))
+    assert "packed numbers are not read" in cause(path)
 
 
 def test_a_mesh_without_a_node_is_told(tmp_path: Path) -> None:

@@ -30,7 +30,9 @@ def objects_of(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def whole(value: object, what: str, least: int = 0) -> int:
-    """Check that a value is a whole number, `least` or more; JSON's true and 1.5 are not."""
+    """Check that a value is a whole number, `least` or more, as 1 and 1.0; true and 1.5 are not."""
+    if type(value) is float and value.is_integer():
+        value = int(value)
     if type(value) is not int or not least <= value < 2**53:
         raise UnreadableError(f"it is damaged: {what} is no whole number from {least} on")
     return value
@@ -96,6 +98,7 @@ class Accessors:
         self._buffers = objects_of(tree, "buffers")
         self._views = objects_of(tree, "bufferViews")
         self._accessors = objects_of(tree, "accessors")
+        self._is_packed = "compression" in str(tree.get("extensionsUsed"))
         self._chunks, self._folder = chunks, folder
         self._contents: dict[object, memoryview] = {}
         self._arrays: dict[int, NDArray[np.generic]] = {}
@@ -121,7 +124,9 @@ class Accessors:
         if isinstance(accessor.get("sparse"), dict):
             return self._sparse(accessor, np.zeros((count, width), dtype), what)
         if "bufferView" not in accessor:
-            raise UnreadableError(f"{what} has no buffer view: packed numbers are not read")
+            if self._is_packed:
+                raise UnreadableError(f"{what} has no buffer view: packed numbers are not read")
+            return np.zeros((count, width), dtype)
         view = item(self._views, accessor["bufferView"], "buffer view")
         content = self._view(view)
         start = whole(accessor.get("byteOffset", 0), f"the 'byteOffset' of {what}")

@@ -7,8 +7,9 @@ import pytest
 import hapticdb
 from hapticdb.cli import main
 from hapticdb.cli.options import RenderingName
-from hapticdb.cli.verbs.serving import _serving
+from hapticdb.cli.verbs.serving import _serving, _tokens
 from hapticdb.realtime import fork_server
+from hapticdb.server.access import Role
 from hapticdb.server.running import _page_request
 
 
@@ -63,6 +64,13 @@ def test_a_coupling_is_refused_at_the_start_where_no_object_can_have_distances(
     assert (told.out, len(told.err.splitlines()), started) == ("", 1, [])
     assert "plain.db has no distances" in told.err
     assert "leave out --rendering coupled" in told.err
+
+
+def test_a_token_file_may_have_a_byte_order_mark_and_comments(tmp_path: Path) -> None:
+    (file := tmp_path / "tokens").write_text(
+        "\ufeff# of the workshop\neditor=0123456789abcdef\n\n  # viewer=no\n", "utf-8"
+    )
+    assert _tokens(str(file), are_made=False) == {"0123456789abcdef": Role.EDITOR}
 
 
 @pytest.mark.parametrize("rendering", [None, "coupled", "direct"])

@@ -1,10 +1,17 @@
 """Tokens, cookies and roles."""
 
+from dataclasses import replace
+from types import SimpleNamespace
+from typing import cast
+
 import pytest
+from starlette.requests import Request
 
 from hapticdb.errors import UsageError
 from hapticdb.server import access
 from hapticdb.server.access import Access, Role
+from hapticdb.server.front_page import ClientPage, FrontDoor
+from hapticdb.server.limits import Limits
 
 VIEWER = "a-token-for-viewers"
 EDITOR = "a-token-for-editors"
@@ -47,6 +54,19 @@ def test_each_token_gives_its_role_by_header_and_by_cookie() -> None:
 )
 def test_whoever_shows_nothing_that_is_known_has_no_role(headers: dict[str, str]) -> None:
     assert of_two_roles(Clock()).role_of_headers(headers) is None
+
+
+def test_attempts_are_counted_for_each_address() -> None:
+    """An IPv6 address stands for its network of 64 bits."""
+    limits = replace(Limits(), sign_ins_per_second=1e-9, sign_ins_at_once=1.0)
+    door = FrontDoor(of_two_roles(Clock()), cast("ClientPage", None), limits, "", "title")
+
+    def status(address: str) -> int:
+        request = SimpleNamespace(client=SimpleNamespace(host=address), method="POST")
+        return door._sign_in(cast("Request", request), "wrong").status_code
+
+    tries = ("10.0.0.1", "10.0.0.1", "10.0.0.2", "fe80:0:0:1::1", "fe80:0:0:1::2", "fe80:0:0:2::1")
+    assert [status(address) for address in tries] == [403, 429, 403, 403, 429, 403]
 
 
 def test_a_wrong_token_has_no_role_where_no_token_has_one() -> None:

@@ -130,6 +130,9 @@ def _bytes_of(digits: NDArray[np.uint8]) -> bytes:
     return whole.astype(">u4").tobytes() + tail.to_bytes(max(rest - 1, 0), "big")
 
 
+MOST_ADDRESSES = 4096
+"""Addresses whose attempts at tokens are counted; the oldest one makes room. Smaller: who has many
+addresses gets more attempts."""
 STYLE = (
     "body{font:16px system-ui,sans-serif;max-width:24rem;margin:20vh auto;padding:0 1rem}"
     "input,button{font:inherit;padding:.5rem;width:100%;box-sizing:border-box;margin-top:.5rem}"
@@ -162,7 +165,7 @@ class FrontDoor:
     ) -> None:
         self._access, self._page, self._limits = access, page, limits
         self._prefix, self._title = prefix, title
-        self._tries = TokenBucket(limits.sign_ins_per_second, limits.sign_ins_at_once)
+        self._tries: dict[str, TokenBucket] = {}
 
     async def view(self, request: Request) -> Response:
         """Answer a GET of the page."""
@@ -189,7 +192,7 @@ class FrontDoor:
         return self._sign_in(request, fields.get("token", [""])[0])
 
     def _sign_in(self, request: Request, token: str) -> Response:
-        if not self._tries.take():
+        if not self._may_try(request):
             return self._form("Too many attempts. Wait a few seconds, then try again.", 429)
         cookie = self._access.sign_in(token)
         if cookie is None:
@@ -210,6 +213,17 @@ class FrontDoor:
             samesite="strict",
         )
         return answer
+
+    def _may_try(self, request: Request) -> bool:
+        """Whether an address may try a token now; an IPv6 address stands for its network of /64."""
+        address = "" if request.client is None else request.client.host
+        address = ":".join(address.split(":")[:4])
+        limits = self._limits
+        if address not in self._tries:
+            if len(self._tries) >= MOST_ADDRESSES:
+                del self._tries[next(iter(self._tries))]
+            self._tries[address] = TokenBucket(limits.sign_ins_per_second, limits.sign_ins_at_once)
+        return self._tries[address].take()
 
     def _form(self, words: str, status: int) -> Response:
         page = FORM.format(

@@ -225,10 +225,12 @@ def _tokens(file: str | None, *, are_made: bool) -> "dict[str, Role]":
     tokens = {make_token(): role for role in Role} if are_made else {}
     if file is not None:
         try:
-            lines = Path(file).read_text("utf-8").splitlines()
+            lines = Path(file).read_text("utf-8-sig").splitlines()
         except (OSError, UnicodeDecodeError) as error:
             raise UsageError(f"--token-file {file}: cannot be read: {error}") from None
-        for line in filter(None, map(str.strip, lines)):
+        for line in map(str.strip, lines):
+            if not line or line.startswith("#"):
+                continue
             role, token = _pair(line, "--token-file")
             check_token(token)
             tokens[token] = role

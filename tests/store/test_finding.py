@@ -1,5 +1,6 @@
 """Objects are chosen by ids, names and patterns; a shell covers all chosen objects."""
 
+import unicodedata
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -26,6 +27,16 @@ NAMES = (
     "7",
     "007",
 )
+
+
+def test_names_are_compared_in_normal_form_c(tmp_path: Path) -> None:
+    apart = unicodedata.normalize("NFD", "T\u00fcr/Griff")
+    write_obj(tmp_path / "a.obj", {apart: box((0, 0, 0), (0.1, 0.1, 0.1))})
+    options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=6))
+    hapticdb.import_files(tmp_path / "a.db", [tmp_path / "a.obj"], options)
+    with hapticdb.open(tmp_path / "a.db") as env:
+        for word in ("T\u00fcr", apart, "T\u00fc*", unicodedata.normalize("NFD", "T\u00fcr/*")):
+            assert [obj.id for obj in env.find(word)] == [1]
 
 
 @pytest.fixture(scope="module")

@@ -1,6 +1,7 @@
 """Finds objects by ids, names, patterns and attributes."""
 
 import re
+import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from fnmatch import translate
@@ -43,10 +44,10 @@ def find_objects(store: HasObjects, words: Words) -> list[Object]:
     an id; ``3,4`` is several. Any other text, such as ``007``, is a name or a pattern as of
     `fnmatch`; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
     compared with every element of the path, one with ``/`` with the path from its beginning. A
-    sub-assembly chooses everything below it. A text that is exactly a name is no pattern. A text
-    that fits no name, but has ``=``, is ``attribute=value``: see
-    `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name, too. A text with commas is
-    several words, unless it chooses something as a whole.
+    sub-assembly chooses everything below it. Names are compared in Unicode's normal form C. A text
+    that is exactly a name is no pattern. A text that fits no name, but has ``=``, is
+    ``attribute=value``: see `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name,
+    too. A text with commas is several words, unless it chooses something as a whole.
 
     Raises `ObjectNotFoundError` when a word chooses nothing; `UsageError` when a word is neither an
     int nor a text.
@@ -151,13 +152,18 @@ def _object_of(store: HasObjects, object_id: int) -> Object:
 
 def _named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
     """Objects that a name or pattern chooses, by the rules of `find_objects`, in their order."""
-    pattern = pattern.rstrip("/") or pattern
-    branches = [_branches(obj.name, is_path="/" in pattern) for obj in objects]
+    pattern = composed(pattern.rstrip("/") or pattern)
+    branches = [_branches(composed(obj.name), is_path="/" in pattern) for obj in objects]
     as_it_stands = [obj for obj, some in zip(objects, branches, strict=True) if pattern in some]
     if as_it_stands:
         return as_it_stands
     fits: Callable[[str], object] = re.compile(translate(pattern)).match
     return [obj for obj, some in zip(objects, branches, strict=True) if any(map(fits, some))]
+
+
+def composed(text: str) -> str:
+    """Text in Unicode's normal form C: macOS writes file names with letters and accents apart."""
+    return text if text.isascii() else unicodedata.normalize("NFC", text)
 
 
 def _branches(name: str, *, is_path: bool) -> list[str]:

@@ -150,8 +150,8 @@ def _copy_objects(source: Store, target: Store, progress: Progress | None) -> Co
             voxels += obj.voxels
             if progress is not None:
                 progress(done, len(objects))
-    if not target.rules() and (rules := source.rules()):
-        target.put_rules(rules)
+    if rules := source.rules():
+        target.change_rules(lambda now: now or rules)
     present = len(objects) - copied
     return CopyReport(source.url, target.url, copied, voxels, present, renumbered)
 

@@ -9,7 +9,7 @@ import hapticdb
 from assemblies import row_of_boxes
 from hapticdb import Environment, accept_clash, find_clashes
 from hapticdb.clashes.result import Clash, Clashes, rule_for
-from hapticdb.clashes.rules import Rules, parse_rule, read_rules, rule_text
+from hapticdb.clashes.rules import Rules, add_rules, parse_rule, read_rules, rule_text
 from hapticdb.errors import FileError, UsageError
 from hapticdb.store.base import Object
 from hapticdb.store.pairs import Rule
@@ -33,7 +33,7 @@ def path(tmp_path: Path) -> Path:
 
 
 def decided(env: Environment, *texts: str, within: float = MM) -> Clashes:
-    env.store.put_rules([parse_rule(text) for text in texts])
+    env.store.change_rules(lambda _: [parse_rule(text) for text in texts])
     return find_clashes(env, within=within)
 
 
@@ -78,6 +78,7 @@ def test_parse_rule_reads_what_rule_text_writes(text: str, rule: Rule) -> None:
         ("a in b: too near is meant", "touching"),
         ("a and b: keep away apart", "'away'"),
         ("a and \x1b: ignore", "ONE in OTHER"),
+        ("a in " + "b: c in " * 300 + "d", "2,406 characters"),
     ],
 )
 def test_parse_rule_refuses_others_in_one_line(text: str, word: str) -> None:
@@ -217,11 +218,22 @@ def test_an_ignored_pair_is_not_measured_until_the_rule_goes(path: Path) -> None
         assert find_clashes(env).measured == 0
 
 
+def test_add_rules_keeps_each_once_and_none_with_too_great_a_clearance(path: Path) -> None:
+    ignore, apart = "bolts/* and *: ignore", "plates/* and *: keep 2 mm apart"
+    with hapticdb.open(path) as env:
+        for texts in ([ignore], [ignore, apart], [apart]):
+            add_rules(env.store, texts, 2 * MM)
+        assert env.store.rules() == (parse_rule(ignore), parse_rule(apart))
+        with pytest.raises(UsageError, match="rule 2 keeps"):
+            add_rules(env.store, ["a and b: ignore"], MM)
+        assert len(env.store.rules()) == 2
+
+
 def test_rules_are_copied_into_an_environment_without_some(tmp_path: Path, path: Path) -> None:
     rule = parse_rule("plates/* and *: ignore")
     with hapticdb.open(path) as env:
-        env.store.put_rules([rule])
+        env.store.change_rules(lambda _: [rule])
     copy_environment(path, tmp_path / "copy.db")
     with hapticdb.open(tmp_path / "copy.db") as env:
         assert env.store.rules() == (rule,)
-        env.store.put_rules([])
+        env.store.change_rules(lambda _: [])

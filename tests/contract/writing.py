@@ -29,6 +29,10 @@ FIRST = PairRow(1, 2, Kind.APART, 0.1, 0.1 + 2**-50, PLACE, "new", 2, "a setting
 SECOND = PairRow(1, 3, Kind.OVERLAPPING, 1e-3, None, PLACE, "new", 2, "a setting")
 
 
+def change_to(store: Store, *rules: Rule) -> None:
+    store.change_rules(lambda _: rules)
+
+
 def made_up(store: Store) -> set[str]:
     return {digest for digest in store.surface_digests() if len(digest) < 64}
 
@@ -295,14 +299,16 @@ class WritingContract(StoreCase):
             "bolts/*", "*", "meant", (Kind.OVERLAPPING, Kind.NOT_KNOWN), 3e-4, "thr\u00e9ads"
         )
         others = Rule("a", "b,c", "apart", (), 0.002), Rule("b", "x=1", "ignore", because="")
-        store.put_rules([meant, *others])
+        change_to(store, meant, *others)
         assert store.rules() == (meant, *others)
-        store.put_rules(others)
+        change_to(store, *others)
         for wrong in (
             meant._replace(length=float("inf")), meant._replace(kinds=()),
             others[0]._replace(length=None), others[0]._replace(kinds=(Kind.INSIDE,)),
         ):  # fmt: skip
             with pytest.raises(UsageError, match="rule 2"):
-                store.put_rules([meant, wrong])
+                change_to(store, meant, wrong)
         assert store.rules() == others
+        store.change_rules(lambda old: [meant, *old])
+        assert store.rules() == (meant, *others)
         assert store.revision() == revision

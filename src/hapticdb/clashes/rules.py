@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import FileError, ObjectNotFoundError, UsageError
-from hapticdb.store.base import Object
+from hapticdb.store.base import Object, Store
 from hapticdb.store.finding import Listing, checked_words
 from hapticdb.store.pairs import Rule, Says
 from hapticdb.units import length_of, length_text
@@ -27,6 +27,8 @@ FORM = (
     "give 'ONE in OTHER: overlap up to 0.3 mm is meant', 'ONE and OTHER: keep 2 mm apart' or "
     "'ONE and OTHER: ignore', and if wanted 'because REASON' after it"
 )
+LONGEST = 2000
+"""Characters of a rule: the time of `GRAMMAR` grows with their square, to 30 ms."""
 GRAMMAR = re.compile(
     r"('[^']+'|.+?) (?:in|and) ('[^']+'|.+?): *(?:(?P<kinds>[^:]+?)(?: up to (?P<depth>[^:]+?))?"
     r" is meant|keep (?P<apart>[^:]+?) apart|ignore)(?: because (?P<because>.+))?"
@@ -36,6 +38,8 @@ GRAMMAR = re.compile(
 def parse_rule(text: str, place: str = "") -> Rule:
     """Rule of a text in one of the forms of `FORM`; UsageError with the place."""
     place = place or f"rule {text[:200]!r}"
+    if len(text) > LONGEST:
+        raise UsageError(f"{place}: {len(text):,} characters: give {LONGEST:,} at most")
     found = GRAMMAR.fullmatch(text.strip())
     if found is None or not text.isprintable():
         raise UsageError(f"{place}: {FORM}")
@@ -70,6 +74,26 @@ def read_rules(path: str | Path) -> list[Rule]:
         wrong = f"unknown key {next(iter(content))!r}" if content else "rules is no list of texts"
         raise UsageError(f"{path}: {wrong}: give rules = ['...', '...']")
     return [parse_rule(text, f"{path}, rule {n}") for n, text in enumerate(texts, start=1)]
+
+
+def add_rules(
+    store: Store, texts: Iterable[str], within: float, path: str | Path | None = None
+) -> None:
+    """Add rules to those of a store, or replace these by those of a file before, each rule once.
+
+    within : greatest distance of a search, metres; UsageError for a greater clearance.
+    """
+    given = None if path is None else read_rules(path)
+    new = [parse_rule(text) for text in texts]
+    if given is None and not new:
+        return
+
+    def changed(old: tuple[Rule, ...]) -> list[Rule]:
+        rules = [*dict.fromkeys([*(old if given is None else given), *new])]
+        check_clearances(rules, within)
+        return rules
+
+    store.change_rules(changed)
 
 
 def rule_text(rule: Rule) -> str:

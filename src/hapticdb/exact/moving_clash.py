@@ -164,7 +164,7 @@ def _gravest(
 ) -> tuple[Kind, float, tuple[float, ...]]:
     """The gravest kind of a pair at poses, its depth, and its place."""
     judged = [judge(still, moved, pose, 2.0 * contact, contact) for pose in poses]
-    told = [one for one in judged if not one.kind.is_free or one.kind is Kind.TOUCHING] or judged
+    told = [one for one in judged if one.kind.gravity <= Kind.TOUCHING.gravity] or judged
     worst = min(told, key=lambda one: (one.kind.gravity, -one.at_least))
     kind = Kind.TOUCHING if worst.kind.is_free else worst.kind
     depth = worst.at_least if kind == Kind.OVERLAPPING else 0.0

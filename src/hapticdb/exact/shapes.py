@@ -45,7 +45,7 @@ class Shapes:
     def placement(self, obj: Object) -> tuple[tuple[str, bytes], Floats]:
         """Key of an object's shape, equal for equal ones, and its rigid placement (4, 4)."""
         if obj.id not in self._placements:
-            linear, pose = rigid_placement(obj.transform)
+            linear, pose = _rigid_placement(obj.transform)
             self._placements[obj.id] = (obj.digest, linear.tobytes()), pose
         return self._placements[obj.id]
 
@@ -66,7 +66,7 @@ def _bytes_of(shape: CollisionShape) -> int:
     return BYTES_OF_CORNERS * int(shape.tree.corners.nbytes)
 
 
-def rigid_placement(transform: Floats) -> tuple[Floats, Floats]:
+def _rigid_placement(transform: Floats) -> tuple[Floats, Floats]:
     """A linear map (3, 3) to be built into the shape, and the rigid placement of the result."""
     linear, pose = transform[:3, :3], np.eye(4)
     pose[:3, 3] = transform[:3, 3]

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from hapticdb.clashes.groups import Group
 from hapticdb.clashes.result import Known
-from hapticdb.clashes.rules import parse_rule
+from hapticdb.clashes.rules import add_rules
 from hapticdb.clashes.run import accept_pairs
 from hapticdb.environment import Environment
 from hapticdb.errors import (
@@ -118,9 +118,9 @@ class PersonsEdits:
         accept_pairs(self._env.store, [(one.a, one.b) for one in group.pairs], known, because)
         return "the pairs are " + ("no longer accepted" if because is None else "accepted")
 
-    def add_rule(self, text: str) -> str:
-        """Add a rule about pairs after the others."""
-        self._env.store.put_rules([*self._env.store.rules(), parse_rule(text)])
+    def add_rule(self, text: str, within: float) -> str:
+        """Add a rule about pairs within a distance, metres, after the others."""
+        add_rules(self._env.store, [text], within)
         return "the rule is kept: look again"
 
     def _move(self, obj: Object, place: Floats, revision: int) -> Object:

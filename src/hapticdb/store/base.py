@@ -458,8 +458,8 @@ class Store(Protocol):
     def rules(self) -> tuple[Rule, ...]:
         """What is decided about pairs; the first rule that reaches a pair counts."""
 
-    def put_rules(self, rules: Sequence[Rule]) -> None:
-        """Replace all rules, in one transaction."""
+    def change_rules(self, change: Callable[[tuple[Rule, ...]], Sequence[Rule]]) -> None:
+        """Replace all rules by what is made of them, in one transaction."""
 
     # -- statistics, cost figures, checks ----------------------------------------------------------
 

@@ -339,17 +339,16 @@ class Tables(ABC):
         text = "UPDATE pair SET because = %s, shapes = %s WHERE (a, b) = (%s, %s)"
         self._save(text, (because, shapes, a, b))
 
-    def put_rules(self, rules: Sequence[Rule]) -> None:
-        rows = [(*rule[:3], ",".join(rule.kinds), *rule[4:]) for rule in rules]
-        for n, row in enumerate(rows, start=1):
-            try:
-                parsing.rule_of(self.url, row)
-            except DamagedError:
-                raise UsageError(f"rule {n}, {row}: give what parse_rule returns") from None
-
+    def change_rules(self, change: Callable[[tuple[Rule, ...]], Sequence[Rule]]) -> None:
         def work() -> None:
+            rules = change(tuple(parsing.rule_of(self.url, row) for row in self._do(RULES)))
             self._do("DELETE FROM rule")
-            for n, row in enumerate(rows, start=1):
+            for n, rule in enumerate(rules, start=1):
+                row = (*rule[:3], ",".join(rule.kinds), *rule[4:])
+                try:
+                    parsing.rule_of(self.url, row)
+                except DamagedError:
+                    raise UsageError(f"rule {n}, {row}: give what parse_rule returns") from None
                 self._do("INSERT INTO rule VALUES (%s, %s, %s, %s, %s, %s, %s)", (n, *row))
 
         self._alone(work)

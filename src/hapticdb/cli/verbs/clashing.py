@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Annotated, NamedTuple
 
 import typer
 
+import hapticdb
 from hapticdb.cli import render
 from hapticdb.cli.choosing import opened_to_keep
 from hapticdb.cli.csv_files import AXES, STDOUT, CsvWriter, new_files, open_csv, text_cell
@@ -215,7 +216,7 @@ def clashes(
             raise UsageError("--poses and --turn: give --of; no report, rule, --seconds, --on")
         motion = partial(_meetings, url, of, poses, turn, about, from_, to, against, contact)
         raise typer.Exit(_moved(motion, turn, kinds, csv, json=json))
-    from hapticdb.clashes.run import find_clashes
+    from hapticdb.clashes.rules import add_rules
 
     with (
         open_csv(csv, "--csv", COLUMNS) as table,
@@ -223,8 +224,8 @@ def clashes(
         opened_to_keep(url) as env,
         render.bar("measuring", "pairs") as progress,
     ):
-        _put_rules(env, rules, rule or [], within)
-        found = find_clashes(
+        add_rules(env.store, rule or (), within, rules)
+        found = hapticdb.find_clashes(
                 env, within=within, contact=contact, of=of or (), against=against or (), on=on,
                 seconds=seconds, budget=budget_bytes(budget), progress=progress)  # fmt: skip
         with env.store.snapshot():  # others may remove objects meanwhile
@@ -338,7 +339,6 @@ def _meetings(
     begin: float, end: float, against: list[str] | None, contact: float,
 ) -> "list[Meeting]":  # fmt: skip
     """When parts that move meet others: numbers of poses, or degrees."""
-    import hapticdb
     from hapticdb.exact.moving_clash import find_meetings, hinge
     from hapticdb.poses import read_poses
     from hapticdb.store.attributes import scene_bounds
@@ -383,7 +383,6 @@ def _checked(names: list[str] | None) -> "tuple[Kind, ...]":
 
 
 def _accept(url: str, pair: tuple[str, str] | None, because: str | None, *, json: bool) -> int:
-    import hapticdb
     from hapticdb.clashes.run import accept_clash
 
     if pair is None or because is None:
@@ -401,18 +400,6 @@ def _say_accepted(pairs: list[tuple[int, int]], because: str, *, json: bool) -> 
     what = "accepted until a part changes its shape" if because else "no longer accepted"
     render.say(f"{render.counted(len(pairs), 'pair')} {what}")
     return 0
-
-
-def _put_rules(env: "Environment", path: str | None, texts: list[str], within: float) -> None:
-    """Replace the rules by those of a file, and add others, each once."""
-    from hapticdb.clashes.rules import check_clearances, parse_rule, read_rules
-
-    if path is None and not texts:
-        return
-    rules = [*env.store.rules()] if path is None else read_rules(path)
-    rules = [*dict.fromkeys([*rules, *map(parse_rule, texts)])]
-    check_clearances(rules, within)
-    env.store.put_rules(rules)
 
 
 def _row(one: "Clash", group: str | None) -> list[object]:

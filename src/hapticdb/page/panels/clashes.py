@@ -74,11 +74,15 @@ class ClashPanel:
             gui.add_button("Add rule").on_click(guard("editor", self._add_rule))
         self._rules = gui.add_html("")
 
-    def _look(self, _: object) -> None:
-        within, contact = (
+    def _lengths(self) -> list[float]:
+        """Greatest distance of a pair and contact tolerance, metres."""
+        return [
             1e-3 * checks.number_of(entry.value, 1e-6, 1e6, "a length")
             for entry in (self._within, self._contact)
-        )
+        ]
+
+    def _look(self, _: object) -> None:
+        within, contact = self._lengths()
         site, may_write = self._browser.site, self._browser.visitor.may("editor")
         url = site.request.urls.get("editor", site.url) if may_write else site.url
 
@@ -222,10 +226,10 @@ class ClashPanel:
 
     def _add_rule(self, _: object) -> None:
         text = checks.text_of(self._rule.value, LONGEST_TEXT, "a rule")
-        edits = self._browser.site.edits
+        within, edits = self._lengths()[0], self._browser.site.edits
         if edits is not None:
             edits.ask(
                 self._browser.client.client_id,
-                lambda own: own.add_rule(text),
+                lambda own: own.add_rule(text, within),
                 lambda said: self._browser.tell("Done", said, is_good=True), self._browser.failed,
             )  # fmt: skip

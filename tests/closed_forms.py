@@ -23,8 +23,8 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DISTANCE
-from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import spheres_of
+from hapticdb.session.stations import Station, Stations
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]

@@ -18,9 +18,9 @@ from command_line import made, run, scene  # noqa: F401 - fixtures
 from hapticdb import Environment, PointShell
 from hapticdb.kernels import _machine_code, _sets
 from hapticdb.pointshell.shell import fibonacci_sphere
-from realtime.sessions import floor_points, floored
-from realtime.worlds import make
 from servers import FOUND, admin, database, named, place  # noqa: F401 - fixtures
+from session.sessions import floor_points, floored
+from session.worlds import make
 from voxels import KINDS
 
 NEWEST = {"cli", "house"}

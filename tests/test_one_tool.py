@@ -10,7 +10,7 @@ import hapticdb
 from command_line import Run, poses
 from hapticdb.page.tools import from_files, middle_of
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.realtime.coupling import limit_text
+from hapticdb.session.coupling import limit_text
 
 
 def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Path) -> None:

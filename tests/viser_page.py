@@ -6,7 +6,7 @@ import time
 import viser
 
 from hapticdb.page.connection import PageConnection, PageRequest
-from hapticdb.realtime.processes import MessageSender, parent_is_gone
+from hapticdb.session.processes.process import MessageSender, parent_is_gone
 
 
 def work(request: PageRequest, sender: MessageSender) -> None:

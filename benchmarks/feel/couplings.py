@@ -16,8 +16,8 @@ from hapticdb.kernels.hand.device_spring import DeviceSpring
 from hapticdb.kernels.records import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
-from hapticdb.realtime.stations import Station, Stations
 from hapticdb.resident.held import clusters_of
+from hapticdb.session.stations import Station, Stations
 
 Floats = NDArray[np.float64]
 

@@ -58,13 +58,13 @@ if TYPE_CHECKING:
     from hapticdb.query.law import TangentPlane as TangentPlane
     from hapticdb.query.touches import Query as Query
     from hapticdb.query.touches import Touch as Touch
-    from hapticdb.realtime.coupling import Coupling as Coupling
-    from hapticdb.realtime.replay import Replayed as Replayed
-    from hapticdb.realtime.replay import replay as replay
-    from hapticdb.realtime.report import Report as Report
-    from hapticdb.realtime.resident_cells import ResidentCells as ResidentCells
-    from hapticdb.realtime.session import Session as Session
     from hapticdb.recording.file import Recording as Recording
+    from hapticdb.session.coupling import Coupling as Coupling
+    from hapticdb.session.prefetch.resident_cells import ResidentCells as ResidentCells
+    from hapticdb.session.replay import Replayed as Replayed
+    from hapticdb.session.replay import replay as replay
+    from hapticdb.session.report import Report as Report
+    from hapticdb.session.session import Session as Session
     from hapticdb.store.base import Object as Object
     from hapticdb.store.connect import backup_environment as backup_environment
     from hapticdb.transfer import CopyReport as CopyReport

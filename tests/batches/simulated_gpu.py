@@ -24,7 +24,7 @@ from hapticdb.kernels.gpu import frames as kernels
 from hapticdb.resident import mirror
 from hapticdb.resident.table import LEAST_BUDGET
 from query import test_second_law as second
-from realtime.worlds import cloud, make, poses_in, random_shell
+from session.worlds import cloud, make, poses_in, random_shell
 from voxels import blob, write_voxels
 
 BOUND = 1e-12

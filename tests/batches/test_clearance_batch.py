@@ -16,7 +16,7 @@ from hapticdb.batches import threads
 from hapticdb.errors import UsageError
 from hapticdb.resident.table import LEAST_BUDGET
 from moving_boxes import Boxes, apart, mesh
-from realtime.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
+from session.worlds import HIERARCHICAL, SIZE, block, cloud, ids_by_voxel, make, poses_in, scatter
 from voxels import write_voxels
 
 Floats = NDArray[np.float64]

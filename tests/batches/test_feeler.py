@@ -8,7 +8,7 @@ import hapticdb
 from hapticdb.errors import ConnectionLostError, ObjectNotFoundError, UsageError
 from hapticdb.resident.residency import Residency
 from hapticdb.store.base import Keys
-from realtime.worlds import SIZE, block, cloud, make, move, poses_in, scatter
+from session.worlds import SIZE, block, cloud, make, move, poses_in, scatter
 from voxels import write_voxels
 
 

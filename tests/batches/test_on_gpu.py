@@ -11,7 +11,7 @@ from numba import cuda
 from children import finished
 from hapticdb import Environment
 from hapticdb.errors import MissingExtraError, UsageError
-from realtime.worlds import SIZE, block, cloud, make, poses_in
+from session.worlds import SIZE, block, cloud, make, poses_in
 from voxels import write_voxels
 
 CHECKS = (
@@ -45,7 +45,7 @@ SEARCH = """
 import sys
 import hapticdb
 from hapticdb.kernels.gpu import nearest
-from realtime.worlds import SIZE, cloud, poses_in
+from session.worlds import SIZE, cloud, poses_in
 sys.setswitchinterval(1e-4)
 nearest.THREADS = 2
 with hapticdb.open(sys.argv[1], read_only=True) as env:

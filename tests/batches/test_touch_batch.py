@@ -15,7 +15,7 @@ from hapticdb.batches import threads
 from hapticdb.batches.result import TouchBatch
 from hapticdb.errors import ObjectNotFoundError, UsageError
 from hapticdb.resident.table import LEAST_BUDGET
-from realtime.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter
+from session.worlds import HIERARCHICAL, block, cloud, make, poses_in, scatter
 from voxels import write_voxels
 
 Floats = NDArray[np.float64]

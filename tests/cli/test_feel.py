@@ -17,9 +17,10 @@ from hapticdb.cli.session_page import tell_cost
 from hapticdb.cli.values import size_bytes
 from hapticdb.errors import UsageError
 from hapticdb.query.law import LawName
-from hapticdb.realtime import coupling, fork_server
 from hapticdb.recording.file import Frames, Recording
 from hapticdb.resident.table import is_alive
+from hapticdb.session import coupling
+from hapticdb.session.processes import fork_server
 from hapticdb.transfer import copy_environment
 from postgres_servers import serving
 from servers import FOUND, SETTINGS
@@ -183,7 +184,7 @@ def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.Mo
     monkeypatch.setattr(coupling, "rendering_of", refuse)
     refused(run(*feel(*PLAY)), "enough is seen")
     assert done == [
-        "hapticdb.realtime.loop:work", "hapticdb.realtime.fetching:fetch", "options"
+        "hapticdb.session.loop:work", "hapticdb.session.prefetch.fetching:fetch", "options"
     ]  # fmt: skip
 
 

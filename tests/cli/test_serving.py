@@ -8,9 +8,9 @@ import hapticdb
 from hapticdb.cli import main
 from hapticdb.cli.options import RenderingName
 from hapticdb.cli.verbs.serving import _serving, _tokens
-from hapticdb.realtime import fork_server
 from hapticdb.server.access import Role
 from hapticdb.server.running import _page_request
+from hapticdb.session.processes import fork_server
 
 
 @pytest.fixture

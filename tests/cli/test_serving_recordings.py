@@ -13,8 +13,8 @@ from banded import write_points
 from children import PATIENCE, child, until
 from hapticdb import Grid
 from hapticdb.cli.root import TERMINATED
-from hapticdb.realtime.replay import replay
 from hapticdb.recording.file import Recording
+from hapticdb.session.replay import replay
 from page_person import PagePerson
 from serving import browser_at
 from voxels import floor_voxels

@@ -14,7 +14,7 @@ from hapticdb.devices.protocol import Reading
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import HAND, pose_numbers
 from hapticdb.poses import poses_of
-from realtime.worlds import turned
+from session.worlds import turned
 
 Floats = NDArray[np.float64]
 SEEDS = st.integers(0, 2**32 - 1)

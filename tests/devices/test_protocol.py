@@ -12,7 +12,7 @@ from hapticdb.devices.protocol import Reader, Reading
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
 from hapticdb.errors import DeviceError, UsageError
-from realtime.hands import Odd, still
+from session.hands import Odd, still
 
 Change = Callable[[Any], object]
 

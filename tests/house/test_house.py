@@ -218,7 +218,7 @@ def test_nothing_is_waited_for_without_an_end() -> None:
     allowed = [
         "tests/children.py",
         "tests/postgres_servers.py",
-        "tests/realtime/workers.py",
+        "tests/session/processes/workers.py",
         "tests/viser_page.py",
         "tests/devices/fake_hd.py",
     ]

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 from hapticdb import Grid
 from hapticdb.kernels.resident import cell_table as kernels
 from hapticdb.kernels.resident.cells import Place, cell_key, spread_key
-from realtime.worlds import poses_in
+from session.worlds import poses_in
 
 CAPACITY = 16
 

@@ -22,7 +22,7 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.query.frame import locate
 from hapticdb.resident.held import clusters_of
 from naive_frame import NaiveTouch, distance_at, touch_distances
-from realtime import worlds
+from session import worlds
 
 ORIGIN = (-0.31, 0.17, -0.05)
 SIZE = 0.013

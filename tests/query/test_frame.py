@@ -18,8 +18,8 @@ from hapticdb.grid import CurveName
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
 from naive_frame import NaiveTouch, touch_of_shell
-from realtime import worlds
 from servers import ENGINES, Place, named, url_on
+from session import worlds
 from voxels import EVERYWHERE, KINDS, blob, write_voxels
 
 ORIGIN = (-0.31, 0.17, -0.05)

@@ -14,7 +14,7 @@ import hapticdb
 from hapticdb import Environment, Grid, PointShell
 from hapticdb.paper.strategies import STRATEGIES, Strategy
 from hapticdb.store.base import Layout
-from realtime.worlds import random_shell
+from session.worlds import random_shell
 from voxels import blob, floor_voxels, write_voxels
 
 K = 1000.0

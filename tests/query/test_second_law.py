@@ -14,7 +14,7 @@ from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from naive_frame import NaiveTouch, touch_of_shell
-from realtime.worlds import random_shell
+from session.worlds import random_shell
 from voxels import blob, write_voxels
 
 ORIGIN = (-0.31, 0.17, -0.05)

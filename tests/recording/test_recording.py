@@ -25,14 +25,14 @@ from hapticdb.devices.profiles import PROFILES
 from hapticdb.errors import FileError, UsageError
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DistanceField
-from hapticdb.realtime.session import Session
 from hapticdb.recording import file as module
 from hapticdb.recording.file import FRAME, LEFT_FREE, Frames, Recorder, Recording, State
 from hapticdb.recording.header import OLDER, Start
-from realtime.hands import still
-from realtime.sessions import RATE, floored, recorded
-from realtime.worlds import make
+from hapticdb.session.session import Session
 from recordings import HEADER, begun, header, motion, write
+from session.hands import still
+from session.sessions import RATE, floored, recorded
+from session.worlds import make
 
 repeatedly = settings(suppress_health_check=[HealthCheck.function_scoped_fixture], deadline=None)
 

@@ -10,7 +10,7 @@ from hapticdb import PointShell
 from hapticdb.resident.frames import FeltFrames, ResidentFrames
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
-from realtime.worlds import make, scatter, turned
+from session.worlds import make, scatter, turned
 
 Poses = NDArray[np.float64]
 

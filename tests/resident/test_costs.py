@@ -14,8 +14,8 @@ from hapticdb.resident.residency import Residency
 from hapticdb.resident.source import ASKED, FAR, costs_at_start
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Store
-from realtime.troubled import troubled
-from realtime.worlds import make, move, scatter
+from session.troubled import troubled
+from session.worlds import make, move, scatter
 
 MEASURED = CostModel(*range(1, 6))
 ELSEWHERE = "a machine without kept figures"

@@ -20,7 +20,7 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import Band, Rows
 from hapticdb.store.connect import open_store
 from hapticdb.store.objects_at import ids_near_voxels
-from realtime.worlds import block, cells_of, make
+from session.worlds import block, cells_of, make
 from voxels import write_voxels
 
 BUDGET = 8 << 20

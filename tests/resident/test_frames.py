@@ -18,7 +18,7 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.store.base import Layout
 from hapticdb.store.connect import open_store
 from naive_frame import touch_of_shell
-from realtime.worlds import HIERARCHICAL, cloud, ids_by_voxel, make, poses_in, scatter
+from session.worlds import HIERARCHICAL, cloud, ids_by_voxel, make, poses_in, scatter
 from voxels import write_voxels
 
 

@@ -25,7 +25,7 @@ from hapticdb.resident.table import LEAST_BUDGET, CellTable
 from hapticdb.resident.writer import ROUNDS_KEPT
 from hapticdb.store.connect import open_store
 from naive import Voxel
-from realtime.worlds import Reader, block, cells_of, make, move, scatter
+from session.worlds import Reader, block, cells_of, make, move, scatter
 from voxels import voxel_object, write_voxels
 
 NOTHING = np.empty(0, dtype=np.int64)

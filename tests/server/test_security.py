@@ -16,11 +16,11 @@ from websockets.exceptions import ConnectionClosed, InvalidStatus
 import hapticdb
 from children import PATIENCE, descendants, named, until
 from hapticdb.errors import UsageError
-from hapticdb.realtime.processes import Process
 from hapticdb.server import access, page_keeper, relay
 from hapticdb.server.access import Role
 from hapticdb.server.limits import Limits
 from hapticdb.server.served import Serving, check
+from hapticdb.session.processes.process import Process
 from serving import CAMERA, TOKENS, Running, close_code, running, sent, text_until, urls
 
 EDITOR = "a-token-for-editor"

@@ -17,8 +17,8 @@ from children import until
 from command_line import PLACES, Run, refused
 from hapticdb import PointShell
 from hapticdb.paper.strategies import STRATEGIES
-from hapticdb.realtime.fetching import Fetcher, FetchRequest
 from hapticdb.resident.table import LEAST_BUDGET, CellTable
+from hapticdb.session.prefetch.fetching import Fetcher, FetchRequest
 from hapticdb.store.engines import MayLag
 from hapticdb.store.postgres.store import PostgresStore
 from postgres_servers import Server, serving

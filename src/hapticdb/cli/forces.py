@@ -7,7 +7,7 @@ from hapticdb.errors import UsageError
 if TYPE_CHECKING:
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.query.law import ForceLaw, LawName
-    from hapticdb.realtime.coupling import Coupling, Rendering
+    from hapticdb.session.coupling import Coupling, Rendering
 
 CONTACT_STIFFNESS = 1000.0
 """Stiffness of a contact, rendered directly, unless --stiffness is given, N/m."""
@@ -27,7 +27,7 @@ def law_and_coupling(
     milliseconds.
     """
     from hapticdb import DistanceField, TangentPlane
-    from hapticdb.realtime.coupling import Coupling
+    from hapticdb.session.coupling import Coupling
 
     if rendering == "coupled":
         delay = None if delay_ms is None else 1e-3 * delay_ms

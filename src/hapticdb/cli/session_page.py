@@ -12,9 +12,9 @@ from hapticdb.units import length_text
 if TYPE_CHECKING:
     from hapticdb.cli.options import LawName
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.realtime.report import Report
-    from hapticdb.realtime.resident_cells import ResidentCells
-    from hapticdb.realtime.session import Session
+    from hapticdb.session.prefetch.resident_cells import ResidentCells
+    from hapticdb.session.report import Report
+    from hapticdb.session.session import Session
 
 MOST_NAMED = 8
 """Objects that were touched whose names are printed; more are counted."""
@@ -107,7 +107,7 @@ def _frame_facts(report: "Report") -> Facts:
 
 def _force_facts(report: "Report") -> Facts:
     """Law and coupling, the greatest force, and what was done to keep it stable."""
-    from hapticdb.realtime.coupling import SettledCoupling, limit_text
+    from hapticdb.session.coupling import SettledCoupling, limit_text
 
     spring = report.coupling
     facts = [("force law", report.law), ("rendering", "coupled: the hand feels a spring")]

@@ -48,7 +48,7 @@ class DeviceProfile:
     usual_stiffness : float or None
         Stiffness of a session unless another is asked for, N/m. None: `stiffness`.
     torque_cap : float or None
-        Greatest torque of its motors, N m. None: not known; see `hapticdb.realtime.coupling`.
+        Greatest torque of its motors, N m. None: not known; see `hapticdb.session.coupling`.
     turn_stiffness : float or None
         Stiffest spring of turns, N m/rad. None: not known.
     delay : float or None

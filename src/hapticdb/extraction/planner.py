@@ -20,7 +20,7 @@ from hapticdb.extraction.planner_child import PlanRequest
 from hapticdb.extraction.problem import Exit, Problem
 from hapticdb.extraction.pulls import Pulls, first_run
 from hapticdb.poses import quaternion_of, rotation_of
-from hapticdb.realtime.processes import Process
+from hapticdb.session.processes.process import Process
 
 Floats = NDArray[np.float64]
 

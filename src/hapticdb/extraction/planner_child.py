@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import MissingExtraError, pip_line
-from hapticdb.realtime.processes import MessageSender, receive_from_parent
+from hapticdb.session.processes.process import MessageSender, receive_from_parent
 
 Floats = NDArray[np.float64]
 

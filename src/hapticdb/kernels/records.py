@@ -315,7 +315,7 @@ bins: less exact percentiles. The worst time is kept exactly."""
 SEAT: Layout = _record(
     [
         # written by who began the session
-        ("state", "<i8"),  # named in `hapticdb.realtime.board`
+        ("state", "<i8"),  # named in `hapticdb.session.board`
         ("id", "<i8"),  # of the session
         ("worker", "<i8"),  # number of the worker process
         ("is_asked_to_end", "<i8"),
@@ -354,7 +354,7 @@ SEAT: Layout = _record(
         ("elapsed", "<i8", TIME_BINS + 1),
     ]
 )
-"""A session on the board (`hapticdb.realtime.board`), which several processes share."""
+"""A session on the board (`hapticdb.session.board`), which several processes share."""
 
 WAY: Layout = _record(
     [

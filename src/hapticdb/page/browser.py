@@ -11,7 +11,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.hosting.hosted import HostedSession
 from hapticdb.page import checks, colours
 from hapticdb.page.connection import Visitor
 from hapticdb.page.drawing import HandDrawing, add_tool, put_at
@@ -20,7 +19,8 @@ from hapticdb.page.site import Site
 from hapticdb.page.tools import HeldTool
 from hapticdb.page.wording import plain_name
 from hapticdb.poses import pose_of_row, row_of_pose
-from hapticdb.realtime.coupling import Coupling
+from hapticdb.session.coupling import Coupling
+from hapticdb.session.hosted import HostedSession
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:

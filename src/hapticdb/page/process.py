@@ -7,11 +7,11 @@ import time
 import warnings
 from typing import TYPE_CHECKING
 
-from hapticdb.hosting.attached import AttachedHost
 from hapticdb.page.connection import PageConnection, PageRequest, Visitor
 from hapticdb.page.site import Site
 from hapticdb.page.tabs import TabbedBrowser
-from hapticdb.realtime.processes import MessageSender, parent_is_gone
+from hapticdb.session.attached import AttachedHost
+from hapticdb.session.processes.process import MessageSender, parent_is_gone
 
 if TYPE_CHECKING:
     from collections.abc import Callable

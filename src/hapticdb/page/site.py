@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
-from hapticdb.hosting.attached import AttachedHost
 from hapticdb.page import tools
 from hapticdb.page.connection import PageConnection, PageRequest
 from hapticdb.page.database import DatabaseThread
@@ -21,6 +20,7 @@ from hapticdb.page.editing import Edits
 from hapticdb.page.scene.surroundings import set_first_view
 from hapticdb.page.scene.view import SceneView
 from hapticdb.page.wording import error_text
+from hapticdb.session.attached import AttachedHost
 
 if TYPE_CHECKING:
     from viser import ViserServer

@@ -13,10 +13,10 @@ from prometheus_client.registry import Collector
 
 from hapticdb.environment import Environment
 from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.hosting.host import SessionHost
-from hapticdb.hosting.hosted import HostedFigures
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.served import Served
+from hapticdb.session.host import SessionHost
+from hapticdb.session.hosted import HostedFigures
 from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.server")

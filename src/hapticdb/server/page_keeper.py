@@ -10,7 +10,7 @@ from collections.abc import Callable
 
 from hapticdb.errors import HapticDBError
 from hapticdb.page.connection import LONGEST_LINE, NAME, ROLE, SECRET, line
-from hapticdb.realtime.processes import Process
+from hapticdb.session.processes.process import Process
 
 LOG = logging.getLogger("hapticdb.server")
 START_PATIENCE = 120.0

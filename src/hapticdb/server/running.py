@@ -12,7 +12,6 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from hapticdb.errors import UsageError
-from hapticdb.hosting.host import SessionHost
 from hapticdb.page.connection import PageRequest
 from hapticdb.server.access import Access, Role
 from hapticdb.server.app import application
@@ -24,6 +23,7 @@ from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served, Serving, check
 from hapticdb.server.transports import limited
+from hapticdb.session.host import SessionHost
 
 if TYPE_CHECKING:
     from starlette.types import ASGIApp

@@ -12,9 +12,9 @@ from hapticdb.server.access import Access, Role
 from hapticdb.server.limits import Limits
 
 if TYPE_CHECKING:
-    from hapticdb.hosting.host import SessionHost
-    from hapticdb.realtime.coupling import Rendering
     from hapticdb.server.figures import Figures
+    from hapticdb.session.coupling import Rendering
+    from hapticdb.session.host import SessionHost
 
 PAGE = "hapticdb.page.process:work"
 """The page's process."""

@@ -39,9 +39,9 @@ from hapticdb.errors import UsageError
 if TYPE_CHECKING:
     from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.realtime.coupling import Rendering
-    from hapticdb.realtime.report import Report
-    from hapticdb.realtime.session import Session
+    from hapticdb.session.coupling import Rendering
+    from hapticdb.session.report import Report
+    from hapticdb.session.session import Session
 
 LOOK_EVERY, OBJECTS_EVERY = 0.1, 3
 """Seconds between two looks at the session: how late a lost database is reported, or the end of its
@@ -282,22 +282,22 @@ def _begin_loop(
     frames_on: FramesOn,
 ) -> "Rendering":
     """Start the fork server, check the loop; returns the rendering."""
-    from hapticdb.realtime.fork_server import prepare
+    from hapticdb.session.processes.fork_server import prepare
 
     # at once: another interpreter with numba takes as long to load as all that is done here
-    prepare("hapticdb.realtime.loop:work", with_kernels=True)
-    prepare("hapticdb.realtime.fetching:fetch", with_kernels=True)
+    prepare("hapticdb.session.loop:work", with_kernels=True)
+    prepare("hapticdb.session.prefetch.fetching:fetch", with_kernels=True)
     from hapticdb.query.law import DISTANCE, as_law
-    from hapticdb.realtime.coupling import rendering_of
+    from hapticdb.session.coupling import rendering_of
 
     chosen = rendering_of(rendering, as_law(law) or DISTANCE)
     if frames_on != "cpu":
-        from hapticdb.realtime.on_gpu import check_frames
+        from hapticdb.session.on_gpu import check_frames
 
         check_frames(frames_on, chosen)
 
     with render.bar("loading", ""):
-        from hapticdb.realtime.timing import Timing
+        from hapticdb.session.timing import Timing
 
     Timing(processor=processor)
     return chosen

@@ -10,8 +10,8 @@ from hapticdb.cli.csv_files import FRAME_COLUMNS, STDOUT, open_csv, rows_of_fram
 from hapticdb.cli.options import CsvOption, JsonOption
 
 if TYPE_CHECKING:
-    from hapticdb.realtime.replay import Replayed
     from hapticdb.recording.file import Recording
+    from hapticdb.session.replay import Replayed
 
 PIECE = 4096
 """Frames that are written to CSV at once. Larger: more memory."""

@@ -195,7 +195,7 @@ def _serving(
     for other in dict.fromkeys(urls.values()):
         with closing(open_store(other, read_only=True)) as store:
             if rendering == "coupled" and not store.wants_distances:
-                from hapticdb.realtime.resident_cells import without_distances
+                from hapticdb.session.prefetch.resident_cells import without_distances
 
                 raise UsageError(without_distances(store.url, "leave out --rendering coupled"))
     for tool in tools or ():
@@ -257,8 +257,8 @@ def _run(
     import asyncio
     import logging
 
-    from hapticdb.realtime.fork_server import prepare
     from hapticdb.server import served
+    from hapticdb.session.processes.fork_server import prepare
 
     if seconds is not None and not seconds > 0.0:
         raise UsageError(f"--seconds {seconds:g}: give a time above 0")

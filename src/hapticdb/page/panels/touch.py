@@ -17,8 +17,8 @@ from hapticdb.page.wording import (
     swatch,
     torque_text,
 )
-from hapticdb.realtime.coupling import limit_text
 from hapticdb.recording.frame import State
+from hapticdb.session.coupling import limit_text
 from hapticdb.store.base import Object
 
 if TYPE_CHECKING:

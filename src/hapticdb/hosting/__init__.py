@@ -1,1 +1,0 @@
-"""Many hands in few processes, which share one table of cells."""

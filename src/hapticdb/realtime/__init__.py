@@ -1,1 +1,0 @@
-"""The real-time engine: frames that never wait on the database."""

@@ -1,0 +1,1 @@
+"""A hand in an environment, felt in real time: its processes, slots and reports."""

@@ -1,0 +1,92 @@
+"""AttachedHost: a host's sessions from another process, over a pair of sockets."""
+
+import logging
+import socket
+from collections.abc import Callable
+from typing import Any
+
+from numpy.typing import ArrayLike
+
+from hapticdb.closing import Closes
+from hapticdb.errors import HapticDBError
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.session.board import Board
+from hapticdb.session.coupling import Coupling
+from hapticdb.session.hosted import Calls, HostedSession
+from hapticdb.session.prefetch.tables import Words
+from hapticdb.session.processes.channel import Channel, Message
+
+LOG = logging.getLogger("hapticdb.session")
+
+
+class AttachedHost(Closes):
+    """The `SessionHost` of another process, which serves the other end of `sock`.
+
+    Frames, contacts and hands are in memory that both processes share; all else goes over the
+    socket, one request at a time. The sessions that this process has begun end when it dies or
+    closes. Also a context manager. Raises `HapticDBError` if the other process does not answer.
+    """
+
+    def __init__(self, sock: socket.socket) -> None:
+        sock.settimeout(None)
+        self._channel = Channel(sock)
+        try:
+            _, (descriptor,) = self._channel.receive()
+        except (EOFError, OSError, ValueError) as error:
+            self._channel.close()
+            raise HapticDBError("no host answers at the other end of the socket") from error
+        self._board = Board(descriptor)
+
+    def begin(
+        self,
+        shell: PointShell,
+        start: ArrayLike,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        coupling: Coupling | None = None,
+        scale: float = 1.0,
+    ) -> HostedSession:
+        """Begin a session; as `SessionHost.begin`, with its errors."""
+        options = {"where": where, "exclude": exclude, "coupling": coupling, "scale": scale}
+        seat, session = self._channel.ask("begin", shell, start, options)
+        return HostedSession(self._board, seat, session, self._call)
+
+    def _call(self, word: str, session: int, /, *content: object) -> object:
+        return self._channel.ask("call", word, session, *content)
+
+    def close(self) -> None:
+        """Leave the host; the sessions that this process has begun end."""
+        self._channel.close()
+        self._board.close()
+
+
+def serve_attached(
+    sock: socket.socket, board: Board, begin: Callable[..., HostedSession], call: Calls
+) -> None:
+    """Serve an `AttachedHost` until it leaves, by a host's methods; then end its sessions."""
+    channel = Channel(sock)
+    begun: set[int] = set()
+
+    def do(ask: Message, _: list[int]) -> Any:  # noqa: ANN401 - the answer to any request
+        if ask.word == "begin":
+            shell, start, options = ask.content
+            session = begin(shell, start, **options)
+            begun.add(session.id)
+            return session.seat, session.id
+        word, number, *content = ask.content
+        return call(word, number, *content)
+
+    try:
+        channel.send(None, [board.descriptor])
+        while True:
+            channel.reply(do)
+    except (EOFError, OSError):
+        pass
+    finally:
+        channel.close()
+        for number in begun:
+            try:
+                call("end", number)
+            except Exception:
+                LOG.exception("session %d of a process that left did not end well", number)

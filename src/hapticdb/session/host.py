@@ -1,0 +1,299 @@
+"""SessionHost: many hands in few worker processes, over tables of cells that they share."""
+
+import itertools
+import logging
+import os
+import socket
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike
+
+from hapticdb.closing import Closes
+from hapticdb.devices.handle import Handle
+from hapticdb.devices.profiles import SCRIPTED
+from hapticdb.devices.scripted import pose_at
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.kernels.rigid import is_rigid
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.poses import row_of_pose
+from hapticdb.query.law import DISTANCE, PLANE
+from hapticdb.resident.table import DEFAULT_BUDGET
+from hapticdb.session.attached import serve_attached
+from hapticdb.session.board import Board
+from hapticdb.session.coupling import Coupling, DirectRendering, Rendering, radius_of, rendering_of
+from hapticdb.session.hosted import HostedSession, Recorded
+from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
+from hapticdb.session.prefetch.tables import SharedTables, Words
+from hapticdb.session.running import Running
+from hapticdb.session.stations import without_surface
+from hapticdb.session.timing import Timing
+from hapticdb.session.worker import SeatRequest
+from hapticdb.session.workers import Workers
+from hapticdb.store.filtering import Filter
+
+LOG = logging.getLogger("hapticdb.session")
+MOST_SESSIONS = 64
+"""Most sessions of a host. Larger: more shared memory, 960 kB each."""
+TEND_EVERY = 0.05
+"""Seconds between two looks after recordings and processes. Larger: less work, and what has died is
+noticed later. A recording loses frames from 2 s on."""
+
+
+class SessionHost(Closes):
+    """Hands in an environment, `MOST_SESSIONS` at once, each felt in real time.
+
+    Sessions run in worker processes, many in each. All sessions that feel the same objects share
+    one table of resident cells and its fetching process. Also a context manager.
+
+    url : the environment; rate : frames a second of each session; budget_bytes : memory of each
+    table of cells; processes : most worker processes, one for each processor unless given, and one
+    for each rendering; rendering : of all sessions. Without it sessions whose objects have
+    distances to surfaces are coupled, and the others feel tangent planes directly.
+    """
+
+    _pid = 0
+    """Id of the process that made this object. In a forked copy `close` does nothing."""
+
+    def __init__(
+        self,
+        url: str,
+        *,
+        rate: float = 1000.0,
+        budget_bytes: int = DEFAULT_BUDGET,
+        processes: int | None = None,
+        rendering: Rendering | None = None,
+    ) -> None:
+        Timing(rate)  # checks it
+        rendering_of(rendering, DISTANCE)  # likewise
+        if processes is not None and processes < 1:
+            raise UsageError(f"{processes} worker processes: give 1 or more")
+        self.url, self.rate, self._rendering = url, rate, rendering
+        self._tables = SharedTables(url, budget_bytes)
+        self._board = Board.create(MOST_SESSIONS)
+        self._workers = Workers(self._board, rate, processes or os.cpu_count() or 1)
+        self._running: dict[int, Running] = {}
+        self._ids = itertools.count(1)
+        self._changing = threading.RLock()
+        self._served: list[socket.socket] = []
+        self._is_closed = threading.Event()
+        self.failure: HapticDBError | None = None
+        """Error that keeps the database from being read again; None while all is well."""
+        self._pid = os.getpid()
+        self._logged: set[str] = set()
+        self._tending = [
+            threading.Thread(target=self._tend, args=(look,), daemon=True, name="host")
+            for look in (self._look_after_sessions, self._look_after_cells)
+        ]
+        for thread in self._tending:
+            thread.start()
+
+    def begin(
+        self,
+        shell: PointShell,
+        start: ArrayLike,
+        *,
+        where: Words = (),
+        exclude: Words = (),
+        coupling: Coupling | None = None,
+        scale: float = 1.0,
+    ) -> HostedSession:
+        """Begin a session; its tool waits at `start`, (4, 4), scene metres, until the hand moves.
+
+        where, exclude : words as of `Environment.find`, of the objects in contact (all without
+        `where`) and of exceptions; coupling : without a profile no force moves its hand; rendered
+        directly, it gives caps alone; scale :
+        metres of the scene for a metre of the device, for the coupling alone: poses of the hand are
+        the scene's.
+
+        Raises `UsageError` if a number is out of its range, no seat is free, or a hand is to be
+        coupled where an object has no distances to its surfaces; `ObjectNotFoundError` if a word
+        chooses nothing; `DatabaseError` if the environment cannot be opened.
+        """
+        pose = pose_at(start)
+        if not is_rigid(pose):
+            raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
+        Handle(scale=scale)  # checks it
+        felt = self._tables.checked(where, exclude)
+        with self._changing:
+            if self._is_closed.is_set():
+                raise UsageError("the host is closed: make another")
+            return self._begin(shell, pose, felt, coupling, scale)
+
+    def _begin(
+        self,
+        shell: PointShell,
+        pose: Any,  # noqa: ANN401 - (4, 4), checked
+        felt: Filter,
+        coupling: Coupling | None,
+        scale: float,
+    ) -> HostedSession:
+        """Take seat, cells and worker for a session; all are given back if one is not to be had."""
+        session = next(self._ids)
+        with ExitStack() as undo:
+            cells = self._tables.take(felt)
+            undo.callback(self._tables.release, cells)
+            law = DISTANCE if cells.has_distances else PLANE
+            if self._rendering == "coupled" and law is PLANE:
+                raise UsageError(without_distances(self.url, "leave out --rendering coupled"))
+            rendering = rendering_of(self._rendering, law)
+            settled = self._settled(coupling, cells, shell, scale, rendering)
+            worker = self._workers.least_busy(law, rendering)
+            seat = self._board.take(session, worker.number)
+            undo.callback(self._board.release, seat)
+            reader = cells.table.join()
+            undo.callback(cells.table.leave, reader)
+            cells.table.desk.pids[reader] = worker.pid
+            request = SeatRequest(
+                seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
+                grid=cells.grid, shell=without_surface(shell), coupling=settled,
+                pose=tuple(row_of_pose(pose).tolist()),
+            )  # fmt: skip
+            hand = np.array(request.pose)
+            self._board.seats["hand_pose"][seat] = hand
+            self._board.seats["is_held"][seat] = 1
+            worker.ask("begin", request, descriptors=[cells.table.descriptor])
+            self._running[session] = Running(request, session, cells, worker)
+            undo.pop_all()
+        return HostedSession(self._board, seat, session, self._call)
+
+    def _settled(
+        self,
+        coupling: Coupling | None,
+        cells: ResidentCells,
+        shell: PointShell,
+        scale: float,
+        rendering: Rendering,
+    ) -> DirectRendering:
+        """Coupling or caps of a session, with all numbers."""
+        radius, coupling = radius_of(shell, cells.grid.voxel_size), coupling or Coupling()
+        if rendering == "direct":
+            return coupling.direct(SCRIPTED, scale, radius)
+        return coupling.settled(SCRIPTED, self.rate, scale, radius)
+
+    def sessions(self) -> list[HostedSession]:
+        """Sessions that run now, by their ids."""
+        running = sorted(self._running.items())
+        return [HostedSession(self._board, r.seat, number, self._call) for number, r in running]
+
+    def _call(self, word: str, session: int, /, *content: object) -> object:
+        """Do what a session asks for; see `HostedSession`."""
+        known: dict[str, Callable[..., object]] = {
+            "set_coupling": self._set_coupling,
+            "record": self._record,
+            "stop_recording": lambda running: running.stop_recording(self._board),
+            "end": self._end,
+        }
+        with self._changing:
+            running = self._running.get(session)
+            if running is None:
+                if word == "end":
+                    return None
+                raise UsageError(f"the hosted session {session} is over: begin another")
+            return known[word](running, *content)
+
+    def _set_coupling(self, running: Running, coupling: Coupling | None) -> None:
+        asked = running.request
+        settled = self._settled(
+            coupling, running.cells, asked.shell, asked.coupling.scale,
+            running.worker.request.rendering,
+        )  # fmt: skip
+        running.worker.ask("set_coupling", asked.seat, settled)
+        running.request = replace(asked, coupling=settled)
+
+    def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
+        running.record(path, self.rate, replace=replace)
+
+    def _end(self, running: Running) -> Recorded:
+        """End a session, whatever of it still works; returns what its recording has."""
+        self._running.pop(running.session, None)
+        with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
+            ends.callback(self._board.release, running.seat)
+            ends.callback(self._tables.release, running.cells)
+            ends.callback(running.cells.table.leave, running.request.reader)
+            try:
+                if running.worker.is_alive:
+                    running.worker.ask("end", running.seat)
+            finally:
+                recorded = running.stop_recording(self._board)
+        return recorded
+
+    def serve(self, sock: socket.socket) -> None:
+        """Serve an `AttachedHost` in a thread; the host owns the socket from now on."""
+        self._served.append(sock)
+        threading.Thread(
+            target=serve_attached,
+            args=(sock, self._board, self.begin, self._call),
+            daemon=True,
+            name="attached",
+        ).start()
+
+    def _tend(self, look: Callable[[], None]) -> None:
+        """Look after something again and again; without `_changing`, which a slow begin holds."""
+        while not self._is_closed.wait(TEND_EVERY):
+            look()
+
+    def _look_after_sessions(self) -> None:
+        """Record frames, notice workers that died."""
+        for running in list(self._running.values()):
+            with self._surviving("recording a session"):
+                if running.worker.is_alive:
+                    running.take_frames(self._board)
+                else:
+                    self._board.lose(running.seat, running.session)
+
+    def _look_after_cells(self) -> None:
+        """Start fetching processes again that have ended."""
+        for cells in self._tables.all():
+            with self._surviving("starting a fetching process again"):
+                try:
+                    cells.supervise()
+                except HapticDBError as error:
+                    self.failure = error
+
+    @contextmanager
+    def _surviving(self, work: str) -> Iterator[None]:
+        """Go on after an error, which is logged when it is met for the first time."""
+        try:
+            yield
+        except Exception as error:
+            said = f"{work}: {type(error).__name__}: {error}"
+            if said not in self._logged:
+                self._logged.add(said)
+                LOG.exception("%s failed; later errors of this kind are not logged", work)
+
+    @property
+    def cells(self) -> list[ResidentCells]:
+        """Tables of cells in use, one for each filter of what is felt, with their figures."""
+        return self._tables.all()
+
+    @property
+    def pids(self) -> list[int]:
+        """Process ids of the workers."""
+        return self._workers.pids
+
+    def close(self) -> None:
+        """End all sessions, processes and recordings; a second call does nothing."""
+        if os.getpid() != self._pid or self._is_closed.is_set():
+            return
+        self._is_closed.set()
+        for thread in self._tending:
+            with suppress(RuntimeError):
+                thread.join()
+        with self._changing, ExitStack() as ends:
+            ends.callback(self._board.close)
+            ends.callback(self._tables.close)
+            ends.callback(self._workers.close)
+            for sock in self._served:
+                ends.callback(_shut, sock)
+            for running in list(self._running.values()):
+                ends.callback(self._end, running)
+
+
+def _shut(sock: socket.socket) -> None:
+    with suppress(OSError):
+        sock.shutdown(socket.SHUT_RDWR)

@@ -1,0 +1,160 @@
+"""HostedSession: one hand that a host runs, seen from the process that moves it."""
+
+import math
+import os
+import time
+from collections.abc import Callable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from hapticdb.errors import UsageError
+from hapticdb.kernels.hand.handle import FARTHEST
+from hapticdb.kernels.rigid import is_rigid
+from hapticdb.poses import row_of_pose
+from hapticdb.recording.frame import Frames, State
+from hapticdb.session.board import TAKEN, Board
+from hapticdb.session.coupling import Coupling
+from hapticdb.session.report import LoopFigures, Spread
+
+
+class HostedFigures(NamedTuple):
+    """Figures of a hosted session so far.
+
+    frames : number of frames; missed : deadlines at which no frame began; in_time : share of all
+    deadlines whose frame was done before the next one; lateness : seconds from a deadline to the
+    begin of the session's frame; elapsed : seconds of computing a frame; unknown, held, stale :
+    numbers of frames with a point in a cell that was not resident, with an earlier wrench, and with
+    a database that had not answered for too long.
+    """
+
+    frames: int
+    missed: int
+    in_time: float
+    lateness: Spread
+    elapsed: Spread
+    unknown: int
+    held: int
+    stale: int
+
+
+class Recorded(NamedTuple):
+    """What a recording has at its end: frames, and frames that were lost on the way to it."""
+
+    frames: int
+    lost: int
+
+
+Calls = Callable[..., object]
+"""What a hosted session asks of the host: a word, the session's id, what goes with it -> result."""
+
+
+class HostedSession:
+    """A hand in an environment that a worker process of the host runs, among others.
+
+    `move`, `latest`, `contacts`, `touched` and `figures` read and write shared memory and take
+    microseconds; the others wait for the host, which `call` reaches.
+
+    id : number that no other session of the host ever has; seat : row of the board; lost_frames :
+    frames that this session's last recording lacks, known when this object has ended it.
+    """
+
+    def __init__(self, board: Board, seat: int, session: int, call: Calls) -> None:
+        self._board, self.seat, self._call = board, seat, call
+        self.id = session
+        self.lost_frames = 0
+
+    @property
+    def is_over(self) -> bool:
+        """Whether the session has ended: by `end`, or because its process died."""
+        seats = self._board.seats
+        return bool(seats["id"][self.seat] != self.id or seats["state"][self.seat] != TAKEN)
+
+    def _open_seat(self) -> int:
+        if self.is_over:
+            raise UsageError(f"the hosted session {self.id} is over: begin another")
+        return self.seat
+
+    def move(self, pose: ArrayLike) -> None:
+        """Put the hand at a pose (4, 4) of the scene, metres; the newest one counts.
+
+        A position and a unit quaternion, (7,), are a pose, too, and save the conversion.
+
+        The hand moves there from where it is, in about the time between two calls, so that calls at
+        20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
+        UsageError if the pose is no rigid transform or is beyond 1e9 m, or the session is over.
+        """
+        row = np.asarray(pose, dtype=np.float64)
+        if row.shape == (4, 4) and is_rigid(row):
+            row = row_of_pose(row)
+        if row.shape != (7,) or not (
+            np.abs(row).max() <= FARTHEST and abs(math.hypot(*row[3:]) - 1.0) <= 1e-6
+        ):
+            raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
+        self._board.put_hand(self._open_seat(), time.monotonic_ns(), row)
+
+    def latest(self) -> Frames | None:
+        """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""
+        return self._board.last_frame(self._open_seat())
+
+    def touched(self) -> tuple[int, ...]:
+        """Ids of the objects that the tool touches now, or lies in; asked 100 times a second."""
+        seat = self._open_seat()
+        last = self._board.last_frame(seat)
+        if last is None or not (last["hits"][0] or last["state"][0] & State.IN_OBJECT):
+            return ()
+        seats = self._board.seats
+        ids = seats["objects"][seat, : int(seats["n_objects"][seat])]
+        return tuple(sorted(set(ids.tolist())))
+
+    def contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+        """Points (n, 3) in contact, m, and forces there, N; world frame, n <= 64, 30 Hz."""
+        found = self._board.contacts(self._open_seat())
+        return found[:, :3], found[:, 3:]
+
+    def set_coupling(self, coupling: Coupling | None) -> None:
+        """Replace the coupling between hand and tool; None: the default one."""
+        self._call("set_coupling", self.id, coupling)
+
+    def record(self, path: str | os.PathLike[str], *, replace: bool = False) -> None:
+        """Record the frames from now on into a file.
+
+        UsageError if the session is recorded already, or the file exists and `replace` is False;
+        FileError if the file cannot be written.
+        """
+        self._call("record", self.id, os.path.abspath(path), replace)  # noqa: PTH100 - a text to send
+
+    def stop_recording(self) -> int:
+        """End the recording, which stays; returns the number of its frames, 0 without one."""
+        return self._ended_recording("stop_recording")
+
+    def _ended_recording(self, word: str) -> int:
+        """Do what ends a recording; returns the number of its frames."""
+        recorded = self._call(word, self.id)
+        if recorded is None:  # the session was over
+            return 0
+        assert isinstance(recorded, Recorded)  # noqa: S101 - the host counts
+        self.lost_frames = recorded.lost
+        return recorded.frames
+
+    def figures(self) -> HostedFigures:
+        """Figures of the session so far."""
+        seat = self._open_seat()
+        row = self._board.seats[seat]
+        loop = LoopFigures.of_seat(row, 0.0)
+        return HostedFigures(
+            frames=loop.frames,
+            missed=loop.missed,
+            in_time=int(row["in_time"]) / max(loop.frames + loop.missed, 1),
+            lateness=loop.lateness,
+            elapsed=loop.elapsed,
+            unknown=int(row["unknown_frames"]),
+            held=int(row["held_frames"]),
+            stale=int(row["stale_frames"]),
+        )
+
+    def end(self) -> None:
+        """End the session and its recording; a second call does nothing."""
+        if self._board.seats["id"][self.seat] == self.id:
+            self._ended_recording("end")

@@ -1,0 +1,324 @@
+"""The servo loop, in a process of its own: every frame on time, no frame queries the database.
+
+The loop is one kernel, which calls this module to read the device and to push it. While it runs, no
+kernel is compiled and no garbage is collected.
+"""
+
+import contextlib
+import math
+import signal
+import threading
+import time
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from hapticdb.devices.handle import Handle
+from hapticdb.devices.protocol import (
+    Device,
+    Reader,
+    Reading,
+    SupportsClose,
+    SupportsEnd,
+    SupportsOpen,
+    SupportsRewind,
+)
+from hapticdb.errors import DeviceError, HapticDBError
+from hapticdb.grid import Grid
+from hapticdb.kernels._jit import ENTRIES
+from hapticdb.kernels.hand.calling import FUNCTION, address_of
+from hapticdb.kernels.hand.handle import is_somewhere
+from hapticdb.kernels.period.loop import DEVICE, NOBODY
+from hapticdb.kernels.records import pose_numbers, views_of
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import ForceLaw, reads_distances
+from hapticdb.resident.held import clusters_of
+from hapticdb.resident.table import LOST, STOP, CellTable
+from hapticdb.session.board import Board
+from hapticdb.session.coupling import DirectRendering, Rendering
+from hapticdb.session.processes.process import MessageSender, parent_is_gone
+from hapticdb.session.report import LoopAnswer, LoopFigures
+from hapticdb.session.stations import Station, Stations
+from hapticdb.session.timing import Timing, undisturbed
+
+if TYPE_CHECKING:
+    from hapticdb.session.on_gpu import GpuLooks
+
+EMPTY_SECONDS = 2.0
+"""Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
+Larger: the machine's own lateness is measured better, the first frame comes later."""
+LOOK_EVERY = 0.25
+"""Seconds between two checks whether the process that started the loop still runs."""
+WARM_PATIENCE = 30.0
+"""Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
+
+
+@dataclass(frozen=True)
+class LoopRequest:
+    """Request to a loop's process: see `hapticdb.session.session.Session`."""
+
+    table: CellTable
+    row: int
+    board: Board
+    grid: Grid
+    shell: PointShell
+    device: Device
+    law: ForceLaw
+    rendering: Rendering
+    coupling: DirectRendering
+    handle: Handle
+    timing: Timing
+    seconds: float
+    staleness: float
+    has_baseline: bool = True
+    is_on_gpu: bool = False
+
+
+class Loop:
+    """A session's loop in this process. It is made, warmed up, and run once.
+
+    Parameters
+    ----------
+    request : LoopRequest
+        Its reader row of the table is already taken.
+    """
+
+    def __init__(self, request: LoopRequest) -> None:
+        self.request = request
+        self.device = request.device
+        self.reader = Reader(request.device)
+        self.table, self.board = request.table, request.board
+        self.session = self.table.desk.sessions[request.row, ...]
+        self.stations = Stations(request.law, self.board.seats, self.board.rings, request.rendering)
+        cells = self.table.cells
+        if not reads_distances(request.law):
+            cells = cells.without_distances()
+        tool = clusters_of(request.shell, request.grid.voxel_size)
+        self.station = Station(
+            self.stations.rows, cells, request.row, self.session, request.grid, tool
+        )
+        self.station.set_spring(request.coupling.spring())
+        self.station.row["source"], self.station.row["is_running"] = DEVICE, True
+        self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
+        self.gpu: GpuLooks | None = None
+        if request.is_on_gpu:
+            from hapticdb.session import on_gpu  # noqa: PLC0415 - loads numba.cuda
+
+            self.gpu = on_gpu.GpuLooks(self.station, self.table)
+            self.station.follower["merges_from"] = on_gpu.MERGES_FROM
+        self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
+        self.sent = views_of(self.station.servo["sent"])
+        self._reading = views_of(self.station.record["reading"])
+        self._is_asked_to_end = self.board.seats[0, ...]["is_asked_to_end"]
+        self.bad_reading: str | None = None
+        self.is_warm = False
+        self._error: BaseException | None = None
+        self._signal = 0
+
+    # -- before the first frame --------------------------------------------------------------
+
+    def prepare(self) -> None:
+        """Place the tool at the hand and wait for its cells.
+
+        Without a database it does not wait: what supervises the session tells of that at once.
+        """
+        started = time.monotonic()
+        session, asked = self.session, 0
+        control = self.table.cells.control
+        self._place()
+        while time.monotonic() - started < WARM_PATIENCE and not self._is_left():
+            if control[LOST]:
+                break
+            if asked and session["heard"] >= asked:
+                if session["n_missing"] == 0:
+                    self.is_warm = True
+                    break
+                asked = 0
+            if not asked:  # a person's hand has moved while the loop waited
+                self._place()
+                self._step(1e-3)
+                asked = int(session["sequence"])
+            time.sleep(1e-3)
+        self._place()
+
+    def _place(self) -> None:
+        """Put the tool where the hand is, at rest."""
+        if isinstance(self.device, SupportsRewind):
+            self.device.rewind()
+        reading, handle = self._read(), self.request.handle
+        self._take(reading)
+        handle.start(reading, self.hand)
+        self.station.record["handle"] = handle.record
+        # a held first frame must not report hits at an earlier place
+        self.station.rest_at(pose_numbers(self.hand).copy())
+
+    def _read(self) -> Reading:
+        """Read the hand's pose; wait for a device that does not know it yet after its opening."""
+        until = time.monotonic() + WARM_PATIENCE
+        reading = self.reader.read()
+        while not is_somewhere(reading.pose, reading.velocity):
+            if time.monotonic() > until or self._is_left():
+                raise DeviceError(
+                    f"the device has not said where it is within {WARM_PATIENCE:g} s: "
+                    f"{self.reader.complaint()}; check its connection and calibration"
+                )
+            time.sleep(1e-3)
+            reading = self.reader.read()
+        return reading
+
+    def warm_up(self) -> None:
+        """Run every kernel of a frame, so that none is compiled later; the tool stays in place."""
+        if isinstance(self.device, SupportsOpen):
+            self.device.open()
+        self._place()
+        for _ in range(3):
+            self._step(1e-3)
+        self.session["told"]["is_active"] = False
+        self.device.apply(np.zeros(6))
+
+    # -- one frame ---------------------------------------------------------------------------
+
+    def _take(self, reading: Reading) -> None:
+        """Write a reading for the kernel."""
+        taken = self._reading
+        taken.pose[:], taken.velocity[:], taken.buttons[()] = reading
+
+    def _step(self, dt: float) -> None:
+        """Run a period of `dt` s; `sent` then has the wrench for the device."""
+        self.stations.step(dt, time.monotonic_ns())
+        if self.gpu is not None:
+            self.gpu.check()
+
+    def _is_stopped(self) -> bool:
+        return bool(self.table.cells.control[STOP]) or bool(self._is_asked_to_end)
+
+    def _is_left(self) -> bool:
+        return self._is_stopped() or parent_is_gone()
+
+    # -- the loop ----------------------------------------------------------------------------
+
+    def run(self) -> LoopFigures:
+        """Run frames until the time is over, the device's script ends, or a stop is requested."""
+        timing, row = self.request.timing, self.station.row
+        called = self._called(self._read_hand), self._called(self._pusher())
+        row["reads"], row["pushes"] = map(address_of, called)
+        row["is_frame"] = True
+        before = signal.signal(signal.SIGTERM, self._end)
+        try:
+            seconds = self.stations.run(timing.rate, self.request.seconds)
+        finally:
+            signal.signal(signal.SIGTERM, before)
+        if self._signal:
+            signal.raise_signal(self._signal)
+        if self._error is not None:
+            raise self._error
+        self.device.apply(np.zeros(6))
+        return LoopFigures.of_seat(self.board.seats[0], seconds)
+
+    def _end(self, number: int, _: object) -> None:
+        """End the loop, and the call of a device that hangs.
+
+        What is raised at the entrance of a kernel's call is lost; `run` then raises the signal.
+        """
+        self._signal = number
+        self.stations.stop()
+        raise SystemExit(128 + number)
+
+    def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
+        """Return what a kernel calls for `work`, which says if the loop ends: an error ends it."""
+
+        def answer() -> bool:
+            try:
+                return work()
+            except BaseException as error:  # noqa: BLE001 - `run` raises it
+                self._error = error
+                return True
+
+        return FUNCTION(answer)
+
+    def _read_hand(self) -> bool:
+        self._take(self.reader.read())
+        return False
+
+    def _pusher(self) -> Callable[[], bool]:
+        """Return what pushes the device and looks whether the loop ends."""
+        device, seat = self.device, self.board.seats[0, ...]
+        ends = device if isinstance(device, SupportsEnd) else None
+        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], seat["n_frames"]
+        look_every = max(round(LOOK_EVERY * self.request.timing.rate), 1)
+
+        def push() -> bool:
+            if self.gpu is not None:
+                self.gpu.check()
+            device.apply(applied)
+            if math.isnan(x.item()) and self.bad_reading is None:
+                self.bad_reading = self.reader.complaint() or None
+            if self._is_stopped() or (ends is not None and ends.is_over):
+                return True
+            return n_frames.item() % look_every == 0 and parent_is_gone()
+
+        return push
+
+    def close(self) -> None:
+        """Set the force to zero, however the loop ended, and close the device."""
+        with contextlib.suppress(Exception):  # a device that has failed may fail here, too
+            self.device.apply(np.zeros(6))
+        if isinstance(self.device, SupportsClose):
+            self.device.close()
+
+
+def empty_loop(
+    law: ForceLaw, rendering: Rendering | None, rate: float, seconds: float
+) -> LoopFigures:
+    """Run a loop that does nothing at that rate, to measure the machine's lateness.
+
+    It ends at once if the process that started this one ends, or closes its channel.
+    """
+    stations = Stations(law, rendering=rendering)
+    stations.rows["source"], stations.rows["is_running"] = NOBODY, True
+
+    # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
+    def end() -> None:
+        if parent_is_gone(seconds):
+            stations.stop()
+
+    watch = threading.Thread(target=end)
+    watch.start()
+    took = stations.run(rate, seconds)
+    watch.join()
+    return LoopFigures.of_seat(stations.seats[0], took)
+
+
+def n_compiled() -> int:
+    """Number of signatures of all kernels that have been compiled or loaded."""
+    return sum(len(getattr(e.compiled, "signatures", ())) for e in ENTRIES.values())
+
+
+def work(request: LoopRequest, sender: MessageSender) -> None:
+    """Run a session's loop in this process, and send its results."""
+    loop = Loop(request)
+    try:
+        loop.warm_up()
+        with undisturbed(request.timing.processor):
+            empty = None
+            if request.has_baseline:
+                seconds = min(EMPTY_SECONDS, request.seconds)
+                rate = request.timing.rate
+                empty = empty_loop(request.law, request.rendering, rate, seconds)
+            loop.prepare()
+            compiled = n_compiled()
+            sender.send("running", loop.station.state())
+            figures = loop.run()
+            if n_compiled() != compiled:
+                raise HapticDBError("a kernel was compiled while the loop ran: report this")
+        card = None if loop.gpu is None else loop.gpu.card
+        answer = LoopAnswer(figures, empty, loop.bad_reading, loop.is_warm, card)
+        sender.send("done", answer)
+    finally:
+        try:  # the loop is ending, so SIGTERM is ignored: the device must be closed completely
+            before = signal.signal(signal.SIGTERM, signal.SIG_IGN)
+        finally:
+            loop.close()
+        signal.signal(signal.SIGTERM, before)

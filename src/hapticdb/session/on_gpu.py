@@ -1,0 +1,301 @@
+"""Looks of a session's coupling on a graphics processor, which the kernel of its periods calls."""
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numba import config, cuda
+from numpy.typing import NDArray
+
+from hapticdb.batches.on_gpu import check_gpu
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.kernels.gpu import looks as kernels
+from hapticdb.kernels.hand.calling import FUNCTION, address_of
+from hapticdb.kernels.hand.near_points import (
+    BOUND,
+    FAR,
+    FLOOR,
+    LAST_BOUND,
+    LAST_U,
+    LEAST_BOUND,
+    MOST_MERGED,
+    NEAR,
+    NEAR_POINTS,
+    NEAR_ROWS,
+    NEVER,
+    NOT_KNOWN,
+    OPEN,
+    POINTS_ANEW,
+    SHUT,
+    U,
+)
+from hapticdb.kernels.records import MOST_MISSED, views_of
+from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
+from hapticdb.query.law import DISTANCE
+from hapticdb.resident.mirror import CellMirror
+from hapticdb.resident.table import CellTable
+from hapticdb.session.stations import Station
+
+ROOM = 1 << 17, 8
+"""Near points for which there is room at first: so many, or all of a smaller tool's, or this part
+of a larger tool's, at 0.2 kB each. More make new room, in a frame that is late."""
+NOBODY = 1 << 62
+"""In the place of a point's number: none."""
+NUMBER, RUN, LAST, N_DUE = map(kernels.Look._fields.index, ("number", "run", "last", "n_due"))
+"""Of `Look`."""
+NOTHING = np.array([0.0, 0.0, 0.0, NEVER])
+"""What a look finds at first."""
+MERGES_FROM = 4096
+"""Near points from which one contact stands for several: the processor solves for them, 34 ms a
+period with 57,600 of them, 1.3 ms merged. Larger: broad contacts are felt point by point."""
+USED_EVERY = 16
+"""Looks after which the table learns which cells were read. Larger: less copying; a cell may be
+evicted sooner after it was read."""
+
+
+def check_frames(frames_on: str, rendering: str) -> None:
+    """Refuse a session whose frames cannot be computed there."""
+    if frames_on != "cuda":
+        raise UsageError(f"frames on {frames_on!r}: choose 'cpu' or 'cuda'")
+    if rendering != "coupled":
+        raise UsageError("frames on 'cuda' are of the rendering coupled, and this one is direct")
+    check_gpu()
+
+
+class _Repeated:
+    """Launches and copies of a stream, repeated with the arguments that they have now.
+
+    A launch by numba reads its arguments in Python, a third of a millisecond for twenty arrays; a
+    CUDA graph has read them. numba's simulator has no graphs.
+    """
+
+    def __init__(self, stream: Any, work: Callable[[], None]) -> None:  # noqa: ANN401 - numba's
+        self._stream, self._work = stream, work
+        self._graph: Any = None
+        if config.ENABLE_CUDASIM:
+            return
+        from cuda.bindings import driver  # noqa: PLC0415 - of the extra, on a machine with a GPU
+
+        self._driver = driver
+        mode = driver.CUstreamCaptureMode.CU_STREAM_CAPTURE_MODE_RELAXED
+        self._checked(driver.cuStreamBeginCapture(int(stream), mode))
+        work()
+        graph = self._checked(driver.cuStreamEndCapture(int(stream)))
+        self._graph = self._checked(driver.cuGraphInstantiate(graph, 0))
+
+    def __call__(self) -> None:
+        """Begin them once more."""
+        if self._graph is None:
+            self._work()
+        else:
+            self._checked(self._driver.cuGraphLaunch(self._graph, int(self._stream)))
+
+    @staticmethod
+    def _checked(answer: tuple[Any, ...]) -> Any:  # noqa: ANN401 - the driver's
+        if int(answer[0]):
+            raise HapticDBError(f"the driver says {answer[0]}")
+        return answer[-1]
+
+
+class GpuLooks:
+    """The looks of a station's coupling on the GPU: same near points, in the same order.
+
+    Parameters
+    ----------
+    station : Station
+        Of a tool whose periods this process runs; from now on the GPU looks for it.
+    table : CellTable
+        Where the station reads its cells.
+
+    Attributes
+    ----------
+    card : str
+        Name of the GPU.
+    """
+
+    def __init__(self, station: Station, table: CellTable) -> None:
+        check_gpu()
+        name = getattr(cuda.current_context().device, "name", "simulated")
+        self.card = name.decode() if isinstance(name, bytes) else str(name)
+        self._station, self._table = station, table
+        self._follower = views_of(station.follower)
+        self._tried = station.servo["tool"]["tried_pose"]
+        self._place = Place(*station.record["place"].tolist())
+        self._mirror = CellMirror(table, DISTANCE.for_kernels, side=None)
+        self._n_looks, self._epoch = 0, 0
+        self._error: BaseException | None = None
+        self._stream = cuda.stream()
+        self._nothing = cuda.to_device(NOTHING)
+        self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
+        self._asked: NDArray[np.float64] = cuda.pinned_array(kernels.ASKED, np.float64)
+        self._sight = self._sight_of(station)
+        n_runs = self._sight.run_due.size
+        self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
+        self._of_points = min(n_runs, kernels.MOST_BLOCKS)
+        self._kernel = kernels.look_at_runs(kernels.THREADS)
+        self._asked[:] = 0.0
+        self._asked[NUMBER], self._asked[RUN] = -1, 1
+        self._launch_look()  # compiles them; no run is due yet
+        self._launch_put_back()
+        self._stream.synchronize()
+        self._repeat()
+        self._called = FUNCTION(self._answer)
+        station.follower["looker"] = address_of(self._called)
+
+    def _sight_of(self, station: Station) -> kernels.Sight:
+        """Memory of the GPU for a tool."""
+        clusters, table = station.clusters, self._table
+        n_points = len(clusters.points)
+        n_runs = -(-n_points // clusters.run)
+        room = min(n_points, max(ROOM[0], n_points // ROOM[1]))
+        points = np.empty((3, n_points + 1))
+        points[:, :-1], points[:, -1] = clusters.columns, clusters.center
+        return kernels.Sight(
+            points=cuda.to_device(points),
+            spheres=cuda.to_device(clusters.spheres if len(clusters.spheres) else np.zeros((1, 4))),
+            due=cuda.device_array(n_points, np.float64),
+            run_due=cuda.to_device(np.full(n_runs, NEVER)),
+            due_before=cuda.device_array(n_points, np.float64),
+            run_due_before=cuda.device_array(n_runs, np.float64),
+            epochs=cuda.to_device(np.full(n_runs, -1)),
+            seen=cuda.to_device(np.zeros(n_runs, np.int64)),
+            due_runs=cuda.device_array(n_runs, np.int64),
+            asked=cuda.device_array(kernels.ASKED, np.float64),
+            used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
+            missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
+            found=cuda.to_device(NOTHING),
+            numbers=cuda.mapped_array(room, np.int64),
+            rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
+        )
+
+    def check(self) -> None:
+        """Raise what went wrong in a look of the last period, or a signal that came in one."""
+        if isinstance(self._error, Exception):
+            raise HapticDBError(f"the GPU has failed: {self._error}") from self._error
+        if self._error is not None:
+            raise self._error
+
+    def _answer(self) -> int:
+        """Do what a look asks for; an error leaves the tool held until `check`."""
+        try:
+            return self._looked()
+        except BaseException as error:  # noqa: BLE001 - no kernel can take it
+            self._error = error
+            return NOT_KNOWN
+
+    def _looked(self) -> int:
+        """Look at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
+        follower, station = self._follower, self._station
+        self._mirror.update(int(station.cells.readers[station.reader * READER_STRIDE]))
+        self._mirror.seen()  # in the arrays that the launches read
+        if self._n_looks % USED_EVERY == 0:
+            self._tell_used()
+        self._epoch += int(follower.anew) == POINTS_ANEW
+        most, half, field = int(follower.merges_from), 1 - int(follower.side), station.field
+        while True:
+            n_due, n_near, n_unknown, least = self._look_once().tolist()
+            n, numbers = int(n_near), self._sight.numbers
+            if n > numbers.size:
+                self._put_back(-1, n_due)
+                self._make_room(n)
+                continue
+            numbers = np.array(numbers[:n])
+            shut = self._first_shut(numbers)
+            if not (0 < most < n and follower.merged < MOST_MERGED):
+                break
+            last = int(np.partition(numbers, most)[most])
+            if shut < last:
+                break
+            self._put_back(last, n_due)
+            follower.merged[()] *= 2
+        if shut < NOBODY:
+            self._put_back(shut, n_due)
+            return SHUT
+        order = np.argsort(numbers)
+        rows = field[NEAR + half * NEAR_ROWS : NEAR + (half + 1) * NEAR_ROWS, :n]
+        np.take(self._sight.rows[:, :n], order, axis=1, out=rows)
+        station.met[NEAR_POINTS + half, :n] = numbers[order]
+        follower.n_tried[()], follower.n_unknown[()] = n, n_unknown
+        follower.tried_clearance[()] = least - float(follower.travelled) + FAR
+        self._tell_missed(int(n_unknown))
+        return NOT_KNOWN if n_unknown else OPEN
+
+    def _first_shut(self, numbers: NDArray[np.int64]) -> int:
+        """First of the near points that may not be there; NOBODY if all may."""
+        if not self._follower.is_walking:
+            return NOBODY
+        field = self._station.field
+        u, bound = np.array(self._sight.rows[U : BOUND + 1, : len(numbers)])
+        is_shut = (u < FLOOR) & (u <= field[LAST_U, numbers])
+        is_shut |= (bound < LEAST_BOUND) & (bound <= field[LAST_BOUND, numbers])
+        return int(numbers[is_shut].min(initial=NOBODY))
+
+    def _look_once(self) -> NDArray[np.float64]:
+        """Look at the tried pose once -> what was found (FOUND,). It forgets what it is to."""
+        follower = self._follower
+        self._n_looks += 1
+        asked = kernels.Look(
+            self._n_looks, self._epoch, self._station.clusters.run, follower.is_large,
+            follower.anew > 0, follower.is_bent, follower.merged, -1, 0, follower.travelled,
+            follower.way, tuple(self._tried[:3].ravel().tolist()),
+        )  # fmt: skip
+        self._asked[: -len(asked.pose)], self._asked[-len(asked.pose) :] = asked[:-1], asked.pose
+        follower.anew[()] = 0
+        self._begin_look()
+        self._stream.synchronize()
+        return self._found
+
+    def _put_back(self, last: int, n_due: float) -> None:
+        """Put back what a look wrote beyond a point; a later launch waits for it."""
+        self._asked[LAST], self._asked[N_DUE] = last, n_due
+        self._begin_put_back()
+        self._stream.synchronize()
+
+    def _launch_look(self) -> None:
+        """Launches and copies of a look."""
+        place, stream, sight = self._place, self._stream, self._sight
+        seen = self._mirror.seen()._replace(used=sight.used)
+        sight.asked.copy_to_device(self._asked, stream=stream)
+        kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, sight)
+        self._kernel[self._of_points, kernels.THREADS, stream](
+            place, seen, self._mirror.arrays[-1], sight
+        )
+        sight.found.copy_to_host(self._found, stream=stream)
+        sight.found.copy_to_device(self._nothing, stream=stream)
+
+    def _launch_put_back(self) -> None:
+        """Launch and copy of what puts back."""
+        self._sight.asked.copy_to_device(self._asked, stream=self._stream)
+        kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._sight)
+
+    def _repeat(self) -> None:
+        """Take both with the arrays that they have now."""
+        self._begin_look = _Repeated(self._stream, self._launch_look)
+        self._begin_put_back = _Repeated(self._stream, self._launch_put_back)
+
+    def _make_room(self, n: int) -> None:
+        """Make room for n near points."""
+        room = 1 << (n - 1).bit_length()
+        self._sight = self._sight._replace(
+            numbers=cuda.mapped_array(room, np.int64),
+            rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
+        )
+        self._repeat()
+
+    def _tell_missed(self, n_unknown: int) -> None:
+        """List the unknown cells that the look met, for the fetching process."""
+        missed, keys = self._station.missed, self._sight.missed
+        missed[LISTED] = 0
+        if n_unknown:
+            found = keys.copy_to_host()
+            keys.copy_to_device(np.full(kernels.ROOM_FOR_MISSED, -1))
+            found = np.sort(found[found >= 0])[:MOST_MISSED]
+            missed[LISTED] = len(found)
+            missed[LISTED + 1 : LISTED + 1 + len(found)] = found
+
+    def _tell_used(self) -> None:
+        """Mark the cells that were read in the table, which evicts others."""
+        used = self._sight.used
+        found = used.copy_to_host()
+        self._table.cells.used[found > 0] = 1
+        used.copy_to_device(np.zeros_like(found))

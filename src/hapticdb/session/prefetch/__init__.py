@@ -1,0 +1,1 @@
+"""Cells that tools are heading for, fetched before a frame needs them."""

@@ -1,0 +1,112 @@
+"""Channel: pickled messages between processes of our own, with file descriptors beside them.
+
+The processes trust one another: one of them started the others, and the socket between them is a
+pair that has no name. Nothing of a client from outside goes through a channel unparsed.
+"""
+
+import contextlib
+import logging
+import os
+import pickle
+import socket
+import threading
+from collections.abc import Callable, Sequence
+from typing import Any, NamedTuple
+
+from hapticdb.errors import HapticDBError
+
+LOG = logging.getLogger("hapticdb.session")
+MOST_DESCRIPTORS = 16
+"""Most file descriptors beside one message."""
+HEADER = 8
+"""Bytes of a message's length."""
+
+
+class Message(NamedTuple):
+    """A word for the kind of a message, and its content: of "error" the error, which is raised."""
+
+    word: str
+    content: Any = None
+
+
+class Channel:
+    """Messages over one end of a pair of sockets of the family AF_UNIX, which it owns."""
+
+    def __init__(self, sock: socket.socket) -> None:
+        self.sock = sock
+        self._asking = threading.Lock()
+
+    def send(self, content: object, descriptors: Sequence[int] = ()) -> None:
+        """Send a message, and file descriptors with it."""
+        packed = pickle.dumps(content)
+        whole = len(packed).to_bytes(HEADER, "little") + packed
+        sent = socket.send_fds(self.sock, [whole], list(descriptors))
+        self.sock.sendall(memoryview(whole)[sent:])
+
+    def receive(self) -> tuple[Any, list[int]]:
+        """Next message and the descriptors with it; EOFError if the other process has gone."""
+        header, descriptors, _, _ = socket.recv_fds(self.sock, HEADER, MOST_DESCRIPTORS)
+        header += self._receive_exactly(HEADER - len(header))
+        packed = self._receive_exactly(int.from_bytes(header, "little"))
+        return pickle.loads(packed), descriptors  # noqa: S301 - from a process of our own
+
+    def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
+        """Send a request and return the answer of the other process; one request at a time.
+
+        Raises
+        ------
+        HapticDBError
+            If the other process has ended or does not answer; and every error of the other process.
+        """
+        with self._asking:
+            try:
+                self.send(Message(word, content), descriptors)
+                answer, _ = self.receive()
+            except (EOFError, OSError) as error:
+                self.close()  # a late answer must not be taken for that of the next request
+                raise HapticDBError(
+                    "the process that runs the sessions does not answer: begin them again"
+                ) from error
+        if answer.word == "error":
+            raise answer.content
+        return answer.content
+
+    def reply(self, do: Callable[[Message, list[int]], Any]) -> None:
+        """Receive a request, do it, and send its result or the error that it raised.
+
+        An error that is no HapticDBError is logged, and sent as one without its words. The
+        descriptors that came with the request are closed afterwards.
+
+        Raises
+        ------
+        EOFError, OSError
+            If the other process has closed its end, or has died; never for what `do` raises.
+        """
+        asked, descriptors = self.receive()
+        try:
+            answer = Message("done", do(asked, descriptors))
+        except HapticDBError as error:
+            answer = Message("error", error)
+        except Exception:
+            LOG.exception("a request failed: %s", asked.word)
+            told = "the host failed at this request: its log says why; try again"
+            answer = Message("error", HapticDBError(told))
+        finally:
+            for descriptor in descriptors:
+                os.close(descriptor)
+        self.send(answer)
+
+    def _receive_exactly(self, size: int) -> bytes:
+        parts = bytearray()
+        while len(parts) < size:
+            part = self.sock.recv(min(size - len(parts), 1 << 20))
+            if not part:
+                raise EOFError
+            parts += part
+        return bytes(parts)
+
+    def close(self) -> None:
+        """Close the socket; the other process then reads the end."""
+        with contextlib.suppress(OSError):
+            self.sock.shutdown(socket.SHUT_RDWR)
+        self.sock.close()

@@ -1,0 +1,233 @@
+"""Processes of a real-time session: each gets a request and sends messages over a `Channel`.
+
+Each process is a copy of the fork server (`fork_server`) and calls one function. The request and
+the messages go only between a process and what it has started.
+"""
+
+import contextlib
+import os
+import pickle
+import select
+import signal
+import socket
+import sys
+import weakref
+from collections.abc import Callable, Sequence
+from importlib import import_module
+from typing import Any, Self
+
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.session.processes.channel import Channel, Message
+from hapticdb.session.processes.fork_server import start
+
+END_PATIENCE = 5.0
+"""Seconds that a process has to end by itself before it is killed. Larger: slower devices can
+close, a hanging process delays the end longer."""
+_ends = select.poll()
+"""Tells that the process that started this one has ended, or has closed its channel."""
+_parent: Channel | None = None
+"""Of a process that was started: to the one that started it."""
+
+
+class Process:
+    """One process of a session, used by the process that started it.
+
+    Parameters
+    ----------
+    work : str
+        Function that the process calls, as ``package.module:function``; its arguments are the
+        request and a `MessageSender`.
+    request : object
+        Argument of that function; picklable.
+    descriptors : sequence of int
+        File descriptors that the process inherits, under the same numbers.
+    with_kernels : bool
+        Whether it begins with the function's module and its kernels loaded.
+    """
+
+    def __init__(
+        self, work: str, request: object, descriptors: Sequence[int], *, with_kernels: bool = False
+    ) -> None:
+        content = pickle.dumps(request)
+        sock, theirs = socket.socketpair()
+        channel = self._channel = Channel(sock)
+        try:
+            streams = [theirs.fileno(), 2, 2]
+            self.pid, self._standing = start(work, streams, descriptors, with_kernels=with_kernels)
+        except BaseException:
+            channel.close()
+            raise
+        finally:
+            theirs.close()
+        with contextlib.suppress(OSError):  # the child died at once; `receive` reports that
+            channel.send(content)
+        # the channel of an unreferenced object would stay open, and its process would go on
+        weakref.finalize(self, channel.close)
+        weakref.finalize(self, os.close, self._standing)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.end()
+
+    @property
+    def is_alive(self) -> bool:
+        """Whether the process runs."""
+        return not self.wait(0.0)
+
+    def receive(self, seconds: float) -> Message | None:
+        """Return the next message, or None if none comes in `seconds` or the process has ended.
+
+        Raises
+        ------
+        HapticDBError
+            If the process ended with this error.
+        """
+        arrived = select.poll()  # `select` refuses descriptors from 1024 on
+        arrived.register(self._channel.sock, select.POLLIN)
+        if not arrived.poll(max(1000.0 * seconds, 0.0)):
+            return None
+        try:
+            message, _ = self._channel.receive()
+        except (EOFError, OSError):
+            return None
+        assert isinstance(message, Message)  # noqa: S101 - nothing else is sent
+        if message.word == "error":
+            raise message.content
+        return message
+
+    def await_ready(self, name: str, seconds: float) -> Any:  # noqa: ANN401 - what was sent
+        """Content of the first message; where none comes the process is ended.
+
+        Raises
+        ------
+        HapticDBError
+            That says why, or with which the process ended.
+        """
+        try:
+            ready, is_slow = self.receive(seconds), self.is_alive
+        except BaseException:
+            self.end()
+            raise
+        if ready is not None:
+            return ready.content
+        self.end()
+        raise HapticDBError(
+            f"the {name} process was not ready after {seconds:g} s: the database or this machine "
+            "is too slow now; try again"
+            if is_slow
+            else f"the {name} process did not start: its errors are above"
+        )
+
+    def send(self, content: object) -> None:
+        """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
+        with contextlib.suppress(OSError):  # `receive` reports that
+            self._channel.send(content)
+
+    def wait(self, seconds: float) -> bool:
+        """Wait for the end of the process; returns whether it ended in `seconds`."""
+        ended = select.poll()
+        ended.register(self._standing, select.POLLIN)
+        return bool(ended.poll(1000.0 * seconds))
+
+    def end(self, patience: float = END_PATIENCE) -> None:
+        """End the process: close its channel, and kill it if it runs `patience` s later."""
+        self._channel.close()
+        if not self.wait(patience):
+            with contextlib.suppress(ProcessLookupError):
+                signal.pidfd_send_signal(self._standing, signal.SIGKILL)
+            self.wait(END_PATIENCE)
+
+
+class _EndQuietly(SystemExit):
+    """Ends the process without a message: after a signal, or because the parent has ended."""
+
+    def __init__(self, status: int) -> None:
+        super().__init__(status)
+        self.status = status
+
+
+class MessageSender:
+    """Sends messages from a process to the one that started it."""
+
+    def __init__(self, channel: Channel) -> None:
+        self._channel = channel
+
+    def send(self, word: str, content: object = None) -> None:
+        """Send a message; does nothing if no process can receive it any more."""
+        with contextlib.suppress(OSError):
+            self._channel.send(Message(word, content))
+
+
+def run(module: str, name: str, starter: int) -> None:
+    """Run the request in the process that `Process` started, and end that process.
+
+    `starter` is a descriptor that stands for the process that used `Process`.
+    """
+    global _parent  # noqa: PLW0603 - one a process
+    _parent = Channel(socket.socket(fileno=os.dup(0)))
+    _ends.register(_parent.sock, 0)  # its end, which is always told
+    _ends.register(starter, select.POLLIN)
+    signal.signal(signal.SIGINT, signal.SIG_IGN)
+    status = 0
+    sender = MessageSender(_parent)
+    try:
+        signal.signal(signal.SIGTERM, _end)
+        function: Callable[[Any, MessageSender], None] = getattr(import_module(module), name)
+        function(_request(), sender)
+    except _EndQuietly as ended:
+        status = ended.status
+    except HapticDBError as error:
+        sender.send("error", error)
+    except BaseException as error:  # noqa: BLE001 - the parent waits, and must learn of any error
+        import traceback  # noqa: PLC0415 - only now
+
+        traceback.print_exc()
+        cause = str(error).partition("\n")[0]
+        sender.send(
+            "error", HapticDBError(f"the session's process ended: {type(error).__name__}: {cause}")
+        )
+    sys.stderr.flush()
+    os._exit(status)  # exit handlers would remove resources that other processes still use
+
+
+def _end(number: int, _: object) -> None:
+    """Signal handler: raise an exit, so that each `finally` runs and no device keeps its force."""
+    signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the clean-up
+    raise _EndQuietly(128 + number)
+
+
+def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
+    """Next object that the parent has sent by `Process.send`; a SystemExit if the parent ended."""
+    assert _parent is not None  # noqa: S101 - `run` was called
+    try:
+        return _parent.receive()[0]
+    except (EOFError, OSError):  # it may have ended while it was sending
+        raise _EndQuietly(0) from None
+
+
+def reply_to_parent(do: Callable[[Message, list[int]], Any], seconds: float) -> None:
+    """Do what the parent asks by its channel, if that comes in `seconds`; see `Channel.reply`."""
+    assert _parent is not None  # noqa: S101 - `run` was called
+    if select.select([_parent.sock], [], [], seconds)[0]:
+        _parent.reply(do)
+
+
+def _request() -> object:
+    """Read the request of the process; a UsageError if a module that it names cannot be found."""
+    try:
+        return pickle.loads(receive_from_parent())  # noqa: S301 - from our own parent
+    except (AttributeError, ImportError) as error:
+        raise UsageError(
+            f"a session's process cannot find what it was given ({error}): define devices in a "
+            "module that can be imported, not in the script itself"
+        ) from error
+
+
+def parent_is_gone(seconds: float = 0.0) -> bool:
+    """Whether the process that started this one has ended, or has closed its channel.
+
+    It waits so long for that. Processes that were forked from it may still hold the channel open.
+    """
+    return bool(_ends.poll(1000.0 * seconds))

@@ -1,0 +1,422 @@
+"""Session: a hand in an environment, felt in real time by processes of its own."""
+
+import os
+import time
+from contextlib import ExitStack, suppress
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from hapticdb.closing import Closes
+from hapticdb.devices.handle import Handle
+from hapticdb.devices.profiles import profile_of
+from hapticdb.devices.protocol import Device, check_device
+from hapticdb.errors import HapticDBError, UsageError
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
+from hapticdb.recording.file import DEFAULT_LIMIT, Recorder
+from hapticdb.recording.frame import Frames, State
+from hapticdb.session.board import Board
+from hapticdb.session.coupling import (
+    Coupling,
+    DirectRendering,
+    Rendering,
+    radius_of,
+    rendering_of,
+)
+from hapticdb.session.loop import LoopRequest
+from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
+from hapticdb.session.processes.process import Process
+from hapticdb.session.report import LoopAnswer, Report, counts_of
+from hapticdb.session.stations import FOREVER, without_surface
+from hapticdb.session.timing import Timing
+
+if TYPE_CHECKING:
+    from hapticdb.batches.feeler import BatchDevice
+
+RING_SECONDS = 4.0
+"""Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
+loses no frame over longer pauses of this process, and takes more memory."""
+LEAST_RING = 1024
+"""Least number of frames in the ring, however low the rate."""
+DRAIN_EVERY = 0.05
+"""Seconds between two checks of the loop in `wait`. A larger value reports its end later."""
+START_PATIENCE = 120.0
+"""Seconds in which the loop's process must be ready. A device may take long to open."""
+END_PATIENCE = 10.0
+"""Seconds in which the loop must end after a request to end; normally it ends after a frame."""
+DEFAULT_STALENESS = 1.0
+"""Default of `staleness`, seconds without an answer of the database."""
+
+
+class Session(Closes):
+    """A hand in an environment, felt in real time.
+
+    The loop and the fetching of its cells run in two separate processes. This object starts and
+    supervises them, records, and reports. Also a context manager.
+
+    Parameters
+    ----------
+    cells : ResidentCells or str
+        The environment: its resident cells, which several sessions may share, or its URL. With a
+        URL all objects are felt, and cells take the default budget.
+    shell : PointShell
+        The tool.
+    device : Device
+        The device; it is sent to the loop's process, so its class must be importable there.
+    rate : float
+        Frames a second, 10 to 20,000.
+    seconds : float or None
+        Duration; None: until the device's script ends or `stop` is called.
+    law : {"plane", "distance"}, ForceLaw or None
+        Force law of a frame. None: ``distance``, which needs distances to surfaces.
+    rendering : {"coupled", "direct"} or None
+        ``coupled``: a virtual coupling with contact constraints, which needs distances. ``direct``:
+        the tool is at the hand, and the wrench of each frame goes to the device, up to its caps.
+        None: coupled under the law ``distance``, direct under every other one.
+    coupling : Coupling or None
+        Coupling between hand and tool. Its stiffness is lowered to what the device holds: see
+        `coupling.lowered`. Rendered directly, it gives caps alone.
+    handle : Handle or None
+        Mapping of the hand to the scene: scale and clutch.
+    staleness : float
+        Seconds without an answer of the database after which all frames act as if all cells were
+        unknown.
+    frames_on : {"cpu", "cuda"}
+        What finds the tool's points near surfaces in each period: a processor, or a GPU of NVIDIA
+        for tools of millions of points (docs/realtime.md, Large tools).
+    record : path or None
+        A file for the recording; see `hapticdb.recording.file.Recorder`.
+    replace_recording : bool
+        Replace an existing recording when the first frame is recorded.
+    record_limit_bytes : int or None
+        Greatest size of the recording, 4 GiB unless given; None: no limit of its own. 64 MiB of the
+        disk always stay free. At the limit, or if the disk fails, the recording ends and stays
+        whole, and the session continues: see `recording_ended`.
+    processor : int or None
+        Number of the processor that the loop is bound to.
+    has_baseline : bool
+        Run an empty loop at the same rate before the first frame, for 2 s at most, to report the
+        machine's own lateness; if False, `Report.empty` is None.
+
+    Raises
+    ------
+    UsageError
+        If a number is out of its range, options contradict one another, or `device` is no device.
+    DeviceError
+        If the device fails, or its reading is of the wrong kind; here or in `wait`.
+    DatabaseError
+        If the environment cannot be opened.
+    """
+
+    _pid = 0
+    """Id of the process that made this object. In a forked copy `close` does nothing."""
+
+    def __init__(
+        self,
+        cells: ResidentCells | str,
+        shell: PointShell,
+        device: Device,
+        *,
+        rate: float = 1000.0,
+        seconds: float | None = None,
+        law: ForceLaw | LawName | None = None,
+        rendering: Rendering | None = None,
+        coupling: Coupling | None = None,
+        handle: Handle | None = None,
+        staleness: float = DEFAULT_STALENESS,
+        frames_on: "BatchDevice" = "cpu",
+        record: str | os.PathLike[str] | None = None,
+        replace_recording: bool = False,
+        record_limit_bytes: int | None = DEFAULT_LIMIT,
+        processor: int | None = None,
+        has_baseline: bool = True,
+    ) -> None:
+        check_device(device)
+        _check_choices(seconds, staleness)
+        self._has_baseline = has_baseline
+        self.shell, self.handle = shell, handle or Handle()
+        self.law = as_law(law) or DISTANCE
+        self.rendering = rendering_of(rendering, self.law)
+        self.frames_on = _checked_frames(frames_on, self.rendering)
+        self.timing = Timing(rate, processor)
+        self._owns_cells = isinstance(cells, str)
+        if isinstance(cells, str):
+            cells = ResidentCells(cells, distances=None if law is None else reads_distances(law))
+        elif cells.is_closed:
+            raise UsageError("these cells are closed: make others")
+        self.cells = cells
+        self._check_distances(law)
+        self.coupling = self._settled(coupling or Coupling(), device)
+        self._pid, self._row = os.getpid(), -1
+        self._board: Board | None = None
+        self._process: Process | None = None
+        self._objects: set[int] = set()
+        self._loose_objects: set[int] = set()
+        self._n_drained, self._has_touched = 0, False  # touched since it last lay in something
+        self._answer: LoopAnswer | None = None
+        self._recording: Recorder | None = None
+        if record is not None:
+            self._recording = Recorder(
+                record, limit_bytes=record_limit_bytes, replace=replace_recording
+            )
+        try:
+            self._begin(device, staleness, seconds)
+        except BaseException:
+            try:
+                if self._recording is not None:
+                    self._recording.discard()
+            finally:  # even if a second signal interrupts that
+                self.close()
+            raise
+
+    def _check_distances(self, asked: ForceLaw | LawName | None) -> None:
+        if not reads_distances(self.law) or self.cells.has_distances:
+            return
+        if asked is None:
+            instead = "feel tangent planes directly with --law plane"
+            raise UsageError(without_distances(self.cells.url, instead))
+        raise UsageError(
+            "the law distance needs cells with distances to surfaces, and these have none: make "
+            "ResidentCells(..., distances=True), or give law='plane'"
+        )
+
+    def _settled(self, coupling: Coupling, device: Device) -> DirectRendering:
+        """Coupling or caps of the session, with all numbers."""
+        profile, scale = profile_of(device), self.handle.scale
+        radius = radius_of(self.shell, self.cells.grid.voxel_size)
+        if self.rendering == "coupled":
+            return coupling.settled(profile, self.timing.rate, scale, radius)
+        return coupling.direct(profile, scale, radius)
+
+    def _begin(
+        self,
+        device: Device,
+        staleness: float,
+        seconds: float | None,
+    ) -> None:
+        table = self.cells.table
+        if self._recording is not None:
+            self._recording.open()
+        n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
+        self._board = board = Board.create(1, n_ring)
+        self._row = table.join()
+        request = LoopRequest(
+            table=table,
+            row=self._row,
+            board=board,
+            grid=self.cells.grid,
+            shell=without_surface(self.shell),
+            device=device,
+            law=self.law,
+            rendering=self.rendering,
+            coupling=self.coupling,
+            handle=self.handle,
+            timing=self.timing,
+            seconds=FOREVER if seconds is None else seconds,
+            staleness=staleness,
+            has_baseline=self._has_baseline,
+            is_on_gpu=self.frames_on == "cuda",
+        )
+        self._process = Process(
+            "hapticdb.session.loop:work",
+            request,
+            [table.descriptor, board.descriptor],
+            with_kernels=True,
+        )
+        table.desk.pids[self._row] = self._process.pid
+        start = self._process.await_ready("loop's", START_PATIENCE)
+        if self._recording is not None:
+            self._recording.begin(
+                self.cells.header(
+                    self.shell, self.timing.rate, self.law, self.coupling, start,
+                    self.frames_on,
+                )
+            )  # fmt: skip
+
+    def __del__(self) -> None:
+        with suppress(Exception):
+            self.close()
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames so far."""
+        return int(self._open_board.seats["n_frames"][0])
+
+    @property
+    def pid(self) -> int:
+        """Process id of the loop."""
+        return self._open_process.pid
+
+    @property
+    def _open_process(self) -> Process:
+        if self._process is None:
+            raise UsageError("the session is closed: begin another")
+        return self._process
+
+    @property
+    def _open_board(self) -> Board:
+        if self._board is None:
+            raise UsageError("the session is closed: begin another")
+        return self._board
+
+    @property
+    def objects(self) -> tuple[int, ...]:
+        """Ids of the objects touched so far; sampled a hundred times a second."""
+        return tuple(sorted(self._objects))
+
+    @property
+    def is_loose(self) -> bool:
+        """Whether the tool lies in an object now and feels nothing; only with distances."""
+        last = self.last()
+        return last is not None and bool(last["state"][0] & State.IN_OBJECT)
+
+    @property
+    def loose_objects(self) -> tuple[int, ...]:
+        """Ids of the objects in which the tool lay so far; sampled a hundred times a second."""
+        return tuple(sorted(self._loose_objects))
+
+    @property
+    def recording_ended(self) -> str | None:
+        """One line: why the recording has ended before the session; None while it continues."""
+        return None if self._recording is None else self._recording.ended
+
+    @property
+    def database_lost(self) -> str | None:
+        """One line: why the database cannot be read now; None while it can. As of `wait`."""
+        return self.cells.database_lost
+
+    def last(self) -> Frames | None:
+        """Latest frame, (1,) of `FRAME`; None before the first."""
+        return self._open_board.last_frame(0)
+
+    def wait(self, seconds: float | None = None) -> Report | None:
+        """Supervise the session until it ends; returns its report, or None after `seconds`.
+
+        Call this again and again, or without a time: only during the call frames are recorded, and
+        a fetching process that has died is started again.
+        """
+        process = self._open_process
+        until = time.monotonic() + (FOREVER if seconds is None else seconds)
+        while self._answer is None and time.monotonic() < until:
+            is_alive = process.is_alive  # read first: the last message may come with the end
+            message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
+            self._drain()
+            if message is not None:
+                self._answer = message.content
+            elif not is_alive:
+                raise HapticDBError(
+                    "the loop's process was ended from outside: begin the session again"
+                )
+            self.cells.supervise()
+        return self._report() if self._answer is not None else None
+
+    def ask_to_end(self) -> None:
+        """Make the loop end after its next frame. `wait` then returns the report."""
+        self._open_board.seats["is_asked_to_end"][0] = True
+
+    def stop(self) -> Report:
+        """End the session; returns its report."""
+        self.ask_to_end()
+        report = self.wait(END_PATIENCE)
+        if report is None:
+            raise HapticDBError("the loop did not end when asked to")
+        return report
+
+    def _drain(self) -> None:
+        """Add the touched objects to the list, and record the new frames."""
+        sessions, done = self.cells.table.desk.sessions, self.n_frames
+        ring = self._open_board.rings[0]
+        n_objects = int(sessions["n_objects"][self._row])
+        named = set(sessions["objects"][self._row, :n_objects].tolist())
+        first = max(self._n_drained, done - len(ring))
+        frames = ring[np.arange(first, done) % len(ring)]
+        self._n_drained = done
+        if self.is_loose:
+            self._loose_objects |= named
+            self._has_touched = False
+        else:
+            touched = bool((frames["hits"] | frames["contacts"]).any())
+            self._has_touched = self._has_touched or touched
+            # before the first contact an answer about the place where the tool lay may be left
+            self._objects |= named if self._has_touched else named - self._loose_objects
+        if self._recording is not None:
+            self._recording.take(ring, done)
+
+    def _report(self) -> Report:
+        answer = self._answer
+        assert answer is not None  # noqa: S101 - asked before
+        recording = self._recording
+        if recording is not None:
+            recording.finish()
+        return Report(
+            rate=self.timing.rate,
+            loop=answer.loop,
+            empty=answer.empty,
+            bad_reading=answer.bad_reading,
+            conditions=self._conditions() | ({"frames on": answer.card} if answer.card else {}),
+            is_warm=answer.is_warm,
+            cache=self.cells.figures(),
+            objects=self.objects,
+            loose_objects=self.loose_objects,
+            recorded_frames=0 if recording is None else len(recording),
+            recording_ended=self.recording_ended,
+            database_lost=self.database_lost,
+            lost_records=0 if recording is None else recording.n_lost,
+            law="distance" if reads_distances(self.law) else "plane",
+            rendering=self.rendering,
+            coupling=self.coupling,
+            **counts_of(self._open_board.seats[0]),
+        )
+
+    def _conditions(self) -> dict[str, str]:
+        """What a report says of the tool and the processor."""
+        points, processor = {"points": str(len(self.shell))}, self.timing.processor
+        if processor is None:
+            return points
+        return points | {"processor": f"bound to processor {processor}"}
+
+    def close(self) -> None:
+        """End the processes and close the recording, which stays.
+
+        Does nothing in a forked copy, because the session belongs to the parent process.
+        """
+        if os.getpid() != self._pid:
+            return
+        # the last callback runs first, and each one runs even if another raises
+        with ExitStack() as ends:
+            if self._owns_cells:
+                ends.callback(self.cells.close)
+            if self._recording is not None:
+                ends.callback(self._recording.close)
+            ends.callback(self._leave)
+            if self._row >= 0:
+                ends.callback(self._drain)
+            if self._process is not None:
+                self.ask_to_end()
+                ends.callback(self._process.end)
+                self._process = None
+
+    def _leave(self) -> None:
+        if self._row >= 0:
+            self.cells.table.leave(self._row)
+            self._row = -1
+        if self._board is not None:
+            self._board.close()
+            self._board = None
+
+
+def _check_choices(seconds: float | None, staleness: float) -> None:
+    if seconds is not None and not 0.0 < seconds <= 1e6:
+        raise UsageError(f"{seconds} seconds: give a number above 0, a million at most")
+    if not staleness > 0.0:
+        raise UsageError(f"a staleness of {staleness} s: give a number above 0, or inf")
+
+
+def _checked_frames(frames_on: "BatchDevice", rendering: Rendering) -> "BatchDevice":
+    """Refuse a session whose frames cannot be computed there."""
+    if frames_on != "cpu":
+        from hapticdb.session.on_gpu import check_frames  # noqa: PLC0415 - loads numba.cuda
+
+        check_frames(frames_on, rendering)
+    return frames_on

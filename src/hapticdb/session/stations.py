@@ -1,0 +1,190 @@
+"""Stations: sessions in the form that the kernel of their periods reads (`kernels.period.loop`)."""
+
+import time
+from dataclasses import replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from hapticdb.grid import Grid
+from hapticdb.kernels.hand.calling import address_of_kernel
+from hapticdb.kernels.hand.device_spring import DeviceSpring
+from hapticdb.kernels.hand.near_points import FIELD_ROWS
+from hapticdb.kernels.period import loop
+from hapticdb.kernels.period.following import USUAL_GAP_NS
+from hapticdb.kernels.period.memory import PERIOD_ROWS
+from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
+from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
+from hapticdb.pointshell.shell import PointShell
+from hapticdb.query.law import ForceLaw
+from hapticdb.recording.frame import Frames
+from hapticdb.recording.header import Start
+from hapticdb.resident.table import HEARTBEAT
+from hapticdb.session.coupling import Rendering, rendering_of
+
+LARGE_FROM = 4096
+"""Points from which the quasi-static coupling tests spheres of runs before their points. The
+results are the same: a larger value only costs time."""
+STALENESS_NS = 1_000_000_000
+"""Nanoseconds without an answer of the database after which hosted hands take all cells for
+unknown."""
+FOREVER = 1e9
+"""Seconds that mean "no limit": thirty years."""
+
+Record = NDArray[np.void]
+
+
+def without_surface(shell: PointShell) -> PointShell:
+    """Return the shell without the tool's triangles, which no frame reads."""
+    return replace(shell, surface=None)
+
+
+class Station:
+    """One session: its row of STATION, and the memory whose addresses the row has.
+
+    Parameters
+    ----------
+    row : array
+        (1,) of STATION.
+    cells, reader : Cells, int
+        The cells that the session reads, and its row there.
+    session : array
+        (1,) of SESSION: its row on the desk.
+    grid : Grid
+        Grid of the cells.
+    clusters : Clusters
+        The tool.
+    """
+
+    def __init__(
+        self,
+        row: Record,
+        cells: Cells,
+        reader: int,
+        session: Record,
+        grid: Grid,
+        clusters: Clusters,
+    ) -> None:
+        row[:] = np.zeros((), STATION)
+        self.row, self.cells, self.reader, self.session = row, cells, reader, session
+        self.record = row[0, ...]
+        self.servo, self.follower = self.record["servo"], self.record["follower"]
+        self.clusters, n_points = clusters, len(clusters.points)
+        self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
+        self.field = np.zeros((FIELD_ROWS, n_points))
+        self.met = np.zeros((PERIOD_ROWS, n_points), dtype=np.int64)
+        self.pose, self.felt = np.eye(4), np.zeros(RESULTS)
+        self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
+        row["reader"], row["session"] = reader, session.ctypes.data
+        row["place"], row["bits"], row["curve"] = self.place, grid.bits, grid.curve_code
+        row["staleness"] = STALENESS_NS
+        self._write_cells()
+        self._write_tool()
+
+    def _write_cells(self) -> None:
+        """Write the addresses of the table's arrays."""
+        row, cells = self.row, self.cells
+        for name, array in cells._asdict().items():
+            row[name] = 0 if array is None else array.ctypes.data
+        row["n_control"], row["heartbeat"] = len(cells.control), HEARTBEAT
+        row["n_readers"] = len(cells.readers) // READER_STRIDE
+        row["n_slots"], row["capacity"] = len(cells.used), cells.keys.shape[1]
+
+    def _write_tool(self) -> None:
+        """Write the addresses of the tool's arrays."""
+        row, clusters = self.row, self.clusters
+        self._arrays = {
+            name: np.ascontiguousarray(getattr(clusters, name))
+            for name in ("points", "center", "spheres", "groups", "columns", "scratch")
+        } | {name: getattr(self, name) for name in ("met", "field", "pose", "felt", "missed")}
+        for name, array in self._arrays.items():
+            row[name] = array.ctypes.data
+        n_points = len(clusters.points)
+        row["n_points"], row["run"] = n_points, clusters.run
+        row["n_spheres"], row["n_groups"] = len(clusters.spheres), len(clusters.groups)
+        self.follower["is_large"] = n_points >= LARGE_FROM
+
+    def set_spring(self, spring: DeviceSpring) -> None:
+        """Replace the coupling; periods take the new one whole."""
+        which = 1 - int(self.row["coupling"][0])
+        self.row["springs"][:, which] = spring
+        self.row["coupling"] = which
+
+    def rest_at(self, pose: NDArray[np.float64]) -> None:
+        """Put hand and tool at a pose (7,), at rest."""
+        tool, hand = self.servo["tool"], self.servo["hand"]
+        tool[()] = np.zeros((), tool.dtype)
+        pose_numbers(tool)[:] = pose_numbers(hand)[:] = pose
+
+    def state(self) -> Start:
+        """What the next period depends on, beside its cells and the hand."""
+        tool = self.servo["tool"]
+        of_points = (self.field, self.met) if tool["version"] else ()
+        parts = (self.servo, self.follower, *of_points)
+        return Start(*(part.tobytes() for part in parts))
+
+    def restore(self, state: Start) -> None:
+        """Continue from a state that a station of this tool and this build has had."""
+        looker, parts = (
+            self.follower["looker"].copy(),
+            (self.servo, self.follower, self.field, self.met),
+        )
+        for part, content in zip(parts, state, strict=True):
+            if content:
+                part[...] = np.frombuffer(content, part.dtype).reshape(part.shape)
+        self.follower["looker"] = looker
+
+    def arrive_at(self, pose: NDArray[np.float64]) -> None:
+        """Take the hand from the board, where it has arrived at a pose (7,)."""
+        way = self.record["way"]
+        way["start"], way["end"], way["seconds"] = pose, pose, 1e-9
+        self.row["source"], self.row["gap"] = loop.BOARD, USUAL_GAP_NS
+
+
+class Stations:
+    """Stations of a process, and the call of their periods.
+
+    law : that all sessions feel; seats, rings : of the board (`session.board.Board`), and for each
+    seat a station; unless given, of one session alone; rendering : as of `rendering_of`.
+    """
+
+    def __init__(
+        self,
+        law: ForceLaw,
+        seats: Record | None = None,
+        rings: Frames | None = None,
+        rendering: Rendering | None = None,
+    ) -> None:
+        self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
+        rings = np.zeros((1, 1), FRAME) if rings is None else rings
+        self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
+        is_coupled = rendering_of(rendering, law) == "coupled"
+        mover = loop.move_by_coupling if is_coupled else loop.move_directly
+        self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
+        if not is_coupled:
+            self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
+        self._arguments = (self.rows, seats, rings, self.pace)
+        self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
+
+    def run(self, rate: float, seconds: float = FOREVER) -> float:
+        """Run periods at a rate until `stop` or for so long -> seconds that they took.
+
+        A period that takes longer than its time misses the deadlines within it; the next one is due
+        at the next deadline of the grid. It holds no interpreter lock.
+        """
+        begun, pace = time.monotonic_ns(), self.pace
+        self.rows["began"] = self.rows["last"] = begun
+        pace["period"], pace["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
+        pace["due"] = begun + pace["period"]
+        loop.run(*self._arguments)
+        return 1e-9 * (time.monotonic_ns() - begun)
+
+    def step(self, dt: float, begun: int) -> None:
+        """Run one period that has begun at a time, ns, `dt` s after the last one."""
+        times = self._times
+        times[0][()], times[1][()], times[2][()] = begun, begun, dt
+        loop.run(*self._arguments)
+
+    def stop(self) -> None:
+        """End `run` after its period."""
+        self.pace["is_over"] = 1

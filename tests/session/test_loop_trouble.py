@@ -1,0 +1,224 @@
+"""The loop, frame by frame, when cells are lost, the hand leaves, or its process must end."""
+
+import os
+import signal
+import tempfile
+import time
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+import hapticdb
+from banded import write_points
+from feel.tools import flat_tool
+from hapticdb import Grid, TangentPlane
+from hapticdb.devices.handle import Handle
+from hapticdb.devices.profiles import SCRIPTED
+from hapticdb.devices.protocol import Reading
+from hapticdb.errors import DeviceError
+from hapticdb.kernels.period.loop import WITHDRAWN_NS
+from hapticdb.query.law import DistanceField, ForceLaw
+from hapticdb.resident.residency import Residency
+from hapticdb.resident.table import HEARTBEAT, CellTable
+from hapticdb.session import loop as subject
+from hapticdb.session.board import Board
+from hapticdb.session.coupling import Coupling, DirectRendering, rendering_of
+from hapticdb.session.loop import Loop, LoopRequest, work
+from hapticdb.session.timing import Timing
+from session.hands import Heard, at
+from session.sessions import floor_points
+from session.worlds import block, cells_of
+from voxels import write_voxels
+
+Floats = NDArray[np.float64]
+SIZE = 0.005
+"""Voxel size in metres."""
+BITS = 6
+SIDE = 1 << BITS
+N_RING = 64
+MIDDLE = SIDE // 2
+FLOOR = block((MIDDLE - 12, MIDDLE - 12, MIDDLE - 4), (MIDDLE + 11, MIDDLE + 11, MIDDLE - 1))
+
+
+class World:
+    """A floor in voxels of 5 mm about the world's origin; all cells are resident."""
+
+    def __init__(self, *, has_distances: bool) -> None:
+        self.grid = Grid(SIZE, (-SIZE * SIDE / 2,) * 3, BITS)
+        self.table = CellTable.create(4 << 20, distances=has_distances)
+        with (
+            tempfile.TemporaryDirectory() as folder,
+            hapticdb.create(Path(folder) / "world.db", self.grid) as env,
+        ):
+            if has_distances:
+                write_points(env.store, floor_points(MIDDLE - 1.1))
+            else:
+                write_voxels(env.store, FLOOR)
+            Residency(env.store, self.table).make_resident(cells_of(self.grid))
+
+
+class Pressing:
+    """A hand at height z (metres) that records the wrenches it is sent."""
+
+    def __init__(self, z: float) -> None:
+        self.z = z
+        self.buttons = 0
+        self.sent: list[Floats] = []
+
+    def read(self) -> Reading:
+        return Reading(at(0.0, 0.0, self.z), np.zeros(6), self.buttons)
+
+    def apply(self, wrench: Floats) -> None:
+        self.sent.append(wrench.copy())
+
+
+@pytest.fixture(params=["plane", "distance"])
+def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> Iterator[World]:
+    """A floor that is felt directly, or through the coupling."""
+    monkeypatch.setattr(
+        subject, "parent_is_gone", lambda _=0.0: False
+    )  # standard input may be closed
+    monkeypatch.setattr(subject, "WARM_PATIENCE", 0.0)  # no fetching process exists
+    before = signal.getsignal(signal.SIGTERM)
+    made = World(has_distances=request.param == "distance")
+    yield made
+    made.table.close()
+    signal.signal(signal.SIGTERM, before)
+
+
+def requested(world: World, hand: Pressing, seconds: float = 1.0) -> LoopRequest:
+    law: ForceLaw = TangentPlane()
+    coupling: DirectRendering = Coupling().direct(SCRIPTED, 1.0, 0.01)
+    if world.table.has_distances:
+        law = DistanceField()
+        coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
+    board = Board.create(1, N_RING)
+    return LoopRequest(
+        table=world.table,
+        row=world.table.join(),
+        board=board,
+        grid=world.grid,
+        shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
+        device=hand,
+        law=law,
+        rendering=rendering_of(None, law),
+        coupling=coupling,
+        handle=Handle(),
+        timing=Timing(200.0),
+        seconds=seconds,
+        staleness=1e9,
+    )
+
+
+def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
+    """A whole run: a hand leaves the floor while the database keeps answering."""
+
+    class Leaving(Pressing):
+        def apply(self, wrench: Floats) -> None:
+            super().apply(wrench)
+            world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
+            if wrench.any():
+                self.n_asked = int(world.table.desk.sessions["n_asked"].max())
+            self.z = -0.004 if 5 < len(self.sent) <= 30 else 0.02
+
+        @property
+        def is_over(self) -> bool:
+            return len(self.sent) > 120
+
+    hand = Leaving(0.02)
+    work(requested(world, hand, seconds=60.0), Heard())
+    assert hand.n_asked > 0
+    assert not hand.sent[-1].any()
+    assert not world.table.desk.sessions["n_asked"].any()
+
+
+def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
+    hand = Pressing(-0.004)
+    loop = Loop(requested(world, hand))
+    loop.warm_up()
+    assert loop.tool["felt"].any() or world.table.has_distances  # there the tool lies in the floor
+    hand.z = 0.02
+    loop._place()
+    loop.station.row["staleness"] = -(10**18)
+    loop.station.row["is_frame"] = True
+    loop._step(1e-3)
+    noted = loop.board.rings[0, 0]
+    assert noted["hits"] == loop.board.seats["hit_frames"][0] == 0
+    assert not noted["applied"].any()
+
+
+class Ended(SystemExit):
+    """Raised by the signal handler of these tests."""
+
+
+def _end(number: int, _: object) -> None:
+    signal.signal(number, signal.SIG_IGN)
+    raise Ended
+
+
+def test_a_loop_told_to_end_while_it_runs_lets_its_device_go(world: World) -> None:
+    class Told(Pressing):
+        def apply(self, wrench: Floats) -> None:
+            super().apply(wrench)
+            if len(self.sent) == 20:
+                os.kill(os.getpid(), signal.SIGTERM)
+
+    signal.signal(signal.SIGTERM, _end)
+    hand = Told(-0.004)
+    with pytest.raises(Ended):
+        work(requested(world, hand, seconds=60.0), Heard())
+    assert len(hand.sent) < 30
+    assert not hand.sent[-1].any()
+
+
+def test_a_loop_told_to_end_while_its_device_hangs_lets_it_go(world: World) -> None:
+    class Hanging(Pressing):
+        def read(self) -> Reading:
+            if len(self.sent) == 20:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(60.0)
+            return super().read()
+
+    signal.signal(signal.SIGTERM, _end)
+    hand, started = Hanging(-0.004), time.monotonic()
+    with pytest.raises(Ended):
+        work(requested(world, hand, seconds=60.0), Heard())
+    assert time.monotonic() - started < 50.0
+    assert not hand.sent[-1].any()
+
+
+@pytest.mark.parametrize("when", ["apply", "close"])
+def test_a_process_told_to_end_while_it_gives_its_device_back_does_so_first(
+    world: World, when: str
+) -> None:
+    class Told(Pressing):
+        is_failing = is_closed = False
+
+        def tell(self, now: str) -> None:
+            if self.is_failing and now == when:
+                os.kill(os.getpid(), signal.SIGTERM)
+                time.sleep(1e-3)
+
+        def read(self) -> Reading:
+            if len(self.sent) > 5:
+                self.is_failing = True
+                raise DeviceError("unplugged")
+            return super().read()
+
+        def apply(self, wrench: Floats) -> None:
+            self.tell("apply")
+            super().apply(wrench)
+
+        def close(self) -> None:
+            self.tell("close")
+            self.is_closed = True
+
+    signal.signal(signal.SIGTERM, _end)
+    hand = Told(0.02)
+    with pytest.raises(DeviceError, match="unplugged"):
+        work(requested(world, hand), Heard())
+    assert hand.is_closed
+    assert not hand.sent[-1].any()

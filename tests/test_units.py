@@ -15,6 +15,7 @@ import hapticdb
 from command_line import Run, boxes, refused
 from command_line import tool as stl
 from hapticdb.cli import VERBS
+from hapticdb.cli.options import command
 from hapticdb.cli.values import point_of
 from hapticdb.errors import UsageError
 from hapticdb.mesh import parse_in_process, read_file
@@ -241,7 +242,7 @@ def test_every_length_among_the_options_shows_its_default_and_takes_a_unit() -> 
     """Defaults of verbs are metres, those in the help are in the option's unit."""
     found = set()
     for verb in VERBS:
-        for name, one in inspect.signature(verb).parameters.items():
+        for name, one in inspect.signature(command(verb)).parameters.items():
             option = getattr(one.annotation, "__metadata__", [None])[0]
             if not getattr(option, "parser", None) or option.metavar == "VOLUME":
                 continue

@@ -32,7 +32,7 @@ def test_where_chooses_what_is_felt(run: Run, scene: Path) -> None:
     for n in range(3):
         found = json.loads(run("sweep", scene, *path, "--where", f"box{n}")[1])
         assert [one["name"] for one in found["hits"]] == ["box1"] * (n == 1)
-        assert found["tool"]["excluded"] == sorted({1, 2, 3} - {n + 1})
+        assert found["excluded"] == sorted({1, 2, 3} - {n + 1})
     hand = ("--tool", "tool.npz", "--device", "path.csv", "--rate", 200)
     code, out, err = run("feel", scene, *hand, "--json", "--where", "box*", "--exclude", "up=?")
     assert (code, json.loads(out)["hit_frames"]) == (0, 0), err
@@ -48,7 +48,7 @@ def test_several_parts_are_one_tool(run: Run, scene: Path, parts: tuple[str, ...
     code, out, err = run("sweep", scene, "--part", *parts, "--path", up, "--json")
     found = json.loads(out)
     assert (code, err) == (0, "")
-    assert (found["tool"]["parts"], found["tool"]["excluded"]) == ([1, 3], [1, 3])
+    assert (found["parts"], found["excluded"]) == ([1, 3], [1, 3])
     code, out, _ = run("sweep", scene, "--part", *parts, "--path", aside, "--json")
     assert (code, [one["id"] for one in json.loads(out)["hits"]]) == (1, [2])
     # box 2 alone has a free path, so the result above does not come from it alone

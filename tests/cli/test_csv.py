@@ -10,7 +10,10 @@ import pytest
 
 import hapticdb
 from command_line import Run, refused, succeeded
-from hapticdb.cli.csv_files import CONTACTS, FRAME_COLUMNS, TOUCHED, CsvWriter, text_cell
+from hapticdb.cli.emit import CsvWriter, text_cell
+from hapticdb.cli.schema import COLUMNS
+from hapticdb.cli.verbs.replaying import FRAMES
+from hapticdb.cli.verbs.touching import CONTACTS, TOUCHED
 from hapticdb.recording.file import Header, Recording
 from hapticdb.recording.frame import FRAME
 from recordings import write
@@ -24,6 +27,10 @@ def table(text: str) -> tuple[list[str], list[list[str]]]:
     return header, rows
 
 
+def columns(keys: tuple[str, ...]) -> list[str]:
+    return [name for key in keys for name in COLUMNS.get(key, (key,))]
+
+
 def touches(folder: Path) -> list[hapticdb.Touch]:
     with hapticdb.open(folder / "scene.db") as env:
         shell = hapticdb.PointShell.load(folder / "tool.npz")
@@ -34,7 +41,7 @@ def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> Non
     out = succeeded(run(*TOUCH, "--csv", "felt.csv"))
     assert "peak force" in out
     header, rows = table(scene.with_name("felt.csv").read_text())
-    assert header == list(TOUCHED)
+    assert header == columns(TOUCHED)
     found = touches(scene.parent)
     assert len(rows) == len(found)
     for n, (row, one) in enumerate(zip(rows, found, strict=True)):
@@ -52,7 +59,7 @@ def test_a_touched_path_is_written_to_the_last_bit(run: Run, scene: Path) -> Non
 def test_contacts_are_written_with_their_objects(run: Run, scene: Path) -> None:
     out = succeeded(run(*TOUCH, "--contacts-csv", "-"))
     header, rows = table(out)
-    assert header == list(CONTACTS)
+    assert header == columns(CONTACTS)
     poses = hapticdb.read_poses(scene.with_name("path.csv"))
     shell = hapticdb.PointShell.load(scene.with_name("tool.npz"))
     expected = []
@@ -125,12 +132,12 @@ def test_a_recording_is_written_to_the_last_bit(run: Run, recording: Path) -> No
     code, out, err = run("replay", "felt.hdbrec", "--csv", "frames.csv")
     assert (code, out, err) == (0, "frames.csv: 5,000 frames\n", "")
     header, rows = table(recording.with_name("frames.csv").read_text())
-    assert header == [name for names in FRAME_COLUMNS.values() for name in names]
+    assert header == columns(FRAMES)
     at = 0
-    for name, columns in FRAME_COLUMNS.items():
+    for name in FRAMES:
         known = Recording(recording).frames()[name]
         kind = FRAME[name].base
-        for column in known.reshape(5000, len(columns)).T:
+        for column in known.reshape(5000, -1).T:
             read = np.array([row[at] for row in rows]).astype(kind)
             assert read.tobytes() == np.ascontiguousarray(column).tobytes(), header[at]
             at += 1
@@ -168,7 +175,7 @@ def test_a_full_disk_leaves_no_file(run: Run, scene: Path, monkeypatch: pytest.M
         ([*TOUCH, "--csv", "-", "--json"], ["only one may be standard output"]),
         ([*TOUCH, "--csv", "-", "--contacts-csv", "-"], ["only one may be standard output"]),
         (["replay", "felt.hdbrec", "scene.db", "--csv", "-"], ["leave out URL, --json"]),
-        (["replay", "felt.hdbrec", "--csv", "-", "--json"], ["leave out URL, --json"]),
+        (["replay", "felt.hdbrec", "--csv", "f.csv", "--json"], ["leave out URL, --json"]),
         (["touch", "none.db", *TOUCH[2:], "--csv", "-"], ["none.db"]),
     ],
 )

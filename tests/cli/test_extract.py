@@ -32,8 +32,8 @@ def test_json_has_the_documented_keys(run: Run, tmp_path: Path) -> None:
     out = succeeded(run("extract", lid(tmp_path, 0.0), "lid", "--motions", 0, "--json"))
     found = json.loads(out)
     assert list(found) == [
-        "verdict", "line", "parts", "way", "to", "near", "blockers", "pulls", "motions", "poses",
-        "is_planned", "is_out_of_time", "seconds", "seed",
+        "line", "verdict", "parts", "to", "way", "near", "blockers", "pulls", "motions", "looks",
+        "is_planned", "is_out_of_time", "elapsed", "seed",
     ]  # fmt: skip
     assert set(found["way"]) == {"how", "poses", "length", "gap", "proof"}
     assert (found["verdict"], found["way"]["how"]) == ("comes out", "pull")
@@ -105,7 +105,7 @@ def test_json_of_an_order_has_a_proof_a_step(run: Run, tmp_path: Path) -> None:
     found = json.loads(out)
     assert code == 0
     assert list(found) == [
-        "verdict", "line", "parts", "steps", "failed", "is_out_of_time", "seconds", "seed",
+        "line", "verdict", "parts", "steps", "failed", "is_out_of_time", "elapsed", "seed",
     ]  # fmt: skip
     assert [step["parts"][0]["name"] for step in found["steps"]] == ["weight", "lid"]
     assert [step["way"]["proof"]["verdict"] for step in found["steps"]] == ["clear"] * 2

@@ -10,7 +10,7 @@ from numba import cuda
 import hapticdb
 from command_line import Run, refused
 from hapticdb.batches import feeler
-from hapticdb.cli.csv_files import WRENCH
+from hapticdb.cli.schema import WRENCH
 
 TOUCH = ("touch", "scene.db", "--tool", "tool.npz", "--poses")
 

@@ -8,7 +8,7 @@ import pytest
 
 from cli.test_verbs import (  # noqa: F401 - the same lines again, on the fixture `scene` below
     test_calibrate_prints_figures_with_their_spread,
-    test_info_json_has_the_documented_keys,
+    test_info_json_is_what_the_library_says,
     test_info_speaks_to_people,
     test_statistics_are_renewed_after_many_edits,
 )

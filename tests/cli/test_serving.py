@@ -7,7 +7,7 @@ import pytest
 import hapticdb
 from hapticdb.cli import main
 from hapticdb.cli.options import RenderingName
-from hapticdb.cli.verbs.serving import _serving, _tokens
+from hapticdb.cli.verbs.serving import PageOptions, _tokens
 from hapticdb.server.access import Role
 from hapticdb.server.running import _page_request
 from hapticdb.session.processes import fork_server
@@ -75,6 +75,6 @@ def test_a_token_file_may_have_a_byte_order_mark_and_comments(tmp_path: Path) ->
 
 @pytest.mark.parametrize("rendering", [None, "coupled", "direct"])
 def test_a_rendering_reaches_host_and_page(scene: Path, rendering: RenderingName | None) -> None:
-    serving = _serving(str(scene), None, {}, None, None, rendering)
+    serving = PageOptions(rendering=rendering).serving(str(scene), {})
     assert serving.rendering == rendering
     assert _page_request(serving, 0, 0, "").is_direct == (rendering == "direct")

@@ -1,13 +1,10 @@
-"""What is told of a sweep: the verdict's line, JSON, rows of CSV."""
-
-import json
+"""What is told of a sweep: the verdict's line."""
 
 import numpy as np
 import pytest
 
 from hapticdb import PointShell
-from hapticdb.cli.csv_files import SWEPT, rows_of_sweep
-from hapticdb.exact.report import gap_text, sweep_record, verdict_line
+from hapticdb.exact.report import gap_text, verdict_line
 from hapticdb.exact.swept import Gap, Swept
 from made_sweeps import CORNERS, line, place_at, swept, thing, touching
 
@@ -66,42 +63,3 @@ def test_a_gap_without_a_place_is_a_bound() -> None:
     assert [gap_text(swept(gap=gap)) for gap in (GAP, Gap(0.5, 0.5, None), swept().gap)] == [
         "0.4 mm", "more than 0.5 m", "-",
     ]  # fmt: skip
-
-
-def test_json_has_the_documented_keys_and_no_infinity() -> None:
-    both = touching(SEAT, 0.6), touching(BOLT, 0.0, by="", start=np.inf)
-    found = swept(gap=GAP, hits=(HIT,), touching=both, enclosed=(LID,))
-    record = json.loads(json.dumps(sweep_record(found, TOOL, [7], [7, 8]), allow_nan=False))
-    assert set(record) == {
-        "verdict", "gap", "gap_at_most", "chord_error", "nearest", "line", "comes_out", "hits",
-        "touching", "undecided", "enclosed", "contact", "overlap", "objects", "looks", "revision",
-        "elapsed", "is_stopped", "poses", "tool",
-    }  # fmt: skip
-    assert set(record["hits"][0]) == {
-        "id", "name", "fraction", "segment", "pose", "on_tool", "on_object", "at_least",
-    }  # fmt: skip
-    assert set(record["touching"][0]) == {
-        "id", "name", "start", "start_at_least", "reach", "until", "by", "is_sliding",
-    }  # fmt: skip
-    assert [one["start"] for one in record["touching"]] == [5e-5, None]
-    assert (record["verdict"], record["gap"], record["nearest"]["name"]) == ("hits", 4e-4, "bolt")
-    assert record["tool"] == {"parts": [7], "excluded": [7, 8]}
-    nothing = sweep_record(swept(), TOOL, [], [])
-    assert (nothing["verdict"], nothing["gap"], nothing["nearest"]) == ("clear", None, None)
-
-
-def test_csv_has_a_row_for_each_object_that_is_met() -> None:
-    hit = place_at(BOLT, 0.5, PATH)
-    found = swept(hits=(hit, DEEP), touching=(touching(SEAT, 0.6),), enclosed=(LID,))
-    rows = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(found)]
-    told = [(row["object_name"], row["what"], row["fraction"]) for row in rows]
-    assert told == [
-        ("bolt", "hit", 0.5), ("seat", "hit", 0.25), ("lid", "enclosed", ""),
-        ("seat", "touched", ""),
-    ]  # fmt: skip
-    assert [rows[0][f"object_{axis}_m"] for axis in "xyz"] == hit.on_object.tolist()
-    assert [row["reach_m"] for row in rows] == ["", "", "", 7e-5]
-    assert [row["depth_at_least_m"] for row in rows] == [0.0, 2e-3, "", ""]
-    assert (rows[3]["until_fraction"], rows[3]["start_m"], rows[3]["by"]) == (0.6, 5e-5, "shift")
-    (nearest,) = [dict(zip(SWEPT, row, strict=True)) for row in rows_of_sweep(swept(gap=GAP))]
-    assert (nearest["what"], nearest["gap_m"], nearest["verdict"]) == ("nearest", 4e-4, "clear")

@@ -15,6 +15,7 @@ from numba import typeof
 
 from children import PATIENCE
 from hapticdb import Environment, PointShell
+from hapticdb.cli.schema import plain
 from hapticdb.errors import DeviceError, HapticDBError, UsageError
 from hapticdb.kernels.period.loop import _layout_of
 from hapticdb.query.law import LawName
@@ -119,7 +120,7 @@ def test_the_figures_are_those_of_the_frames(played: Played) -> None:
 
 
 def test_the_report_is_finite_json(by_law: Played) -> None:
-    found = json.loads(json.dumps(by_law.report.figures(), allow_nan=False))
+    found = json.loads(json.dumps(plain(by_law.report), allow_nan=False))
     assert found["loop"]["frames"] == by_law.report.loop.frames
     assert found["loop"]["lateness"]["p99"] == by_law.report.loop.lateness.p99
     assert by_law.report.empty is not None

@@ -13,6 +13,7 @@ from itertools import takewhile
 
 from hapticdb import interrupting
 from hapticdb.cli import render
+from hapticdb.cli.options import command
 from hapticdb.cli.root import Interrupted, PipeClosedError, app, leaving_in_order
 from hapticdb.cli.verbs.clashing import HELP as CLASHES_HELP
 from hapticdb.cli.verbs.clashing import clashes
@@ -69,7 +70,7 @@ HELP = {clashes: CLASHES_HELP, sweep: SWEEP_HELP, extract: EXTRACT_HELP}
 for verb, summary in VERBS.items():
     app.command(
         verb.__name__.rstrip("_"), short_help=summary, help=HELP.get(verb), hidden=verb in HIDDEN
-    )(verb)
+    )(command(verb))
 
 
 def main(argv: Sequence[str] | None = None) -> int:

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterable
 from contextlib import suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
 if TYPE_CHECKING:
@@ -16,6 +17,26 @@ class Felt(NamedTuple):
     where: list[str]
     exclude: list[int | str]
     left_out: list[int]
+
+
+@dataclass(frozen=True)
+class FilterOptions:
+    """The options that say which objects are felt."""
+
+    where: list[str] | None = None
+    exclude: list[str] | None = None
+
+    def felt(self, env: "Environment", parts: Iterable[int] = ()) -> Felt:
+        """Check the words; parts : ids of what moves, which is not felt."""
+        words = as_named(env, self.where or (), "--where")
+        more = as_named(env, self.exclude or (), "--exclude")
+        _found(env, words, "--where")
+        _found(env, more, "--exclude")
+        left_out: list[int | str] = [*parts, *more]
+        if not words and not left_out:
+            return Felt([], [], [])
+        is_felt = {obj.id for obj in env.felt(words, left_out)}
+        return Felt(words, left_out, [obj.id for obj in env.objects() if obj.id not in is_felt])
 
 
 def opened_to_keep(url: str) -> "Environment":
@@ -67,21 +88,3 @@ def as_named(env: "HasObjects", words: Iterable[str], option: str) -> list[str]:
 def ids_of(env: "Environment", words: Iterable[str] | None, option: str) -> list[int]:
     """Ids of those objects."""
     return [obj.id for obj in chosen(env, words or (), option)]
-
-
-def felt_objects(
-    env: "Environment",
-    where: Iterable[str] | None,
-    exclude: Iterable[str] | None,
-    parts: Iterable[int] = (),
-) -> Felt:
-    """Check the words of --where and --exclude; parts : ids of what moves, which is not felt."""
-    words = as_named(env, where or (), "--where")
-    more = as_named(env, exclude or (), "--exclude")
-    _found(env, words, "--where")
-    _found(env, more, "--exclude")
-    left_out: list[int | str] = [*parts, *more]
-    if not words and not left_out:
-        return Felt([], [], [])
-    is_felt = {obj.id for obj in env.felt(words, left_out)}
-    return Felt(words, left_out, [obj.id for obj in env.objects() if obj.id not in is_felt])

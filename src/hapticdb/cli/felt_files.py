@@ -6,7 +6,8 @@ from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from hapticdb.cli.csv_files import WRENCH, new_file
+from hapticdb.cli.emit import new_file
+from hapticdb.cli.schema import WRENCH
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
 if TYPE_CHECKING:

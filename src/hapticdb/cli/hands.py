@@ -3,10 +3,10 @@
 from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
+from hapticdb.cli.values import Point
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
-    from hapticdb.cli.values import Point
     from hapticdb.devices.profiles import DeviceProfile
     from hapticdb.devices.protocol import Device
 
@@ -22,82 +22,77 @@ RANDOM_SPEED = 0.3
 
 @dataclass(frozen=True)
 class HandOptions:
-    """What the options of `feel` say of the hand.
+    """The options that say whose hand feels, and how its motion reaches the tool."""
 
-    word : --device; speed : m/s; place : --at; loops : a path begins again at its end;
-    is_simulated : the force moves the hand; profile : what the device renders.
-    """
+    device: str
+    speed: float | None = None
+    at: Point | None = None
+    simulate: bool = False
+    loop: bool = False
+    scale: float = 1.0
+    clutch: int | None = None
 
-    word: str
-    speed: float | None
-    place: "Point | None"
-    seed: int
-    loops: bool
-    is_simulated: bool
-    profile: "DeviceProfile | None" = None
-
-    def open(self) -> "tuple[Device, float | None]":
+    def open(self, seed: int, profile: "DeviceProfile | None") -> "tuple[Device, float | None]":
         """Open the device, or read the motion; also the speed assumed for a path without times."""
-        self._check()
-        if self.word in VENDORS:
-            return self._vendor_device(), None
-        hand = self._scripted()
+        self._check(seed)
+        if self.device in VENDORS:
+            return self._vendor_device(profile), None
+        hand = self._scripted(seed)
         assumed = getattr(hand, "assumed_speed", None)
-        return self._simulated(hand) if self.is_simulated else hand, assumed
+        return _simulated(hand, profile) if self.simulate else hand, assumed
 
-    def _ends_with(self, suffix: str) -> bool:
-        return self.word.lower().endswith(suffix)
-
-    def _check(self) -> None:
+    def _check(self, seed: int) -> None:
         """Refuse options that the hand does not take."""
-        word = self.word
-        if self.seed < 0:
-            raise UsageError(f"--seed {self.seed}: give 0 or more")
-        if word == "random" and self.place is None:
+        word = self.device
+        if seed < 0:
+            raise UsageError(f"--seed {seed}: give 0 or more")
+        if word == "random" and self.at is None:
             raise UsageError("--device random: give --at, where the hand is")
-        if word != "random" and self.place is not None:
+        if word != "random" and self.at is not None:
             raise UsageError(f"--at belongs to random, not to {word}")
-        if self.loops and word == "random":
+        if self.loop and word == "random":
             raise UsageError("--loop: --device random has no end; leave it out")
-        if self.speed is not None and self._ends_with(".hdbrec"):
+        if self.speed is not None and word.lower().endswith(".hdbrec"):
             raise UsageError(f"--speed: --device {word} has its own; leave it out")
-        if word in VENDORS and (self.is_simulated or self.loops or self.speed is not None):
+        if word in VENDORS and (self.simulate or self.loop or self.speed is not None):
             raise UsageError(
                 f"--device {word} is a real hand: leave out --simulate, --loop, --speed"
             )
 
-    def _vendor_device(self) -> "Device":
+    def _vendor_device(self, profile: "DeviceProfile | None") -> "Device":
         from importlib import import_module
 
-        module, name = VENDORS[self.word]
-        given = {} if self.profile is None else {"profile": self.profile}
+        module, name = VENDORS[self.device]
+        given = {} if profile is None else {"profile": profile}
         device: Device = getattr(import_module(module), name)(**given)
         return device
 
-    def _simulated(self, hand: "Device") -> "Device":
-        """Device that a hand holds, with cap and mass of the profile."""
-        from hapticdb.devices.simulated import SimulatedDevice
-
-        if self.profile is None:
-            return SimulatedDevice(hand)
-        if self.profile.mass is None:
-            return SimulatedDevice(hand, max_force=self.profile.cap)
-        return SimulatedDevice(hand, max_force=self.profile.cap, mass=self.profile.mass)
-
-    def _scripted(self) -> "Device":
+    def _scripted(self, seed: int) -> "Device":
         """The hand that a motion moves."""
         from hapticdb.devices import scripted
         from hapticdb.recording.file import Recording
 
-        if self.word == "random":
+        if self.at is not None:
             greatest = RANDOM_SPEED if self.speed is None else self.speed
-            assert self.place is not None  # noqa: S101 - checked before
-            return scripted.RandomHand(self.place, self.seed, greatest)
-        if self._ends_with(".hdbrec"):
-            times, poses = Recording(self.word).poses()
-            return scripted.Player(times, poses, loops=self.loops)
-        if self._ends_with(".csv"):
-            return scripted.Path(self.word, speed=self.speed, loops=self.loops)
+            return scripted.RandomHand(self.at, seed, greatest)
+        word = self.device.lower()
+        if word.endswith(".hdbrec"):
+            times, poses = Recording(self.device).poses()
+            return scripted.Player(times, poses, loops=self.loop)
+        if word.endswith(".csv"):
+            return scripted.Path(self.device, speed=self.speed, loops=self.loop)
         raise UsageError(
-            f"--device {self.word!r}: give poses in a .csv, a .hdbrec, random, {', '.join(VENDORS)}"
+            f"--device {self.device!r}: give poses in a .csv, a .hdbrec, random, "
+            f"{', '.join(VENDORS)}"
         )
+
+
+def _simulated(hand: "Device", profile: "DeviceProfile | None") -> "Device":
+    """Device that a hand holds, with cap and mass of the profile."""
+    from hapticdb.devices.simulated import SimulatedDevice
+
+    if profile is None:
+        return SimulatedDevice(hand)
+    if profile.mass is None:
+        return SimulatedDevice(hand, max_force=profile.cap)
+    return SimulatedDevice(hand, max_force=profile.cap, mass=profile.mass)

@@ -9,8 +9,10 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 from unicodedata import category, east_asian_width
+
+from hapticdb.cli.schema import plain
 
 if TYPE_CHECKING:
     import numpy as np
@@ -60,9 +62,9 @@ def say(text: str = "") -> None:
     print(printable(text))
 
 
-def say_json(record: Mapping[str, Any]) -> None:
-    """Print one JSON object on a line; numbers round-trip and are finite."""
-    print(json.dumps(record, allow_nan=False))
+def say_json(result: object) -> None:
+    """Print a result as one JSON object on a line; numbers round-trip and are finite."""
+    print(json.dumps(plain(result), allow_nan=False))
 
 
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:

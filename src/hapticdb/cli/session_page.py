@@ -3,9 +3,10 @@
 from collections.abc import Sequence
 from contextlib import suppress
 from time import perf_counter
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 from hapticdb.cli import render
+from hapticdb.cli.schema import plain
 from hapticdb.cli.tools import shell_record, shell_text
 from hapticdb.units import length_text
 
@@ -40,40 +41,50 @@ def tell_cost(n_points: int, rate: float, law: "LawName", frames_on: str = "cpu"
         )
 
 
-def show(
-    report: "Report",
-    cells: "ResidentCells",
-    shell: "PointShell",
-    recording: str | None,
-    path_speed: float | None,
-    began: float | None,
-) -> None:
-    """Print how the loop kept its time, beside the empty loop, and what happened in it.
+class SessionPage(NamedTuple):
+    """What there is to say of a session.
 
-    recording : file that the session was recorded to; path_speed : speed assumed for a path without
-    times, m/s; began : as of `perf_counter`, None: print JSON instead.
+    recording : file that it was recorded to; path_speed : assumed for a path without times, m/s.
     """
-    if began is None:
-        more = {"path_speed": path_speed, "shell": shell_record(shell)}
-        render.say_json(report.figures() | more)
-        return
-    _show_loops(report)
-    facts = [("shell", shell_text(shell)), *_frame_facts(report), *_force_facts(report)]
-    cache = report.cache
-    resident = f"{render.counted(cache.resident, 'cell')} in {cache.budget_bytes / 2**20:.4g} MiB"
-    facts.append(("resident", resident))
-    loaded = render.counted(cache.loaded, "cell")
-    facts.append(("fetched", f"{loaded}, {1e3 * cache.worst:.3g} ms at worst"))
-    if report.loose_frames:
-        facts.append(("in something", loose_text(report, cells)))
-    facts.append(("objects", f"{len(report.objects)} touched{_names_after(cells, report.objects)}"))
-    facts += _exceptional_facts(report)
-    if path_speed is not None:
-        facts.append(("played at", f"{path_speed} m/s: the path has no times (column t); --speed"))
-    if recording is not None:
-        facts.append(("recorded", _recording_text(report, recording)))
-    facts.append(("took", f"{perf_counter() - began:.1f} s in all"))
-    render.facts([*facts, *sorted(report.conditions.items())])
+
+    report: "Report"
+    cells: "ResidentCells"
+    shell: "PointShell"
+    recording: str | None
+    path_speed: float | None
+
+    def record(self) -> dict[str, Any]:
+        """What JSON has."""
+        told: dict[str, Any] = {"path_speed": self.path_speed, "shell": shell_record(self.shell)}
+        told |= plain(self.report)
+        told["touched"] = told.pop("objects")
+        return told
+
+    def show(self, began: float) -> None:
+        """Print how the loop kept its time, beside the empty loop, and what happened in it.
+
+        began : as of `perf_counter`.
+        """
+        report, cache = self.report, self.report.cache
+        _show_loops(report)
+        cells, fetched = (render.counted(n, "cell") for n in (cache.resident, cache.loaded))
+        touched = f"{len(report.objects)} touched{_names_after(self.cells, report.objects)}"
+        inside = loose_text(report, self.cells) if report.loose_frames else ""
+        speed = f"{self.path_speed} m/s: the path has no times (column t); --speed"
+        render.facts([
+            ("shell", shell_text(self.shell)),
+            *_frame_facts(report),
+            *_force_facts(report),
+            ("resident", f"{cells} in {cache.budget_bytes / 2**20:.4g} MiB"),
+            ("fetched", f"{fetched}, {1e3 * cache.worst:.3g} ms at worst"),
+            *[("in something", text) for text in (inside,) if text],
+            ("objects", touched),
+            *_exceptional_facts(report),
+            *[("played at", speed) for one in (self.path_speed,) if one is not None],
+            *[("recorded", _recording_text(report, one)) for one in (self.recording,) if one],
+            ("took", f"{perf_counter() - began:.1f} s in all"),
+            *sorted(report.conditions.items()),
+        ])  # fmt: skip
 
 
 def _show_loops(report: "Report") -> None:
@@ -185,6 +196,7 @@ class Notes:
 def _exceptional_facts(report: "Report") -> Facts:
     """What most sessions have not: missing cells at the start, bad readings, outages, a standby."""
     facts: Facts = []
+    cache = report.cache
     if not report.is_warm:
         facts.append(("warm start", "it began although cells were missing"))
     if report.empty is None:
@@ -192,14 +204,12 @@ def _exceptional_facts(report: "Report") -> Facts:
     if report.bad_reading is not None:
         held = render.counted(report.nowhere_frames, "frame")
         facts.append(("hand nowhere", f"{held}: {report.bad_reading}"))
-    losses, restarts = report.cache.losses, report.cache.restarts
-    if losses or restarts:
-        outages = f"{losses:,} of the database, {restarts:,} of the process that fetches"
-        facts.append(("outages", outages))
-    if report.cache.lag is not None:
-        facts.append(
-            ("standby", f"the last commit that it has replayed: {report.cache.lag:.3g} s old")
-        )
+    if cache.losses or cache.restarts:
+        fetching = f"{cache.restarts:,} of the process that fetches"
+        facts.append(("outages", f"{cache.losses:,} of the database, {fetching}"))
+    if cache.lag is not None:
+        old = f"{cache.lag:.3g} s old"
+        facts.append(("standby", f"the last commit that it has replayed: {old}"))
     return facts
 
 

@@ -1,9 +1,11 @@
 """The tool that a file holds."""
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 from hapticdb.cli import render
+from hapticdb.cli.options import UnitName
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 
@@ -11,6 +13,27 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
+    from hapticdb.query.law import LawName
+
+
+@dataclass(frozen=True)
+class ToolOptions:
+    """The options that say which tool feels, and where its points are."""
+
+    tool: str
+    tool_unit: UnitName | None = None
+    points: int | None = None
+    seed: int | None = None
+    conservative: bool = False
+
+    def made(self, env: "Environment", law: "LawName", left_out: Iterable[int]) -> "Tool":
+        """The tool, its points where contact begins under a law."""
+        from hapticdb.query.law import inset_of
+
+        inset = 0.0 if self.conservative else inset_of(env.grid.voxel_size, law)
+        made = tool_of(self.tool, self.tool_unit, self.points, self.seed, inset)
+        warn_of_size(env, made, left_out)
+        return made
 
 
 def tool_of(

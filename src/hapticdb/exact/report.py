@@ -1,8 +1,6 @@
-"""Reports of a sweep: a line, and JSON in metres and fractions of the path, world frame."""
+"""Reports of a sweep in a line: metres and fractions of the path, world frame."""
 
-import math
 from collections.abc import Iterable, Sequence
-from typing import Any
 
 import numpy as np
 
@@ -14,11 +12,6 @@ from hapticdb.verdicts import PathVerdict
 
 MOST_NAMED = 3
 """Objects with a name in a line; the others are only counted."""
-FOUND = (
-    "comes_out", "hits", "touching", "enclosed", "undecided", "contact", "overlap", "objects",
-    "looks", "revision", "elapsed", "is_stopped",
-)  # fmt: skip
-"""Fields of a `Swept` in JSON."""
 
 
 def percent(fraction: float) -> str:
@@ -159,44 +152,3 @@ def _touching_clauses(found: Swept) -> Iterable[str]:
 def _touched_text(touched: Sequence[TouchedObject]) -> str:
     last = max(one.until for one in touched)
     return f"{names_of([one.object for one in touched])} {until_text(last)}"
-
-
-def sweep_record(
-    found: Swept, shell: PointShell, parts: list[int], excluded: list[int]
-) -> dict[str, Any]:
-    """Convert a sweep's result to numbers and strings, as `hapticdb sweep --json` prints it.
-
-    shell : the tool; parts : ids of its objects, empty for a tool from a file; excluded : ids of
-    the objects outside the filter.
-    """
-    return {
-        "verdict": found.verdict,
-        "gap": plain(found.gap.at_least),
-        "gap_at_most": plain(found.gap.at_most),
-        "chord_error": found.gap.error,
-        "nearest": plain(found.gap.place),
-        "line": verdict_line(found, shell),
-        **{name: plain(getattr(found, name)) for name in FOUND},
-        "poses": len(found.path.poses),
-        "tool": {"parts": parts, "excluded": excluded},
-    }
-
-
-def plain(value: Any) -> Any:  # noqa: ANN401 - a part of a result
-    """Convert a part of a result; infinity and NaN, absent from JSON, are None.
-
-    An object is its id and name, among the fields of the part with it.
-    """
-    if isinstance(value, Object):
-        return {"id": value.id, "name": value.name}
-    if isinstance(value, np.ndarray):
-        return plain(value.tolist())
-    if isinstance(value, float):
-        return value if math.isfinite(value) else None
-    if hasattr(value, "_asdict"):
-        told = value._asdict()
-        about = plain(told.pop("object")) if "object" in told else {}
-        return about | {name: plain(one) for name, one in told.items()}
-    if isinstance(value, tuple | list):
-        return [plain(one) for one in value]
-    return value

@@ -1,6 +1,6 @@
 """Report of a session: its rate, lateness and computing time, and those of an empty loop."""
 
-from dataclasses import asdict, dataclass, fields
+from dataclasses import dataclass, fields
 from typing import Any, NamedTuple, Self
 
 import numpy as np
@@ -53,6 +53,8 @@ class LoopFigures:
     missed: int
     lateness: Spread
     elapsed: Spread
+
+    FIELDS = ("frames", "seconds", "missed", "lateness", "elapsed", "rate")
 
     @property
     def rate(self) -> float:
@@ -177,20 +179,6 @@ class Report:
             f"{self.contact_frames:,} in contact, peak {self.peak_force:.4g} N, "
             f"{self.loop.missed:,} deadlines missed)"
         )
-
-    def figures(self) -> dict[str, object]:
-        """All fields as plain numbers and strings, for JSON; times in seconds."""
-        plain = asdict(self)
-        for name in ("loop", "empty"):
-            part = getattr(self, name)
-            if part is None:
-                continue
-            plain[name] = asdict(part) | {"rate": part.rate}
-            for times in ("lateness", "elapsed"):
-                plain[name][times] = getattr(part, times)._asdict()
-        plain["cache"] = self.cache._asdict()
-        plain["objects"], plain["loose_objects"] = list(self.objects), list(self.loose_objects)
-        return plain
 
 
 def counts_of(seat: NDArray[np.void]) -> dict[str, Any]:

@@ -9,6 +9,7 @@ import pytest
 
 from children import PATIENCE
 from hapticdb import Coupling, Environment, Handle, PointShell, TangentPlane
+from hapticdb.cli.schema import plain
 from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.devices.simulated import SimulatedDevice
@@ -89,7 +90,7 @@ def test_with_distances_the_force_is_stiffness_times_depth_and_zero_when_free(
     header = Recording(tmp_path / "s.hdbrec").header
     assert header.law == DistanceField()
     assert header.coupling["stiffness"] == 1000.0
-    assert json.loads(json.dumps(report.figures(), allow_nan=False))["law"] == "distance"
+    assert json.loads(json.dumps(plain(report), allow_nan=False))["law"] == "distance"
 
 
 @pytest.mark.parametrize("law", [TangentPlane(800.0), DistanceField(800.0)])

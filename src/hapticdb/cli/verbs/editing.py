@@ -1,32 +1,20 @@
 """The verbs that edit an environment: move, remove."""
 
-from typing import Annotated
-
-import typer
-
-from hapticdb.cli import render
 from hapticdb.cli.choosing import chosen
-from hapticdb.cli.options import JsonOption, ObjectsArgument, UrlArgument, length_option
+from hapticdb.cli.emit import Output
 from hapticdb.cli.root import left_at
-from hapticdb.cli.values import Point, numbers_of, point_of
+from hapticdb.cli.schema import OBJECT, record
+from hapticdb.cli.values import Point, numbers_of
+from hapticdb.errors import UsageError
 
 
 def move(
-    url: UrlArgument,
-    objects: ObjectsArgument,
+    url: str,
+    objects: list[str],
     *,
-    translate: Annotated[
-        Point | None,
-        length_option("shift from the present place, world frame.", parse=point_of, unit="m"),
-    ] = None,
-    matrix: Annotated[
-        str | None,
-        typer.Option(
-            metavar="NUMBERS",
-            help="New placement: 16 numbers, row by row, separated by commas or blanks.",
-        ),
-    ] = None,
-    json: JsonOption = False,
+    translate: Point | None = None,
+    matrix: str | None = None,
+    output: Output,
 ) -> None:
     """Place objects anew.
 
@@ -41,8 +29,6 @@ def move(
     import numpy as np
 
     import hapticdb
-    from hapticdb.cli.verbs.listing import record_of
-    from hapticdb.errors import UsageError
 
     if (translate is None) == (matrix is None):
         raise UsageError("give one of --translate and --matrix")
@@ -61,14 +47,12 @@ def move(
             else:
                 moved = [env.move(found[0].id, np.array(placed).reshape(4, 4))]
     for obj in moved:
-        if json:
-            render.say_json(record_of(obj))
-        else:
-            low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in obj.bounds.tolist())
-            render.say(f"moved {obj.id} ({obj.name}): now from ({low}) to ({high}) m")
+        low, high = (", ".join(f"{x:.4g}" for x in corner) for corner in obj.bounds.tolist())
+        words = f"moved {obj.id} ({obj.name}): now from ({low}) to ({high}) m"
+        output.emit(record(obj, OBJECT), words)
 
 
-def remove(url: UrlArgument, objects: ObjectsArgument, *, json: JsonOption = False) -> None:
+def remove(url: str, objects: list[str], *, output: Output) -> None:
     """Remove objects, each in a transaction of its own.
 
     'hapticdb objects --help' says how names choose objects.
@@ -78,12 +62,8 @@ def remove(url: UrlArgument, objects: ObjectsArgument, *, json: JsonOption = Fal
     Example: hapticdb remove car.db 'wheel_bolt_*'
     """
     import hapticdb
-    from hapticdb.cli.verbs.listing import record_of
 
     with hapticdb.open(url) as env:
         for obj in chosen(env, objects, "WORDS"):  # all, or an error before any is removed
             env.remove(obj.id)
-            if json:
-                render.say_json(record_of(obj))
-            else:
-                render.say(f"removed {obj.id} ({obj.name})")
+            output.emit(record(obj, OBJECT), f"removed {obj.id} ({obj.name})")

@@ -1,25 +1,18 @@
 """The verb extract."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+from typing import TYPE_CHECKING, Any, Literal
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import felt_objects, ids_of
-from hapticdb.cli.options import (
-    BudgetOption,
-    ClusterOption,
-    ExcludeOption,
-    JsonOption,
-    ObjectsArgument,
-    UrlArgument,
-    WhereOption,
-    length_option,
-)
+from hapticdb.cli.choosing import FilterOptions, ids_of
+from hapticdb.cli.emit import Output
+from hapticdb.cli.schema import plain
 from hapticdb.cli.values import budget_bytes, numbers_of, point_of
-from hapticdb.cli.verbs.sweeping import ContactOption, OverlapOption
 from hapticdb.errors import UsageError
 from hapticdb.verdicts import EXTRACT_VERDICTS, exit_codes
 
@@ -33,61 +26,6 @@ if TYPE_CHECKING:
 
 MOST_BLOCKERS = 10
 """Rows of the table of what is in the way, and of the table of searches that failed."""
-
-UpName = Literal["x", "y", "z"]
-SecondsOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="S", help="Time of the search.", show_default="60; 600 with --disassemble"
-    ),
-]
-SeedOption = Annotated[int, typer.Option(metavar="N", help="Seed of the search.")]
-MotionsOption = Annotated[
-    int, typer.Option(metavar="N", help="Motions that the planner tries; 0: straight pulls only.")
-]
-OutOption = Annotated[
-    float | None,
-    length_option("so far from its start the part counts as out.", "clear of all that stands"),
-]
-ToOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="POSE",
-        help="Reach this displacement instead: x,y,z,qw,qx,qy,qz, millimetres, or "
-        "such as 0,5,0.2in,1,0,0,0; or a CSV file of one pose, metres.",
-    ),
-]
-ScrewOption = Annotated[
-    float | None, length_option("the pitch of a thread, of either hand, a turn.")
-]
-WayOption = Annotated[
-    str | None, typer.Option("--path", metavar="CSV", help="Write the path that was found.")
-]
-
-DisassembleOption = Annotated[
-    bool,
-    typer.Option("--disassemble", help="Take off what blocks the parts first, step by step."),
-]
-DepthOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        help="Most objects that wait for one another, beside the parts.",
-        show_default="3",
-    ),
-]
-KeepOption = Annotated[
-    list[str] | None,
-    typer.Option(metavar="WORDS", help="Objects that are never taken off; as for --exclude."),
-]
-AnimationOption = Annotated[
-    str | None,
-    typer.Option(metavar="HTML", help="Write a page that shows how the parts come out."),
-]
-UpOption = Annotated[
-    UpName | None,
-    typer.Option(help="Axis that points up in the animation.", show_default="the files'"),
-]
 
 HELP = f"""Search a path on which parts come out, judged by a sweep of their surfaces.
 
@@ -119,64 +57,98 @@ Example: hapticdb extract car.db body/hood --path out.csv
 """
 
 
+@dataclass(frozen=True)
+class OrderOptions:
+    """The options of a search that takes off what blocks the parts."""
+
+    disassemble: bool = False
+    depth: int | None = None
+    keep: list[str] | None = None
+    on: str | None = None
+
+    def __post_init__(self) -> None:
+        if not self.disassemble and (self.depth is not None or self.keep or self.on):
+            raise UsageError("--depth, --keep and --on go with --disassemble")
+
+
+@dataclass(frozen=True)
+class SearchOptions:
+    """The options of every search."""
+
+    seconds: float | None = None
+    seed: int = 0
+    motions: int = 20_000
+    out: float | None = None
+    screw: float | None = None
+    contact: float = 5e-5
+    overlap: float = 0.0
+
+
+@dataclass(frozen=True)
+class _Output(Output):
+    path: str | None = None
+    animation: str | None = None
+    up: Literal["x", "y", "z"] | None = None
+
+    def __post_init__(self) -> None:
+        if self.animation is None:
+            return
+        if not self.animation.lower().endswith(".html"):
+            raise UsageError(
+                f"--animation {self.animation}: it is a page, give a name that ends in .html"
+            )
+        from hapticdb.page.animation import check_view
+
+        check_view()
+
+    def files(self, n_steps: int | None) -> list[str]:
+        """Files of the path, or of the steps of an order: ``out-1.csv`` of ``out.csv``."""
+        if self.path is None or n_steps is None:
+            return [self.path] if self.path else []
+        path = Path(self.path)
+        names = (f"{path.stem}-{n + 1}{path.suffix}" for n in range(n_steps))
+        return [str(path.with_name(name)) for name in names]
+
+
 def extract(
-    url: UrlArgument,
-    parts: ObjectsArgument,
+    url: str,
+    parts: list[str],
     *,
-    disassemble: DisassembleOption = False,
-    depth: DepthOption = None,
-    keep: KeepOption = None,
-    seconds: SecondsOption = None,
-    seed: SeedOption = 0,
-    motions: MotionsOption = 20_000,
-    out: OutOption = None,
-    to: ToOption = None,
-    screw: ScrewOption = None,
-    contact: ContactOption = 5e-5,
-    overlap: OverlapOption = 0.0,
-    where: WhereOption = None,
-    exclude: ExcludeOption = None,
-    budget: BudgetOption = 256.0,
-    on: ClusterOption = None,
-    path: WayOption = None,
-    animation: AnimationOption = None,
-    up: UpOption = None,
-    json: JsonOption = False,
+    order: OrderOptions,
+    to: str | None = None,
+    search: SearchOptions,
+    felt: FilterOptions,
+    budget: float = 256.0,
+    output: _Output,
 ) -> None:
     """Search a path on which parts come out; the help text is `HELP`."""
     import hapticdb
-    from hapticdb.extraction import disassembly as orders
-    from hapticdb.extraction import run
+    from hapticdb.extraction.disassembly import disassemble
+    from hapticdb.extraction.run import extract as search_way
 
-    _check_animation(animation)
-    if not disassemble and (depth is not None or keep or on):
-        raise UsageError("--depth, --keep and --on go with --disassemble")
-    if to and (disassemble or out or screw):
+    if to and (order.disassemble or search.out or search.screw):
         raise UsageError("--to goes with none of --disassemble, --out and --screw")
     goal = _goal(to) if to else None
-    asked = _Outputs(path, animation, up, json)
-    options: dict[str, Any] = {
-        "seed": seed, "motions": motions, "out": out, "screw": screw,
-        "contact": contact, "overlap": overlap, "budget_bytes": budget_bytes(budget),
-        **({} if seconds is None else {"seconds": seconds}),
-    }  # fmt: skip
+    options: dict[str, Any] = vars(search) | {"budget_bytes": budget_bytes(budget)}
+    options |= {"depth": order.depth} if order.disassemble else {"to": goal}
+    options = {name: value for name, value in options.items() if value is not None}
+    found: Extraction | Disassembly
+    steps: list[tuple[Extraction, Sequence[int]]]
     with hapticdb.open(url, read_only=True) as env:
         ids = ids_of(env, parts, "PART")
-        felt = felt_objects(env, where, exclude, ids)
-        kept = ids_of(env, keep, "--keep") if keep else []
-        with render.bar("pulling", "searches" if on else "pulls") as progress:
-            options |= {"where": felt.where, "progress": progress}
-            if disassemble:
-                options |= {} if depth is None else {"depth": depth}
-                options |= {"exclude": exclude or (), "keep": kept, "on": on}
-                order = orders.disassemble(env, *ids, **options)
+        chosen = felt.felt(env, ids)
+        kept = ids_of(env, order.keep, "--keep") if order.keep else []
+        with render.bar("pulling", "searches" if order.on else "pulls") as progress:
+            options |= {"where": chosen.where, "progress": progress}
+            if order.disassemble:
+                more: dict[str, Any] = {"exclude": felt.exclude or (), "keep": kept, "on": order.on}
+                found = disassemble(env, *ids, **more, **options)
+                steps = [(step.found, step.excluded) for step in found.steps if found.is_found]
             else:
-                found = run.extract(env, *ids, exclude=felt.exclude, to=goal, **options)
-        if disassemble:
-            _report_order(env, order, asked)
-        else:
-            _report(env, found, felt.left_out, asked)
-    raise typer.Exit((order if disassemble else found).verdict.exit_status)
+                found = search_way(env, *ids, exclude=chosen.exclude, **options)
+                steps = [(found, chosen.left_out)] if found.way else []
+        _report(env, found, steps, output)
+    raise typer.Exit(found.verdict.exit_status)
 
 
 def _goal(to: str) -> "NDArray[np.float64]":
@@ -200,91 +172,44 @@ def _goal(to: str) -> "NDArray[np.float64]":
     return pose_of_row(place, turn)
 
 
-class _Outputs(NamedTuple):
-    """What is written beside the printed lines: names of files, or None."""
+def _report(
+    env: "Environment", found: "Extraction | Disassembly",
+    steps: "Sequence[tuple[Extraction, Sequence[int]]]", output: _Output,
+) -> None:  # fmt: skip
+    """Write paths, print the verdict, and draw the animation if it was asked for.
 
-    path: str | None
-    animation: str | None
-    up: UpName | None
-    json: bool
-
-    def of_step(self, step: int) -> "_Outputs":
-        """Files of a step of an order: ``out.csv`` is ``out-1.csv`` for the first step, 0."""
-        if self.path is None:
-            return self
-        path = Path(self.path)
-        return self._replace(path=str(path.with_name(f"{path.stem}-{step + 1}{path.suffix}")))
-
-
-class _Way(NamedTuple):
-    """A way that was found, the ids of what is not felt on it, and its files."""
-
-    found: "Extraction"
-    excluded: Sequence[int]
-    files: _Outputs
-
-
-def _check_animation(animation: str | None) -> None:
-    """Refuse, before anything is searched, an animation that could not be written."""
-    if animation is None:
-        return
-    if not animation.lower().endswith(".html"):
-        raise UsageError(f"--animation {animation}: it is a page, give a name that ends in .html")
-    from hapticdb.page.animation import check_view
-
-    check_view()
-
-
-def _report(env: "Environment", found: "Extraction", left_out: list[int], asked: _Outputs) -> None:
-    """Print the verdict; write path and animation of a path that was found."""
-    from hapticdb.extraction.verdict import extraction_record
-
-    ways = [] if found.way is None else [_Way(found, left_out, asked)]
-    _write_paths(ways)
-    if asked.json:
-        render.say_json(extraction_record(found, left_out))
-    else:
-        _show(found, asked)
-    _draw(env, ways, asked)
-
-
-def _report_order(env: "Environment", found: "Disassembly", asked: _Outputs) -> None:
-    """Print an order or why there is none; write a path a step, and an animation."""
-    from hapticdb.extraction.verdict import disassembly_record
-
-    steps = found.steps if found.is_found else ()
-    ways = [_Way(step.found, step.excluded, asked.of_step(n)) for n, step in enumerate(steps)]
-    _write_paths(ways)
-    if asked.json:
-        render.say_json(disassembly_record(found))
-    else:
-        _show_order(found, ways)
-    _draw(env, ways, asked)
-
-
-def _write_paths(ways: Sequence[_Way]) -> None:
+    steps : those that were found, with the ids of what is not felt in each.
+    """
+    from hapticdb.extraction.result import Extraction
+    from hapticdb.extraction.verdict import disassembly_line, extraction_line
     from hapticdb.poses import write_poses
 
-    for found, _, files in ways:
-        if files.path is not None and found.way is not None:
-            write_poses(files.path, found.way.poses)
+    is_one = isinstance(found, Extraction)
+    files = output.files(None if is_one else len(steps)) if steps else []
+    for file, (step, _) in zip(files, steps, strict=False):
+        assert step.way is not None  # noqa: S101 - it was found
+        write_poses(file, step.way.poses)
+    line = extraction_line(found) if isinstance(found, Extraction) else disassembly_line(found)
+    shown = partial(_show if is_one else _show_order, found)  # type: ignore[arg-type]
+    names = " ... ".join(dict.fromkeys([*files[:1], *files[-1:]]))
+    written = [("path", names), ("animation", output.animation if steps else "")]
 
+    def words() -> None:
+        render.say(line)
+        render.facts([*shown(), *((name, file) for name, file in written if file)])
 
-def _draw(env: "Environment", ways: Sequence[_Way], asked: _Outputs) -> None:
-    """Draw the animation if it was asked for."""
-    if asked.animation is not None and ways:
+    output.emit({"line": line} | plain(found), words)
+    if output.animation is not None and steps:
         from hapticdb.page.animation import animate
 
-        steps = [way.found for way in ways]
-        animate(asked.animation, env, steps, exclude=ways[-1].excluded, up=asked.up)
+        ways = [step for step, _ in steps]
+        animate(output.animation, env, ways, exclude=steps[-1][1], up=output.up)
 
 
-def _show(found: "Extraction", asked: _Outputs) -> None:
-    """Print the verdict, what is in the way, and the figures of the search."""
+def _show(found: "Extraction") -> list[tuple[str, str]]:
+    """Print what is in the way; returns the figures of the search."""
     from hapticdb.exact.report import names_of
-    from hapticdb.extraction.verdict import extraction_line
 
-    render.say(extraction_line(found))
     if found.way is None and found.blockers:
         rows = [
             (str(one.object.id), one.object.name, f"{one.pulls} of {found.pulls}")
@@ -295,22 +220,17 @@ def _show(found: "Extraction", asked: _Outputs) -> None:
         render.counted(n, noun)
         for n, noun in ((found.pulls, "pull"), (found.motions, "motion"), (found.poses, "pose"))
     )
-    facts = [
+    return [
         ("near its start", names_of(found.near) or "nothing"),
         ("searched", f"{pulls}, {motions}, {poses}"),
         ("took", f"{found.seconds:.1f} s"),
     ]
-    if found.way is not None:
-        files = asked._asdict()
-        facts += [(name, files[name]) for name in ("path", "animation") if files[name]]
-    render.facts(facts)
 
 
-def _show_order(found: "Disassembly", ways: Sequence[_Way]) -> None:
+def _show_order(found: "Disassembly") -> list[tuple[str, str]]:
     from hapticdb.exact.report import names_of
-    from hapticdb.extraction.verdict import disassembly_line, extraction_line, failed_line
+    from hapticdb.extraction.verdict import extraction_line, failed_line
 
-    render.say(disassembly_line(found))
     for n, step in enumerate(found.steps):
         render.say(f"{n + 1}. {names_of(step.found.parts)}: {extraction_line(step.found)}")
     if not found.is_found and found.failed:
@@ -319,12 +239,4 @@ def _show_order(found: "Disassembly", ways: Sequence[_Way]) -> None:
             for one in found.failed[-MOST_BLOCKERS:]
         ]
         render.table(("tried", "after steps>", "result"), rows)
-    facts = [("took", f"{found.seconds:.1f} s")]
-    if ways:
-        ends = [way.files._asdict() for way in (ways[0], ways[-1])]
-        facts += [
-            (name, " ... ".join(dict.fromkeys(end[name] for end in ends)))
-            for name in ("path", "animation")
-            if ends[0][name]
-        ]
-    render.facts(facts)
+    return [("took", f"{found.seconds:.1f} s")]

@@ -1,222 +1,142 @@
 """The verb feel."""
 
 import signal
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, replace
 from functools import partial
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 import hapticdb
 from hapticdb.cli import render, session_page
-from hapticdb.cli.choosing import Felt, felt_objects
-from hapticdb.cli.forces import law_and_coupling
+from hapticdb.cli.choosing import Felt, FilterOptions
+from hapticdb.cli.emit import Output
 from hapticdb.cli.hands import HandOptions
-from hapticdb.cli.options import (
-    BudgetOption,
-    ConservativeOption,
-    ExcludeOption,
-    FramesOn,
-    JsonOption,
-    LawName,
-    LawOption,
-    PointsOption,
-    RenderingName,
-    ToolOption,
-    ToolUnitOption,
-    UrlArgument,
-    WhereOption,
-    length_option,
-)
+from hapticdb.cli.options import FramesOn, LawName, RenderingName
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
-from hapticdb.cli.tools import tool_of, warn_of_size
-from hapticdb.cli.values import Point, budget_bytes, point_of, size_bytes
-from hapticdb.devices.profiles import profile_named
+from hapticdb.cli.tools import ToolOptions
+from hapticdb.cli.values import budget_bytes, size_bytes
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
-    from hapticdb.pointshell.kept import Tool
-    from hapticdb.pointshell.shell import PointShell
-    from hapticdb.session.coupling import Rendering
+    from hapticdb.devices.profiles import DeviceProfile
+    from hapticdb.query.law import ForceLaw
+    from hapticdb.session.coupling import Coupling, Rendering
     from hapticdb.session.report import Report
     from hapticdb.session.session import Session
 
 LOOK_EVERY, OBJECTS_EVERY = 0.1, 3
 """Seconds between two looks at the session: how late a lost database is reported, or the end of its
 recording; and looks between two whether the tool lies in an object, which may last a moment."""
+CONTACT_STIFFNESS = 1000.0
+"""Stiffness of a contact, rendered directly, unless --stiffness is given, N/m."""
 
-DeviceOption = Annotated[
-    str,
-    typer.Option(
-        metavar="DEVICE",
-        help="The hand: poses in a .csv (column t: seconds), a recording .hdbrec, random, "
-        "force-dimension, openhaptics or haply.",
-    ),
-]
-RateOption = Annotated[float, typer.Option(metavar="HZ", help="Frames a second.")]
-SecondsOption = Annotated[
-    float | None,
-    typer.Option(metavar="S", help="How long; unless given, until the device ends or Ctrl-C."),
-]
-SpeedOption = Annotated[
-    float | None,
-    typer.Option(metavar="M/S", help="Speed along a path, or greatest speed of a random hand."),
-]
-PlaceOption = Annotated[
-    Point | None, length_option("where the hand random is.", parse=point_of, unit="m")
-]
-SimulateOption = Annotated[
-    bool, typer.Option("--simulate", help="Let the force push the hand, as a simulated device.")
-]
-LoopOption = Annotated[bool, typer.Option("--loop", help="Begin a path again at its end.")]
-ScaleOption = Annotated[
-    float, typer.Option(metavar="N", help="Metres in the scene for each metre of the hand.")
-]
-ClutchOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="BUTTON", help="While this button is down, only the hand moves; 0 is the first."
-    ),
-]
-RecordOption = Annotated[
-    str | None, typer.Option(metavar="FILE", help="Record the session: a new .hdbrec.")
-]
-ReplaceOption = Annotated[
-    bool,
-    typer.Option("--replace", help="Replace a recording that exists, once there is a first frame."),
-]
-RecordLimitOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="SIZE",
-        help="Size at which the recording ends and the session goes on: MiB, or such as 4GiB. "
-        "It also ends when its disk has 64 MiB left.",
-        show_default="4GiB",
-    ),
-]
-FramesOnOption = Annotated[
-    FramesOn,
-    typer.Option(
-        help="What finds the tool's points near surfaces: a processor, or a GPU of NVIDIA for "
-        "tools of millions of points.",
-    ),
-]
-RenderingOption = Annotated[
-    RenderingName | None,
-    typer.Option(
-        "--rendering",
-        help="coupled: a spring between hand and tool, which stays outside of surfaces; needs "
-        "distances. direct: each frame's wrench goes to the device, up to its caps.",
-        show_default="coupled; direct with --law plane",
-    ),
-]
-DeviceStiffnessOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="N/M",
-        help="Stiffness that the hand feels; lowered to what the device holds without trembling. "
-        "With --rendering direct: of a contact.",
-        show_default="the device's, or 1000",
-    ),
-]
-ProfileOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="NAME",
-        help="What the device renders: touch, omni, desktop, premium-1.5, falcon, omega, delta or "
-        "sigma.7.",
-        show_default="the device's own",
-    ),
-]
-CapOption = Annotated[
-    float | None,
-    typer.Option(metavar="N", help="Greatest force.", show_default="the device's"),
-]
-DelayOption = Annotated[
-    float | None,
-    typer.Option(
-        metavar="MS",
-        help="Milliseconds from reading the hand's place until its force acts.",
-        show_default="the device's, or one period",
-    ),
-]
-HandSeedOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N", help="Seed of the points' places, and of a random hand.", show_default="0"
-    ),
-]
-ProcessorOption = Annotated[
-    int | None, typer.Option(metavar="N", help="Bind the loop to that processor.")
-]
-NoBaselineOption = Annotated[
-    bool,
-    typer.Option(
-        "--no-baseline", help="Skip the empty loop that is measured before, for 2 s at most."
-    ),
-]
+
+@dataclass(frozen=True)
+class ForceOptions:
+    """The options of how contacts become the force on the hand."""
+
+    law: LawName | None = None
+    rendering: RenderingName | None = None
+    stiffness: float | None = None
+    device_profile: str | None = None
+    cap: float | None = None
+    delay: float | None = None
+
+    @property
+    def profile(self) -> "DeviceProfile | None":
+        """What the device renders; None: what it says itself."""
+        from hapticdb.devices.profiles import profile_named
+
+        return None if self.device_profile is None else profile_named(self.device_profile)
+
+    def settled(self, rendering: "Rendering") -> "tuple[ForceLaw | None, Coupling]":
+        """Law and coupling of a session; a UsageError where options contradict."""
+        from hapticdb.query.law import law_named
+        from hapticdb.session.coupling import Coupling
+
+        if rendering == "coupled":
+            delay = None if self.delay is None else 1e-3 * self.delay
+            return None, Coupling(self.stiffness, self.cap, delay=delay, profile=self.profile)
+        if self.delay is not None:
+            raise UsageError("--delay belongs to --rendering coupled: leave it out")
+        stiffness = CONTACT_STIFFNESS if self.stiffness is None else self.stiffness
+        law = law_named(self.law or "distance", stiffness)
+        return law, Coupling(cap=self.cap, profile=self.profile)
+
+
+@dataclass(frozen=True)
+class RecordOptions:
+    """The options of a recording."""
+
+    record: str | None = None
+    replace: bool = False
+    record_limit: str | None = None
+
+    def settled(self) -> dict[str, Any]:
+        """Arguments of a session; refuses options of a recording where there is none."""
+        from hapticdb.recording.file import DEFAULT_LIMIT
+
+        limit = self.record_limit
+        bytes_ = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
+        if self.record is None and (self.replace or limit is not None):
+            raise UsageError("--replace and --record-limit belong to --record: give it, too")
+        return {
+            "record": self.record, "replace_recording": self.replace, "record_limit_bytes": bytes_
+        }  # fmt: skip
+
+
+@dataclass(frozen=True)
+class LoopOptions:
+    """The options of the loop, and of the processor or GPU that runs it."""
+
+    rate: float = 1000.0
+    seconds: float | None = None
+    frames_on: FramesOn = "cpu"
+    processor: int | None = None
 
 
 def feel(
-    url: UrlArgument,
+    url: str,
     *,
-    tool: ToolOption,
-    device: DeviceOption,
-    rate: RateOption = 1000.0,
-    seconds: SecondsOption = None,
-    speed: SpeedOption = None,
-    at: PlaceOption = None,
-    simulate: SimulateOption = False,
-    loop: LoopOption = False,
-    scale: ScaleOption = 1.0,
-    clutch: ClutchOption = None,
-    where: WhereOption = None,
-    exclude: ExcludeOption = None,
-    record: RecordOption = None,
-    replace: ReplaceOption = False,
-    record_limit: RecordLimitOption = None,
-    budget: BudgetOption = 256.0,
-    frames_on: FramesOnOption = "cpu",
-    law: LawOption = None,
-    rendering: RenderingOption = None,
-    conservative: ConservativeOption = False,
-    stiffness: DeviceStiffnessOption = None,
-    device_profile: ProfileOption = None,
-    cap: CapOption = None,
-    delay: DelayOption = None,
-    tool_unit: ToolUnitOption = None,
-    points: PointsOption = None,
-    seed: HandSeedOption = None,
-    processor: ProcessorOption = None,
-    no_baseline: NoBaselineOption = False,
-    json: JsonOption = False,
+    tool: ToolOptions,
+    hand: HandOptions,
+    loop: LoopOptions,
+    felt: FilterOptions,
+    force: ForceOptions,
+    recorded: RecordOptions,
+    budget: float = 256.0,
+    no_baseline: bool = False,
+    output: Output,
 ) -> None:
     """Feel an environment in real time with a device; report how well frames kept their time.
 
     Example: hapticdb feel car.db --tool wrench.stl --device path.csv --rate 1000 --seconds 10
     """
     began = perf_counter()
-    chosen_rendering = _begin_loop(law, rendering, processor, frames_on)
-    profile = None if device_profile is None else profile_named(device_profile)
-    chosen, coupling = law_and_coupling(law, chosen_rendering, stiffness, cap, delay, profile)
-    limit_bytes = _recording_limit(record, record_limit, is_replaced=replace)
-    hands = HandOptions(device, speed, at, seed or 0, loop, simulate, profile)
-    (hand, speed), handle = hands.open(), hapticdb.Handle(scale=scale, clutch=clutch)
-    drawn_in = partial(_tool, tool, tool_unit, points, seed, device)
-    felt, shell = _looked_at(url, where, exclude, drawn_in, law or "distance", not conservative)
-    session_page.tell_cost(len(shell), rate, law or "distance", frames_on)
+    rendering = _begin_loop(force, loop)
+    chosen, coupling = force.settled(rendering)
+    recording, law = recorded.settled(), force.law or "distance"
+    device, path_speed = hand.open(tool.seed or 0, force.profile)
+    if hand.device == "random" and tool.tool.lower().endswith(".npz"):
+        tool = replace(tool, seed=None)  # it is the hand's
+    with hapticdb.open(url, read_only=True) as env:  # before a process starts
+        found = felt.felt(env)
+        shell = tool.made(env, law, found.left_out).shell
+    session_page.tell_cost(len(shell), loop.rate, law, loop.frames_on)
     begin = partial(
-        hapticdb.Session, shell=shell, device=hand, rate=rate, seconds=seconds, handle=handle,
-        law=chosen, rendering=chosen_rendering, coupling=coupling, frames_on=frames_on,
-        processor=processor, record=record, replace_recording=replace,
-        record_limit_bytes=limit_bytes, has_baseline=not no_baseline,
+        hapticdb.Session, shell=shell, device=device, law=chosen, rendering=rendering,
+        handle=hapticdb.Handle(scale=hand.scale, clutch=hand.clutch), coupling=coupling,
+        has_baseline=not no_baseline, **vars(loop), **recording,
     )  # fmt: skip
-    with _begun(begin, url, budget_bytes(budget), felt, law) as session:
+    with _begun(begin, url, budget_bytes(budget), found, force.law) as session:
         with ended_by_signals(session.ask_to_end) as signals:
-            report = _waited_for(session, stiffness, seconds)
-        session_page.show(report, session.cells, shell, record, speed, None if json else began)
+            report = _waited_for(session, force.stiffness, loop.seconds)
+        page = session_page.SessionPage(report, session.cells, shell, recorded.record, path_speed)
+        output.emit(page.record(), partial(page.show, began))
     _exit_after(signals, report)
 
 
@@ -237,50 +157,7 @@ def _begun(
         yield session
 
 
-def _tool(
-    tool: str, unit: str | None, points: int | None, seed: int | None, device: str, inset: float
-) -> "Tool":  # fmt: skip
-    """Make the tool, its points drawn inward by `inset` metres."""
-    # a saved shell takes no seed, and a random hand does
-    is_for_hand_alone = device == "random" and tool.lower().endswith(".npz")
-    seed = None if is_for_hand_alone else seed
-    return tool_of(tool, unit, points, seed, inset=inset)
-
-
-def _looked_at(
-    url: str,
-    where: Sequence[str] | None,
-    exclude: Sequence[str] | None,
-    drawn_in: "Callable[[float], Tool]",
-    law: LawName,
-    is_inset: bool,  # noqa: FBT001 - of one call
-) -> "tuple[Felt, PointShell]":
-    """Filter and shell, before a process starts; `is_inset`: drawn in to the contact."""
-    from hapticdb.query.law import inset_of
-
-    with hapticdb.open(url, read_only=True) as env:
-        felt = felt_objects(env, where, exclude)
-        tool = drawn_in(inset_of(env.grid.voxel_size, law) if is_inset else 0.0)
-        warn_of_size(env, tool, felt.left_out)
-    return felt, tool.shell
-
-
-def _recording_limit(record: str | None, limit: str | None, *, is_replaced: bool) -> int:
-    """Bytes at which a recording ends; refuses options of a recording where there is none."""
-    from hapticdb.recording.file import DEFAULT_LIMIT
-
-    limit_bytes = DEFAULT_LIMIT if limit is None else size_bytes(limit, "--record-limit")
-    if record is None and (is_replaced or limit is not None):
-        raise UsageError("--replace and --record-limit belong to --record: give it, too")
-    return limit_bytes
-
-
-def _begin_loop(
-    law: LawName | None,
-    rendering: RenderingName | None,
-    processor: int | None,
-    frames_on: FramesOn,
-) -> "Rendering":
+def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
     """Start the fork server, check the loop; returns the rendering."""
     from hapticdb.session.processes.fork_server import prepare
 
@@ -290,16 +167,16 @@ def _begin_loop(
     from hapticdb.query.law import DISTANCE, as_law
     from hapticdb.session.coupling import rendering_of
 
-    chosen = rendering_of(rendering, as_law(law) or DISTANCE)
-    if frames_on != "cpu":
+    chosen = rendering_of(force.rendering, as_law(force.law) or DISTANCE)
+    if loop.frames_on != "cpu":
         from hapticdb.session.on_gpu import check_frames
 
-        check_frames(frames_on, chosen)
+        check_frames(loop.frames_on, chosen)
 
     with render.bar("loading", ""):
         from hapticdb.session.timing import Timing
 
-    Timing(processor=processor)
+    Timing(processor=loop.processor)
     return chosen
 
 

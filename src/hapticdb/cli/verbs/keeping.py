@@ -1,17 +1,17 @@
 """The verbs that keep an environment: check, backup, grant."""
 
-from typing import TYPE_CHECKING, Annotated, Literal
+from typing import TYPE_CHECKING
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import JsonOption, UrlArgument
+from hapticdb.cli.emit import Output
+from hapticdb.cli.options import RightName
 from hapticdb.cli.root import left_at
 
 if TYPE_CHECKING:
     from hapticdb.check import CheckReport
 
-RightName = Literal["viewer", "toucher", "editor", "nobody"]
 MEANINGS: dict[RightName, str] = {
     "viewer": "may read and touch",
     "toucher": "may read and touch, and keep what 'hapticdb info --calibrate' measures",
@@ -20,19 +20,7 @@ MEANINGS: dict[RightName, str] = {
 }
 
 
-def check(
-    url: UrlArgument,
-    *,
-    repair: Annotated[
-        bool,
-        typer.Option(
-            "--repair",
-            help="Then make wrong rows and boxes anew, from surfaces; remove stray rows; have "
-            "'clashes' measure wrong pairs again.",
-        ),
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+def check(url: str, *, repair: bool = False, output: Output) -> None:
     """Read all of an environment and say what is wrong with it, a line each.
 
     The structure, rows, objects, surfaces, pairs and the log of changes are
@@ -53,15 +41,10 @@ def check(
         with render.bar("mending", "objects") as progress:
             repair_environment(url, report, progress=progress)
         report = _read(url)
-    if json:
-        render.say_json({"sound": report.is_sound} | vars(report))
-    else:
-        for finding in report.findings:
-            render.say(finding)
-        if report.n_findings > len(report.findings):
-            more = report.n_findings - len(report.findings)
-            render.say(f"and {render.counted(more, 'finding')} more")
-        render.say(_checked(report))
+    lines = list(report.findings)
+    if report.n_findings > len(lines):
+        lines.append(f"and {render.counted(report.n_findings - len(lines), 'finding')} more")
+    output.emit(report, "\n".join([*lines, _checked(report)]))
     if not report.is_sound:
         raise typer.Exit(1)
 
@@ -84,15 +67,7 @@ def _checked(report: "CheckReport") -> str:
     )
 
 
-def backup(
-    url: UrlArgument,
-    file: Annotated[str, typer.Argument(metavar="FILE", help="The copy: an SQLite file.")],
-    *,
-    replace: Annotated[
-        bool, typer.Option("--replace", help="Replace an environment that exists, with its log.")
-    ] = False,
-    json: JsonOption = False,
-) -> None:
+def backup(url: str, file: str, *, replace: bool = False, output: Output) -> None:
     """Copy an environment whole into a file, while others go on working with it.
 
     The copy holds the environment as of one moment, can be opened as any
@@ -107,25 +82,14 @@ def backup(
 
     with left_at(f"there is no new {file}"), render.bar("copying", "MB", of=10**6) as progress:
         report = backup_environment(url, file, replace=replace, progress=progress)
-    if json:
-        render.say_json(report._asdict())
-        return
-    render.say(
+    output.emit(
+        report,
         f"{report.target}: {report.source} at revision {report.revision}, "
-        f"{render.counted(report.objects, 'object')}, {report.bytes / 1e6:,.1f} MB"
+        f"{render.counted(report.objects, 'object')}, {report.bytes / 1e6:,.1f} MB",
     )
 
 
-def grant(
-    url: UrlArgument,
-    role: Annotated[str, typer.Argument(metavar="ROLE", help="A role of the server.")],
-    *,
-    right: Annotated[
-        RightName,
-        typer.Option("--as", help="What ROLE may do from now on, instead of what it may do now."),
-    ],
-    json: JsonOption = False,
-) -> None:
+def grant(url: str, role: str, *, as_: RightName, output: Output) -> None:
     """Say what a role may do with an environment on PostgreSQL; the server holds it to that.
 
     A viewer reads and touches; a toucher also keeps cost figures; an editor
@@ -137,8 +101,6 @@ def grant(
     from hapticdb.store.connect import grant as grant_right
     from hapticdb.store.urls import redact
 
-    grant_right(url, role, right)
-    if json:
-        render.say_json({"environment": redact(url), "role": role, "right": right})
-    else:
-        render.say(f"{redact(url)}: {role} {MEANINGS[right]}")
+    grant_right(url, role, as_)
+    told = {"environment": redact(url), "role": role, "right": as_}
+    output.emit(told, f"{redact(url)}: {role} {MEANINGS[as_]}")

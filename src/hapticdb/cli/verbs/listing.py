@@ -1,20 +1,21 @@
 """The verbs that look at an environment: info, objects."""
 
 import sys
+from contextlib import closing, suppress
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
 from hapticdb.cli.choosing import as_named, opened_to_keep
-from hapticdb.cli.options import JsonOption, UrlArgument
+from hapticdb.cli.emit import Output
+from hapticdb.cli.schema import OBJECT, record
+from hapticdb.errors import AccessError, ObjectNotFoundError, UsageError
 from hapticdb.units import length_text, place_text
 
 if TYPE_CHECKING:
     from hapticdb.paper.cost_model import CostModel
-    from hapticdb.store.base import Freshness, Object, Store
-    from hapticdb.store.engines import Lag
+    from hapticdb.store.base import Object, Store
 
 PAGE = 40
 """Objects that a terminal shows, unless asked otherwise."""
@@ -34,40 +35,8 @@ SOURCES = {
 }
 """Where the statistics of the keys come from, in words."""
 
-NameOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="WORDS",
-        help="Only these objects: 7 or 3,4, 'wheel*', attribute=value. Give it again for more.",
-    ),
-]
-LimitOption = Annotated[
-    int | None,
-    typer.Option(
-        metavar="N",
-        min=0,
-        help="Objects to list; 0: all.",
-        show_default=f"{PAGE} on a terminal, all in a pipe",
-    ),
-]
 
-CalibrateOption = Annotated[
-    bool,
-    typer.Option("--calibrate", help="Measure what queries cost on this machine, and keep it."),
-]
-ColdOption = Annotated[
-    bool,
-    typer.Option("--cold", help="With --calibrate: measure with empty caches, on SQLite."),
-]
-
-
-def info(
-    url: UrlArgument,
-    *,
-    calibrate: CalibrateOption = False,
-    cold: ColdOption = False,
-    json: JsonOption = False,
-) -> None:
+def info(url: str, *, calibrate: bool = False, cold: bool = False, output: Output) -> None:
     """Show an environment's engine, grid, layout, scene, size and statistics.
 
     With --calibrate, what statements, descents and rows cost is measured, and
@@ -76,27 +45,22 @@ def info(
 
     Example: hapticdb info car.db --calibrate
     """
-    from contextlib import closing
-
-    from hapticdb.errors import UsageError
     from hapticdb.store.connect import open_store
 
     if cold and not calibrate:
         raise UsageError("--cold belongs to --calibrate: give it, too")
-    measured = _measured(url, cold=cold) if calibrate else None
+    costs, is_kept = _measured(url, cold=cold) if calibrate else (None, False)
     # the store: an Environment brings what touches and imports, a tenth of a second
     with closing(open_store(url, read_only=True)) as store:
-        record, words = _overview(store)
-    if json:
-        costs = {} if measured is None else {"costs": _costs_record(*measured)}
-        render.say_json(record | costs)
-        return
-    render.facts(words)
-    if measured is not None:
-        _show_costs(measured[0])
+        told, words = _overview(store)
+    if costs is not None:
+        known = costs.figures()
+        figures = {name: known[name] for name in (*MEANINGS, *RATIOS)}
+        told["costs"] = {"figures": figures, "spread": costs.spread, "is_kept": is_kept}
+    output.emit(told, partial(_show, words, costs))
 
 
-def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]:
+def _overview(store: "Store") -> tuple[dict[str, Any], list[tuple[str, str]]]:
     """What `info` tells of an environment, as JSON and in words."""
     from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
     from hapticdb.store.attributes import scene_bounds
@@ -105,36 +69,25 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
     objects, grid, size = store.objects(), store.grid, store.size()
     n_banded = sum(obj.has_distances for obj in objects)
     voxels, scene = sum(obj.voxels for obj in objects), scene_bounds(objects)
-    freshness = store.freshness(DEFAULT_RESOLUTION)
+    fresh = store.freshness(DEFAULT_RESOLUTION)
     source = QuantileVector.of(store, DEFAULT_RESOLUTION).source
     lag = store.lag() if isinstance(store, MayLag) else None
-    record = {
-        "name": store.name,
-        "engine": store.engine,
-        "voxel_size": grid.voxel_size,
-        "bits": grid.bits,
-        "origin": list(grid.origin),
-        "curve": grid.curve,
-        "layout": store.layout,
-        "objects": len(objects),
-        "scene": render.box_record(scene),
-        "voxels": voxels,
-        "rows": size.rows,
-        "bytes": size.bytes,
-        "distances": {"objects": n_banded},
-        "surfaces": {"shapes": size.surfaces, "bytes": size.surface_bytes},
-        "standby": None if lag is None else lag._asdict(),
-        "statistics": {"source": source, **freshness._asdict()},
-    }
+    told = record(store, "name engine layout") | {
+        **record(grid, "voxel_size bits origin curve"),
+        "objects": len(objects), "scene": render.box_record(scene), "voxels": voxels,
+        **record(size, "rows bytes"), "distances": {"objects": n_banded},
+        "surfaces": {"shapes": size.surfaces, "bytes": size.surface_bytes}, "standby": lag,
+        "statistics": {"source": source, **fresh._asdict()},
+    }  # fmt: skip
     a_voxel = f" ({size.bytes / voxels:.3g} a voxel)" if voxels else ""
-    distances = f"of {render.counted(n_banded, 'object')}" if n_banded else "none"
     n_shapes = render.counted(size.surfaces, "shape")
     surfaces = f"{n_shapes}, {render.bytes_text(size.surface_bytes)}" if size.surfaces else "none"
+    behind = f"{render.counted(fresh.changes, 'write')} behind" if fresh.changes else "fresh"
+    age = "none made yet" if fresh.revision is None else behind
     words = [
         ("environment", store.url),
         ("name", store.name),
         ("engine", store.engine),
-        *([] if lag is None else [("standby", _lag_text(lag))]),
         ("voxel size", length_text(grid.voxel_size)),
         ("bits an axis", f"{grid.bits}: {render.counted(8.0**grid.bits, 'cell')}"),
         ("origin", f"{place_text(grid.origin, grid.voxel_size / 100)} m"),
@@ -145,25 +98,18 @@ def _overview(store: "Store") -> tuple[dict[str, object], list[tuple[str, str]]]
         ("voxels", f"{voxels:,}"),
         ("rows", f"{size.rows:,}"),
         ("size", f"{render.bytes_text(size.bytes)}{a_voxel}"),
-        ("distances", distances),
+        ("distances", f"of {render.counted(n_banded, 'object')}" if n_banded else "none"),
         ("surfaces", surfaces),
-        ("statistics", f"{SOURCES[source]}; {_age(freshness)}"),
+        ("statistics", f"{SOURCES[source]}; {age}"),
     ]
-    return record, words
-
-
-def _lag_text(lag: "Lag") -> str:
-    """Put in words how far a standby is behind."""
-    age = "none yet" if lag.seconds is None else f"{lag.seconds:.3g} s old"
-    return f"replayed to {lag.replayed}, the last commit there: {age}"
+    if lag is not None:
+        old = "none yet" if lag.seconds is None else f"{lag.seconds:.3g} s old"
+        words.insert(3, ("standby", f"replayed to {lag.replayed}, the last commit there: {old}"))
+    return told, words
 
 
 def objects(
-    url: UrlArgument,
-    *,
-    name: NameOption = None,
-    limit: LimitOption = None,
-    json: JsonOption = False,
+    url: str, *, name: list[str] | None = None, limit: int | None = None, output: Output
 ) -> None:
     """List the objects of an environment.
 
@@ -182,12 +128,11 @@ def objects(
 
     Example: hapticdb objects car.db --name up=z
     """
-    from contextlib import closing
-
-    from hapticdb.errors import ObjectNotFoundError
     from hapticdb.store.connect import open_store
     from hapticdb.store.finding import find_objects
 
+    if limit is not None and limit < 0:
+        raise UsageError(f"--limit {limit}: give 0, for all, or more")
     with closing(open_store(url, read_only=True)) as store:
         shown_url = store.url
         try:
@@ -196,11 +141,11 @@ def objects(
         except ObjectNotFoundError as error:
             raise ObjectNotFoundError(f"--name: {error}") from None
     if limit is None:
-        limit = PAGE if sys.stdout.isatty() and not json else 0
+        limit = PAGE if sys.stdout.isatty() and not output.json else 0
     shown = found[: limit or None]
-    if json:
+    if output.json:
         for obj in shown:
-            render.say_json(record_of(obj))
+            render.say_json(record(obj, OBJECT))
     elif found:
         rows = [
             (str(o.id), o.name, f"{o.voxels:,}", size_text(o), Path(o.link).name) for o in shown
@@ -210,21 +155,6 @@ def objects(
             render.note(f"{len(shown):,} of {len(found):,} objects; --limit 0 shows all")
     else:
         render.note(f"{shown_url} is empty; 'hapticdb import URL FILE' fills it")
-
-
-def record_of(obj: "Object") -> dict[str, object]:
-    """One object as JSON knows it: metres, world frame."""
-    return {
-        "id": obj.id,
-        "name": obj.name,
-        "link": obj.link,
-        "voxels": obj.voxels,
-        "bounds": obj.bounds.tolist(),
-        "transform": obj.transform.tolist(),
-        "digest": obj.digest,
-        "attributes": dict(obj.attributes),
-        "revision": obj.revision,
-    }
 
 
 def size_text(obj: "Object") -> str:
@@ -237,10 +167,6 @@ def size_text(obj: "Object") -> str:
 
 def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
     """Costs as measured now, and whether they are kept; renews the statistics, too, if it may."""
-    from contextlib import suppress
-
-    from hapticdb.errors import AccessError
-
     with opened_to_keep(url) as env:
         is_kept = not env.store.is_read_only
         if is_kept:
@@ -252,15 +178,11 @@ def _measured(url: str, *, cold: bool) -> "tuple[CostModel, bool]":
     return costs, is_kept
 
 
-def _costs_record(costs: "CostModel", is_kept: bool) -> dict[str, object]:  # noqa: FBT001 - private
-    known = costs.figures()
-    figures = {name: known[name] for name in (*MEANINGS, *RATIOS)}
-    return {"figures": figures, "spread": dict(costs.spread), "kept": is_kept}
-
-
-def _show_costs(costs: "CostModel") -> None:
-    rows = []
-    figures = costs.figures()
+def _show(words: list[tuple[str, str]], costs: "CostModel | None") -> None:
+    render.facts(words)
+    if costs is None:
+        return
+    rows, figures = [], costs.figures()
     for name, meaning in MEANINGS.items():
         spread = costs.spread.get(name)
         known = "" if spread is None else f"± {100 * spread:.0f} %"
@@ -269,12 +191,3 @@ def _show_costs(costs: "CostModel") -> None:
     worth = costs.descent / costs.row_in_gap if costs.row_in_gap else None
     when = "always" if worth is None else f"when it should hold fewer than {worth:.1f} rows"
     render.say(f"{costs.rows_per_block:.0f} rows in a leaf block; a gap is scanned {when}")
-
-
-def _age(freshness: "Freshness") -> str:
-    """Put the age of statistics in words."""
-    if freshness.revision is None:
-        return "none made yet"
-    if not freshness.changes:
-        return "fresh"
-    return f"{render.counted(freshness.changes, 'write')} behind"

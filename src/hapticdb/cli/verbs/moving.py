@@ -1,17 +1,19 @@
 """The verbs that copy and compare environments: copy, diff."""
 
-from typing import TYPE_CHECKING, Annotated, Any
+from functools import partial
+from typing import TYPE_CHECKING, Any
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import JsonOption, SameCurveOption, SameLayoutOption
+from hapticdb.cli.emit import Output
+from hapticdb.cli.options import CurveName, LayoutName
 from hapticdb.cli.root import left_at
+from hapticdb.cli.schema import plain, record
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.difference import Difference
-    from hapticdb.store.base import Object
     from hapticdb.transfer import CopyReport
 
 KINDS = {
@@ -19,20 +21,18 @@ KINDS = {
     "moved": "another place", "attributes": "other attributes", "boxes": "another box",
     "voxels": "other voxels", "distances": "other distances",
 }  # fmt: skip
-"""Kinds of differences, the most important first, by their names in JSON."""
+"""Fields of a `Difference`, the most important first, and what they say of an object."""
 MOST_LINES = 20
 """Differences that are listed; more are counted."""
 
 
 def copy(
-    source: Annotated[str, typer.Argument(metavar="SRC", help="The environment to copy.")],
-    target: Annotated[
-        str, typer.Argument(metavar="DST", help="Made when it does not exist; of any engine.")
-    ],
+    source: str,
+    target: str,
     *,
-    layout: SameLayoutOption = None,
-    curve: SameCurveOption = None,
-    json: JsonOption = False,
+    layout: LayoutName | None = None,
+    curve: CurveName | None = None,
+    output: Output,
 ) -> None:
     """Copy an environment, also to another engine, layout or curve.
 
@@ -49,12 +49,9 @@ def copy(
         render.bar("copying", "objects") as progress,
     ):
         report = copy_environment(source, target, layout=layout, curve=curve, progress=progress)
-    if json:
-        render.say_json(vars(report))
-    else:
-        render.say(_copied(report))
-        if layout == "voxel":
-            render.note("the layout voxel has no distances: it has the law plane alone")
+    output.emit(report, _copied(report))
+    if layout == "voxel":
+        render.note("the layout voxel has no distances: it has the law plane alone")
 
 
 def _copied(report: "CopyReport") -> str:
@@ -72,12 +69,7 @@ def _copied(report: "CopyReport") -> str:
     return line
 
 
-def diff(
-    a: Annotated[str, typer.Argument(metavar="A", help="An environment.")],
-    b: Annotated[str, typer.Argument(metavar="B", help="Another one; of any engine.")],
-    *,
-    json: JsonOption = False,
-) -> None:
+def diff(a: str, b: str, *, output: Output) -> None:
     """Say whether two environments hold the same, and what differs.
 
     Objects are the same by file and name. Their surfaces, places, attributes,
@@ -91,47 +83,25 @@ def diff(
 
     with render.bar("comparing", "rows") as progress:
         difference = diff_environments(a, b, progress=progress)
-    record = _record(difference)
-    if json:
-        render.say_json(record)
-    elif difference.is_equal:
-        render.say(_equal(difference))
-    else:
-        _show(difference, record)
+    told = _record(difference)
+    shown = partial(_show, difference, told["differences"])
+    output.emit(told, _equal(difference) if difference.is_equal else shown)
     if not difference.is_equal:
         raise typer.Exit(1)
 
 
-def _record(difference: "Difference") -> dict[str, Any]:
+def _record(found: "Difference") -> dict[str, Any]:
     from hapticdb.difference import farthest_corner, moved_by
 
-    size = difference.grids[0].voxel_size
-
-    def named(obj: "Object") -> dict[str, object]:
-        return {"id": obj.id, "name": obj.name, "link": obj.link}
-
-    def amount(a: "Object", b: "Object") -> dict[str, object]:
-        farthest = farthest_corner(a, b)
-        return named(a) | {
-            "moved_by": moved_by(a, b).tolist(),
-            "farthest_corner": farthest,
-            "farthest_corner_voxels": farthest / size,
-        }
-
-    lone = {kind: [named(obj) for obj in getattr(difference, kind)] for kind in [*KINDS][:2]}
-    both = {kind: [amount(*pair) for pair in getattr(difference, kind)] for kind in [*KINDS][2:]}
-    return {
-        "equal": difference.is_equal,
-        "a": difference.a,
-        "b": difference.b,
-        "same_grid": difference.is_same_grid,
-        **lone,
-        **both,
-        "with_distances": list(difference.with_distances),
-        "renumbered": [named(obj) | {"id_in_b": other.id} for obj, other in difference.renumbered],
-        "objects_compared": difference.compared,
-        "voxels_compared": difference.n_voxels,
-    }
+    told: list[dict[str, Any]] = []
+    for kind, what in KINDS.items():
+        for one in getattr(found, kind):
+            pair = one if isinstance(one, tuple) else (one,)
+            told.append({"what": what} | record(pair[0], "id name link"))
+            if len(pair) == 2:
+                told[-1]["moved_by"] = moved_by(*pair)
+                told[-1]["farthest_corner"] = farthest_corner(*pair)
+    return {**plain(found), "differences": told}
 
 
 def _equal(difference: "Difference") -> str:
@@ -151,25 +121,22 @@ def _equal(difference: "Difference") -> str:
     return line
 
 
-def _show(difference: "Difference", record: dict[str, Any]) -> None:
+def _show(found: "Difference", told: list[dict[str, Any]]) -> None:
     """Print differences, a row each, the most important first."""
-    a, b = difference.a, difference.b
-    if not difference.is_same_grid:
-        grid_a, grid_b = (grid.describe() for grid in difference.grids)
+    size = found.grids[0].voxel_size
+    if not found.is_same_grid:
+        grid_a, grid_b = (grid.describe() for grid in found.grids)
         render.say(
-            f"other grids, so that rows cannot be compared: {grid_a} in {a}; {grid_b} in {b}"
+            f"other grids, so that rows cannot be compared: {grid_a} in {found.a}; {grid_b} in "
+            f"{found.b}"
         )
-    rows = [_row(kind, one) for kind in KINDS for one in record[kind]]
+    rows = []
+    for one in told[:MOST_LINES]:
+        way = one.get("farthest_corner")
+        moved = f"{length_text(way)} ({way / size:.3g} voxels)" if way else ""
+        rows.append((str(one["id"]), one["name"], one["what"], moved, one["link"]))
     if rows:
-        render.table(("id>", "name", "what", "moved by>", "file"), rows[:MOST_LINES])
-        render.say(f"A: {a}; B: {b}")
-    count = render.counted(len(rows) + (not difference.is_same_grid), "difference")
-    cut = "" if len(rows) <= MOST_LINES else f", {MOST_LINES} of them shown"
-    render.say(f"{count}{cut}")
-
-
-def _row(kind: str, one: dict[str, Any]) -> tuple[str, ...]:
-    """Row of the table for an entry of the record."""
-    way = one.get("farthest_corner", 0.0)
-    moved = f"{length_text(way)} ({one['farthest_corner_voxels']:.3g} voxels)" if way else ""
-    return str(one["id"]), one["name"], KINDS[kind], moved, one["link"]
+        render.table(("id>", "name", "what", "moved by>", "file"), rows)
+        render.say(f"A: {found.a}; B: {found.b}")
+    count = render.counted(len(told) + (not found.is_same_grid), "difference")
+    render.say(count + (f", {MOST_LINES} of them shown" if len(told) > MOST_LINES else ""))

@@ -2,7 +2,7 @@
 
 from collections import Counter
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
@@ -11,13 +11,8 @@ from hapticdb.cli import render
 if TYPE_CHECKING:
     from hapticdb.demo import DemoScene, Imported, LayoutFigures
 
-FolderArgument = Annotated[Path, typer.Argument(metavar="DIR", help="Made when it does not exist.")]
-FramesOption = Annotated[
-    int, typer.Option(metavar="N", help="Poses of the path; the sample's has 1,000.")
-]
 
-
-def sample(folder: FolderArgument, *, frames: FramesOption = 1000) -> None:
+def sample(folder: Path, *, frames: int = 1000) -> None:
     """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
 
     Example: hapticdb sample sample
@@ -29,11 +24,7 @@ def sample(folder: FolderArgument, *, frames: FramesOption = 1000) -> None:
 
 
 def demo(
-    folder: FolderArgument = Path("demo"),
-    *,
-    bits: Annotated[int, typer.Option(metavar="1..21", help="Bits of each axis of the grid.")] = 10,
-    frames: FramesOption = 1000,
-    points: Annotated[int, typer.Option(metavar="N", help="Points of the tool.")] = 300,
+    folder: Path = Path("demo"), *, bits: int = 10, frames: int = 1000, points: int = 300
 ) -> None:
     """Make a car, import it, slide a tool over it by every strategy, and draw what it felt.
 

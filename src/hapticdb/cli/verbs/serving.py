@@ -3,13 +3,14 @@
 import signal
 import webbrowser
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.options import RenderingName, UrlArgument
+from hapticdb.cli.options import RenderingName
 from hapticdb.cli.root import TERMINATED, Interrupted, ended_by_signals
 from hapticdb.errors import MissingExtraError, UsageError, pip_line
 
@@ -18,85 +19,58 @@ if TYPE_CHECKING:
     from hapticdb.server.served import Serving
 
 
-ToolsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--tool",
-        metavar="FILE",
-        help="Mesh of a tool to choose from, beside a ball and a peg. Give it again for more.",
-    ),
-]
-RenderingOption = Annotated[
-    RenderingName | None,
-    typer.Option(
-        help="coupled: a spring between hand and tool, which stays outside of surfaces; needs "
-        "distances. direct: the wrench of each frame, capped.",
-        show_default="coupled where there are distances",
-    ),
-]
-RecordingsOption = Annotated[
-    str | None,
-    typer.Option(metavar="FOLDER", help="Folder in which people's sessions may be recorded."),
-]
-SecondsOption = Annotated[
-    float | None,
-    typer.Option(metavar="S", help="End that long after the start.", show_default="Ctrl-C"),
-]
-NoBrowserOption = Annotated[
-    bool, typer.Option("--no-browser", help="Print the address, and open no browser.")
-]
-TokenOption = Annotated[
-    bool,
-    typer.Option(
-        "--token", help="Ask for a token. One is made for each role, and printed at the start."
-    ),
-]
-TokenFileOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        help="Tokens of yours, 16 characters or more: a file with ROLE=TOKEN on each line. Roles: "
-        "viewer, toucher, editor.",
-    ),
-]
-RoleUrlOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        metavar="ROLE=URL",
-        help="Address of the environment for a role, with the rights of a user of the database.",
-    ),
-]
-HostOption = Annotated[
-    str, typer.Option(metavar="ADDRESS", help="Address to listen on; 0.0.0.0 is all of them.")
-]
-PortOption = Annotated[int, typer.Option(metavar="N", help="Port to listen on; 0 is a free one.")]
-PrefixOption = Annotated[
-    str, typer.Option(metavar="/PATH", help="Path under which a proxy hands requests on.")
-]
-HostNameOption = Annotated[
-    list[str] | None,
-    typer.Option(metavar="NAME", help="Name of this server for browsers, such as that of a proxy."),
-]
-CertificateOption = Annotated[
-    str | None, typer.Option("--tls-cert", metavar="FILE", help="Certificate of TLS, PEM.")
-]
-KeyOption = Annotated[
-    str | None, typer.Option("--tls-key", metavar="FILE", help="Key of the certificate, PEM.")
-]
-LogJsonOption = Annotated[
-    bool, typer.Option("--log-json", help="Write the log as JSON, an object a line.")
-]
+@dataclass(frozen=True)
+class PageOptions:
+    """The options of what a page shows, and for how long."""
+
+    tool: list[str] | None = None
+    rendering: RenderingName | None = None
+    recordings: str | None = None
+    seconds: float | None = None
+
+    def serving(
+        self, url: str, tokens: "dict[str, Role]", role_urls: Sequence[str] = ()
+    ) -> "Serving":
+        """What to serve; refuses what is not there, and a coupling where there are no distances."""
+        from contextlib import closing
+
+        from hapticdb.server.access import Role
+        from hapticdb.server.served import Serving
+        from hapticdb.store.connect import open_store
+
+        urls = dict.fromkeys(Role, url) | dict(_pair(text, "--role-url") for text in role_urls)
+        for other in dict.fromkeys(urls.values()):
+            with closing(open_store(other, read_only=True)) as store:
+                if self.rendering == "coupled" and not store.wants_distances:
+                    from hapticdb.session.prefetch.resident_cells import without_distances
+
+                    raise UsageError(without_distances(store.url, "leave out --rendering coupled"))
+        for tool in self.tool or ():
+            if not Path(tool).is_file():
+                raise UsageError(f"--tool {tool}: no such file")
+        folder = self.recordings
+        if folder is not None and not Path(folder).is_dir():
+            raise UsageError(f"--recordings {folder}: no such folder")
+        return Serving(
+            urls=urls, tools=tuple(self.tool or ()), tokens=tokens,
+            open_role=None if tokens else Role.EDITOR, title=_title(url), rendering=self.rendering,
+            recordings=None if folder is None else str(Path(folder).resolve()),
+        )  # fmt: skip
 
 
-def view(
-    url: UrlArgument,
-    *,
-    tool: ToolsOption = None,
-    rendering: RenderingOption = None,
-    recordings: RecordingsOption = None,
-    seconds: SecondsOption = None,
-    no_browser: NoBrowserOption = False,
-) -> None:
+@dataclass(frozen=True)
+class ReachOptions:
+    """The options of how a server is reached."""
+
+    host: str = "127.0.0.1"
+    port: int = 0
+    prefix: str = ""
+    host_name: list[str] | None = None
+    tls_cert: str | None = None
+    tls_key: str | None = None
+
+
+def view(url: str, *, page: PageOptions, no_browser: bool = False) -> None:
     """See and feel an environment in a browser on this machine.
 
     Example: hapticdb view car.db --tool wrench.stl
@@ -105,7 +79,7 @@ def view(
     from hapticdb.server.access import Role, make_token
 
     token = make_token()
-    serving = _serving(url, tool, {token: Role.EDITOR}, None, recordings, rendering)
+    serving = page.serving(url, {token: Role.EDITOR})
 
     def ready(port: int) -> None:
         address = serving.address(port, token)
@@ -113,39 +87,29 @@ def view(
         if not no_browser:
             webbrowser.open(address)
 
-    _run(serving, ready, seconds, log_json=False, is_quiet=True)
+    _run(serving, ready, page.seconds, log_json=False, is_quiet=True)
 
 
 def serve(
-    url: UrlArgument,
+    url: str,
     *,
-    tool: ToolsOption = None,
-    token: TokenOption = False,
-    token_file: TokenFileOption = None,
-    role_url: RoleUrlOption = None,
-    host: HostOption = "127.0.0.1",
-    port: PortOption = 0,
-    prefix: PrefixOption = "",
-    host_name: HostNameOption = None,
-    rendering: RenderingOption = None,
-    recordings: RecordingsOption = None,
-    tls_cert: CertificateOption = None,
-    tls_key: KeyOption = None,
-    log_json: LogJsonOption = False,
-    seconds: SecondsOption = None,
+    page: PageOptions,
+    token: bool = False,
+    token_file: str | None = None,
+    role_url: list[str] | None = None,
+    reach: ReachOptions,
+    log_json: bool = False,
 ) -> None:
     """Let others see and feel an environment in browsers.
 
     Example: hapticdb serve car.db --tool wrench.stl --token
     """
     _check_extra()
-    from dataclasses import replace
-
     tokens = _tokens(token_file, are_made=token)
     serving = replace(
-        _serving(url, tool, tokens, role_url, recordings, rendering),
-        host=host, port=port, prefix=prefix.rstrip("/"), host_names=tuple(host_name or ()),
-        certificate=tls_cert, key=tls_key,
+        page.serving(url, tokens, role_url or ()), host=reach.host, port=reach.port,
+        prefix=reach.prefix.rstrip("/"), host_names=tuple(reach.host_name or ()),
+        certificate=reach.tls_cert, key=reach.tls_key,
     )  # fmt: skip
 
     def ready(port: int) -> None:
@@ -161,7 +125,7 @@ def serve(
         if not tokens:
             render.note("every program on this machine may edit; --token asks for a token")
 
-    _run(serving, ready, seconds, log_json=log_json)
+    _run(serving, ready, page.seconds, log_json=log_json)
 
 
 def _check_extra() -> None:
@@ -171,44 +135,6 @@ def _check_extra() -> None:
                if find_spec(name) is None]  # fmt: skip
     if missing:
         raise MissingExtraError(f"the browser view needs {', '.join(missing)}: {pip_line('view')}")
-
-
-def _serving(
-    url: str,
-    tools: Sequence[str] | None,
-    tokens: "dict[str, Role]",
-    role_urls: Sequence[str] | None,
-    recordings: str | None,
-    rendering: RenderingName | None,
-) -> "Serving":
-    """What to serve; refuses what is not there, and a coupling where there are no distances."""
-    from contextlib import closing
-
-    from hapticdb.server.access import Role
-    from hapticdb.server.served import Serving
-    from hapticdb.store.connect import open_store
-
-    urls = dict.fromkeys(Role, url)
-    for text in role_urls or ():
-        role, other = _pair(text, "--role-url")
-        urls[role] = other
-    for other in dict.fromkeys(urls.values()):
-        with closing(open_store(other, read_only=True)) as store:
-            if rendering == "coupled" and not store.wants_distances:
-                from hapticdb.session.prefetch.resident_cells import without_distances
-
-                raise UsageError(without_distances(store.url, "leave out --rendering coupled"))
-    for tool in tools or ():
-        if not Path(tool).is_file():
-            raise UsageError(f"--tool {tool}: no such file")
-    if recordings is not None and not Path(recordings).is_dir():
-        raise UsageError(f"--recordings {recordings}: no such folder")
-    return Serving(
-        urls=urls, tools=tuple(tools or ()), tokens=tokens,
-        open_role=None if tokens else Role.EDITOR,
-        title=_title(url), rendering=rendering,
-        recordings=None if recordings is None else str(Path(recordings).resolve()),
-    )  # fmt: skip
 
 
 def _title(url: str) -> str:

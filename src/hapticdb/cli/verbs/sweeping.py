@@ -2,28 +2,20 @@
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from time import perf_counter
-from typing import TYPE_CHECKING, Annotated, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import typer
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import felt_objects, ids_of
-from hapticdb.cli.csv_files import STDOUT, SWEPT, open_csv, rows_of_sweep
-from hapticdb.cli.options import (
-    CsvOption,
-    ExcludeOption,
-    JsonOption,
-    OptionalToolOption,
-    PathUnitOption,
-    ToolUnitOption,
-    UrlArgument,
-    WhereOption,
-    length_option,
-)
+from hapticdb.cli.choosing import FilterOptions, ids_of
+from hapticdb.cli.emit import CsvWriter, TableOutput, open_csv
+from hapticdb.cli.options import UnitName
+from hapticdb.cli.schema import plain
 from hapticdb.cli.sweep_lists import Asked, naming, read_sweeps
 from hapticdb.cli.tools import tool_of, warn_of_size
-from hapticdb.cli.values import Point, point_of
+from hapticdb.cli.values import Point
 from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 from hapticdb.verdicts import SWEEP_VERDICTS, WORST, exit_codes
@@ -39,46 +31,12 @@ if TYPE_CHECKING:
 
 MOST_OBJECTS = 20
 """Rows of the table of what is hit or touched; the other objects are counted below it."""
-
-PartsOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--part",
-        metavar="WORDS",
-        help="Instead of --tool: objects that move, all together; chosen as for --exclude.",
-    ),
-]
-PathOption = Annotated[
-    str | None, typer.Option(metavar="CSV", help="Poses x,y,z,qw,qx,qy,qz with a header.")
-]
-ContactOption = Annotated[
-    float,
-    length_option(
-        "what is so near where the path starts may be touched; a motion by so much has to free "
-        "the tool from it all along.",
-        "0.05",
-    ),
-]
-OverlapOption = Annotated[
-    float, length_option("by so much a part may overlap others where it stands.", "0")
-]
-UntilHitOption = Annotated[
-    bool, typer.Option("--until-hit", help="End at the first hit on the path: faster.")
-]
-AboutOption = Annotated[
-    Point | None,
-    length_option(
-        "the centre of the path's turns, tool's frame.", "middle of the tool's box", parse=point_of
-    ),
-]
-SweepSecondsOption = Annotated[
-    float | None,
-    typer.Option(metavar="S", help="Time of a sweep.", show_default="no limit"),
-]
-BatchOption = Annotated[
-    str | None,
-    typer.Option(metavar="CSV", help="Many sweeps, one a line; see above."),
-]
+SWEPT = (
+    "what", "id", "name", "fraction", "segment", "on_tool", "on_object", "at_least", "until",
+    "start", "start_at_least", "reach", "by", "gap", "verdict",
+)  # fmt: skip
+"""Keys of `sweep --csv`: a row for each object that is hit, enclosed or touched at the start, and
+one for the nearest object; `what` says which. A cell that does not belong to it is empty."""
 
 HELP = f"""Say whether a tool or part is free on a path: what it hits, where, how near it comes.
 
@@ -113,14 +71,16 @@ Example: hapticdb sweep car.db --part 17 --path out.csv
 """
 
 
-class _Options(NamedTuple):
-    """Options that all sweeps of a command share; about, overlap : metres."""
+@dataclass(frozen=True)
+class SweepOptions:
+    """The options that all sweeps of a command share."""
 
-    tool_unit: str | None
-    about: Point | None
-    overlap: float
-    seconds: float | None
-    until_hit: bool
+    about: Point | None = None
+    overlap: float = 0.0
+    tool_unit: UnitName | None = None
+    path_unit: UnitName | None = None
+    seconds: float | None = None
+    until_hit: bool = False
 
 
 class _Job(NamedTuple):
@@ -133,55 +93,44 @@ class _Job(NamedTuple):
 
 
 class _Told(NamedTuple):
-    """A sweep's result with its tool, the exit code, and the seconds that it took with the tool."""
+    """A sweep's result with its tool, and the seconds that it took with the tool."""
 
     job: _Job
     shell: "PointShell"
     found: "Swept"
-    code: int
     seconds: float
 
 
 def sweep(
-    url: UrlArgument,
+    url: str,
     *,
-    tool: OptionalToolOption = None,
-    part: PartsOption = None,
-    path: PathOption = None,
-    where: WhereOption = None,
-    exclude: ExcludeOption = None,
-    contact: ContactOption = 5e-5,
-    overlap: OverlapOption = 0.0,
-    about: AboutOption = None,
-    tool_unit: ToolUnitOption = None,
-    path_unit: PathUnitOption = None,
-    batch: BatchOption = None,
-    seconds: SweepSecondsOption = None,
-    until_hit: UntilHitOption = False,
-    csv: CsvOption = None,
-    json: JsonOption = False,
+    tool: str | None = None,
+    part: list[str] | None = None,
+    path: str | None = None,
+    batch: str | None = None,
+    felt: FilterOptions,
+    contact: float = 5e-5,
+    motion: SweepOptions,
+    output: TableOutput,
 ) -> None:
     """Sweep a tool or parts along a path; the help text is `HELP`."""
     import hapticdb
 
-    one = Asked(tool, part or [], path or "", where or [], exclude or [], contact, "")
-    _check(one, tool_unit, batch, csv)
-    if csv == STDOUT and json:
-        raise UsageError("--csv - and --json: only one may be standard output")
-    options = _Options(tool_unit, about, overlap, seconds, until_hit)
+    where, exclude = felt.where or [], felt.exclude or []
+    one = Asked(tool, part or [], path or "", where, exclude, contact, "")
+    _check(one, motion.tool_unit, batch, output.csv)
     asked = [one] if batch is None else read_sweeps(batch, one)
-    with open_csv(csv, "--csv", SWEPT) as table, hapticdb.open(url, read_only=True) as env:
-        jobs = [_job(env, each, path_unit) for each in asked]
-        if batch is not None:
-            raise typer.Exit(_run_batch(env, jobs, options, json=json))
-        told = _swept(env, jobs[0], options)
+    with open_csv(output.csv, SWEPT) as table, hapticdb.open(url, read_only=True) as env:
+        jobs = [_job(env, each, motion.path_unit) for each in asked]
+        told = _all_swept(env, jobs, motion, output)
         if table:
-            table.write(rows_of_sweep(told.found))
-        if json:
-            _say_json(told)
-        elif csv != STDOUT:
-            _show(told)
-    raise typer.Exit(told.code)
+            _write(table, told[0].found)
+        if batch is None and output.has_words:
+            _show(told[0])
+        elif output.has_words:
+            _show_batch(told)
+    codes = {one.found.verdict.exit_status for one in told}
+    raise typer.Exit(next(code for code in WORST if code in codes))
 
 
 def _check(one: Asked, tool_unit: str | None, batch: str | None, csv: str | None) -> None:
@@ -208,10 +157,27 @@ def _job(env: "Environment", asked: Asked, path_unit: str | None) -> _Job:
     with naming(asked.line):
         poses = read_poses(asked.path, unit=path_unit or "m")
         parts = ids_of(env, asked.part, "--part")
-        return _Job(asked, poses, parts, felt_objects(env, asked.where, asked.exclude, parts))
+        return _Job(asked, poses, parts, FilterOptions(asked.where, asked.exclude).felt(env, parts))
 
 
-def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
+def _all_swept(
+    env: "Environment", jobs: Sequence[_Job], motion: SweepOptions, output: TableOutput
+) -> list[_Told]:
+    """Run sweeps, each told as JSON at once."""
+    from hapticdb.exact.report import verdict_line
+
+    told = []
+    for job in jobs:
+        told.append(one := _swept(env, job, motion))
+        if output.json:
+            asked, line = job.asked, verdict_line(one.found, one.shell)
+            about = {"moved": asked.name, "path": asked.path, "line": line}
+            left = {"parts": job.parts, "excluded": job.felt.left_out}
+            render.say_json(about | plain(one.found) | left)
+    return told
+
+
+def _swept(env: "Environment", job: _Job, motion: SweepOptions) -> _Told:
     """Make the tool, and move it along the path."""
     from hapticdb.exact.sweep import sweep as sweep_path
 
@@ -224,48 +190,49 @@ def _swept(env: "Environment", job: _Job, options: _Options) -> _Told:
         else:
             is_saved = asked.tool.lower().endswith(".npz")
             points = None if is_saved else 1
-            tool = tool_of(asked.tool, options.tool_unit, points, None, has_surface=True)
+            tool = tool_of(asked.tool, motion.tool_unit, points, None, has_surface=True)
             warn_of_size(env, tool, felt.left_out)
             shell = tool.shell
         with render.bar("sweeping", "objects") as progress:
             found = sweep_path(
                 env, shell, job.poses, where=felt.where, exclude=felt.exclude,
-                contact=asked.contact, overlap=options.overlap, seated=asked.tool is None,
-                about=options.about, seconds=options.seconds,
-                until_hit=options.until_hit, progress=progress,
+                contact=asked.contact, overlap=motion.overlap, seated=asked.tool is None,
+                about=motion.about, seconds=motion.seconds, until_hit=motion.until_hit,
+                progress=progress,
             )  # fmt: skip
     if env.store.revision() != found.revision:
         render.note(f"{env.url} was written meanwhile; this is of revision {found.revision}")
-    return _Told(job, shell, found, found.verdict.exit_status, perf_counter() - began)
+    return _Told(job, shell, found, perf_counter() - began)
 
 
-def _run_batch(env: "Environment", jobs: Sequence[_Job], options: _Options, *, json: bool) -> int:
-    """Run all sweeps, print a line or a row for each; returns the worst exit code."""
+def _write(table: CsvWriter, found: "Swept") -> None:
+    """Write rows: what is hit, along the path; enclosed; touched at the start; the nearest."""
+
+    def add(what: str, part: object, **more: object) -> None:
+        told: dict[str, Any] = plain(part)
+        table.add({"what": what} | told | {"verdict": found.verdict} | more)
+
+    for place in found.hits:
+        add("hit", place)
+    for obj in found.enclosed:
+        add("enclosed", obj)
+    for one in found.touching:
+        add("touched", one)
+    if found.gap.place is not None and found.is_free:
+        add("nearest", found.gap.place, gap=found.gap.at_least, at_least=None)
+
+
+def _show_batch(told: Sequence[_Told]) -> None:
+    """Print a row for each sweep."""
     from hapticdb.exact.report import gap_text, percent
 
-    rows, codes = [], set()
-    for job in jobs:
-        told = _swept(env, job, options)
-        codes.add(told.code)
-        if json:
-            _say_json(told)
-            continue
-        found = told.found
+    rows = []
+    for job, _, found, _ in told:
         place = found.hits[0] if found.hits else found.gap.place
         name, at = ("", "") if place is None else (place.object.name, percent(place.fraction))
         gap = gap_text(found) if found.is_free else "-"
         rows.append((job.asked.name, job.asked.path, found.verdict, gap, name, at))
-    if rows:
-        render.table(("part or tool", "path", "verdict", "gap>", "nearest or hit", "at>"), rows)
-    return next(code for code in WORST if code in codes)
-
-
-def _say_json(told: _Told) -> None:
-    from hapticdb.exact.report import sweep_record
-
-    job = told.job
-    record = sweep_record(told.found, told.shell, job.parts, job.felt.left_out)
-    render.say_json({"moved": job.asked.name, "path": job.asked.path} | record)
+    render.table(("part or tool", "path", "verdict", "gap>", "nearest or hit", "at>"), rows)
 
 
 def _show(told: _Told) -> None:

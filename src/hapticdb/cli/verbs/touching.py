@@ -1,45 +1,20 @@
 """The verb touch."""
 
 from collections import Counter
-from collections.abc import Generator, Iterator
-from contextlib import closing, contextmanager
+from collections.abc import Generator
+from contextlib import closing
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
-
-import typer
+from typing import TYPE_CHECKING, Any
 
 from hapticdb.cli import render
-from hapticdb.cli.choosing import felt_objects
-from hapticdb.cli.csv_files import (
-    CONTACTS,
-    STDOUT,
-    TOUCHED,
-    CsvWriter,
-    open_csv,
-    row_of_pose,
-    rows_of_contacts,
-)
+from hapticdb.cli.choosing import FilterOptions
+from hapticdb.cli.emit import STDOUT, TableOutput, open_csv
 from hapticdb.cli.felt_files import columns_of, open_felt
-from hapticdb.cli.options import (
-    ConservativeOption,
-    CsvOption,
-    ExcludeOption,
-    JsonOption,
-    LawOption,
-    PathUnitOption,
-    PointsOption,
-    SeedOption,
-    StiffnessOption,
-    StrategyName,
-    ToolOption,
-    ToolUnitOption,
-    UnitName,
-    UrlArgument,
-    WhereOption,
-)
-from hapticdb.cli.tools import shell_record, shell_text, tool_of, warn_of_size
+from hapticdb.cli.options import LawName, StrategyName, UnitName
+from hapticdb.cli.schema import record
+from hapticdb.cli.tools import ToolOptions, shell_record, shell_text
 from hapticdb.errors import UsageError
 
 if TYPE_CHECKING:
@@ -50,7 +25,6 @@ if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.paper.strategies import Strategy
     from hapticdb.pointshell.shell import PointShell
-    from hapticdb.query.law import ForceLaw, LawName
     from hapticdb.query.touches import Touch
     from hapticdb.store.base import Object
 
@@ -59,114 +33,90 @@ MOST_TOUCHED = 8
 FEW_POSES = 500
 """Poses of a path below which it does not pay to measure the database's costs. Measuring takes most
 of a second, and `touch` opens the environment to read, so that it could not keep the figures."""
+TOUCHED = ("pose", "force", "torque", "hits", "contacts", "deepest", "touched")
+"""Keys of `touch --csv`: a row for each pose."""
+CONTACTS = ("pose", "point", "place", "depth", "id", "name")
+"""Keys of `touch --contacts-csv`: a row for each contact with each object that it touches."""
 
-StrategyOption = Annotated[StrategyName, typer.Option(help="How the database is asked.")]
-MaxgapOption = Annotated[
-    int,
-    typer.Option(
-        metavar="KEYS", help="Widest gap that the strategy maxgap reads across, in voxel keys."
-    ),
-]
-TouchPosesOption = Annotated[
-    str,
-    typer.Option(
-        metavar="FILE",
-        help="Poses x,y,z,qw,qx,qy,qz with a header, or with --out a .npy of (M, 4, 4) matrices.",
-    ),
-]
-OutOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE",
-        help="Feel all poses as a batch, and write a table to a new file: .parquet or .npz.",
-    ),
-]
-OnOption = Annotated[
-    str,
-    typer.Option(
-        metavar="cpu|cuda|ADDRESS",
-        help="With --out, what computes: the processors, a GPU of NVIDIA, or workers of "
-        "dask.distributed, by their scheduler, tcp://host:8786.",
-    ),
-]
-ContactsCsvOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="FILE", help="Write every contact as CSV to a new file; - is standard output."
-    ),
-]
+
+@dataclass(frozen=True)
+class _Output(TableOutput):
+    contacts_csv: str | None = None
+    out: str | None = None
+    on: str = "cpu"
+
+    def __post_init__(self) -> None:
+        if self.out is not None and (self.csv or self.contacts_csv or self.json):
+            raise UsageError("--out: leave out --csv, --contacts-csv and --json")
+        if [self.csv, self.contacts_csv, "-" if self.json else ""].count(STDOUT) > 1:
+            raise UsageError(
+                "--csv -, --contacts-csv - and --json: only one may be standard output"
+            )
+        if self.on != "cpu" and self.out is None:
+            raise UsageError(f"--on {self.on}: give --out, too")
 
 
 def touch(
-    url: UrlArgument,
+    url: str,
     *,
-    tool: ToolOption,
-    poses: TouchPosesOption,
-    tool_unit: ToolUnitOption = None,
-    path_unit: PathUnitOption = None,
-    points: PointsOption = None,
-    seed: SeedOption = None,
-    strategy: StrategyOption = "auto",
-    maxgap: MaxgapOption = 500,
-    where: WhereOption = None,
-    exclude: ExcludeOption = None,
-    law: LawOption = None,
-    conservative: ConservativeOption = False,
-    stiffness: StiffnessOption = 1000.0,
-    csv: CsvOption = None,
-    contacts_csv: ContactsCsvOption = None,
-    out: OutOption = None,
-    on: OnOption = "cpu",
-    json: JsonOption = False,
+    tool: ToolOptions,
+    poses: str,
+    path_unit: UnitName | None = None,
+    strategy: StrategyName = "auto",
+    maxgap: int = 500,
+    felt: FilterOptions,
+    law: LawName | None = None,
+    stiffness: float = 1000.0,
+    output: _Output,
 ) -> None:
     """Touch an environment with a tool along a path: force, torque and objects of every pose.
 
     Example: hapticdb touch car.db --tool wrench.stl --poses path.csv --json
     """
     import hapticdb
-    from hapticdb.query.law import inset_of
+    from hapticdb.query.law import law_named
 
-    plane, distance = hapticdb.TangentPlane(stiffness), hapticdb.DistanceField(stiffness)
-    path, opened = _path_of(poses, path_unit, out, on), partial(hapticdb.open, url, read_only=True)
-    with _output(csv, contacts_csv, out, json=json) as output, opened() as env:
-        name: LawName = law or ("distance" if env.has_distances else "plane")
-        chosen: ForceLaw = distance if name == "distance" else plane
-        felt = felt_objects(env, where, exclude)
-        reach = inset_of(env.grid.voxel_size, name)
-        held = tool_of(tool, tool_unit, points, seed, inset=0.0 if conservative else reach)
-        warn_of_size(env, held, felt.left_out)
-        shell = held.shell
-        if out is not None:
-            pieces = env.touch_pieces(
-                shell, path, where=felt.where, exclude=felt.exclude, law=chosen, on=on
-            )
-            _touch_into(Path(out), shell, pieces)
+    path = _path_of(poses, path_unit, output)
+    summary = _Summary()
+    with (
+        open_csv(output.csv, TOUCHED) as table,
+        open_csv(output.contacts_csv, CONTACTS, "--contacts-csv") as contacts,
+        hapticdb.open(url, read_only=True) as env,
+    ):
+        name = law or ("distance" if env.has_distances else "plane")
+        chosen, found = law_named(name, stiffness), felt.felt(env)
+        shell = tool.made(env, name, found.left_out).shell
+        which: dict[str, Any] = {"where": found.where, "exclude": found.exclude, "law": chosen}
+        if output.out is not None:
+            pieces = env.touch_pieces(shell, path, on=output.on, **which)
+            _touch_into(Path(output.out), shell, pieces)
             return
-        touch_at = partial(
-            env.touch, shell, strategy=_strategy_of(strategy, env, len(path)), where=felt.where,
-            exclude=felt.exclude, maxgap=maxgap, law=chosen,
-        )  # fmt: skip
+        used = _strategy_of(strategy, env, len(path))
+        touch_at = partial(env.touch, shell, strategy=used, maxgap=maxgap, **which)
         touch_at(path[0])  # compiles kernels and reads statistics, which belong to no frame's time
         for index, pose in enumerate(path):
-            output.add(index, touch_at(pose), shell, pose)
-    output.finish(shell)
+            touched = touch_at(pose)
+            summary.add(touched)
+            if table or output.json:
+                told = {"pose": index, "law": name} | _record(touched)
+                output.add(table, told | {"shell": shell_record(shell)})
+            if contacts:
+                contacts.add(*_contacts(index, touched, shell, pose))
+    if output.has_words and output.contacts_csv != STDOUT:
+        summary.show(shell, name)
 
 
-def _path_of(
-    poses: str, unit: "UnitName | None", out: str | None, on: str
-) -> "NDArray[np.float64]":
+def _path_of(poses: str, unit: UnitName | None, output: _Output) -> "NDArray[np.float64]":
     """Poses of a CSV file, or of a .npy file for a batch; refuses what only a batch takes."""
     from hapticdb.poses import map_poses, read_poses
 
-    if on != "cpu" and out is None:
-        raise UsageError(f"--on {on}: give --out, too")
-    if on == "cuda":
+    if output.on == "cuda":
         from hapticdb.batches.on_gpu import check_gpu
 
         check_gpu()  # before kernels are compiled
     if not poses.lower().endswith(".npy"):
         return read_poses(poses, unit=unit or "m")
-    if out is None or unit not in {None, "m"}:
+    if output.out is None or unit not in {None, "m"}:
         raise UsageError(f"--poses {poses}: a .npy file is for --out, and in metres")
     return map_poses(poses)
 
@@ -190,23 +140,6 @@ def _touch_into(
     ])  # fmt: skip
 
 
-@contextmanager
-def _output(
-    csv: str | None, contacts_csv: str | None, out: str | None, *, json: bool
-) -> "Iterator[_Output]":
-    """Open the files that the options name; at most one result goes to standard output."""
-    if out is not None and (csv or contacts_csv or json):
-        raise UsageError("--out: leave out --csv, --contacts-csv and --json")
-    to_stdout = [csv == STDOUT, contacts_csv == STDOUT, json]
-    if sum(to_stdout) > 1:
-        raise UsageError("--csv -, --contacts-csv - and --json: only one may be standard output")
-    with (
-        open_csv(csv, "--csv", TOUCHED) as poses,
-        open_csv(contacts_csv, "--contacts-csv", CONTACTS) as contacts,
-    ):
-        yield _Output(poses, contacts, json, None if any(to_stdout) else _Summary())
-
-
 def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strategy":
     """`array` in place of `auto` on a short path where no costs are kept, else as wanted."""
     from hapticdb.paper.cost_model import machine_name
@@ -216,45 +149,25 @@ def _strategy_of(wanted: "Strategy", env: "Environment", n_poses: int) -> "Strat
     return wanted
 
 
-@dataclass(frozen=True)
-class _Output:
-    """Where the results of a path go: CSV files, JSON, or a summary at the end."""
-
-    poses: CsvWriter | None
-    contacts: CsvWriter | None
-    is_json: bool
-    summary: "_Summary | None"
-
-    def add(
-        self, index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
-    ) -> None:
-        """Write the touch at one pose of the path."""
-        if self.poses is not None:
-            self.poses.write([row_of_pose(index, touched)])
-        if self.contacts is not None:
-            self.contacts.write(rows_of_contacts(index, touched, shell, pose))
-        if self.is_json:
-            render.say_json(_record(index, touched) | {"shell": shell_record(shell)})
-        if self.summary is not None:
-            self.summary.add(touched)
-
-    def finish(self, shell: "PointShell") -> None:
-        """Print the summary, unless standard output has been taken for something else."""
-        if self.summary is not None:
-            self.summary.show(shell)
-
-
-def _record(index: int, touched: "Touch") -> dict[str, object]:
-    return {
-        "pose": index,
-        "law": getattr(touched.law, "name", ""),
-        "force": touched.force.tolist(),
-        "torque": touched.torque.tolist(),
+def _record(touched: "Touch") -> dict[str, Any]:
+    return record(touched, "force torque touched=objects query") | {
         "hits": len(touched.hits),
         "contacts": len(touched.contacts),
-        "objects": [{"id": obj.id, "name": obj.name} for obj in touched.objects],
-        "query": touched.query._asdict(),
+        "deepest": float(touched.contact_depths.max(initial=0.0)),
     }
+
+
+def _contacts(
+    index: int, touched: "Touch", shell: "PointShell", pose: "NDArray[np.float64]"
+) -> list[dict[str, Any]]:
+    """Contacts, ordered by point and id; points at their places in the world."""
+    depths = dict(zip(touched.contacts.tolist(), touched.contact_depths.tolist(), strict=True))
+    names = {obj.id: obj.name for obj in touched.objects}
+    return [
+        {"pose": index, "point": point, "depth": depths[point], "id": i, "name": names[i],
+         "place": (pose[:3, :3] @ shell.points[point] + pose[:3, 3]).tolist()}
+        for point, i in touched.contact_pairs.tolist()
+    ]  # fmt: skip
 
 
 def _mean_of(numbers: "NDArray[np.float64]", noun: str) -> str:
@@ -272,7 +185,6 @@ class _Summary:
 
     frames: list[tuple[float, ...]] = field(default_factory=list)
     strategies: Counter[str] = field(default_factory=Counter)
-    laws: Counter[str] = field(default_factory=Counter)
     frames_of: Counter[int] = field(default_factory=Counter)
     objects: dict[int, "Object"] = field(default_factory=dict)
 
@@ -284,12 +196,10 @@ class _Summary:
         strategy, *asked = touched.query
         self.frames.append((force, torque, len(touched.hits), len(touched.contacts), *asked))
         self.strategies[strategy] += 1
-        self.laws[getattr(touched.law, "name", "")] += 1
-        for obj in touched.objects:
-            self.frames_of[obj.id] += 1
-            self.objects[obj.id] = obj
+        self.frames_of.update(obj.id for obj in touched.objects)
+        self.objects |= {obj.id: obj for obj in touched.objects}
 
-    def show(self, shell: "PointShell") -> None:
+    def show(self, shell: "PointShell", law: str) -> None:
         """Print it."""
         import numpy as np
 
@@ -297,20 +207,15 @@ class _Summary:
         peak, twist = int(np.argmax(forces)), int(np.argmax(torques))
         median, p99 = np.percentile(elapsed, [50, 99])
         n_hit, n_contact = np.count_nonzero(hits), np.count_nonzero(contacts)
+        asked = (_mean_of(statements, "statement"), _mean_of(ranges, "range"))
         render.facts([
             ("shell", shell_text(shell)),
             ("frames", f"{len(hits):,}: {n_hit:,} hit, {n_contact:,} in contact"),
             ("peak force", f"{forces[peak]:.4g} N at pose {peak}"),
             ("peak torque", f"{torques[twist]:.4g} N m at pose {twist}"),
             ("frame time", f"median {median:.0f} µs, p99 {p99:.0f} µs"),
-            (
-                "a frame asks",
-                (
-                    f"{_mean_of(statements, 'statement')}, {_mean_of(ranges, 'range')}, "
-                    f"reads {_mean_of(rows, 'row')}"
-                ),
-            ),
-            ("law", render.shares(self.laws)),
+            ("a frame asks", f"{', '.join(asked)}, reads {_mean_of(rows, 'row')}"),
+            ("law", law),
             ("strategy", render.shares(self.strategies)),
             ("objects", f"{len(self.objects)} touched"),
         ])  # fmt: skip

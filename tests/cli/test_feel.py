@@ -184,7 +184,7 @@ def test_the_fork_server_starts_before_all_else(run: Run, monkeypatch: pytest.Mo
     monkeypatch.setattr(coupling, "rendering_of", refuse)
     refused(run(*feel(*PLAY)), "enough is seen")
     assert done == [
-        "hapticdb.session.loop:work", "hapticdb.session.prefetch.fetching:fetch", "options"
+        "hapticdb.session.worker:work", "hapticdb.session.prefetch.fetching:fetch", "options"
     ]  # fmt: skip
 
 

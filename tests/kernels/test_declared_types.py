@@ -91,7 +91,7 @@ def test_entries_are_called_with_their_declared_types_alone(tmp_path: Path) -> N
     """So nothing is compiled in place: sets have the machine code of declared types.
 
     A session's loop runs in its own process and raises an error if a kernel is compiled while it
-    runs (`session.loop.work`).
+    runs (`session.device_loop`).
     """
     paths = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
     done = finished([sys.executable, "-c", SCRIPT, str(tmp_path)], env=paths, check=True)

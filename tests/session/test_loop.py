@@ -15,13 +15,15 @@ from hapticdb.devices.protocol import Device
 from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
 from hapticdb.recording.frame import State
-from hapticdb.session import loop as subject
+from hapticdb.session import device_loop as subject
 from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling
-from hapticdb.session.loop import LoopRequest, work
+from hapticdb.session.device_loop import DeviceRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.report import LoopAnswer, counts_of
+from hapticdb.session.stations import SlotRequest
 from hapticdb.session.timing import Timing
+from hapticdb.session.worker import WorkerRequest, work
 from query.test_second_law import Penalty
 from session.hands import Clutched, Heard, Lost, Odd, Slow, Unplugged, at, still, stroking
 from session.worlds import make
@@ -61,13 +63,14 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
         def ran(device: Device, **options: object) -> Ran:
             board = Board.create(1, N_RING)
             rate = float(str(options.pop("rate", 500.0)))
-            request = LoopRequest(
-                table=cells.table, row=row, board=board, grid=cells.grid, shell=sphere,
-                device=device, law=TangentPlane(), rendering="direct", coupling=DIRECT,
-                handle=Handle(), timing=Timing(rate), seconds=0.3, staleness=60.0,
+            law = options.pop("law", TangentPlane())
+            alone = DeviceRequest(
+                SlotRequest(0, row, cells.grid, sphere, DIRECT), cells.table, device, Handle(),
+                seconds=0.3, staleness=60.0,
             )  # fmt: skip
+            alone = dataclasses.replace(alone, **options)  # type: ignore[arg-type]
             heard = Heard()
-            work(dataclasses.replace(request, **options), heard)  # type: ignore[arg-type]
+            work(WorkerRequest(board, Timing(rate), law, "direct", alone), heard)  # type: ignore[arg-type]
             (_, (word, answer)) = heard.said
             assert word == "done"
             frames = board.rings[0, : answer.loop.frames].copy()

@@ -23,11 +23,13 @@ from hapticdb.kernels.period.loop import WITHDRAWN_NS
 from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable
-from hapticdb.session import loop as subject
+from hapticdb.session import device_loop as subject
 from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling, DirectRendering, rendering_of
-from hapticdb.session.loop import Loop, LoopRequest, work
+from hapticdb.session.device_loop import DeviceLoop, DeviceRequest
+from hapticdb.session.stations import SlotRequest, Stations
 from hapticdb.session.timing import Timing
+from hapticdb.session.worker import WorkerRequest, work
 from session.hands import Heard, at
 from session.sessions import floor_points
 from session.worlds import block, cells_of
@@ -89,28 +91,17 @@ def world(request: pytest.FixtureRequest, monkeypatch: pytest.MonkeyPatch) -> It
     signal.signal(signal.SIGTERM, before)
 
 
-def requested(world: World, hand: Pressing, seconds: float = 1.0) -> LoopRequest:
+def requested(world: World, hand: Pressing, seconds: float = 1.0) -> WorkerRequest:
     law: ForceLaw = TangentPlane()
     coupling: DirectRendering = Coupling().direct(SCRIPTED, 1.0, 0.01)
     if world.table.has_distances:
         law = DistanceField()
         coupling = Coupling().settled(SCRIPTED, 200.0, 1.0, 0.01)
+    shell = flat_tool(6, SIZE, np.eye(3), pitch=0.4)
+    slot = SlotRequest(0, world.table.join(), world.grid, shell, coupling)
+    alone = DeviceRequest(slot, world.table, hand, Handle(), seconds, staleness=1e9)
     board = Board.create(1, N_RING)
-    return LoopRequest(
-        table=world.table,
-        row=world.table.join(),
-        board=board,
-        grid=world.grid,
-        shell=flat_tool(6, SIZE, np.eye(3), pitch=0.4),
-        device=hand,
-        law=law,
-        rendering=rendering_of(None, law),
-        coupling=coupling,
-        handle=Handle(),
-        timing=Timing(200.0),
-        seconds=seconds,
-        staleness=1e9,
-    )
+    return WorkerRequest(board, Timing(200.0), law, rendering_of(None, law), alone)
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
@@ -137,7 +128,11 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
 
 def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
     hand = Pressing(-0.004)
-    loop = Loop(requested(world, hand))
+    request = requested(world, hand)
+    board = request.board
+    assert request.alone is not None
+    stations = Stations(request.law, board.seats, board.rings, request.rendering)
+    loop = DeviceLoop(request.alone, request.timing, stations)
     loop.warm_up()
     assert loop.tool["felt"].any() or world.table.has_distances  # there the tool lies in the floor
     hand.z = 0.02
@@ -145,8 +140,8 @@ def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> 
     loop.station.row["staleness"] = -(10**18)
     loop.station.row["is_frame"] = True
     loop._step(1e-3)
-    noted = loop.board.rings[0, 0]
-    assert noted["hits"] == loop.board.seats["hit_frames"][0] == 0
+    noted = board.rings[0, 0]
+    assert noted["hits"] == board.seats["hit_frames"][0] == 0
     assert not noted["applied"].any()
 
 

@@ -12,7 +12,7 @@ import pytest
 from hapticdb.errors import UsageError
 from hapticdb.kernels.records import TIME_BINS
 from hapticdb.query.law import DISTANCE, PLANE, ForceLaw
-from hapticdb.session.loop import empty_loop
+from hapticdb.session.device_loop import empty_loop
 from hapticdb.session.report import spread_of
 from hapticdb.session.timing import SWITCH_INTERVAL, Timing, undisturbed
 

@@ -6,7 +6,7 @@ import logging
 import time
 from collections.abc import Iterator
 from concurrent.futures import ThreadPoolExecutor
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from prometheus_client.core import GaugeMetricFamily, Metric
 from prometheus_client.registry import Collector
@@ -16,7 +16,7 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.server.page_keeper import PageKeeper
 from hapticdb.server.served import Served
 from hapticdb.session.host import SessionHost
-from hapticdb.session.hosted import HostedFigures
+from hapticdb.session.report import LoopFigures
 from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.server")
@@ -115,7 +115,12 @@ class HostCollector(Collector):
 
     def collect(self) -> Iterator[Metric]:
         """Yield one figure after another: sums, and of times and shares the worst."""
-        sessions = self._figures()
+        figures = self._figures()
+        sessions = [loop for loop, _ in figures]
+        unknown, held, stale = (
+            sum(counts[f"{name}_frames"] for _, counts in figures)
+            for name in ("unknown", "held", "stale")
+        )
         tables = [cells.figures() for cells in self._host.cells]
         hit_rates, latencies = ([getattr(t, n) for t in tables] for n in ("hit_rate", "latency"))
         late, took = ([getattr(f, n).p99 for f in sessions] for n in ("lateness", "elapsed"))
@@ -124,9 +129,9 @@ class HostCollector(Collector):
             ("workers", "Worker processes that run.", len(self._host.pids)),
             ("session_frames", "Frames of the sessions.", sum(f.frames for f in sessions)),
             ("session_missed", "Deadlines without a frame.", sum(f.missed for f in sessions)),
-            ("session_unknown_frames", "With unknown cells.", sum(f.unknown for f in sessions)),
-            ("session_held_frames", "With an earlier force.", sum(f.held for f in sessions)),
-            ("session_stale_frames", "Without a database.", sum(f.stale for f in sessions)),
+            ("session_unknown_frames", "With unknown cells.", unknown),
+            ("session_held_frames", "With an earlier force.", held),
+            ("session_stale_frames", "Without a database.", stale),
             ("session_rate_hertz", "Frames a second that are aimed at.", self._host.rate),
             ("session_lateness_seconds", "From a deadline to its frame, p99.", max([0.0, *late])),
             ("session_frame_seconds", "Computing a frame, p99.", max([0.0, *took])),
@@ -140,10 +145,10 @@ class HostCollector(Collector):
         ):  # fmt: skip
             yield GaugeMetricFamily(f"hapticdb_{name}", words, float(value))
 
-    def _figures(self) -> list[HostedFigures]:
-        """Figures of the sessions that run; one may end meanwhile."""
+    def _figures(self) -> list[tuple[LoopFigures, dict[str, Any]]]:
+        """Times and counts of the sessions that run; one may end meanwhile."""
         found = []
         for session in self._host.sessions():
             with contextlib.suppress(UsageError):
-                found.append(session.figures())
+                found.append((session.figures(), session.counts()))
         return found

@@ -13,8 +13,8 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.hosted import Calls, HostedSession
-from hapticdb.session.prefetch.tables import Words
 from hapticdb.session.processes.channel import Channel, Message
+from hapticdb.store.finding import Words
 
 LOG = logging.getLogger("hapticdb.session")
 

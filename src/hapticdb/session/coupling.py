@@ -120,6 +120,19 @@ class Coupling:
             if value is not None and not (math.isfinite(value) and value >= 0.0):
                 raise UsageError(f"a coupling's {name} of {value} {unit}: give 0 or more")
 
+    def of_session(
+        self,
+        rendering: Rendering,
+        profile: DeviceProfile,
+        rate: float,
+        scale: float,
+        radius: float,
+    ) -> "DirectRendering":
+        """Coupling or, rendered directly, caps of one session; parameters as of `settled`."""
+        if rendering == "direct":
+            return self.direct(profile, scale, radius)
+        return self.settled(profile, rate, scale, radius)
+
     def settled(
         self, profile: DeviceProfile, rate: float, scale: float, radius: float
     ) -> "SettledCoupling":

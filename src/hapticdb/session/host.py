@@ -7,7 +7,7 @@ import socket
 import threading
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -25,16 +25,15 @@ from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.session.attached import serve_attached
 from hapticdb.session.board import Board
-from hapticdb.session.coupling import Coupling, DirectRendering, Rendering, radius_of, rendering_of
+from hapticdb.session.coupling import Coupling, Rendering, radius_of, rendering_of
 from hapticdb.session.hosted import HostedSession, Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
-from hapticdb.session.prefetch.tables import SharedTables, Words
+from hapticdb.session.prefetch.tables import SharedTables
 from hapticdb.session.running import Running
-from hapticdb.session.stations import without_surface
 from hapticdb.session.timing import Timing
-from hapticdb.session.worker import SeatRequest
 from hapticdb.session.workers import Workers
 from hapticdb.store.filtering import Filter
+from hapticdb.store.finding import Words
 
 LOG = logging.getLogger("hapticdb.session")
 MOST_SESSIONS = 64
@@ -118,7 +117,7 @@ class SessionHost(Closes):
         if not is_rigid(pose):
             raise UsageError("a session starts at a pose (4, 4) that is a rigid transform")
         Handle(scale=scale)  # checks it
-        felt = self._tables.checked(where, exclude)
+        felt = Filter(where, exclude)
         with self._changing:
             if self._is_closed.is_set():
                 raise UsageError("the host is closed: make another")
@@ -133,7 +132,7 @@ class SessionHost(Closes):
         scale: float,
     ) -> HostedSession:
         """Take seat, cells and worker for a session; all are given back if one is not to be had."""
-        session = next(self._ids)
+        number = next(self._ids)
         with ExitStack() as undo:
             cells = self._tables.take(felt)
             undo.callback(self._tables.release, cells)
@@ -141,39 +140,24 @@ class SessionHost(Closes):
             if self._rendering == "coupled" and law is PLANE:
                 raise UsageError(without_distances(self.url, "leave out --rendering coupled"))
             rendering = rendering_of(self._rendering, law)
-            settled = self._settled(coupling, cells, shell, scale, rendering)
+            settled = (coupling or Coupling()).of_session(
+                rendering, SCRIPTED, self.rate, scale, radius_of(shell, cells.grid.voxel_size)
+            )
             worker = self._workers.least_busy(law, rendering)
-            seat = self._board.take(session, worker.number)
-            undo.callback(self._board.release, seat)
-            reader = cells.table.join()
-            undo.callback(cells.table.leave, reader)
-            cells.table.desk.pids[reader] = worker.pid
-            request = SeatRequest(
-                seat=seat, table=id(cells), n_slots=cells.table.n_slots, reader=reader,
-                grid=cells.grid, shell=without_surface(shell), coupling=settled,
-                pose=tuple(row_of_pose(pose).tolist()),
+            running = Running(number, self._board, cells, shell, settled, worker.number)
+            undo.callback(running.close)
+            running.worker = worker
+            hand = np.array(row_of_pose(pose))
+            self._board.seats["hand_pose"][running.seat] = hand
+            self._board.seats["is_held"][running.seat] = 1
+            table = cells.table
+            worker.ask(
+                "begin", running.request, hand, id(cells), table.n_slots,
+                descriptors=[table.descriptor],
             )  # fmt: skip
-            hand = np.array(request.pose)
-            self._board.seats["hand_pose"][seat] = hand
-            self._board.seats["is_held"][seat] = 1
-            worker.ask("begin", request, descriptors=[cells.table.descriptor])
-            self._running[session] = Running(request, session, cells, worker)
+            self._running[number] = running
             undo.pop_all()
-        return HostedSession(self._board, seat, session, self._call)
-
-    def _settled(
-        self,
-        coupling: Coupling | None,
-        cells: ResidentCells,
-        shell: PointShell,
-        scale: float,
-        rendering: Rendering,
-    ) -> DirectRendering:
-        """Coupling or caps of a session, with all numbers."""
-        radius, coupling = radius_of(shell, cells.grid.voxel_size), coupling or Coupling()
-        if rendering == "direct":
-            return coupling.direct(SCRIPTED, scale, radius)
-        return coupling.settled(SCRIPTED, self.rate, scale, radius)
+        return HostedSession(self._board, running.seat, number, self._call)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions that run now, by their ids."""
@@ -182,44 +166,26 @@ class SessionHost(Closes):
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
         """Do what a session asks for; see `HostedSession`."""
-        known: dict[str, Callable[..., object]] = {
-            "set_coupling": self._set_coupling,
-            "record": self._record,
-            "stop_recording": lambda running: running.stop_recording(self._board),
-            "end": self._end,
-        }
         with self._changing:
             running = self._running.get(session)
             if running is None:
                 if word == "end":
                     return None
                 raise UsageError(f"the hosted session {session} is over: begin another")
-            return known[word](running, *content)
-
-    def _set_coupling(self, running: Running, coupling: Coupling | None) -> None:
-        asked = running.request
-        settled = self._settled(
-            coupling, running.cells, asked.shell, asked.coupling.scale,
-            running.worker.request.rendering,
-        )  # fmt: skip
-        running.worker.ask("set_coupling", asked.seat, settled)
-        running.request = replace(asked, coupling=settled)
-
-    def _record(self, running: Running, path: str, replace: bool) -> None:  # noqa: FBT001 - of a call
-        running.record(path, self.rate, replace=replace)
+            do = partial(self._end, running) if word == "end" else getattr(running, word)
+            return do(*content)
 
     def _end(self, running: Running) -> Recorded:
         """End a session, whatever of it still works; returns what its recording has."""
         self._running.pop(running.session, None)
         with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
-            ends.callback(self._board.release, running.seat)
             ends.callback(self._tables.release, running.cells)
-            ends.callback(running.cells.table.leave, running.request.reader)
+            ends.callback(running.close)
             try:
                 if running.worker.is_alive:
                     running.worker.ask("end", running.seat)
             finally:
-                recorded = running.stop_recording(self._board)
+                recorded = running.stop_recording()
         return recorded
 
     def serve(self, sock: socket.socket) -> None:
@@ -242,7 +208,7 @@ class SessionHost(Closes):
         for running in list(self._running.values()):
             with self._surviving("recording a session"):
                 if running.worker.is_alive:
-                    running.take_frames(self._board)
+                    running.take_frames()
                 else:
                     self._board.lose(running.seat, running.session)
 

@@ -4,7 +4,7 @@ import math
 import os
 import time
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -16,27 +16,7 @@ from hapticdb.poses import row_of_pose
 from hapticdb.recording.frame import Frames, State
 from hapticdb.session.board import TAKEN, Board
 from hapticdb.session.coupling import Coupling
-from hapticdb.session.report import LoopFigures, Spread
-
-
-class HostedFigures(NamedTuple):
-    """Figures of a hosted session so far.
-
-    frames : number of frames; missed : deadlines at which no frame began; in_time : share of all
-    deadlines whose frame was done before the next one; lateness : seconds from a deadline to the
-    begin of the session's frame; elapsed : seconds of computing a frame; unknown, held, stale :
-    numbers of frames with a point in a cell that was not resident, with an earlier wrench, and with
-    a database that had not answered for too long.
-    """
-
-    frames: int
-    missed: int
-    in_time: float
-    lateness: Spread
-    elapsed: Spread
-    unknown: int
-    held: int
-    stale: int
+from hapticdb.session.report import LoopFigures, counts_of
 
 
 class Recorded(NamedTuple):
@@ -138,21 +118,13 @@ class HostedSession:
         self.lost_frames = recorded.lost
         return recorded.frames
 
-    def figures(self) -> HostedFigures:
-        """Figures of the session so far."""
-        seat = self._open_seat()
-        row = self._board.seats[seat]
-        loop = LoopFigures.of_seat(row, 0.0)
-        return HostedFigures(
-            frames=loop.frames,
-            missed=loop.missed,
-            in_time=int(row["in_time"]) / max(loop.frames + loop.missed, 1),
-            lateness=loop.lateness,
-            elapsed=loop.elapsed,
-            unknown=int(row["unknown_frames"]),
-            held=int(row["held_frames"]),
-            stale=int(row["stale_frames"]),
-        )
+    def figures(self) -> LoopFigures:
+        """Frames of the session so far, and their times."""
+        return LoopFigures.of_seat(self._board.seats[self._open_seat()], 0.0)
+
+    def counts(self) -> dict[str, Any]:
+        """Counts of frames and greatest forces so far, by their names in a `Report`."""
+        return counts_of(self._board.seats[self._open_seat()])
 
     def end(self) -> None:
         """End the session and its recording; a second call does nothing."""

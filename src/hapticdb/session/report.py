@@ -71,7 +71,7 @@ class LoopFigures:
 
 
 class LoopAnswer(NamedTuple):
-    """Last message of a loop's process; with the counts on the board a `Report` is made of it.
+    """Last message of a worker with a device; a `Report` is made of it and the counts.
 
     card: name of the GPU that looked, if one did.
     """
@@ -103,7 +103,7 @@ class Report:
         bounded the wrench.
     is_warm : bool
         Whether all wanted cells were resident before the first frame; after
-        `hapticdb.session.loop.WARM_PATIENCE` a session starts without them.
+        `hapticdb.session.device_loop.WARM_PATIENCE` a session starts without them.
     cache : CacheFigures
         Figures of the fetching process.
     objects, loose_objects : tuple of int

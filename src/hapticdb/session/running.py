@@ -1,64 +1,130 @@
-"""Running: what a host keeps of a session while it runs."""
+"""Running: one session in the process that began it, with a device or hosted."""
 
 import threading
+from contextlib import ExitStack
+from dataclasses import replace
 
+from hapticdb.closing import Closes
+from hapticdb.devices.profiles import SCRIPTED
 from hapticdb.errors import UsageError
+from hapticdb.pointshell.shell import PointShell
 from hapticdb.recording.file import Recorder
+from hapticdb.recording.header import Start
 from hapticdb.session.board import Board
+from hapticdb.session.coupling import Coupling, DirectRendering
 from hapticdb.session.hosted import Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells
-from hapticdb.session.worker import SeatRequest
+from hapticdb.session.stations import SlotRequest
 from hapticdb.session.workers import WorkerProcess
 
 
-class Running:
-    """A session that a host runs: what its worker was told, its cells, and its worker."""
+class Running(Closes):
+    """A session that runs: its seat and reader row, until `close`; its worker; its recording.
+
+    session : its number; worker : its process, or the number of one that is still to start.
+    """
 
     def __init__(
-        self, request: SeatRequest, session: int, cells: ResidentCells, worker: WorkerProcess
+        self,
+        session: int,
+        board: Board,
+        cells: ResidentCells,
+        shell: PointShell,
+        coupling: DirectRendering,
+        worker: int = 0,
     ) -> None:
-        self.request, self.session, self.cells, self.worker = request, session, cells, worker
-        self.seat = request.seat
-        self._recording: Recorder | None = None
+        self.session, self.board, self.cells = session, board, cells
+        self._worker: WorkerProcess | None = None
+        self.recording: Recorder | None = None
         self._taking = threading.Lock()
+        with ExitStack() as undo:
+            reader = cells.table.join()
+            undo.callback(cells.table.leave, reader)
+            self.seat = board.take(session, worker)
+            undo.callback(board.release, self.seat)
+            self.request = SlotRequest(
+                self.seat, reader, cells.grid, replace(shell, surface=None), coupling
+            )
+            self._ends = undo.pop_all()
 
-    def record(self, path: str, rate: float, *, replace: bool) -> None:
+    @property
+    def worker(self) -> WorkerProcess:
+        """Process that runs its periods."""
+        assert self._worker is not None  # noqa: S101 - set before anybody else knows the session
+        return self._worker
+
+    @worker.setter
+    def worker(self, worker: WorkerProcess) -> None:
+        self._worker = worker
+        self.cells.table.desk.pids[self.request.reader] = worker.pid
+
+    @property
+    def n_frames(self) -> int:
+        """Number of frames so far."""
+        return int(self.board.seats["n_frames"][self.seat])
+
+    def set_coupling(self, coupling: Coupling | None) -> None:
+        """Replace the coupling between hand and tool, of a session without a device."""
+        before, of_worker = self.request.coupling, self.worker.request
+        settled = (coupling or Coupling()).of_session(
+            of_worker.rendering, SCRIPTED, of_worker.timing.rate, before.scale, before.radius
+        )
+        self.worker.ask("set_coupling", self.seat, settled)
+        self.request = replace(self.request, coupling=settled)
+
+    def record(self, path: str, is_replaced: bool) -> None:  # noqa: FBT001 - of a call
         """Begin a recording at the next frame; errors as of `HostedSession.record`."""
-        if self._recording is not None:
+        if self.recording is not None:
             raise UsageError(
                 f"the hosted session {self.session} is recorded already: stop it first"
             )
-        asked, recording = self.request, Recorder(path, replace=replace)
+        recording = Recorder(path, replace=is_replaced)
         try:
             recording.open()
-            first, start = self.worker.ask("state", self.seat)
-            header = self.cells.header(
-                asked.shell, rate, self.worker.request.law, asked.coupling, start
-            )
-            recording.begin(header, first)
+            self.begin_recording(recording, *self.worker.ask("state", self.seat))
         except BaseException:
             recording.discard()
             raise
-        self._recording = recording
 
-    def take_frames(self, board: Board) -> None:
+    def begin_recording(
+        self, recording: Recorder, first: int, start: Start, frames_on: str = "cpu"
+    ) -> None:
+        """Record from frame `first` on, before which the state is `start`."""
+        request, of_worker = self.request, self.worker.request
+        header = self.cells.header(
+            request.shell, of_worker.timing.rate, of_worker.law, request.coupling, start, frames_on
+        )
+        recording.begin(header, first)
+        self.recording = recording
+
+    def take_frames(self) -> None:
         """Copy new frames from the board into the recording, if there is one; in any thread."""
         with self._taking:
-            recording = self._recording
+            recording = self.recording
             if recording is not None:
                 try:
-                    recording.take(board.rings[self.seat], int(board.seats["n_frames"][self.seat]))
+                    recording.take(self.board.rings[self.seat], self.n_frames)
                 except Exception:
                     recording.ended = "the recording ended early: the host failed at it"
                     raise
 
-    def stop_recording(self, board: Board) -> Recorded:
+    def stop_recording(self) -> Recorded:
         """End the recording, which stays."""
         try:
-            self.take_frames(board)
+            self.take_frames()
         finally:
             with self._taking:
-                recording, self._recording = self._recording, None
+                recording, self.recording = self.recording, None
             if recording is not None:
                 recording.finish()
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)
+
+    def end_worker(self) -> None:
+        """End the worker of a session that runs alone, if it was started."""
+        if self._worker is not None:
+            self.board.seats["is_asked_to_end"][self.seat] = True
+            self._worker.end()
+
+    def close(self) -> None:
+        """Give seat and reader row back."""
+        self._ends.close()

@@ -19,17 +19,18 @@ from hapticdb.recording.frame import Frames, State
 from hapticdb.session.board import Board
 from hapticdb.session.coupling import (
     Coupling,
-    DirectRendering,
     Rendering,
     radius_of,
     rendering_of,
 )
-from hapticdb.session.loop import LoopRequest
+from hapticdb.session.device_loop import DeviceRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
-from hapticdb.session.processes.process import Process
 from hapticdb.session.report import LoopAnswer, Report, counts_of
-from hapticdb.session.stations import FOREVER, without_surface
+from hapticdb.session.running import Running
+from hapticdb.session.stations import FOREVER
 from hapticdb.session.timing import Timing
+from hapticdb.session.worker import WorkerRequest
+from hapticdb.session.workers import WorkerProcess
 
 if TYPE_CHECKING:
     from hapticdb.batches.feeler import BatchDevice
@@ -41,8 +42,6 @@ LEAST_RING = 1024
 """Least number of frames in the ring, however low the rate."""
 DRAIN_EVERY = 0.05
 """Seconds between two checks of the loop in `wait`. A larger value reports its end later."""
-START_PATIENCE = 120.0
-"""Seconds in which the loop's process must be ready. A device may take long to open."""
 END_PATIENCE = 10.0
 """Seconds in which the loop must end after a request to end; normally it ends after a frame."""
 DEFAULT_STALENESS = 1.0
@@ -147,10 +146,12 @@ class Session(Closes):
             raise UsageError("these cells are closed: make others")
         self.cells = cells
         self._check_distances(law)
-        self.coupling = self._settled(coupling or Coupling(), device)
-        self._pid, self._row = os.getpid(), -1
-        self._board: Board | None = None
-        self._process: Process | None = None
+        self.coupling = (coupling or Coupling()).of_session(
+            self.rendering, profile_of(device), rate, self.handle.scale,
+            radius_of(shell, cells.grid.voxel_size),
+        )  # fmt: skip
+        self._pid = os.getpid()
+        self._running: Running | None = None
         self._objects: set[int] = set()
         self._loose_objects: set[int] = set()
         self._n_drained, self._has_touched = 0, False  # touched since it last lay in something
@@ -181,58 +182,29 @@ class Session(Closes):
             "ResidentCells(..., distances=True), or give law='plane'"
         )
 
-    def _settled(self, coupling: Coupling, device: Device) -> DirectRendering:
-        """Coupling or caps of the session, with all numbers."""
-        profile, scale = profile_of(device), self.handle.scale
-        radius = radius_of(self.shell, self.cells.grid.voxel_size)
-        if self.rendering == "coupled":
-            return coupling.settled(profile, self.timing.rate, scale, radius)
-        return coupling.direct(profile, scale, radius)
-
-    def _begin(
-        self,
-        device: Device,
-        staleness: float,
-        seconds: float | None,
-    ) -> None:
-        table = self.cells.table
+    def _begin(self, device: Device, staleness: float, seconds: float | None) -> None:
         if self._recording is not None:
             self._recording.open()
-        n_ring = max(int(RING_SECONDS * self.timing.rate), LEAST_RING)
-        self._board = board = Board.create(1, n_ring)
-        self._row = table.join()
-        request = LoopRequest(
-            table=table,
-            row=self._row,
-            board=board,
-            grid=self.cells.grid,
-            shell=without_surface(self.shell),
+        board = Board.create(1, max(int(RING_SECONDS * self.timing.rate), LEAST_RING))
+        try:
+            self._running = running = Running(1, board, self.cells, self.shell, self.coupling)
+        except BaseException:
+            board.close()
+            raise
+        alone = DeviceRequest(
+            slot=running.request,
+            table=self.cells.table,
             device=device,
-            law=self.law,
-            rendering=self.rendering,
-            coupling=self.coupling,
             handle=self.handle,
-            timing=self.timing,
             seconds=FOREVER if seconds is None else seconds,
             staleness=staleness,
             has_baseline=self._has_baseline,
             is_on_gpu=self.frames_on == "cuda",
         )
-        self._process = Process(
-            "hapticdb.session.loop:work",
-            request,
-            [table.descriptor, board.descriptor],
-            with_kernels=True,
-        )
-        table.desk.pids[self._row] = self._process.pid
-        start = self._process.await_ready("loop's", START_PATIENCE)
+        request = WorkerRequest(board, self.timing, self.law, self.rendering, alone)
+        worker = running.worker = WorkerProcess(0, request)
         if self._recording is not None:
-            self._recording.begin(
-                self.cells.header(
-                    self.shell, self.timing.rate, self.law, self.coupling, start,
-                    self.frames_on,
-                )
-            )  # fmt: skip
+            running.begin_recording(self._recording, 0, worker.ready, self.frames_on)
 
     def __del__(self) -> None:
         with suppress(Exception):
@@ -241,24 +213,18 @@ class Session(Closes):
     @property
     def n_frames(self) -> int:
         """Number of frames so far."""
-        return int(self._open_board.seats["n_frames"][0])
+        return self._open.n_frames
 
     @property
     def pid(self) -> int:
         """Process id of the loop."""
-        return self._open_process.pid
+        return self._open.worker.pid
 
     @property
-    def _open_process(self) -> Process:
-        if self._process is None:
+    def _open(self) -> Running:
+        if self._running is None:
             raise UsageError("the session is closed: begin another")
-        return self._process
-
-    @property
-    def _open_board(self) -> Board:
-        if self._board is None:
-            raise UsageError("the session is closed: begin another")
-        return self._board
+        return self._running
 
     @property
     def objects(self) -> tuple[int, ...]:
@@ -288,7 +254,7 @@ class Session(Closes):
 
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
-        return self._open_board.last_frame(0)
+        return self._open.board.last_frame(0)
 
     def wait(self, seconds: float | None = None) -> Report | None:
         """Supervise the session until it ends; returns its report, or None after `seconds`.
@@ -296,24 +262,25 @@ class Session(Closes):
         Call this again and again, or without a time: only during the call frames are recorded, and
         a fetching process that has died is started again.
         """
-        process = self._open_process
+        running = self._open
+        process = running.worker
         until = time.monotonic() + (FOREVER if seconds is None else seconds)
         while self._answer is None and time.monotonic() < until:
             is_alive = process.is_alive  # read first: the last message may come with the end
             message = process.receive(min(DRAIN_EVERY, max(until - time.monotonic(), 0.0)))
-            self._drain()
+            self._drain(running)
             if message is not None:
                 self._answer = message.content
             elif not is_alive:
                 raise HapticDBError(
-                    "the loop's process was ended from outside: begin the session again"
+                    "the worker process was ended from outside: begin the session again"
                 )
             self.cells.supervise()
         return self._report() if self._answer is not None else None
 
     def ask_to_end(self) -> None:
         """Make the loop end after its next frame. `wait` then returns the report."""
-        self._open_board.seats["is_asked_to_end"][0] = True
+        self._open.board.seats["is_asked_to_end"][0] = True
 
     def stop(self) -> Report:
         """End the session; returns its report."""
@@ -323,16 +290,16 @@ class Session(Closes):
             raise HapticDBError("the loop did not end when asked to")
         return report
 
-    def _drain(self) -> None:
+    def _drain(self, running: Running) -> None:
         """Add the touched objects to the list, and record the new frames."""
-        sessions, done = self.cells.table.desk.sessions, self.n_frames
-        ring = self._open_board.rings[0]
-        n_objects = int(sessions["n_objects"][self._row])
-        named = set(sessions["objects"][self._row, :n_objects].tolist())
+        done = running.n_frames
+        ring, asked = running.board.rings[0], self.cells.table.desk.sessions[running.request.reader]
+        named = set(asked["objects"][: int(asked["n_objects"])].tolist())
         first = max(self._n_drained, done - len(ring))
         frames = ring[np.arange(first, done) % len(ring)]
         self._n_drained = done
-        if self.is_loose:
+        last = running.board.last_frame(running.seat)
+        if last is not None and last["state"][0] & State.IN_OBJECT:
             self._loose_objects |= named
             self._has_touched = False
         else:
@@ -340,8 +307,7 @@ class Session(Closes):
             self._has_touched = self._has_touched or touched
             # before the first contact an answer about the place where the tool lay may be left
             self._objects |= named if self._has_touched else named - self._loose_objects
-        if self._recording is not None:
-            self._recording.take(ring, done)
+        running.take_frames()
 
     def _report(self) -> Report:
         answer = self._answer
@@ -366,7 +332,7 @@ class Session(Closes):
             law="distance" if reads_distances(self.law) else "plane",
             rendering=self.rendering,
             coupling=self.coupling,
-            **counts_of(self._open_board.seats[0]),
+            **counts_of(self._open.board.seats[0]),
         )
 
     def _conditions(self) -> dict[str, str]:
@@ -389,21 +355,12 @@ class Session(Closes):
                 ends.callback(self.cells.close)
             if self._recording is not None:
                 ends.callback(self._recording.close)
-            ends.callback(self._leave)
-            if self._row >= 0:
-                ends.callback(self._drain)
-            if self._process is not None:
-                self.ask_to_end()
-                ends.callback(self._process.end)
-                self._process = None
-
-    def _leave(self) -> None:
-        if self._row >= 0:
-            self.cells.table.leave(self._row)
-            self._row = -1
-        if self._board is not None:
-            self._board.close()
-            self._board = None
+            running, self._running = self._running, None
+            if running is not None:
+                ends.callback(running.board.close)
+                ends.callback(running.close)
+                ends.callback(self._drain, running)
+                ends.callback(running.end_worker)
 
 
 def _check_choices(seconds: float | None, staleness: float) -> None:

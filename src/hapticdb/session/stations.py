@@ -1,7 +1,7 @@
 """Stations: sessions in the form that the kernel of their periods reads (`kernels.period.loop`)."""
 
 import time
-from dataclasses import replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,11 +16,12 @@ from hapticdb.kernels.period.memory import PERIOD_ROWS
 from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
 from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw
+from hapticdb.query.law import ForceLaw, reads_distances
 from hapticdb.recording.frame import Frames
 from hapticdb.recording.header import Start
-from hapticdb.resident.table import HEARTBEAT
-from hapticdb.session.coupling import Rendering, rendering_of
+from hapticdb.resident.held import clusters_of
+from hapticdb.resident.table import HEARTBEAT, CellTable
+from hapticdb.session.coupling import DirectRendering, Rendering, rendering_of
 
 LARGE_FROM = 4096
 """Points from which the quasi-static coupling tests spheres of runs before their points. The
@@ -34,9 +35,19 @@ FOREVER = 1e9
 Record = NDArray[np.void]
 
 
-def without_surface(shell: PointShell) -> PointShell:
-    """Return the shell without the tool's triangles, which no frame reads."""
-    return replace(shell, surface=None)
+@dataclass(frozen=True)
+class SlotRequest:
+    """Session that a worker process is to run.
+
+    seat : row of the board; reader : row of the table of cells; grid : of the cells; shell : the
+    tool, without triangles, which no frame reads; coupling : between hand and tool.
+    """
+
+    seat: int
+    reader: int
+    grid: Grid
+    shell: PointShell
+    coupling: DirectRendering
 
 
 class Station:
@@ -155,16 +166,29 @@ class Stations:
         rings: Frames | None = None,
         rendering: Rendering | None = None,
     ) -> None:
+        self.law, self.rendering = law, rendering_of(rendering, law)
         self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
         self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
-        is_coupled = rendering_of(rendering, law) == "coupled"
+        is_coupled = self.rendering == "coupled"
         mover = loop.move_by_coupling if is_coupled else loop.move_directly
         self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
         if not is_coupled:
             self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
         self._arguments = (self.rows, seats, rings, self.pace)
         self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
+
+    def add(self, request: SlotRequest, table: CellTable) -> Station:
+        """Make the state of a session; its periods run once `is_running` of its row is set."""
+        cells = table.cells if reads_distances(self.law) else table.cells.without_distances()
+        n = int(np.flatnonzero(self.rows["is_running"] == 0)[0])
+        station = Station(
+            self.rows[n : n + 1], cells, request.reader, table.desk.sessions[request.reader, ...],
+            request.grid, clusters_of(request.shell, request.grid.voxel_size),
+        )  # fmt: skip
+        station.row["seat"] = request.seat
+        station.set_spring(request.coupling.spring())
+        return station
 
     def run(self, rate: float, seconds: float = FOREVER) -> float:
         """Run periods at a rate until `stop` or for so long -> seconds that they took.

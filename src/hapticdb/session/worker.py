@@ -1,64 +1,53 @@
-"""A worker process of the host: one loop that runs the frames of many sessions, period by period.
+"""A worker process: one loop that runs the frames of its sessions, period by period.
 
-The loop is one kernel in a thread of its own, which needs no interpreter. Commands of the host come
-over its channel and are done beside it: a session is made there, and enters the loop between two
-periods.
+The loop is one kernel, which needs no interpreter. It runs in a thread of its own; commands of the
+process that started the worker are done beside it: a session is made there, and enters the loop
+between two periods. A session with a device runs alone, in the main thread, where a signal ends a
+call of the device that hangs.
 """
 
 import os
 import threading
 import time
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from hapticdb.errors import HapticDBError, UsageError
-from hapticdb.grid import Grid
-from hapticdb.kernels._jit import load_entries
-from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw, reads_distances
+from hapticdb.errors import HapticDBError
+from hapticdb.query.law import ForceLaw
 from hapticdb.recording.header import Start
-from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.session.board import Board
 from hapticdb.session.coupling import DirectRendering, Rendering
+from hapticdb.session.device_loop import DeviceRequest, run_device
 from hapticdb.session.processes.channel import Message
-from hapticdb.session.processes.process import MessageSender, parent_is_gone, reply_to_parent
-from hapticdb.session.stations import Station, Stations
-from hapticdb.session.timing import undisturbed
+from hapticdb.session.processes.process import (
+    LOOK_EVERY,
+    MessageSender,
+    parent_is_gone,
+    reply_to_parent,
+)
+from hapticdb.session.stations import SlotRequest, Station, Stations
+from hapticdb.session.timing import Timing, undisturbed
 
-LOOK_EVERY = 0.25
-"""Seconds between two checks whether the host still lives."""
 LEAVE_PATIENCE = 5.0
 """Seconds in which the loop must have left a session that ends; normally it is one period."""
 
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """board : of the host; rate : frames/s; law, rendering : of all its sessions."""
+    """Sessions of a worker: all of them share board, timing, law and rendering.
 
-    board: Board
-    rate: float
-    law: ForceLaw
-    rendering: Rendering
-
-
-@dataclass(frozen=True)
-class SeatRequest:
-    """What a worker needs to run a session.
-
-    seat : row of the board; table, n_slots : name and slots of the table of cells, whose descriptor
-    comes beside; reader : the session's row there; pose (7,) : where hand and tool start.
+    alone : the only one, with a device; without it commands begin and end sessions.
     """
 
-    seat: int
-    table: int
-    n_slots: int
-    reader: int
-    grid: Grid
-    shell: PointShell
-    coupling: DirectRendering
-    pose: tuple[float, ...]
+    board: Board
+    timing: Timing
+    law: ForceLaw
+    rendering: Rendering
+    alone: DeviceRequest | None = None
 
 
 class Worker:
@@ -68,15 +57,13 @@ class Worker:
     station is set, which is done last, and leaves it between two periods when that is withdrawn.
     """
 
-    def __init__(self, request: WorkerRequest) -> None:
-        self._rate, self._law = request.rate, request.law
+    def __init__(self, board: Board, rate: float, stations: Stations) -> None:
+        self._board, self._rate, self._stations = board, rate, stations
         self._tables: dict[int, CellTable] = {}
-        self._board = board = request.board
-        self._stations = Stations(request.law, board.seats, board.rings, request.rendering)
-        self._running: dict[int, tuple[SeatRequest, Station]] = {}  # by seat
+        self._running: dict[int, tuple[int, Station]] = {}  # table and state, by seat
 
     def obey(self) -> None:
-        """Do what the host says until it ends; the work of the thread beside the loop's."""
+        """Do what the parent says until it ends; the work of the thread beside the loop's."""
         try:
             while not parent_is_gone():
                 reply_to_parent(self._do, LOOK_EVERY)
@@ -86,39 +73,33 @@ class Worker:
             self._stations.stop()
 
     def _do(self, ask: Message, descriptors: list[int]) -> object:
-        word, content = ask
-        if word == "begin":
-            self._begin(content[0], descriptors[0])
-        elif word == "end":
-            self._end(content[0])
-        elif word == "state":
-            return self._state(content[0])
-        elif word == "set_coupling":
-            seat, coupling = content
-            self._running[seat][1].set_spring(coupling.spring())
-        else:
-            raise UsageError(f"a worker does not know the command {word!r}")
-        return None
+        known: dict[str, Callable[..., object]] = {
+            "begin": self._begin, "end": self._end, "state": self._state,
+            "set_coupling": self._set_coupling,
+        }  # fmt: skip
+        return known[ask.word](*descriptors, *ask.content)
 
-    def _begin(self, request: SeatRequest, descriptor: int) -> None:
-        if request.table not in self._tables:
-            self._tables[request.table] = CellTable(os.dup(descriptor), request.n_slots)
-        table, rows = self._tables[request.table], self._stations.rows
-        cells = table.cells if reads_distances(self._law) else table.cells.without_distances()
-        n = int(np.flatnonzero(rows["is_running"] == 0)[0])
-        row = rows[n : n + 1]
-        station = Station(
-            row, cells, request.reader, table.desk.sessions[request.reader, ...],
-            request.grid, clusters_of(request.shell, request.grid.voxel_size),
-        )  # fmt: skip
-        pose = np.array(request.pose)
+    def _begin(
+        self,
+        descriptor: int,
+        request: SlotRequest,
+        pose: NDArray[np.float64],
+        table: int,
+        n_slots: int,
+    ) -> None:
+        """Begin a session whose hand and tool wait at a pose (7,); table : a name for its cells."""
+        if table not in self._tables:
+            self._tables[table] = CellTable(os.dup(descriptor), n_slots)
+        station = self._stations.add(request, self._tables[table])
         station.rest_at(pose)
         station.arrive_at(pose)
-        station.set_spring(request.coupling.spring())
-        row["seat"], row["is_frame"] = request.seat, True
-        row["began"] = row["last"] = time.monotonic_ns()
-        self._running[request.seat] = request, station
-        row["is_running"] = 1
+        station.row["is_frame"] = True
+        station.row["began"] = station.row["last"] = time.monotonic_ns()
+        self._running[request.seat] = table, station
+        station.row["is_running"] = 1
+
+    def _set_coupling(self, seat: int, coupling: DirectRendering) -> None:
+        self._running[seat][1].set_spring(coupling.spring())
 
     def _state(self, seat: int) -> tuple[int, Start]:
         """Number of a session's next frame, and its state before that frame."""
@@ -140,24 +121,27 @@ class Worker:
             time.sleep(0.5 / self._rate)
 
     def _end(self, seat: int) -> None:
-        request, station = self._running[seat]
+        table, station = self._running[seat]
         self._pause(station)
         station.session["told"]["is_active"] = False
         del self._running[seat]
-        used = {request.table for request, _ in self._running.values()}
-        if request.table not in used:
-            self._tables.pop(request.table).close()
+        if all(used != table for used, _ in self._running.values()):
+            self._tables.pop(table).close()
 
     def run(self) -> None:
-        """Run periods until the host ends; the work of the loop's thread."""
+        """Run periods until the parent ends; the work of the loop's thread."""
         with undisturbed():
             self._stations.run(self._rate)
 
 
 def work(request: WorkerRequest, sender: MessageSender) -> None:
     """Run a worker; the work of the process."""
-    load_entries("period.loop")
-    worker = Worker(request)
+    board, timing = request.board, request.timing
+    stations = Stations(request.law, board.seats, board.rings, request.rendering)
+    if request.alone is not None:
+        run_device(request.alone, timing, stations, sender)
+        return
+    worker = Worker(board, timing.rate, stations)
     looping = threading.Thread(target=worker.run, daemon=True)
     looping.start()
     sender.send("ready", None)

@@ -1,4 +1,4 @@
-"""The worker processes of a host, started when sessions need them."""
+"""Worker processes from the process that starts them: of one session with a device, or of many."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -9,10 +9,11 @@ from hapticdb.query.law import ForceLaw
 from hapticdb.session.board import TAKEN, Board
 from hapticdb.session.coupling import Rendering
 from hapticdb.session.processes.process import Process
+from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 
-START_PATIENCE = 120.0
-"""Seconds in which a worker must be ready: it loads every kernel of a frame."""
+WORK = "hapticdb.session.worker:work"
+"""What a worker process runs, and what it calls kernels for."""
 ANSWER_PATIENCE = 30.0
 """Seconds in which a worker must answer a command; normally milliseconds."""
 FILLED = 8
@@ -20,13 +21,18 @@ FILLED = 8
 
 
 class WorkerProcess(Process):
-    """A worker process, from the host; `number` counts from 0, `request` says what it runs."""
+    """A worker process, from the one that started it.
+
+    number : of the worker, from 0; request : what it runs; ready : content of its first message.
+    """
 
     def __init__(self, number: int, request: WorkerRequest) -> None:
         self.number, self.request = number, request
-        work = "hapticdb.session.worker:work"
-        super().__init__(work, request, [request.board.descriptor], with_kernels=True)
-        self.await_ready("worker's", START_PATIENCE)
+        descriptors = [request.board.descriptor]
+        if request.alone is not None:
+            descriptors.append(request.alone.table.descriptor)
+        super().__init__(WORK, request, descriptors, with_kernels=True)
+        self.ready = self.await_ready("worker")
         self._channel.sock.settimeout(ANSWER_PATIENCE)
 
     def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
@@ -38,7 +44,7 @@ class Workers:
     """Worker processes of a host, `most` at a time."""
 
     def __init__(self, board: Board, rate: float, most: int) -> None:
-        self._board, self._rate, self._most = board, rate, most
+        self._board, self._timing, self._most = board, Timing(rate), most
         self._processes: list[WorkerProcess] = []
         self._next = 0
 
@@ -52,7 +58,7 @@ class Workers:
         for process in [process for process in self._processes if not process.is_alive]:
             self._processes.remove(process)
             process.end()
-        seats, request = self._board.seats, WorkerRequest(self._board, self._rate, law, rendering)
+        seats, request = self._board.seats, WorkerRequest(self._board, self._timing, law, rendering)
         alike = [process for process in self._processes if process.request == request]
         counts = [
             int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == process.number)))

@@ -345,7 +345,7 @@ def test_an_overloaded_worker_runs_all_sessions_at_the_same_lower_rate(
 
         until(share_alike)
         figures = [session.figures() for session in sessions]
-        assert all(one.missed > 0 and one.in_time < 0.9 for one in figures)
+        assert all(one.missed > 0.1 * one.frames for one in figures)
 
 
 def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
@@ -361,7 +361,7 @@ def test_a_database_that_does_not_answer_lets_the_force_fall_until_it_does(
             last = session.latest()
             assert last is not None
             assert last["state"][0] & State.HELD
-            assert session.figures().stale > 0
+            assert session.counts()["stale_frames"] > 0
         finally:
             os.kill(fetching, signal.SIGCONT)
         until(lambda: pushed(session) > 0.5)

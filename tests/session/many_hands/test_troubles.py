@@ -42,7 +42,7 @@ def session(host: SessionHost, sphere: PointShell) -> Iterator[HostedSession]:
 
 def recording_of(host: SessionHost, session: HostedSession) -> Recorder:
     """The recording of a session, in the host."""
-    found = host._running[session.id]._recording
+    found = host._running[session.id].recording
     assert found is not None
     return found
 

@@ -16,8 +16,8 @@ from hapticdb.errors import FileError, HapticDBError, UsageError
 from hapticdb.recording.file import Recorder, Recording
 from hapticdb.resident.table import is_alive
 from hapticdb.session import session as module
-from hapticdb.session.prefetch import resident_cells
 from hapticdb.session.prefetch.resident_cells import ResidentCells
+from hapticdb.session.processes import process
 from hapticdb.session.session import Session
 from session.hands import Noted, still
 from session.sessions import RATE, until
@@ -139,7 +139,7 @@ def test_two_signals_at_once_leave_no_recording_that_was_never_begun(
         close(session)  # later calls, when the session is dropped
 
     path = tmp_path / "never.hdbrec"
-    monkeypatch.setattr(module, "Process", interrupted)
+    monkeypatch.setattr(module, "WorkerProcess", interrupted)
     monkeypatch.setattr(Session, "close", cut_off)
     with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
         with pytest.raises(KeyboardInterrupt):
@@ -158,17 +158,14 @@ def test_cells_that_are_closed_are_refused(voxel_floor: Environment, sphere: Poi
 
 
 @pytest.mark.long
-@pytest.mark.parametrize(("place", "name"), [(resident_cells, "fetching"), (module, "loop's")])
 def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
-    voxel_floor: Environment,
-    sphere: PointShell,
-    monkeypatch: pytest.MonkeyPatch,
-    place: object,
-    name: str,
+    voxel_floor: Environment, sphere: PointShell, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(place, "START_PATIENCE", 0.0)
-    with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s: "):
-        Session(voxel_floor.url, sphere, still(0.03), law="plane")
+    with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
+        monkeypatch.setattr(process, "START_PATIENCE", 0.0)
+        for environment, name in ((voxel_floor.url, "fetching"), (cells, "worker")):
+            with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s"):
+                Session(environment, sphere, still(0.03), law="plane")
 
 
 STARTER = """

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hapticdb.errors import DatabaseError
 from hapticdb.query.law import DISTANCE
-from hapticdb.session.loop import empty_loop
+from hapticdb.session.device_loop import empty_loop
 from hapticdb.session.processes.process import MessageSender, parent_is_gone
 
 

@@ -162,7 +162,7 @@ def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
     from hapticdb.session.processes.fork_server import prepare
 
     # at once: another interpreter with numba takes as long to load as all that is done here
-    prepare("hapticdb.session.loop:work", with_kernels=True)
+    prepare("hapticdb.session.worker:work", with_kernels=True)
     prepare("hapticdb.session.prefetch.fetching:fetch", with_kernels=True)
     from hapticdb.query.law import DISTANCE, as_law
     from hapticdb.session.coupling import rendering_of

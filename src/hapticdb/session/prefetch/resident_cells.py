@@ -28,9 +28,6 @@ from hapticdb.store.urls import redact
 
 FETCH = "hapticdb.session.prefetch.fetching:fetch"
 """What a fetching process runs, and what it calls kernels for."""
-START_PATIENCE = 60.0
-"""Seconds in which a fetching process must be ready; a calibration may take seconds. Larger: a
-caller waits longer for a process that hangs."""
 END_PATIENCE = 0.5
 """Seconds that a fetching process has to end by itself; a database that hangs may hold it up. It
 only reads, so it may be killed at any time."""
@@ -136,7 +133,7 @@ class ResidentCells(Closes):
         self._request = FetchRequest(url, self.table, self.grid, self.filter, wrap)
         try:
             self._process = self._begun()
-            self._process.await_ready("fetching", START_PATIENCE)
+            self._process.await_ready("fetching")
         except BaseException:
             self.table.close()
             raise

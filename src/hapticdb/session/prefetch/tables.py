@@ -1,14 +1,9 @@
 """Tables of cells of one environment: one for each filter of what is felt, while it is used."""
 
 import threading
-from collections.abc import Sequence
-from contextlib import closing
 
 from hapticdb.session.prefetch.resident_cells import ResidentCells
-from hapticdb.store.connect import open_store
 from hapticdb.store.filtering import Filter
-
-Words = Sequence[int | str]
 
 
 class SharedTables:
@@ -19,15 +14,6 @@ class SharedTables:
         self._tables: dict[Filter, ResidentCells] = {}
         self._uses: dict[Filter, int] = {}
         self._making = threading.Lock()
-
-    def checked(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; ObjectNotFoundError if one of them chooses nothing."""
-        felt = Filter(where, exclude)
-        if not felt.is_empty:
-            with closing(open_store(self.url, read_only=True)) as store:
-                for error in felt.left_out(store.objects(), store.url).missing:
-                    raise error
-        return felt
 
     def take(self, felt: Filter) -> ResidentCells:
         """Table of the objects that the filter lets feel, for one more session."""

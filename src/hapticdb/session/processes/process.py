@@ -23,6 +23,11 @@ from hapticdb.session.processes.fork_server import start
 END_PATIENCE = 5.0
 """Seconds that a process has to end by itself before it is killed. Larger: slower devices can
 close, a hanging process delays the end longer."""
+START_PATIENCE = 120.0
+"""Seconds in which a process must be ready: a device may take long to open. Larger: a caller waits
+longer for a process that hangs."""
+LOOK_EVERY = 0.25
+"""Seconds between two checks of a process whether the one that started it still runs."""
 _ends = select.poll()
 """Tells that the process that started this one has ended, or has closed its channel."""
 _parent: Channel | None = None
@@ -97,7 +102,7 @@ class Process:
             raise message.content
         return message
 
-    def await_ready(self, name: str, seconds: float) -> Any:  # noqa: ANN401 - what was sent
+    def await_ready(self, name: str) -> Any:  # noqa: ANN401 - what was sent
         """Content of the first message; where none comes the process is ended.
 
         Raises
@@ -106,7 +111,7 @@ class Process:
             That says why, or with which the process ended.
         """
         try:
-            ready, is_slow = self.receive(seconds), self.is_alive
+            ready, is_slow = self.receive(START_PATIENCE), self.is_alive
         except BaseException:
             self.end()
             raise
@@ -114,8 +119,8 @@ class Process:
             return ready.content
         self.end()
         raise HapticDBError(
-            f"the {name} process was not ready after {seconds:g} s: the database or this machine "
-            "is too slow now; try again"
+            f"the {name} process was not ready after {START_PATIENCE:g} s: the database or this "
+            "machine is too slow now; try again"
             if is_slow
             else f"the {name} process did not start: its errors are above"
         )

@@ -1,4 +1,4 @@
-"""The servo loop, in a process of its own: every frame on time, no frame queries the database.
+"""The loop of a session with a device: every frame on time, no frame queries the database.
 
 The loop is one kernel, which calls this module to read the device and to push it. While it runs, no
 kernel is compiled and no garbage is collected.
@@ -26,21 +26,17 @@ from hapticdb.devices.protocol import (
     SupportsRewind,
 )
 from hapticdb.errors import DeviceError, HapticDBError
-from hapticdb.grid import Grid
 from hapticdb.kernels._jit import ENTRIES
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.handle import is_somewhere
 from hapticdb.kernels.period.loop import DEVICE, NOBODY
 from hapticdb.kernels.records import pose_numbers, views_of
-from hapticdb.pointshell.shell import PointShell
-from hapticdb.query.law import ForceLaw, reads_distances
-from hapticdb.resident.held import clusters_of
+from hapticdb.query.law import ForceLaw
 from hapticdb.resident.table import LOST, STOP, CellTable
-from hapticdb.session.board import Board
-from hapticdb.session.coupling import DirectRendering, Rendering
-from hapticdb.session.processes.process import MessageSender, parent_is_gone
+from hapticdb.session.coupling import Rendering
+from hapticdb.session.processes.process import LOOK_EVERY, MessageSender, parent_is_gone
 from hapticdb.session.report import LoopAnswer, LoopFigures
-from hapticdb.session.stations import Station, Stations
+from hapticdb.session.stations import SlotRequest, Stations
 from hapticdb.session.timing import Timing, undisturbed
 
 if TYPE_CHECKING:
@@ -49,57 +45,37 @@ if TYPE_CHECKING:
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
 Larger: the machine's own lateness is measured better, the first frame comes later."""
-LOOK_EVERY = 0.25
-"""Seconds between two checks whether the process that started the loop still runs."""
 WARM_PATIENCE = 30.0
 """Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
 
 
 @dataclass(frozen=True)
-class LoopRequest:
-    """Request to a loop's process: see `hapticdb.session.session.Session`."""
+class DeviceRequest:
+    """Session of which the worker has the device: see `hapticdb.session.session.Session`."""
 
+    slot: SlotRequest
     table: CellTable
-    row: int
-    board: Board
-    grid: Grid
-    shell: PointShell
     device: Device
-    law: ForceLaw
-    rendering: Rendering
-    coupling: DirectRendering
     handle: Handle
-    timing: Timing
     seconds: float
     staleness: float
     has_baseline: bool = True
     is_on_gpu: bool = False
 
 
-class Loop:
-    """A session's loop in this process. It is made, warmed up, and run once.
+class DeviceLoop:
+    """The loop of a session whose device this process has. It is made, warmed up, and run once.
 
-    Parameters
-    ----------
-    request : LoopRequest
-        Its reader row of the table is already taken.
+    request : its slot and reader row are taken; timing : of the loop; stations : of its one slot.
     """
 
-    def __init__(self, request: LoopRequest) -> None:
-        self.request = request
-        self.device = request.device
+    def __init__(self, request: DeviceRequest, timing: Timing, stations: Stations) -> None:
+        self.request, self.timing, self.stations = request, timing, stations
+        self.device, self.table = request.device, request.table
         self.reader = Reader(request.device)
-        self.table, self.board = request.table, request.board
-        self.session = self.table.desk.sessions[request.row, ...]
-        self.stations = Stations(request.law, self.board.seats, self.board.rings, request.rendering)
-        cells = self.table.cells
-        if not reads_distances(request.law):
-            cells = cells.without_distances()
-        tool = clusters_of(request.shell, request.grid.voxel_size)
-        self.station = Station(
-            self.stations.rows, cells, request.row, self.session, request.grid, tool
-        )
-        self.station.set_spring(request.coupling.spring())
+        self.seat = stations.seats[request.slot.seat, ...]
+        self.station = stations.add(request.slot, request.table)
+        self.session = self.station.session
         self.station.row["source"], self.station.row["is_running"] = DEVICE, True
         self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
         self.gpu: GpuLooks | None = None
@@ -111,7 +87,7 @@ class Loop:
         self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
         self.sent = views_of(self.station.servo["sent"])
         self._reading = views_of(self.station.record["reading"])
-        self._is_asked_to_end = self.board.seats[0, ...]["is_asked_to_end"]
+        self._is_asked_to_end = self.seat["is_asked_to_end"]
         self.bad_reading: str | None = None
         self.is_warm = False
         self._error: BaseException | None = None
@@ -201,13 +177,13 @@ class Loop:
 
     def run(self) -> LoopFigures:
         """Run frames until the time is over, the device's script ends, or a stop is requested."""
-        timing, row = self.request.timing, self.station.row
+        row = self.station.row
         called = self._called(self._read_hand), self._called(self._pusher())
         row["reads"], row["pushes"] = map(address_of, called)
         row["is_frame"] = True
         before = signal.signal(signal.SIGTERM, self._end)
         try:
-            seconds = self.stations.run(timing.rate, self.request.seconds)
+            seconds = self.stations.run(self.timing.rate, self.request.seconds)
         finally:
             signal.signal(signal.SIGTERM, before)
         if self._signal:
@@ -215,7 +191,7 @@ class Loop:
         if self._error is not None:
             raise self._error
         self.device.apply(np.zeros(6))
-        return LoopFigures.of_seat(self.board.seats[0], seconds)
+        return LoopFigures.of_seat(self.seat, seconds)
 
     def _end(self, number: int, _: object) -> None:
         """End the loop, and the call of a device that hangs.
@@ -244,10 +220,10 @@ class Loop:
 
     def _pusher(self) -> Callable[[], bool]:
         """Return what pushes the device and looks whether the loop ends."""
-        device, seat = self.device, self.board.seats[0, ...]
+        device = self.device
         ends = device if isinstance(device, SupportsEnd) else None
-        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], seat["n_frames"]
-        look_every = max(round(LOOK_EVERY * self.request.timing.rate), 1)
+        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.seat["n_frames"]
+        look_every = max(round(LOOK_EVERY * self.timing.rate), 1)
 
         def push() -> bool:
             if self.gpu is not None:
@@ -296,17 +272,18 @@ def n_compiled() -> int:
     return sum(len(getattr(e.compiled, "signatures", ())) for e in ENTRIES.values())
 
 
-def work(request: LoopRequest, sender: MessageSender) -> None:
-    """Run a session's loop in this process, and send its results."""
-    loop = Loop(request)
+def run_device(
+    request: DeviceRequest, timing: Timing, stations: Stations, sender: MessageSender
+) -> None:
+    """Run the session of a device in this process, and send its results."""
+    loop = DeviceLoop(request, timing, stations)
     try:
         loop.warm_up()
-        with undisturbed(request.timing.processor):
+        with undisturbed(timing.processor):
             empty = None
             if request.has_baseline:
                 seconds = min(EMPTY_SECONDS, request.seconds)
-                rate = request.timing.rate
-                empty = empty_loop(request.law, request.rendering, rate, seconds)
+                empty = empty_loop(stations.law, stations.rendering, timing.rate, seconds)
             loop.prepare()
             compiled = n_compiled()
             sender.send("running", loop.station.state())

@@ -90,7 +90,7 @@ def _freed(separation: Separation, pose: Floats, reach: float) -> Kind | None:
     if reach <= 0.0:
         return found
     for moved in separation.separating(pose, reach, TINY, gap=0.0, any_side=True):
-        if not separation.is_nested(pose, moved.motion):
+        if not separation.is_nested(pose, moved):
             return Kind.TOUCHING
         found = Kind.INSIDE
     return found

@@ -94,7 +94,9 @@ def find_meetings(
         near = [objects[i] for i in np.flatnonzero(gaps <= MEETING)]
         found: list[Meeting] = []
         for n, (obj, part) in enumerate(parts_of(env.store, near)):
-            still = CollisionShape(part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord)
+            still = CollisionShape(
+                part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
+            )
             for ways in _intervals(Pair(still.tree, tool, way), contact):
                 kind, depth, place = _gravest(
                     still, tool, way.at(np.linspace(*ways, POSES)), contact

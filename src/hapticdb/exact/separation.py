@@ -7,7 +7,6 @@ motion to another: all places move straight, and the surfaces stay apart.
 """
 
 from collections.abc import Callable, Iterator
-from functools import partial
 from itertools import product
 from typing import NamedTuple
 
@@ -15,9 +14,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.kernels.surfaces.sides import TriangleTree, refitted
-from hapticdb.kernels.triangles.depth import depth_in
-from hapticdb.kernels.triangles.nearest import any_near, nearest
-from hapticdb.pointshell.shape import CollisionShape, units
+from hapticdb.kernels.triangles.depth import depth_in, pieces_kernel
+from hapticdb.kernels.triangles.nearest import free_shift_kernel, nearest
+from hapticdb.kernels.triangles.offsets import (
+    ACROSS,
+    ALONG,
+    WHOLE,
+    any_near_kernel,
+    offset_kernel,
+)
+from hapticdb.pointshell.shape import CollisionShape
 
 Floats = NDArray[np.float64]
 
@@ -46,10 +52,6 @@ MOST_REACH, MOST_SHARE = 20e-3, 0.75
 """Greatest reach: metres, and share of the second edge of the lesser box."""
 BLOCKING = 16
 """Pairs of triangles in collision after earlier motions, tested first."""
-ALL = slice(None)
-Rows = slice | NDArray[np.int64]
-Displacement = Callable[[Rows], Floats]
-"""Displacements (n, 3, 3) of the corners of some triangles of a tree."""
 
 
 class Motion(NamedTuple):
@@ -105,7 +107,7 @@ class Separation:
             if gap > SAME:
                 if self.joins(still, moved, pose):
                     yield moved
-            elif any_side or not self.is_nested(pose, moved.motion):
+            elif any_side or not self.is_nested(pose, moved):
                 yield moved
 
     def least(
@@ -154,7 +156,7 @@ class Separation:
             there[:3, 3] -= other.interior.origin
             least = max(contact, deepest[0])
             found, place = depth_in(
-                other.interior.solid(), one.tree, there, least, TOLERANCE * contact, fine, most
+                other.interior.solid, one.tree, there, least, TOLERANCE * contact, fine, most
             )
             if found:
                 place = place + other.interior.origin
@@ -162,14 +164,16 @@ class Separation:
                 deepest = found, place
         return deepest
 
-    def is_nested(self, pose: Floats, motion: Motion = NOTHING) -> bool:
+    def is_nested(self, pose: Floats, moved: MovedPair | None = None) -> bool:
         """Whether a piece of one surface is in a closed body of the other; they are apart."""
-        placed = pose.copy()
-        placed[:3, 3] += motion.shift
-        back = np.asarray(np.linalg.inv(placed), dtype=np.float64)
+        moved = moved or self.moved(NOTHING)
+        motion, own, theirs = moved.motion, moved.tool.corners, moved.object.corners
+        placed = _shifted(pose, motion)
         return _holds_piece(
-            self._object, motion.object, self._tool, motion.tool, placed
-        ) or _holds_piece(self._tool, motion.tool, self._object, motion.object, back, motion.growth)
+            self._object, motion.object, self._tool, own, placed, is_back=False
+        ) or _holds_piece(
+            self._tool, motion.tool, self._object, theirs, placed, motion.growth, is_back=True
+        )
 
     def moved(self, motion: Motion, base: Motion = NOTHING, share: float = 1.0) -> MovedPair:
         """Both surfaces on the way from one motion to another."""
@@ -182,9 +186,7 @@ class Separation:
     def gap(self, moved: MovedPair, pose: Floats, farthest: float) -> float:
         """Distance of the surfaces after a motion, from below, up to `farthest` metres."""
         self._check()
-        placed = pose.copy()
-        placed[:3, 3] += moved.motion.shift
-        far = np.array([farthest + moved.radius])
+        placed, far = _shifted(pose, moved.motion), np.array([farthest + moved.radius])
         found = nearest(moved.object, moved.tool, placed[None], far)
         return float(found.at_least[0]) - moved.radius
 
@@ -202,27 +204,7 @@ class Separation:
 
     def is_free(self, moved: MovedPair, pose: Floats, clearance: float) -> bool:
         """Whether the surfaces keep a clearance after a motion."""
-        self._check()
-        placed = pose.copy()
-        placed[:3, 3] += moved.motion.shift
-        far = clearance + moved.radius
-        found = nearest(moved.object, moved.tool, placed[None], np.array([far]), far)
-        if found.pairs[0, 0] < 0:
-            return True
-        self._note_blocking(found.pairs)
-        return False
-
-    def _is_blocked(
-        self, pose: Floats, clearance: float, by: Displacement, *, is_tool: bool
-    ) -> bool:
-        """Whether triangles that were too near after the last motions are so after an offset."""
-        first, second = self._blocking.T
-        theirs, own = self._object.tree.corners[first], self._tool.tree.corners[second]
-        if is_tool:
-            own = own + by(second)
-        else:
-            theirs = theirs + by(first)
-        return bool(any_near(theirs, own, pose[None], clearance + self._tool.radius)[0])
+        return any(self.shifted(pose, moved.motion.shift[None], clearance, moved))
 
     def _note_blocking(self, pairs: NDArray[np.int64]) -> None:
         """Note pairs (N, 2) of triangles that were too near."""
@@ -232,20 +214,17 @@ class Separation:
         self, pose: Floats, shifts: Floats, clearance: float, base: MovedPair
     ) -> Iterator[MovedPair]:
         """Of shifts (N, 3) of the tool, those that keep the surfaces a clearance apart."""
-        self._check()
-        poses = np.repeat(pose[None], len(shifts), axis=0)
-        poses[:, :3, 3] += shifts
-        far = clearance + base.radius
-        first, second = self._blocking.T
-        is_open = ~any_near(base.object.corners[first], base.tool.corners[second], poses, far)
-        if not is_open.any():
-            return
-        poses, shifts = poses[is_open], shifts[is_open]
-        found = nearest(base.object, base.tool, poses, np.full(len(poses), far), far)
-        is_free = found.pairs[:, 0] < 0
-        self._note_blocking(found.pairs[~is_free])
-        for shift in shifts[is_free]:
-            yield base._replace(motion=Motion("shift", shift))
+        far, number = clearance + base.radius, 0
+        while number < len(shifts):
+            self._check()
+            out = np.array([number, -1, -1])
+            free_shift_kernel(base.object, base.tool, pose, shifts, self._blocking, far, out)
+            number = int(out[0])
+            if out[1] >= 0:
+                self._note_blocking(out[None, 1:])
+            if number < len(shifts):
+                yield base._replace(motion=Motion("shift", shifts[number]))
+            number += 1
 
     def shifts(self, pose: Floats) -> Floats:
         """Unit vectors (N, 3) of shifts that may separate, those along normals first."""
@@ -289,10 +268,15 @@ class Separation:
         for motion in self._grown(reach):
             if self.is_free(moved := self.moved(motion), pose, clearance):
                 yield moved
-        for is_tool, by in self._offsets(reach, thorough=thorough):
-            if self._is_blocked(pose, clearance, by, is_tool=is_tool):
+        corners = self._object.tree.corners, self._tool.tree.corners
+        far = clearance + self._tool.radius
+        for is_tool, shape, *offset in self._offsets(reach, thorough=thorough):
+            blocking = self._blocking
+            if any_near_kernel(*corners, pose, blocking, far, shape.normals, is_tool, *offset):
                 continue
-            tool, thing = (by(ALL), None) if is_tool else (None, by(ALL))
+            by = np.empty_like(shape.normals)
+            offset_kernel(shape.normals, *offset, by)
+            tool, thing = (by, None) if is_tool else (None, by)
             moved = self.moved(Motion("offset", NOTHING.shift, tool, thing))
             if self.is_free(moved, pose, clearance):
                 yield moved
@@ -303,35 +287,27 @@ class Separation:
             if self._tool.radius and self._tool.radius + growth > LEAST_BALL * self._tool.radius:
                 yield NOTHING._replace(by="offset", growth=growth)
 
-    def _offsets(self, reach: float, *, thorough: bool) -> Iterator[tuple[bool, Displacement]]:
+    def _offsets(
+        self, reach: float, *, thorough: bool
+    ) -> Iterator[tuple[bool, CollisionShape, float, Floats, int]]:
         """Offsets of the tool, then of the object, along their normals, inward first.
 
         thorough : then along their components across and along each of their axes, too, so that a
         peg or a plate gives way by all of the reach at its edges.
         """
         both = [one for one in ((True, self._tool), (False, self._object)) if not one[1].radius]
-        for is_tool, shape in both:
-            for sign in (reach, -reach):
-                yield is_tool, partial(_offset, shape, sign, None, None)
-        for is_tool, shape in both if thorough else []:
-            for axis, sign in product(shape.axes, (reach, -reach)):
-                yield is_tool, partial(_offset, shape, sign, axis, None)
-                yield is_tool, partial(_offset, shape, sign, None, axis)
+        for one, sign in product(both, (reach, -reach)):
+            yield *one, sign, NOTHING.shift, WHOLE
+        for one in both if thorough else []:
+            for axis, sign, part in product(one[1].axes, (reach, -reach), (ACROSS, ALONG)):
+                yield *one, sign, axis, part
 
 
-def _offset(
-    shape: CollisionShape, reach: float, across: Floats | None, along: Floats | None, some: Rows
-) -> Floats:
-    """Displacements (n, 3, 3) of some of a shape's corners along their normals.
-
-    across, along : an axis (3,), along whose normals' components they are instead.
-    """
-    normals = shape.normals[some]
-    if across is not None:
-        normals = units(normals - (normals @ across)[..., None] * across)
-    if along is not None:
-        normals = units((normals @ along)[..., None] * along)
-    return reach * normals
+def _shifted(pose: Floats, motion: Motion) -> Floats:
+    """Pose (4, 4) of the tool after its shift."""
+    placed = pose.copy()
+    placed[:3, 3] += motion.shift
+    return placed
 
 
 def _moved_tree(shape: CollisionShape, by: Floats | None) -> TriangleTree:
@@ -370,35 +346,26 @@ def _travel(first: Motion, second: Motion) -> float:
 
 
 def _holds_piece(
-    outer: CollisionShape, outer_by: Floats | None, inner: CollisionShape, inner_by: Floats | None,
-    outer_from_inner: Floats, growth: float = 0.0,
+    outer: CollisionShape, outer_by: Floats | None, inner: CollisionShape, corners: Floats,
+    pose: Floats, growth: float = 0.0, *, is_back: bool,
 ) -> bool:  # fmt: skip
     """Whether a closed body holds a piece of a surface that is apart from it.
 
-    A piece with a corner outside the body's box is not in it.
+    corners (T, 3, 3) : of the inner one, placed by the pose or back; growth : of a ball's radius,
+    metres. A piece with a corner outside the body's box is not in it.
     """
-
-    def placed(points: NDArray[np.int64]) -> Floats:
-        corners = inner.tree.corners.reshape(-1, 3)[points]
-        if inner_by is not None:
-            corners = corners + inner_by.reshape(-1, 3)[points]
-        return corners @ outer_from_inner[:3, :3].T + outer_from_inner[:3, 3]
-
+    reach = growth if outer_by is None else float(np.abs(outer_by).max())
+    first = np.empty((len(inner.starts), 3))
+    n_in = pieces_kernel(
+        corners, inner.points, inner.pieces, inner.starts, pose, is_back, outer.box, reach, first
+    )
+    if not n_in:
+        return False
     if outer.radius:
-        inside = np.linalg.norm(placed(inner.points), axis=1) < outer.radius + growth
+        inside = np.linalg.norm(first[:n_in], axis=1) < outer.radius + growth
         return bool(inside.any())
-    reach = 0.0 if outer_by is None else float(np.abs(outer_by).max())
-    low, high = outer.box[0] - reach, outer.box[1] + reach
-    first = placed(inner.points[inner.starts])
-    if ((first < low) | (first > high)).any(axis=1).all():
-        return False
-    corners = placed(inner.points)
-    is_out = ((corners < low) | (corners > high)).any(axis=1)
-    first = corners[inner.starts[np.bincount(inner.pieces, is_out) == 0.0]]
-    if not len(first):
-        return False
     interior = outer.moved_interior(outer_by)
-    return interior is not None and bool(interior.holds(first).any())
+    return interior is not None and bool(interior.holds(first[:n_in]).any())
 
 
 def _normals(triangles: Floats) -> Floats:

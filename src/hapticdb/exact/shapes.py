@@ -59,7 +59,7 @@ class Shapes:
         corners = part.vertices @ linear.T
         if part.faces is None:
             return CollisionShape(np.repeat(corners[:, None], 3, axis=1), is_cloud=True)
-        return CollisionShape(corners[part.faces], chord=part.placed_chord)
+        return CollisionShape(corners[part.faces], chord=part.placed_chord, index=part.faces)
 
 
 def _bytes_of(shape: CollisionShape) -> int:

@@ -218,7 +218,9 @@ class _Sweep:
 
         A contact is only followed a little at first: most hits are there.
         """
-        shape = CollisionShape(part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord)
+        shape = CollisionShape(
+            part.surface(), is_cloud=part.is_cloud, chord=part.placed_chord, index=part.faces
+        )
         error = shape.chord + self._tool.chord
         pair = Pair(shape.tree, self._tool, self._way, self._asked.until, self._end, error)
         contact, pose = self._asked.contact, self._way.at([0.0])[0]

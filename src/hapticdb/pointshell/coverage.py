@@ -43,29 +43,30 @@ class Ball(NamedTuple):
 class Interior:
     """The inside of the closed bodies of a result of `orient`, or of a ball.
 
-    Open bodies enclose nothing, and a void is outside. tree : of all triangles, about `origin`
-    (3,); boxes : of the closed bodies, likewise.
+    Open bodies enclose nothing, and a void is outside. solid : the bodies, about `origin` (3,),
+    metres.
     """
 
     def __init__(self, surface: "Surface | Ball") -> None:
         self._ball = surface if isinstance(surface, Ball) else None
-        self._bodies: list[tuple[int, int]] = []
-        self.boxes: dict[int, tuple[Floats, Floats]] = {}
         if isinstance(surface, Ball):
             return
         self.origin = surface.center
         local = surface.triangles - surface.center
-        closed = np.unique(surface.bodies[surface.bodies > 0])
-        self.tree = sides.triangle_tree(local, surface.bodies)
+        tree = sides.triangle_tree(local, surface.bodies)
         volumes = -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas
-        for body in closed.tolist():
-            own = surface.bodies == body
-            corners = local[own].reshape(-1, 3)
-            self._bodies.append((body, 1 if volumes[own].sum() > 0.0 else -1))
-            self.boxes[body] = corners.min(axis=0), corners.max(axis=0)
+        bodies, starts = np.unique(tree.bodies, return_index=True)
+        low = np.minimum.reduceat(tree.corners.min(axis=1), starts)
+        high = np.maximum.reduceat(tree.corners.max(axis=1), starts)
+        signs = np.where(np.bincount(surface.bodies, volumes)[bodies] > 0.0, 1, -1)
+        boxes, closed = np.stack([low, high], axis=1), bodies > 0
+        box = np.stack(
+            [low[closed].min(axis=0, initial=np.inf), high[closed].max(axis=0, initial=-np.inf)]
+        )
+        self.solid = Solid(tree, bodies[closed], signs[closed], boxes[closed], box)
 
     def __bool__(self) -> bool:
-        return self._ball is not None or bool(self._bodies)
+        return self._ball is not None or len(self.solid.bodies) > 0
 
     def moved(self, by: Floats) -> "Interior":
         """The inside after the corners of the surface's triangles have moved by (F, 3, 3) metres.
@@ -73,16 +74,11 @@ class Interior:
         A ball's has none; the bodies stay closed, whatever moves.
         """
         found, reach = copy(self), float(np.abs(by).max(initial=0.0))
-        found.tree = sides.refitted(self.tree, self.tree.corners + by[self.tree.faces])
-        found.boxes = {k: (low - reach, high + reach) for k, (low, high) in self.boxes.items()}
+        solid, larger = self.solid, np.array([[-reach], [reach]])
+        tree = sides.refitted(solid.tree, solid.tree.corners + by[solid.tree.faces])
+        boxes, box = solid.boxes + larger, solid.box + larger
+        found.solid = solid._replace(tree=tree, boxes=boxes, box=box)
         return found
-
-    def solid(self) -> Solid:
-        """The closed bodies for `kernels.triangles.depth`, about `origin`."""
-        numbers = np.array(self._bodies, dtype=np.int64).reshape(-1, 2)
-        boxes = np.array([self.boxes[body] for body, _ in self._bodies]).reshape(-1, 2, 3)
-        box = np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])
-        return Solid(self.tree, numbers[:, 0].copy(), numbers[:, 1].copy(), boxes, box)
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
         """Whether each of the positions (Q, 3), metres, surface's frame, is inside: (Q,).
@@ -92,16 +88,10 @@ class Interior:
         if self._ball is not None:
             return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)
         count = np.zeros(len(positions), dtype=np.int64)
-        for body, sign in self._bodies:
-            count += sign * self._holds_in(body, positions)
-        return count > 0
-
-    def _holds_in(self, body: int, positions: Floats) -> NDArray[np.bool_]:
-        """Whether a closed body encloses each of the positions (Q, 3): (Q,)."""
         local = np.ascontiguousarray(positions - self.origin)
-        low, high = self.boxes[body]
-        held = np.asarray(((local >= low) & (local <= high)).all(axis=1))
-        which = np.flatnonzero(held)
-        if len(which):
-            held[which] = sides.encloses(self.tree, body, local[which])
-        return held
+        solid = self.solid
+        for body, sign, (low, high) in zip(*solid[1:4], strict=True):
+            which = np.flatnonzero(((local >= low) & (local <= high)).all(axis=1))
+            if len(which):
+                count[which] += sign * sides.encloses(solid.tree, body, local[which])
+        return count > 0

@@ -71,7 +71,7 @@ def orient(triangles: Floats, faces: Ints | None = None) -> Surface:
         raise UsageError("no triangles: a tool needs a surface")
     origin = _middle_of(triangles)
     local = triangles - origin
-    faces = join_corners(local) if faces is None else faces
+    faces = faces_of(triangles) if faces is None else faces
     kept, walls = _drop_repeated(faces)
     sides, is_even = _sides_of(faces[kept], local[kept])
     outer = walls[~_are_within(sides, faces[kept], faces[walls], local[walls])]
@@ -120,6 +120,13 @@ def _are_within(sides: _Sides, faces: Ints, walls: Ints, triangles: Floats) -> N
     return is_within
 
 
+def _dense(numbers: Ints) -> Ints:
+    """Numbers 0, 1, ... in the order of others, which are small."""
+    is_there = np.zeros(int(numbers.max(initial=0)) + 1, dtype=bool)
+    is_there[numbers] = True
+    return np.asarray((np.cumsum(is_there) - 1)[numbers], np.int64)
+
+
 def _edges_of(faces: Ints) -> _Edges:
     tail, head = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     keys = np.minimum(tail, head) * (faces.max(initial=0) + 1) + np.maximum(tail, head)
@@ -132,24 +139,26 @@ def _middle_of(triangles: Floats) -> Floats:
     return np.asarray(corners.min(axis=0) / 2.0 + corners.max(axis=0) / 2.0)
 
 
-def faces_of(triangles: Floats) -> Ints:
-    """Numbers (F, 3) of the corners of triangles (F, 3, 3), joined near their middle."""
-    return join_corners(triangles - _middle_of(triangles))
+def faces_of(triangles: Floats, index: Ints | None = None) -> Ints:
+    """Number the corners (F, 3) of triangles (F, 3, 3): corners that coincide have one number.
 
-
-def join_corners(triangles: Floats) -> Ints:
-    """Number the corners (F, 3) so that corners that coincide have one number.
+    index (F, 3) : numbers of corners that are equal for equal bits, not all of these: a sixth of
+    the corners is left to sort.
 
     Corners with equal bits are one. If edges stay open, their corners are also joined within
     `JOIN`, because two faces may store one edge with different rounding errors.
     """
-    corners = triangles.reshape(-1, 3) + 0.0  # -0.0 is 0.0
+    if index is None:
+        index = np.arange(3 * len(triangles)).reshape(-1, 3)
+    index = _dense(index)
+    corners = np.empty((int(index.max()) + 1, 3))
+    corners[index] = triangles - _middle_of(triangles) + 0.0  # -0.0 is 0.0
     order = np.lexsort(corners.T)
     is_new = np.ones(len(corners), dtype=bool)
     is_new[1:] = (corners[order[1:]] != corners[order[:-1]]).any(axis=1)
     number = np.empty(len(corners), dtype=np.int64)
     number[order] = np.cumsum(is_new) - 1
-    faces = number.reshape(-1, 3)
+    faces = number[index]
     edges = _edges_of(faces)
     is_open = (edges.uses == 1)[edges.number]
     if not is_open.any():
@@ -199,11 +208,10 @@ def _drop_repeated(faces: Ints) -> tuple[Ints, Ints]:
     """
     is_face = (faces != np.roll(faces, -1, axis=1)).all(axis=1)
     whole = np.flatnonzero(is_face)
-    if len(whole) == 0:
-        return whole, whole
-    _, first, counts = np.unique(
-        np.sort(faces[whole], axis=1), axis=0, return_index=True, return_counts=True
-    )
+    low, middle, high = np.sort(faces[whole], axis=1).T
+    n = faces.max(initial=0) + 1
+    sides = np.unique(low * n + middle, return_inverse=True)[1]
+    _, first, counts = np.unique(sides * n + high, return_index=True, return_counts=True)
     kept = whole[np.sort(first)]
     is_even = (counts % 2 == 0)[np.argsort(first)]
     if not is_even.any():
@@ -242,7 +250,7 @@ def _wind(faces: Ints, edges: _Edges) -> tuple[Ints, NDArray[np.bool_]]:
     patch = np.minimum(sheet[:n], sheet[n:])
     is_flipped = (sheet[:n] > sheet[n:]) & ~is_one_sided
     patch[is_one_sided] = 2 * n + np.flatnonzero(is_one_sided)
-    return np.unique(patch, return_inverse=True)[1].astype(np.int64), is_flipped
+    return _dense(patch), is_flipped
 
 
 def _bodies(n_faces: int, edges: _Edges) -> Ints:
@@ -253,7 +261,7 @@ def _bodies(n_faces: int, edges: _Edges) -> Ints:
     is_open[body[np.flatnonzero((edges.uses % 2 == 1)[edges.number]) // 3]] = True
     body += 1
     body[is_open[body - 1]] = 0
-    return np.unique(np.append(body, 0), return_inverse=True)[1][:-1].astype(np.int64)
+    return _dense(np.append(body, 0))[:-1]
 
 
 def _vote(sides: _Sides) -> Floats:
@@ -300,11 +308,12 @@ def _guess(sides: _Sides, signs: Floats) -> None:
 def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
     """Whether each body (B,) is a void's wall: completely inside an odd number of closed bodies."""
     n_bodies = int(sides.body.max()) + 1
-    low = np.full((n_bodies, 3), np.inf)
-    high = np.full((n_bodies, 3), -np.inf)
-    np.minimum.at(low, sides.body, sides.triangles.min(axis=1))
-    np.maximum.at(high, sides.body, sides.triangles.max(axis=1))
-    low[0], high[0] = np.inf, -np.inf  # open bodies enclose nothing
+    low = np.full((n_bodies, 3), np.inf)  # as of 0: open bodies enclose nothing
+    high = -low
+    bodies, starts = np.unique(tree.bodies, return_index=True)
+    low[bodies] = np.minimum.reduceat(tree.corners.min(axis=1), starts)
+    high[bodies] = np.maximum.reduceat(tree.corners.max(axis=1), starts)
+    low[0], high[0] = np.inf, -np.inf
     pairs = [
         (inner, outer)
         for inner in range(1, n_bodies)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 
 from hapticdb.errors import UsageError
 from hapticdb.kernels.surfaces.sides import TriangleTree, normals_of, triangle_tree
+from hapticdb.kernels.triangles.offsets import FLAT
 from hapticdb.pointshell.coverage import Interior
 from hapticdb.pointshell.orientation import components, faces_of, orient
 
@@ -23,8 +24,6 @@ ALIKE, CELLS = 1e-3, np.array([1, 1 << 12, 1 << 24])
 """Length of cells of normals that are those of one face, and the steps of their numbers."""
 ASKEW = np.array([0.62, 0.54, 0.57])
 """Vector in no likely plane: it chooses one of two opposite normals."""
-FLAT = 1e-6
-"""Length of a sum of unit vectors below which it has no direction."""
 
 
 class CollisionShape:
@@ -37,14 +36,17 @@ class CollisionShape:
 
     def __init__(
         self, triangles: Floats, surface: "Surface | None" = None, *, radius: float = 0.0,
-        is_cloud: bool = False, chord: float = 0.0,
+        is_cloud: bool = False, chord: float = 0.0, index: Ints | None = None,
     ) -> None:  # fmt: skip
-        """Build the tree; surface : the same triangles, if `orient` has seen them."""
+        """Build the tree.
+
+        surface : the same triangles, if `orient` has seen them; index (T, 3) : as for `faces_of`.
+        """
         self.tree = tree_of(triangles)
         low, high = triangles.min(axis=(0, 1)), triangles.max(axis=(0, 1))
         self.box = np.stack([low - radius, high + radius])
         self.radius, self.is_cloud, self.chord = radius, is_cloud, chord
-        self._given = surface
+        self._given, self._index = surface, index
 
     @cached_property
     def _oriented(self) -> "tuple[Surface, Ints] | None":
@@ -73,12 +75,14 @@ class CollisionShape:
     @cached_property
     def _corners(self) -> Ints:
         """Number (T, 3) of each corner; corners that coincide have the same."""
-        return faces_of(self.tree.corners)
+        return faces_of(
+            self.tree.corners, None if self._index is None else self._index[self.tree.faces]
+        )
 
     @cached_property
     def points(self) -> Ints:
         """Number (V,) among all corners (3 T,) of one at each place, ascending by `_corners`."""
-        return np.unique(self._corners, return_index=True)[1]
+        return _firsts(self._corners.reshape(-1))
 
     @cached_property
     def pieces(self) -> Ints:
@@ -90,7 +94,7 @@ class CollisionShape:
     @cached_property
     def starts(self) -> Ints:
         """Number (P,) of one of `points` in each piece."""
-        return np.unique(self.pieces, return_index=True)[1]
+        return _firsts(self.pieces)
 
     @cached_property
     def _face_normals(self) -> Floats:
@@ -127,13 +131,17 @@ class CollisionShape:
         found = self._face_normals[:, None] * _angles(self.tree.corners)[:, :, None]
         corners = self._corners.reshape(-1)
         sums = [np.bincount(corners, found[..., k].reshape(-1)) for k in range(3)]
-        return units(np.array(sums, dtype=np.float64).T)[corners].reshape(-1, 3, 3)
+        vectors = np.array(sums, dtype=np.float64).T
+        lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
+        units = vectors / np.where(lengths > FLAT, lengths, np.inf)
+        return np.asarray(units[corners].reshape(-1, 3, 3), dtype=np.float64)
 
 
-def units(vectors: Floats) -> Floats:
-    """Unit vectors (.., 3) along others; zero for those shorter than `FLAT`."""
-    lengths = np.linalg.norm(vectors, axis=-1, keepdims=True)
-    return np.asarray(vectors / np.where(lengths > FLAT, lengths, np.inf), dtype=np.float64)
+def _firsts(numbers: Ints) -> Ints:
+    """Where each of the numbers 0, 1, ..., of which none is left out, comes first."""
+    found = np.empty(int(numbers.max()) + 1, dtype=np.int64)
+    found[numbers[::-1]] = np.arange(len(numbers))[::-1]
+    return found
 
 
 def _angles(triangles: Floats) -> Floats:

@@ -11,6 +11,9 @@ from hapticdb.kernels._jit import inlined, leaf
 from hapticdb.kernels.rigid import gap, moment
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE
 
+ROUNDED = 1.0 + 1e-9
+"""Factor of a squared distance from which on a box is farther, whatever the rounding."""
+
 
 @leaf
 def _square_to_box(boxes, node, x, y, z):
@@ -18,6 +21,18 @@ def _square_to_box(boxes, node, x, y, z):
     dx = gap(x, boxes[node, 0, 0], boxes[node, 1, 0])
     dy = gap(y, boxes[node, 0, 1], boxes[node, 1, 1])
     dz = gap(z, boxes[node, 0, 2], boxes[node, 1, 2])
+    return dx * dx + dy * dy + dz * dz
+
+
+@leaf
+def _square_to_own_box(corners, n, x, y, z):
+    """Squared distance from (x, y, z) to the box of triangle n."""
+    a, b, c = corners[n, 0, 0], corners[n, 1, 0], corners[n, 2, 0]
+    dx = gap(x, min(a, b, c), max(a, b, c))
+    a, b, c = corners[n, 0, 1], corners[n, 1, 1], corners[n, 2, 1]
+    dy = gap(y, min(a, b, c), max(a, b, c))
+    a, b, c = corners[n, 0, 2], corners[n, 1, 2], corners[n, 2, 2]
+    dz = gap(z, min(a, b, c), max(a, b, c))
     return dx * dx + dy * dy + dz * dz
 
 
@@ -101,12 +116,17 @@ def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
             there = _square_to_box(boxes, far, x, y, z)
             if there < here:
                 near, far, here, there = far, near, there, here
-            waiting[top], squares[top] = far, there
-            waiting[top + 1], squares[top + 1] = near, here
-            top += 2
+            if there < best:
+                waiting[top], squares[top] = far, there
+                top += 1
+            if here < best:
+                waiting[top], squares[top] = near, here
+                top += 1
             continue
         start = (node - first_leaf) * LEAF_SIZE
         for n in range(start, min(start + LEAF_SIZE, n_triangles)):
+            if _square_to_own_box(tree.corners, n, x, y, z) > ROUNDED * best:
+                continue
             square = square_to_triangle(tree.corners, n, x, y, z)
             if square < best:
                 best, found = square, np.int64(n)

@@ -8,6 +8,7 @@ line from testing every triangle. Lengths are in metres, in one frame of the cal
 docs/decisions/0015 gives the reasons.
 """
 
+from functools import cache
 from typing import NamedTuple
 
 import numpy as np
@@ -94,9 +95,19 @@ def refitted(tree: TriangleTree, corners: Floats) -> TriangleTree:
     return tree._replace(corners=corners, boxes=boxes, slack=slack)
 
 
-@entry(FLOATS3, FLOAT, FLOATS3)
-def boxes_kernel(corners, slack, boxes):
-    """Write boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), `slack` larger on all sides."""
+@entry(FLOATS3, FLOATS3)
+def boxes_kernel(corners, boxes):
+    """Write boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), and return their slack.
+
+    A rounding error could make a line in the plane of a flat box miss it, so boxes are larger on
+    all sides.
+    """
+    slack = 0.0
+    for n in range(corners.shape[0]):
+        for i in range(3):
+            for axis in range(3):
+                slack = max(slack, abs(corners[n, i, axis]))
+    slack *= 1e-11
     first_leaf = boxes.shape[0] // 2
     for node in range(boxes.shape[0] - 1, -1, -1):
         start = (node - first_leaf) * LEAF_SIZE
@@ -110,6 +121,7 @@ def boxes_kernel(corners, slack, boxes):
                     a, b, c = corners[n, 0, axis], corners[n, 1, axis], corners[n, 2, axis]
                     low, high = min(low, min(a, b, c) - slack), max(high, max(a, b, c) + slack)
             boxes[node, 0, axis], boxes[node, 1, axis] = low, high
+    return slack
 
 
 def _boxes_of(corners: Floats) -> tuple[Floats, float]:
@@ -117,11 +129,8 @@ def _boxes_of(corners: Floats) -> tuple[Floats, float]:
     n_leaves = 1
     while n_leaves * LEAF_SIZE < len(corners):
         n_leaves *= 2
-    # A rounding error could make a line in the plane of a flat box miss it, so boxes are larger.
-    slack = 1e-11 * max(float(corners.max()), -float(corners.min()))
     boxes = np.empty((2 * n_leaves - 1, 2, 3))
-    boxes_kernel(corners, slack, boxes)
-    return boxes, slack
+    return boxes, float(boxes_kernel(corners, boxes))
 
 
 @leaf
@@ -308,6 +317,7 @@ def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
     return np.where(is_own, picks, -1).astype(np.int64)
 
 
+@cache
 def directions_of(n: int) -> Floats:
     """Return `n` fixed directions, spread over the sphere, none along an axis."""
     directions = np.random.default_rng(2015).normal(size=(n, 3))

@@ -16,8 +16,19 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INT, INTS, entry, fields_of, leaf
-from hapticdb.kernels.rigid import moved, transform_of
+from hapticdb.kernels._jit import (
+    BOOL,
+    FLOAT,
+    FLOATS,
+    FLOATS2,
+    FLOATS3,
+    INT,
+    INTS,
+    entry,
+    fields_of,
+    leaf,
+)
+from hapticdb.kernels.rigid import moved, transform_of, turn
 from hapticdb.kernels.surfaces.nearest import distance_at, square_to_triangle
 from hapticdb.kernels.surfaces.sides import (
     LEAF_SIZE,
@@ -197,7 +208,7 @@ def _search_triangle(solid, lines, tolerance, fine, most, waiting, middle, scrat
         wanted = max(enough - radius, 0.0)
         far, near = distance_at(solid.tree, x, y, z, wanted, math.inf, hint, nodes, squares)
         hint = near
-        if min(far + radius, _farthest(solid.tree, near, waiting[top])) <= enough:
+        if far + radius <= enough or _farthest(solid.tree, near, waiting[top]) <= enough:
             continue
         side = sides[top]
         if side == 0 and (far > out[0] or radius - far <= enough):
@@ -262,6 +273,45 @@ def depth_kernel(solid, surface, pose, lines, tolerance, fine, most, out):
                 solid, lines, tolerance, fine, most - looks, waiting, middle, scratch, hint, out
             )
             looks += more
+
+
+@entry(FLOATS3, INTS, INTS, INTS, FLOATS2, BOOL, FLOATS2, FLOAT, FLOATS2)
+def pieces_kernel(corners, points, pieces, starts, pose, is_back, box, reach, out):
+    """Write one place of each piece of a surface in a box to out (P, 3); returns how many.
+
+    corners (T, 3, 3), moved by a rigid pose (4, 4) or back; points (V,): numbers of corners; pieces
+    (V,) of these, 0 to P - 1; starts (P,): a point of each; box (2, 3): larger by `reach` metres.
+    """
+    place, count = np.empty(3), np.int64(0)
+    is_in = np.empty(starts.shape[0], dtype=np.bool_)
+    for piece in range(starts.shape[0]):
+        _place_corner(corners, points[starts[piece]], pose, is_back, place)
+        is_in[piece] = _below_ball(box, place, reach) >= 0.0
+        count += is_in[piece]
+    if count == 0:
+        return count
+    for n in range(points.shape[0]):
+        if is_in[pieces[n]]:
+            _place_corner(corners, points[n], pose, is_back, place)
+            is_in[pieces[n]] = _below_ball(box, place, reach) >= 0.0
+    count = np.int64(0)
+    for piece in range(starts.shape[0]):
+        if is_in[piece]:
+            _place_corner(corners, points[starts[piece]], pose, is_back, out[count])
+            count += 1
+    return count
+
+
+@leaf
+def _place_corner(corners, n, pose, is_back, place):
+    """Write corner n of triangles (T, 3, 3) into place (3,), moved by a rigid pose or back."""
+    x, y, z = corners[n // 3, n % 3, 0], corners[n // 3, n % 3, 1], corners[n // 3, n % 3, 2]
+    if not is_back:
+        place[0], place[1], place[2] = moved(transform_of(pose), x, y, z)
+        return
+    x, y, z = x - pose[0, 3], y - pose[1, 3], z - pose[2, 3]
+    for axis in range(3):
+        place[axis] = turn(pose[0, axis], pose[1, axis], pose[2, axis], x, y, z)
 
 
 def depth_in(

@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from hapticdb.kernels._jit import BOOLS, FLOAT, FLOATS, FLOATS2, FLOATS3, INTS2, entry, leaf
+from hapticdb.kernels._jit import FLOAT, FLOATS, FLOATS2, FLOATS3, INTS, INTS2, entry, leaf
 from hapticdb.kernels.rigid import moved, transform_of
 from hapticdb.kernels.surfaces.nearest import sides_of
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE, TREE, TriangleTree
@@ -280,23 +280,37 @@ def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
         nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
 
 
-@entry(FLOATS3, FLOATS3, FLOATS3, FLOAT, BOOLS)
-def any_near_kernel(one, other, poses, far, out):
-    """Find whether any pair n of triangles, one and other (N, 3, 3), is within `far` metres.
+@entry(TREE, TREE, FLOATS2, FLOATS2, INTS2, FLOAT, INTS)
+def free_shift_kernel(a, b, pose, shifts, first, far, out):
+    """Find a shift after which tree b, at a pose (4, 4) in a's frame, is `far` metres from a.
 
-    out (P,): at each of poses (P, 4, 4) of the other ones in the frame of one.
+    shifts (N, 3); first (M, 2): pairs of triangles that are tested first. out (3,): the number of
+    the shift to begin with, then that of the free one, N without any; and, from -1, a pair too near
+    after a shift before it.
     """
-    placed, found = np.empty((1, 3, 3)), np.empty(7)
-    for p in range(poses.shape[0]):
-        out[p] = False
-        for n in range(one.shape[0]):
-            place_corners(other, n, n + 1, poses[p], placed)
-            if (
-                triangle_gap(one, n, placed, 0) < far * far
-                and measure_pair(one, n, placed, 0, 0.0, found)[1] <= far
-            ):
-                out[p] = True
+    nodes = np.empty((WAITING, 2), dtype=np.int64)
+    squares, placed, found = np.empty(WAITING), np.empty((LEAF_SIZE, 3, 3)), np.empty(7)
+    pair, near, here = np.full(2, -1, dtype=np.int64), np.empty(8), pose.copy()
+    while out[0] < shifts.shape[0]:
+        for axis in range(3):
+            here[axis, 3] = pose[axis, 3] + shifts[out[0], axis]
+        is_near = False
+        for n in range(first.shape[0]):
+            place_corners(b.corners, first[n, 1], first[n, 1] + 1, here, placed)
+            is_near = (
+                triangle_gap(a.corners, first[n, 0], placed, 0) < far * far
+                and measure_pair(a.corners, first[n, 0], placed, 0, 0.0, found)[1] <= far
+            )
+            if is_near:
                 break
+        if not is_near:
+            near[0], near[1] = far, math.inf
+            nearest_pair(a, b, here, far, nodes, squares, placed, found, pair, near)
+            if pair[0] < 0:
+                return
+            if out[1] < 0:
+                out[1], out[2] = pair[0], pair[1]
+        out[0] += 1
 
 
 class Nearest(NamedTuple):
@@ -328,10 +342,3 @@ def nearest(
         a, b, np.ascontiguousarray(poses), np.ascontiguousarray(farthest), enough, pairs, out
     )
     return Nearest(out[:, 0], out[:, 1], out[:, 2:5], out[:, 5:], pairs)
-
-
-def any_near(one: Floats, other: Floats, poses: Floats, far: float) -> NDArray[np.bool_]:
-    """Whether any pair of triangles (N, 3, 3) is within `far` metres at poses (P, 4, 4): (P,)."""
-    out = np.zeros(len(poses), dtype=np.bool_)
-    any_near_kernel(one, other, np.ascontiguousarray(poses), far, out)
-    return out

@@ -30,6 +30,7 @@ from hapticdb.kernels.resident.cells import (
     cell_key,
     enter_cell,
     in_voxels,
+    n_runs_of,
     seen_in,
 )
 from hapticdb.kernels.resident.nearest import room_around
@@ -302,12 +303,6 @@ def rest_of_sphere(seen, spheres, run, transform, place):
     """Voxels that a run's sphere may go before a point of it can be near; not above 0 if one is."""
     x, y, z = in_voxels(transform, place, spheres[run, 0], spheres[run, 1], spheres[run, 2])
     return room_around(seen, x, y, z, spheres[run, 3] / place.size + FAR, LONGEST_REST, place.side)
-
-
-@leaf
-def n_runs_of(shell):
-    """Number of a shell's runs."""
-    return (shell.points.shape[0] + shell.run - 1) // shell.run
 
 
 @leaf

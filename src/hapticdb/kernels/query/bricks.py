@@ -30,12 +30,12 @@ from hapticdb.kernels.query.contact import (
     address_of,
     new_table,
     number_of_key,
-    place_of_key,
     place_shell,
 )
 from hapticdb.kernels.query.refining import NO_TALLY, feel_point, is_felt
 from hapticdb.kernels.query.sorting import insert_distinct, sorting_order
 from hapticdb.kernels.records import BRICK, GRID, MEASURED, OCCUPIED
+from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import is_rigid, transform_of
 
 NOT_RIGID, INCOMPLETE = -1, -2
@@ -49,7 +49,7 @@ BY_DISTANCE = {record_of(OCCUPIED): record_of(MEASURED), TANGENT_PLANE: DISTANCE
 def _entry_of(directory, key):
     """Place of a key's entry, or of the free entry where it belongs."""
     # 8 bricks of a cube are neighbours: a frame takes few pages of memory
-    at = (place_of_key(key >> 3, directory.shape[0] >> 3) << 3) | (key & 7)
+    at = (spread_key(key >> 3, directory.shape[0] >> 3) << 3) | (key & 7)
     while directory[at].end != 0 and directory[at].key != key:
         at = (at + 1) & (directory.shape[0] - 1)
     return at

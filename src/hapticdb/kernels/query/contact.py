@@ -20,6 +20,7 @@ from hapticdb.kernels._jit import (
 from hapticdb.kernels.curves import Z_ORDER, compact, key_of, voxel_of, z_encode
 from hapticdb.kernels.query.sorting import sorting_order
 from hapticdb.kernels.records import GRID
+from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
 
 Floats = NDArray[np.float64]
@@ -81,13 +82,6 @@ def address_of(placed, n, place):
     return row_key, (row_key << 9) | z_encode(i & 7, j & 7, k & 7)
 
 
-@inlined
-def place_of_key(key, capacity):
-    """Where the search for a key begins in an open-addressing table of a power of two entries."""
-    # Fibonacci hashing (Knuth, volume 3, section 6.4)
-    return ((key * 0x9E3779B97F4A7C1) >> 20) & (capacity - 1)
-
-
 @maker
 def new_table(total):
     """Table for `number_of_key`, of at most so many keys."""
@@ -103,7 +97,7 @@ def number_of_key(table, found, count, key):
 
     table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
     """
-    at = place_of_key(key, table.shape[0])  # at most half of the table is full
+    at = spread_key(key, table.shape[0])  # at most half of the table is full
     while table[at] >= 0 and found[table[at]] != key:
         at = (at + 1) & (table.shape[0] - 1)
     if table[at] < 0:

@@ -156,6 +156,12 @@ CLUSTERS = fields_of(Clusters, FLOATS2, FLOATS, FLOATS2, FLOATS2, INT, FLOATS2, 
 
 
 @leaf
+def n_runs_of(shell):
+    """Number of a shell's runs."""
+    return (shell.points.shape[0] + shell.run - 1) // shell.run
+
+
+@leaf
 def key_of_cell(ci, cj, ck):
     """Directory key of cell (ci, cj, ck): 16 bits each for cj and ck, the upper bits for ci."""
     return (ci << 32) | (cj << 16) | ck

@@ -63,6 +63,7 @@ from hapticdb.kernels.resident.cells import (
     column_of,
     end_frame,
     enter_cell,
+    n_runs_of,
     seen_in,
 )
 from hapticdb.kernels.resident.runs import (
@@ -73,8 +74,8 @@ from hapticdb.kernels.resident.runs import (
     WORD,
     WORD_BITS,
     cells_of_run,
-    free_runs,
     keep_points,
+    next_run,
     place_run,
     words_of_run,
 )
@@ -287,23 +288,20 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
     Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
     """
-    points, _, spheres, groups, run, columns, scratch = shell
-    words = cells.words
+    points, scratch, words, n_runs = shell.points, shell.scratch, cells.words, n_runs_of(shell)
     felt_in, margin, anyway = felt_where(law, words, cells.near)
     seen = seen_in(cells, which, felt_in)
     transform = transform_of(pose)
     center = moved(transform, shell.center[0], shell.center[1], shell.center[2])
     sums, weight, deepest = NO_WRENCH, 0.0, 0.0
     last = np.int64(-1), np.int64(UNKNOWN), np.uint64(0), 0.0
-    n_hits = n_contacts = n_unknown = n_missed = cluster = start = np.int64(0)
-    while start < points.shape[0]:
-        n_free = free_runs(seen, spheres, groups, cluster, transform, place, margin)
-        if n_free > 0:
-            cluster += n_free
-            start += n_free * run
-            continue
-        n_run = min(run, points.shape[0] - start)
-        place_run(columns, start, n_run, transform, place, scratch)
+    n_hits = n_contacts = n_unknown = n_missed = np.int64(0)
+    run = np.int64(-1)
+    while True:
+        run = next_run(seen, shell, run + 1, n_runs, transform, place, margin)
+        if run >= n_runs:
+            break
+        start, n_run = place_run(shell, run, transform, place, scratch)
         n_near = np.int64(0)
         box = cells_of_run(seen, n_run, place.side, scratch)
         if box[0] > 0 and not anyway:
@@ -316,8 +314,6 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
                 n_missed, last,
             )  # fmt: skip
             n_unknown += n_strange
-        cluster += 1
-        start += n_run
         if n_near == 0:
             continue
         _weigh(law, cells, points, transform, place, scratch, n_near)

@@ -138,31 +138,46 @@ def is_block_free(seen, spheres, groups, cluster, transform, place, reached):
 
 
 @inlined
-def free_runs(seen, spheres, groups, cluster, transform, place, reached):
-    """Number of runs, from run `cluster` on, that are far from all voxels: BLOCK, GROUP, 1 or 0.
+def _free_runs(seen, shell, run, transform, place, reached):
+    """Number of runs, from `run` on, that are far from all voxels: BLOCK, GROUP, 1 or 0.
 
     Far means farther away than `reached` voxels. A shell without spheres says in `groups` what to
     skip (`budget.Budget.skips`), or has no groups: then it is 0.
     """
+    spheres, groups = shell.spheres, shell.groups
     if spheres.shape[0] == 0:
-        return np.int64(groups[cluster, 0]) if groups.shape[0] > 0 else np.int64(0)
-    if is_block_free(seen, spheres, groups, cluster, transform, place, reached):
+        return np.int64(groups[run, 0]) if groups.shape[0] > 0 else np.int64(0)
+    if is_block_free(seen, spheres, groups, run, transform, place, reached):
         return BLOCK
-    if cluster % GROUP == 0 and is_sphere_free(
-        seen, groups, cluster // GROUP, transform, place, reached
-    ):
+    if run % GROUP == 0 and is_sphere_free(seen, groups, run // GROUP, transform, place, reached):
         return GROUP
-    return 1 if is_sphere_free(seen, spheres, cluster, transform, place, reached) else 0
+    return 1 if is_sphere_free(seen, spheres, run, transform, place, reached) else 0
 
 
 @inlined
-def place_run(columns, start, count, transform, place, scratch):
-    """Place points start .. start + count: scratch takes metres (rows 0-2), voxels (rows 3-5).
+def next_run(seen, shell, run, end, transform, place, reached):
+    """First run, from `run` on and before `end`, that may be near a voxel; `end` or more: none is.
 
-    One loop for each axis, which the compiler vectorizes: this halves the time of a flat frame of
-    100,000 points.
+    All frames and searches walk a shell by it, forwards.
     """
-    ox, oy, oz, size = place.x, place.y, place.z, place.size
+    while run < end:
+        n_free = _free_runs(seen, shell, run, transform, place, reached)
+        if n_free == 0:
+            break
+        run += n_free
+    return run
+
+
+@inlined
+def place_run(shell, run, transform, place, scratch):
+    """Place the points of a run: scratch takes metres (rows 0-2), voxels (rows 3-5).
+
+    Returns the first point and their number. One loop for each axis, which the compiler vectorizes:
+    this halves the time of a flat frame of 100,000 points.
+    """
+    ox, oy, oz, size, columns = place.x, place.y, place.z, place.size, shell.columns
+    start = run * shell.run
+    count = min(shell.run, columns.shape[1] - start)
     for at in range(count):
         x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
         x, y, z = moved(transform, x, y, z)
@@ -173,6 +188,7 @@ def place_run(columns, start, count, transform, place, scratch):
         scratch[4, at] = (scratch[1, at] - oy) / size
     for at in range(count):
         scratch[5, at] = (scratch[2, at] - oz) / size
+    return start, count
 
 
 @inlined

@@ -212,8 +212,10 @@ class Hand:
         self.servo, self.follower = self._station.servo, self._station.follower
         views = views_of(self.servo)
         self.tool, self.hand, self.sent = views.tool, views.hand, views.sent
-        self.rows, self.missed = self._station.field, self._station.missed
-        self.rows[:] = np.nan
+        self.kept, self.near = self._station.kept, self._station.near_points
+        self.bends, self.missed = self._station.bends, self._station.missed
+        for array in (self.kept, self.near, self.bends):
+            array.view(np.float64)[:] = np.nan
 
     def advance(self, dt: float = 1e-3) -> Floats:
         """Run one period; returns the force at the device (3,), a copy."""

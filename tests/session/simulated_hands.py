@@ -17,7 +17,6 @@ from closed_forms import UPRIGHT, Field, Hand, field_of, hole, moved, plane, pun
 from hapticdb import PointShell
 from hapticdb.devices.scripted import Player
 from hapticdb.kernels.gpu import looks as kernels
-from hapticdb.kernels.hand.near_points import BEND_ROWS, BENDS, NEAR, NEAR_POINTS, NEAR_ROWS
 from hapticdb.kernels.resident.cells import UNKNOWN, key_of_cell
 from hapticdb.recording.file import Recording
 from hapticdb.resident.table import CellTable
@@ -49,7 +48,7 @@ class Pair:
     ) -> None:
         self.cells, self.hands = field.cells, [Hand(field, points, place, turned) for _ in range(2)]
         for hand in self.hands:
-            hand.rows[:] = 0.0
+            hand.near.view(np.float64)[:] = 0.0
             for name, number in more.items():
                 hand.follower[name] = number
         cells, n_slots = field.cells, len(field.cells.used)
@@ -74,15 +73,11 @@ class Pair:
         ]
         assert near[0] == near[1]
         n_near, side = int(near[0][0]), int(near[0][1])
-        first, end = NEAR + side * NEAR_ROWS, NEAR + (side + 1) * NEAR_ROWS
-        found, wanted = (hand.rows[first:end, :n_near] for hand in self.hands)
-        for bend in (BENDS, BENDS + BEND_ROWS):  # a flat surface has no direction
-            for rows in (found, wanted):
-                rows[bend : bend + BEND_ROWS, rows[bend] == 0.0] = 0.0
-            self.n_bent += int(np.count_nonzero(found[bend]))
+        found, wanted = (hand.near[side, :n_near] for hand in self.hands)
         assert (found == wanted).all()
-        met = [hand._station.met[NEAR_POINTS + side, :n_near] for hand in self.hands]
-        assert met[0].tolist() == met[1].tolist()
+        found, wanted = (hand.bends[side, :n_near][found["is_hollow"]] for hand in self.hands)
+        assert (found == wanted).all()
+        self.n_bent += len(found)
 
 
 def a_flat_tool_is_pressed_on_a_plane_and_leaves() -> None:

@@ -230,6 +230,39 @@ FOLLOWER: Layout = _record(
 )
 """What the quasi-static coupling keeps beside the tool. It makes its own start: all zero."""
 
+POINT: Layout = _record(
+    [
+        ("due", "<f8"),  # way of the farthest point, voxels, at which the point is looked at next
+        ("run_due", "<f8"),  # of point n: the least `due` of run number n
+        ("u", "<f8"),  # distance at the tool's pose, voxels; h where the point is not near
+        ("bound", "<f8"),  # lower bound of it, likewise
+        ("onset", "<f8"),  # distance at which its contact begins, voxels
+    ]
+)
+"""What the coupling keeps of each point of the tool (`kernels.hand.near_points`)."""
+
+NEAR: Layout = _record(
+    [
+        ("point", "<i8"),  # its number
+        ("is_active", "?"),  # it is in the contact set
+        ("is_hollow", "?"),  # the surface bends towards it
+        ("u", "<f8"),  # distance, voxels
+        ("bound", "<f8"),  # lower bound of it, voxels
+        ("along", "<f8", 3),  # gradient of the distance
+        ("about", "<f8", 3),  # its moment about the tool's centre, m
+    ]
+)
+"""A point near a surface. A step reads all near points in turn: 80 bytes each, and no others. With
+the bends in the same record, broad contacts take a tenth longer."""
+BENDS: Layout = _record(
+    [
+        ("curvature", "<f8", 2),  # 1/voxel, 0 for none
+        ("along", "<f8", (2, 3)),  # unit directions
+        ("about", "<f8", (2, 3)),  # their moments about the tool's centre, m
+    ]
+)
+"""The two ways in which a hollow surface bends towards a near point."""
+
 FRAME: Layout = np.dtype(
     [
         ("time", "<f8"),  # s since the session's start, when the frame began
@@ -382,7 +415,7 @@ STATION: Layout = _record(
         ("staleness", "<i8"),  # ns without an answer after which all cells count as unknown
         # addresses of the tool's arrays, and their sizes
         *((name, "<i8") for name in ("points", "center", "spheres", "groups", "columns")),
-        *((name, "<i8") for name in ("scratch", "field", "met")),
+        *((name, "<i8") for name in ("scratch", "kept", "near_points", "bends", "met")),
         # of the tool's pose, the law's frame there, and the unknown cells that were met
         *((name, "<i8") for name in ("pose", "felt", "missed")),
         *((name, "<i8") for name in ("n_points", "n_spheres", "n_groups", "run")),
@@ -404,9 +437,7 @@ STATION: Layout = _record(
         ("gap", "<i8"),  # ns, mean time between arrivals
         ("is_let_go", "<i8"),
         ("way", WAY),
-        # what touches: row of `met`, and number of points
-        ("touching", "<i8"),
-        ("n_touching", "<i8"),
+        ("n_touching", "<i8"),  # points that touch, in `met`
         # what periods keep
         ("servo", SERVO),
         ("follower", FOLLOWER),

@@ -46,14 +46,15 @@ Value = str | int | float | bool | None | list[Any] | dict[str, Any]
 class Start(NamedTuple):
     """State of a session before its first recorded frame: memory of the loop (`kernels.records`).
 
-    servo, follower : a record of SERVO and of FOLLOWER; field, met : the coupling's numbers of each
-    point, empty where the tool has just been placed.
+    servo, follower : a record of SERVO and of FOLLOWER; kept, near, bends : records of POINT, NEAR
+    and BENDS, empty where the tool has just been placed.
     """
 
     servo: bytes = b""
     follower: bytes = b""
-    field: bytes = b""
-    met: bytes = b""
+    kept: bytes = b""
+    near: bytes = b""
+    bends: bytes = b""
 
 
 def _now() -> str:

@@ -12,22 +12,15 @@ from hapticdb.errors import HapticDBError, UsageError
 from hapticdb.kernels.gpu import looks as kernels
 from hapticdb.kernels.hand.calling import FUNCTION, address_of
 from hapticdb.kernels.hand.near_points import (
-    BOUND,
     FAR,
     FLOOR,
-    LAST_BOUND,
-    LAST_U,
     LEAST_BOUND,
     MOST_MERGED,
-    NEAR,
-    NEAR_POINTS,
-    NEAR_ROWS,
     NEVER,
     NOT_KNOWN,
     OPEN,
     POINTS_ANEW,
     SHUT,
-    U,
 )
 from hapticdb.kernels.records import MOST_MISSED, views_of
 from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
@@ -164,8 +157,8 @@ class GpuLooks:
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
             found=cuda.to_device(NOTHING),
-            numbers=cuda.mapped_array(room, np.int64),
-            rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
+            points_near=cuda.mapped_array(room, np.int64),
+            near=cuda.mapped_array((kernels.NEAR_NUMBERS, room), np.float64),
         )
 
     def check(self) -> None:
@@ -191,10 +184,11 @@ class GpuLooks:
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
         self._epoch += int(follower.anew) == POINTS_ANEW
-        most, half, field = int(follower.merges_from), 1 - int(follower.side), station.field
+        most, half = int(follower.merges_from), 1 - int(follower.side)
+        near, bends = station.near_points[half], station.bends[half]
         while True:
             n_due, n_near, n_unknown, least = self._look_once().tolist()
-            n, numbers = int(n_near), self._sight.numbers
+            n, numbers = int(n_near), self._sight.points_near
             if n > numbers.size:
                 self._put_back(-1, n_due)
                 self._make_room(n)
@@ -212,9 +206,10 @@ class GpuLooks:
             self._put_back(shut, n_due)
             return SHUT
         order = np.argsort(numbers)
-        rows = field[NEAR + half * NEAR_ROWS : NEAR + (half + 1) * NEAR_ROWS, :n]
-        np.take(self._sight.rows[:, :n], order, axis=1, out=rows)
-        station.met[NEAR_POINTS + half, :n] = numbers[order]
+        rows, first = self._sight.near[:, order].T, kernels.CURVATURE
+        near["point"][:n], near["is_hollow"][:n] = numbers[order], rows[:, first] > 0.0
+        near.view(np.float64).reshape(len(near), -1)[:n, -first:] = rows[:, :first]
+        bends.view(np.float64).reshape(len(bends), -1)[:n] = rows[:, first:]
         follower.n_tried[()], follower.n_unknown[()] = n, n_unknown
         follower.tried_clearance[()] = least - float(follower.travelled) + FAR
         self._tell_missed(int(n_unknown))
@@ -224,10 +219,10 @@ class GpuLooks:
         """First of the near points that may not be there; NOBODY if all may."""
         if not self._follower.is_walking:
             return NOBODY
-        field = self._station.field
-        u, bound = np.array(self._sight.rows[U : BOUND + 1, : len(numbers)])
-        is_shut = (u < FLOOR) & (u <= field[LAST_U, numbers])
-        is_shut |= (bound < LEAST_BOUND) & (bound <= field[LAST_BOUND, numbers])
+        before = self._station.kept[numbers]
+        u, bound = np.array(self._sight.near[:2, : len(numbers)])
+        is_shut = (u < FLOOR) & (u <= before["u"])
+        is_shut |= (bound < LEAST_BOUND) & (bound <= before["bound"])
         return int(numbers[is_shut].min(initial=NOBODY))
 
     def _look_once(self) -> NDArray[np.float64]:
@@ -277,8 +272,8 @@ class GpuLooks:
         """Make room for n near points."""
         room = 1 << (n - 1).bit_length()
         self._sight = self._sight._replace(
-            numbers=cuda.mapped_array(room, np.int64),
-            rows=cuda.mapped_array((NEAR_ROWS, room), np.float64),
+            points_near=cuda.mapped_array(room, np.int64),
+            near=cuda.mapped_array((kernels.NEAR_NUMBERS, room), np.float64),
         )
         self._repeat()
 

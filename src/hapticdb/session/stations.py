@@ -9,11 +9,20 @@ from numpy.typing import NDArray
 from hapticdb.grid import Grid
 from hapticdb.kernels.hand.calling import address_of_kernel
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS
 from hapticdb.kernels.period import loop
 from hapticdb.kernels.period.following import USUAL_GAP_NS
-from hapticdb.kernels.period.memory import PERIOD_ROWS
-from hapticdb.kernels.records import FRAME, MOST_MISSED, PACE, RESULTS, SEAT, STATION, pose_numbers
+from hapticdb.kernels.records import (
+    BENDS,
+    FRAME,
+    MOST_MISSED,
+    NEAR,
+    PACE,
+    POINT,
+    RESULTS,
+    SEAT,
+    STATION,
+    pose_numbers,
+)
 from hapticdb.kernels.resident.cells import READER_STRIDE, Cells, Clusters, Place
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import ForceLaw, reads_distances
@@ -82,8 +91,9 @@ class Station:
         self.servo, self.follower = self.record["servo"], self.record["follower"]
         self.clusters, n_points = clusters, len(clusters.points)
         self.place = Place(*grid.origin, grid.voxel_size, float(grid.side))
-        self.field = np.zeros((FIELD_ROWS, n_points))
-        self.met = np.zeros((PERIOD_ROWS, n_points), dtype=np.int64)
+        self.kept = np.zeros(n_points, POINT)
+        self.near_points, self.bends = np.zeros((2, n_points), NEAR), np.zeros((2, n_points), BENDS)
+        self.met = np.zeros(n_points, dtype=np.int64)
         self.pose, self.felt = np.eye(4), np.zeros(RESULTS)
         self.missed = np.zeros(1 + MOST_MISSED, dtype=np.int64)
         row["reader"], row["session"] = reader, session.ctypes.data
@@ -107,7 +117,9 @@ class Station:
         self._arrays = {
             name: np.ascontiguousarray(getattr(clusters, name))
             for name in ("points", "center", "spheres", "groups", "columns", "scratch")
-        } | {name: getattr(self, name) for name in ("met", "field", "pose", "felt", "missed")}
+        }
+        for name in ("met", "kept", "near_points", "bends", "pose", "felt", "missed"):
+            self._arrays[name] = getattr(self, name)
         for name, array in self._arrays.items():
             row[name] = array.ctypes.data
         n_points = len(clusters.points)
@@ -130,7 +142,7 @@ class Station:
     def state(self) -> Start:
         """What the next period depends on, beside its cells and the hand."""
         tool = self.servo["tool"]
-        of_points = (self.field, self.met) if tool["version"] else ()
+        of_points = (self.kept, self.near_points, self.bends) if tool["version"] else ()
         parts = (self.servo, self.follower, *of_points)
         return Start(*(part.tobytes() for part in parts))
 
@@ -138,7 +150,7 @@ class Station:
         """Continue from a state that a station of this tool and this build has had."""
         looker, parts = (
             self.follower["looker"].copy(),
-            (self.servo, self.follower, self.field, self.met),
+            (self.servo, self.follower, self.kept, self.near_points, self.bends),
         )
         for part, content in zip(parts, state, strict=True):
             if content:

@@ -27,6 +27,9 @@ THREADS_OF_RUNS, THREADS = 128, 64
 """Threads of a block of each launch; a block of the second one has a thread for each point."""
 MOST_BLOCKS = 1 << 13
 """Most blocks of a launch; each takes several runs if there are more."""
+NEAR_NUMBERS, CURVATURE = 22, 8
+"""Rows of `Sight.near`: the fields of the record NEAR from `u` on, and from CURVATURE on those of
+BENDS, 0 where the surface is not hollow."""
 ROOM_FOR_MISSED = 128
 """Unknown cells that a look can tell of, a power of two. Larger: fewer rounds of fetching."""
 DUE_RUNS, NEARS, UNKNOWNS, LEAST, FOUND = 0, 1, 2, 3, 4
@@ -36,15 +39,17 @@ at which a run is due; their number."""
 _moved, _slot_of, _cell_key, _spread = map(
     on_gpu, (rigid.moved, cells.slot_of, cells.cell_key, cells.spread_key)
 )
-_clamped_into, _bound_at, _distance_at, _write_near, _rest_of_sphere = map(
+_clamped_into, _bound_at, _distance_at, _rest_of_sphere = map(
     on_gpu,
     (
         near_points.clamped_into,
         near_points.bound_at,
         near_points.distance_at,
-        near_points.write_near,
         near_points.rest_of_sphere,
     ),
+)
+_along_and_about, _bends_at, _may_be_hollow = map(
+    on_gpu, (near_points.along_and_about, near_points.bends_at, near_points.may_be_hollow)
 )
 
 
@@ -52,12 +57,13 @@ class Sight(NamedTuple):
     """What the GPU keeps of a tool of N points in R runs, and what a look finds.
 
     points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool. due (N,),
-    run_due (R,): rows DUE and RUN_DUE of `near_points`; due_before, run_due_before: the same
-    before the last look, of what it looked at; epochs (R,) int64: since when the points' numbers
+    run_due (R,): as the record POINT has them; due_before, run_due_before: the same before the last
+    look, of what it looked at; epochs (R,) int64: since when the points' numbers
     are true; seen (R,) int64: number of the last look at the run; due_runs (R,) int64: runs of the
     second launch. asked (ASKED,): a look's `Look`. used (S,) uint8: slots that were read. missed
     (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. found (FOUND,).
-    numbers (M,) int64 and rows (NEAR_ROWS, M): the near points, if there are no more than M.
+    points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, if there are no more than M;
+    neighbours lie side by side, since they are written to the memory of the processor.
     """
 
     points: Any
@@ -73,8 +79,8 @@ class Sight(NamedTuple):
     used: Any
     missed: Any
     found: Any
-    numbers: Any
-    rows: Any
+    points_near: Any
+    near: Any
 
 
 class Look(NamedTuple):
@@ -148,6 +154,21 @@ def _miss(missed, key):
 
 
 @cuda.jit(device=True)
+def _write_near(payload, slot, mask, inside, lever, looked, is_bent, near, at):
+    """Write column `at` of `Sight.near`."""
+    near[0, at], near[1, at], near[CURVATURE, at] = looked[0], looked[4], 0.0
+    both = _along_and_about(lever, looked[1], looked[2], looked[3])
+    for row in range(6):
+        near[2 + row, at] = both[row]
+    if is_bent and _may_be_hollow(mask, inside, looked[0]):
+        c, d, v, w = _bends_at(payload, slot, inside, lever, looked)
+        near[CURVATURE, at], near[CURVATURE + 1, at] = c, d
+        for row in range(3):
+            near[10 + row, at], near[13 + row, at] = v[row], w[row]
+            near[16 + row, at], near[19 + row, at] = v[3 + row], w[3 + row]
+
+
+@cuda.jit(device=True)
 def _look_at_point(n, place, asked, seen, payload, sight):
     """Look at point n, which is due -> when it is due again; see `near_points.look`."""
     points, center, transform = sight.points, sight.points.shape[1] - 1, asked.pose
@@ -170,13 +191,11 @@ def _look_at_point(n, place, asked, seen, payload, sight):
     u, bound = looked[0], looked[4]
     if u < ONSET + MARGIN or bound < LEAST_BOUND:
         at = np.int64(cuda.atomic.add(sight.found, NEARS, 1.0))
-        if at < sight.numbers.shape[0]:
+        if at < sight.points_near.shape[0]:
             cx, cy, cz = _moved(transform, points[0, center], points[1, center], points[2, center])
-            sight.numbers[at] = n
+            sight.points_near[at] = n
             lever = px - cx, py - cy, pz - cz
-            _write_near(
-                payload, slot, mask, inside, lever, looked, asked.is_bent, sight.rows, 0, at
-            )
+            _write_near(payload, slot, mask, inside, lever, looked, asked.is_bent, sight.near, at)
     return asked.travelled + bound - FAR
 
 

@@ -54,27 +54,9 @@ in contact, and more computing for each point."""
 NEVER = 1e30
 """A way that no tool travels."""
 
-DUE, LAST_U, LAST_BOUND, ONSETS, RUN_DUE, ACTIVE = 0, 1, 2, 3, 4, 5
-"""Rows of a field (FIELD_ROWS, N) with a number for each point: way at which the point is looked at
-next; distance and bound at the tool's pose, h where it is not near; onset, voxels. RUN_DUE has the
-least DUE of each run of points; ACTIVE has, for each near point in its order, whether it is in
-the contact set."""
-NEAR = 6
-"""First row with the near points of two poses, in the order of the points: NEAR_ROWS for each."""
-U, BOUND, ALONG, ABOUT = 0, 1, 2, 5
-"""Rows from there on: distance and bound, voxels; gradient (3) and its moment about the centre (3),
-m."""
-BENDS, BEND_ROWS = 8, 7
-"""First row of the two ways in which the surface bends towards a near point, and rows of each:
-curvature, 1/voxel, its direction (3), and that direction's moment about the centre (3), m."""
-NEAR_ROWS = BENDS + 2 * BEND_ROWS
 BENT = 0.05
 """Curvature, 1/voxel, that is not counted: the noise of stored distances. Larger: less resistance
 along rough surfaces, and steps that overshoot in gentle hollows."""
-FIELD_ROWS = NEAR + 2 * NEAR_ROWS
-FELT_POINTS, NEAR_POINTS, MET_ROWS = 0, 1, 3
-"""Rows of `met` (MET_ROWS, N) int64: FELT_POINTS takes the indices of the points that are felt, and
-two rows from NEAR_POINTS on those of the near points, in the order of `field`'s numbers."""
 OPEN, SHUT, NOT_KNOWN, MANY = 0, 1, 2, 3
 """What a look finds: the tool may be there; a point may not; points are in unknown cells; there are
 so many near points that they are merged."""
@@ -149,8 +131,9 @@ def bound_at(payload, slot, mask, at):
 def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
     """Curvatures of a hollow surface across a gradient and their unit directions: c, v, d, w.
 
-    The second derivatives are those of the distance. A curvature is 0 where the surface is flat or
-    bulges. Eigenvalues of the 2 x 2 matrix in the plane across the gradient, in closed form.
+    The second derivatives are those of the distance. c is not below d; a curvature is 0 where the
+    surface is flat or bulges. Eigenvalues of the 2 x 2 matrix in the plane across the gradient, in
+    closed form.
     """
     ux, uy, uz = (gz, 0.0, -gx) if abs(gy) > 0.7 * (abs(gx) + abs(gz)) else (-gz, 0.0, gx)
     if abs(ux) + abs(uz) < 1e-9:
@@ -185,55 +168,56 @@ def _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz):
 
 
 @leaf
-def _write_along(field, row, m, lever, x, y, z):
-    """Write a direction at near point m and its moment about the centre, six rows from `row` on."""
-    field[row, m], field[row + 1, m], field[row + 2, m] = x, y, z
-    x, y, z = moment(lever[0], lever[1], lever[2], x, y, z)
-    field[row + 3, m], field[row + 4, m], field[row + 5, m] = x, y, z
+def along_and_about(lever, x, y, z):
+    """A direction at a lever (3) from the centre, and its moment: six numbers."""
+    a, b, c = moment(lever[0], lever[1], lever[2], x, y, z)
+    return x, y, z, a, b, c
 
 
 @leaf
-def _bend_at(payload, slot, mask, x, y, z, lever, field, rows, m):
-    """Find both bends of near point m, at (x, y, z) voxels."""
-    row = rows + BENDS
-    field[row, m] = field[row + BEND_ROWS, m] = 0.0
-    if not (mask >> brick_bit(np.int64(x), np.int64(y), np.int64(z))) & np.uint64(1):
-        return
-    gx, gy, gz = field[rows + ALONG, m], field[rows + ALONG + 1, m], field[rows + ALONG + 2, m]
-    xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, x, y, z)
-    c, vx, vy, vz, d, wx, wy, wz = _bends_of(gx, gy, gz, xx, yy, zz, xy, xz, yz)
-    field[row, m], field[row + BEND_ROWS, m] = c, d
-    _write_along(field, row + 1, m, lever, vx, vy, vz)
-    _write_along(field, row + BEND_ROWS + 1, m, lever, wx, wy, wz)
+def bends_at(payload, slot, at, lever, looked):
+    """Two curvatures at a near point, and `along_and_about` of both ways in which it bends.
 
-
-@inlined
-def _goes_nearer(u, bound, last_u, last_bound):
-    """Whether a point would be too near a surface, and no farther from it than it was."""
-    return (u < FLOOR and u <= last_u) or (bound < LEAST_BOUND and bound <= last_bound)
-
-
-@inlined
-def write_near(payload, slot, mask, at, lever, found, is_bent, field, rows, m):
-    """Write near point m into its rows.
-
-    at: `clamped_into` the grid; lever (3), m; found: of `distance_at` there.
+    at: `clamped_into` the grid; lever (3), m; looked: of `distance_at` there.
     """
-    u, gx, gy, gz, bound = found
-    field[rows + U, m], field[rows + BOUND, m] = u, bound
-    _write_along(field, rows + ALONG, m, lever, gx, gy, gz)
-    if is_bent and u < ONSET:
-        _bend_at(payload, slot, mask, at[0], at[1], at[2], lever, field, rows, m)
-    else:
-        field[rows + BENDS, m] = field[rows + BENDS + BEND_ROWS, m] = 0.0
+    xx, yy, zz, xy, xz, yz = second_derivatives(payload, slot, at[0], at[1], at[2])
+    c, vx, vy, vz, d, wx, wy, wz = _bends_of(
+        looked[1], looked[2], looked[3], xx, yy, zz, xy, xz, yz
+    )
+    return c, d, along_and_about(lever, vx, vy, vz), along_and_about(lever, wx, wy, wz)
+
+
+@inlined
+def may_be_hollow(mask, at, u):
+    """Whether bends are looked for at a near point of distance u."""
+    bit = brick_bit(np.int64(at[0]), np.int64(at[1]), np.int64(at[2]))
+    return u < ONSET and (mask >> bit) & np.uint64(1) != 0
+
+
+@leaf
+def _write_bends(bends, found):
+    """Write the bends of a near point from `bends_at` -> whether there are any."""
+    bends.curvature[0], bends.curvature[1] = found[0], found[1]
+    for axis in range(3):
+        bends.along[0, axis], bends.about[0, axis] = found[2][axis], found[2][3 + axis]
+        bends.along[1, axis], bends.about[1, axis] = found[3][axis], found[3][3 + axis]
+    return found[0] > 0.0
+
+
+@inlined
+def _goes_nearer(u, bound, before):
+    """Whether a point would be too near a surface, and no farther from it than it was."""
+    return (u < FLOOR and u <= before.u) or (bound < LEAST_BOUND and bound <= before.bound)
 
 
 class Grasp(NamedTuple):
     """What the looks of a tool read and write.
 
     cells, of `Cells` with distances, and which of their directories a frame reads; shell, of
-    `Clusters`; place: the grid; follower: a record of FOLLOWER; field (FIELD_ROWS, N) float64, met
-    (MET_ROWS, N) int64; missed (1 + MOST_MISSED,) int64: the unknown cells, as `felt` has them.
+    `Clusters`; place: the grid; follower: a record of FOLLOWER; kept (N,) of POINT; near (2, N) of
+    NEAR, bends (2, N) of BENDS: the near points of two poses, in the order of the points, row
+    `follower.side` at the tool's; met (N,) int64: the points that touch; missed (1 + MOST_MISSED,)
+    int64: the unknown cells, as `felt` has them.
     """
 
     cells: Any
@@ -241,7 +225,9 @@ class Grasp(NamedTuple):
     shell: Any
     place: Any
     follower: Any
-    field: NDArray[np.float64]
+    kept: Any
+    near: Any
+    bends: Any
     met: NDArray[np.int64]
     missed: NDArray[np.int64]
 
@@ -249,19 +235,18 @@ class Grasp(NamedTuple):
 @leaf
 def _look_at_run(grasp, run, transform, center):
     """Look at the points of run number `run` -> OPEN, SHUT or MANY; see `look`."""
-    cells, which, shell, place, follower, field, met, missed = grasp
+    cells, which, shell, place, follower, kept, _, _, _, missed = grasp
     seen, points = seen_in(cells, which, cells.words), shell.points
     start, end = run * shell.run, min((run + 1) * shell.run, points.shape[0])
-    payload, (cx, cy, cz) = cells.payload, center
-    half = 1 - follower.side
-    base, near = NEAR + half * NEAR_ROWS, NEAR_POINTS + half
+    payload, (cx, cy, cz), half = cells.payload, center, 1 - follower.side
     travelled, n_near, n_missed = follower.travelled, follower.n_tried, missed[LISTED]
     merged, most_near = follower.merged, follower.merges_from
     last_key, slot, mask = np.int64(-1), np.int64(UNKNOWN), np.uint64(0)
     run_due = NEVER
     for n in range(start, end):
-        if travelled < field[DUE, n]:
-            run_due = min(run_due, field[DUE, n])
+        point = kept[n]
+        if travelled < point.due:
+            run_due = min(run_due, point.due)
             continue
         px, py, pz = moved(transform, points[n, 0], points[n, 1], points[n, 2])
         at = clamped_into(place, px, py, pz)
@@ -271,29 +256,35 @@ def _look_at_run(grasp, run, transform, center):
             slot, mask, n_missed = enter_cell(seen, key, missed, n_missed)
         if slot < 0:
             follower.n_unknown += 1
-            field[DUE, n] = run_due = -NEVER
+            point.due = run_due = -NEVER
             continue
         if n & (merged - 1):  # another point's contact stands for this one
             bound = bound_at(payload, slot, mask, at)
             if bound >= LEAST_BOUND:
-                field[DUE, n] = travelled + bound - FAR
-                run_due = min(run_due, field[DUE, n])
+                point.due = travelled + bound - FAR
+                run_due = min(run_due, point.due)
                 continue
         looked = distance_at(payload, slot, mask, at)
         u, bound = looked[0], looked[4]
-        field[DUE, n] = travelled + bound - FAR
-        run_due = min(run_due, field[DUE, n])
+        point.due = travelled + bound - FAR
+        run_due = min(run_due, point.due)
         if u >= ONSET + MARGIN and bound >= LEAST_BOUND:
             continue
-        if follower.is_walking and _goes_nearer(u, bound, field[LAST_U, n], field[LAST_BOUND, n]):
+        if follower.is_walking and _goes_nearer(u, bound, point):
             return SHUT
         if 0 < most_near <= n_near and merged < MOST_MERGED:
             return MANY
-        met[near, n_near] = n
         lever = px - cx, py - cy, pz - cz
-        write_near(payload, slot, mask, at, lever, looked, follower.is_bent, field, base, n_near)
+        near = grasp.near[half, n_near]
+        near.point, near.u, near.bound, near.is_hollow = n, u, bound, False
+        both = along_and_about(lever, looked[1], looked[2], looked[3])
+        for axis in range(3):
+            near.along[axis], near.about[axis] = both[axis], both[3 + axis]
+        if follower.is_bent and may_be_hollow(mask, at, u):
+            bends = grasp.bends[half, n_near]
+            near.is_hollow = _write_bends(bends, bends_at(payload, slot, at, lever, looked))
         n_near += 1
-    field[RUN_DUE, run] = run_due
+    kept[run].run_due = run_due
     follower.n_tried, missed[LISTED] = n_near, n_missed
     return OPEN
 
@@ -311,11 +302,11 @@ def _look_at_due_runs(grasp, transform, center, way):
 
     The sphere of a run that was near at the last look, a way ago, is not tested.
     """
-    cells, which, shell, place, follower, field, _, missed = grasp
+    cells, which, shell, place, follower, kept, _, _, _, missed = grasp
     travelled = follower.travelled
     follower.n_tried = follower.n_unknown = missed[LISTED] = 0
     for run in range(n_runs_of(shell)):
-        due = field[RUN_DUE, run]
+        due = kept[run].run_due
         if travelled < due:
             continue
         if follower.is_large and (due == -NEVER or due >= travelled - way):
@@ -323,7 +314,7 @@ def _look_at_due_runs(grasp, transform, center, way):
                 seen_in(cells, which, cells.words), shell.spheres, run, transform, place
             )
             if rest > 0.0:
-                field[RUN_DUE, run] = travelled + rest
+                kept[run].run_due = travelled + rest
                 continue
         found = _look_at_run(grasp, run, transform, center)
         if found != OPEN:
@@ -337,13 +328,13 @@ def look(grasp, pose, way, is_walking):
 
     way: voxels that the farthest point has moved since the last look. is_walking: SHUT if a point
     is nearer than FLOOR or LEAST_BOUND allow, and no farther than at the tool's pose. The near
-    points go into the half of `field` and `met` that the tool's pose does not use; SHUT leaves it
-    unfinished. A GPU may look instead (`kernels.gpu.looks`): then it is called. Its sessions merge
+    points go into the row of `near` that the tool's pose does not use; SHUT leaves it unfinished. A
+    GPU may look instead (`kernels.gpu.looks`): then it is called. Its sessions merge
     contacts: where `merges_from` points are near, one contact stands for 2, 4, 8 ... neighbours by
     index, up to `MOST_MERGED`. Of the others only the bounds are computed, so that no point passes
     a surface. The processor does the same here, as the oracle of the GPU.
     """
-    shell, follower, field = grasp.shell, grasp.follower, grasp.field
+    shell, follower, kept = grasp.shell, grasp.follower, grasp.kept
     follower.travelled += way
     follower.is_walking, follower.way = is_walking, way
     follower.n_looks += 1
@@ -361,78 +352,88 @@ def look(grasp, pose, way, is_walking):
         return SHUT
     travelled, least = follower.travelled, NEVER
     for run in range(n_runs_of(shell)):
-        least = min(least, field[RUN_DUE, run])
+        least = min(least, kept[run].run_due)
     follower.tried_clearance = least - travelled + FAR
     return OPEN if follower.n_unknown == 0 else NOT_KNOWN
 
 
 @leaf
-def settle(follower, field, met):
+def settle(grasp):
     """Make the pose that was tried the tool's pose: its near points, their onsets."""
-    before, after = follower.side, 1 - follower.side
-    rows = NEAR + after * NEAR_ROWS
-    for m in range(follower.n_near):
-        field[LAST_U, met[NEAR_POINTS + before, m]] = HALF_WIDTH
-        field[LAST_BOUND, met[NEAR_POINTS + before, m]] = HALF_WIDTH
-    for m in range(follower.n_tried):
-        n, u = met[NEAR_POINTS + after, m], field[rows + U, m]
-        field[LAST_U, n], field[LAST_BOUND, n] = u, field[rows + BOUND, m]
-        field[ONSETS, n] = max(field[ONSETS, n], min(u, ONSET))
-    for m in range(follower.n_near):
-        n = met[NEAR_POINTS + before, m]
-        if field[LAST_U, n] == HALF_WIDTH:  # no longer near
-            field[ONSETS, n] = ONSET
-    follower.side, follower.n_near = after, follower.n_tried
+    follower, kept = grasp.follower, grasp.kept
+    before, after = grasp.near[follower.side], grasp.near[1 - follower.side]
+    m = n = 0
+    while m < follower.n_near or n < follower.n_tried:  # both in the order of the points
+        if n == follower.n_tried or (m < follower.n_near and before[m].point < after[n].point):
+            point = kept[before[m].point]  # no longer near
+            point.u, point.bound, point.onset = HALF_WIDTH, HALF_WIDTH, ONSET
+            m += 1
+            continue
+        near = after[n]
+        m += m < follower.n_near and before[m].point == near.point
+        point = kept[near.point]
+        point.u, point.bound = near.u, near.bound
+        point.onset = max(point.onset, min(near.u, ONSET))
+        n += 1
+    follower.side, follower.n_near = 1 - follower.side, follower.n_tried
     follower.clearance, follower.astray = follower.tried_clearance, 0.0
 
 
 @leaf
-def take_more_points(follower, field):
+def take_more_points(grasp):
     """Let the next look merge half as many contacts, if there is room -> whether it does."""
+    follower, kept = grasp.follower, grasp.kept
     if follower.merged <= 1 or ROOMY * follower.n_near > follower.merges_from:
         return False
     follower.merged //= 2
     follower.anew = max(follower.anew, RUNS_ANEW)
     if follower.looker == 0:
-        for n in range(field.shape[1]):
-            field[RUN_DUE, n] = -NEVER
+        for n in range(kept.shape[0]):
+            kept[n].run_due = -NEVER
     return True
 
 
 @leaf
-def look_anew(follower, field):
+def look_anew(grasp):
     """Forget all ways, so that the next look looks at every point; near points stay as they are."""
+    follower, kept = grasp.follower, grasp.kept
     follower.travelled = follower.astray = 0.0
     follower.anew = POINTS_ANEW
     if follower.looker != 0:
         return
-    for n in range(field.shape[1]):
-        field[DUE, n] = field[RUN_DUE, n] = -NEVER
+    for n in range(kept.shape[0]):
+        kept[n].due = kept[n].run_due = -NEVER
 
 
 @leaf
-def forget(follower, field):
+def forget(grasp):
     """Forget everything about the points, as at the start: each has the full onset."""
-    look_anew(follower, field)
+    look_anew(grasp)
+    follower, kept = grasp.follower, grasp.kept
     follower.n_near = follower.n_tried = 0
-    for n in range(field.shape[1]):
-        field[LAST_U, n] = field[LAST_BOUND, n] = HALF_WIDTH
-        field[ONSETS, n] = ONSET
+    for n in range(kept.shape[0]):
+        kept[n].u = kept[n].bound = HALF_WIDTH
+        kept[n].onset = ONSET
 
 
 @leaf
-def least_distance(follower, field):
+def least_distance(grasp):
     """Least distance of the near points at the tool's pose, voxels; h without any."""
-    rows = NEAR + follower.side * NEAR_ROWS
-    least = HALF_WIDTH
-    for m in range(follower.n_near):
-        least = min(least, field[rows + U, m])
+    near, least = grasp.near[grasp.follower.side], HALF_WIDTH
+    for m in range(grasp.follower.n_near):
+        least = min(least, near[m].u)
     return least
 
 
 @leaf
-def fix_onsets(follower, field, met):
+def fix_onsets(grasp):
     """Let each near point's contact begin where it is now, at most at the full onset."""
-    rows = NEAR + follower.side * NEAR_ROWS
-    for m in range(follower.n_near):
-        field[ONSETS, met[NEAR_POINTS + follower.side, m]] = min(field[rows + U, m], ONSET)
+    near = grasp.near[grasp.follower.side]
+    for m in range(grasp.follower.n_near):
+        grasp.kept[near[m].point].onset = min(near[m].u, ONSET)
+
+
+@inlined
+def depth_of(grasp, near):
+    """Depth of a near point below its onset, m; negative above it."""
+    return grasp.place.size * (grasp.kept[near.point].onset - near.u)

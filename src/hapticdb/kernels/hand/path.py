@@ -83,7 +83,7 @@ def _stride_on(grasp, way, done, tool):
         found = look(grasp, tool.tried_pose, follower.astray + passed, np.bool_(True))
         follower.astray = passed
         if found == OPEN:
-            settle(follower, grasp.field, grasp.met)
+            settle(grasp)
             return end, found
         if found == NOT_KNOWN:
             return done, found

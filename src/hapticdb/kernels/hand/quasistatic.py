@@ -31,19 +31,11 @@ from hapticdb.kernels.hand.holding import (
     send,
 )
 from hapticdb.kernels.hand.near_points import (
-    ABOUT,
-    ACTIVE,
-    ALONG,
     FLOOR,
-    LAST_U,
-    NEAR,
-    NEAR_POINTS,
-    NEAR_ROWS,
     NOT_KNOWN,
-    ONSETS,
     OPEN,
     SHUT,
-    U,
+    depth_of,
     fix_onsets,
     forget,
     least_distance,
@@ -99,19 +91,18 @@ def has_moved(tool, follower):
 
 
 @leaf
-def _meet_change(follower, field, met):
+def _meet_change(grasp):
     """Compare the last look with the one before, at the same pose in an older version of the cells.
 
     Where a surface has come nearer, contact begins at the present distance, so that no force jumps.
     Returns whether a point now lies in something.
     """
-    near = NEAR_POINTS + 1 - follower.side
-    rows = NEAR + (1 - follower.side) * NEAR_ROWS
+    near = grasp.near[1 - grasp.follower.side]
     is_sunk = False
-    for m in range(follower.n_tried):
-        n, u = met[near, m], field[rows + U, m]
-        if u < field[LAST_U, n] - SUNK:
-            field[ONSETS, n] = min(field[ONSETS, n], u)
+    for m in range(grasp.follower.n_tried):
+        point, u = grasp.kept[near[m].point], near[m].u
+        if u < point.u - SUNK:
+            point.onset = min(point.onset, u)
             is_sunk = is_sunk or u < FLOOR - SUNK
     return is_sunk
 
@@ -119,24 +110,23 @@ def _meet_change(follower, field, met):
 @leaf
 def _look_here(grasp, tool):
     """Look at the tool where it is, at the start or in a new version -> whether all is known."""
-    follower, field, met = grasp.follower, grasp.field, grasp.met
-    is_first = tool.version == 0
+    follower, is_first = grasp.follower, tool.version == 0
     if is_first:
-        forget(follower, field)
+        forget(grasp)
         begin_steady(follower)
         follower.is_loose = follower.is_braked = follower.is_bent = False
     else:
-        look_anew(follower, field)
+        look_anew(grasp)
     pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
     found = look(grasp, tool.tried_pose, 0.0, np.bool_(False))
     if found == NOT_KNOWN:
         return False
-    is_sunk = not has_moved(tool, follower) and _meet_change(follower, field, met)
-    settle(follower, field, met)
+    is_sunk = not has_moved(tool, follower) and _meet_change(grasp)
+    settle(grasp)
     keep_pose(tool, follower, numbers_of(tool))
     if is_first:
-        fix_onsets(follower, field, met)
-        is_sunk = least_distance(follower, field) < FLOOR
+        fix_onsets(grasp)
+        is_sunk = least_distance(grasp) < FLOOR
     follower.is_loose = follower.is_loose or is_sunk
     return True
 
@@ -148,19 +138,18 @@ def _look_at_more(grasp, tool):
     A point that comes back feels contact from where it is, so that no force jumps. It goes no
     nearer to a surface than it is, if it is nearer than FLOOR.
     """
-    follower, field, met = grasp.follower, grasp.field, grasp.met
     pose_of_quaternion(*numbers_of(tool), tool.tried_pose)
-    found = look(grasp, tool.tried_pose, follower.astray, np.bool_(False))
+    found = look(grasp, tool.tried_pose, grasp.follower.astray, np.bool_(False))
     if found == OPEN:
-        _meet_change(follower, field, met)
-        settle(follower, field, met)
+        _meet_change(grasp)
+        settle(grasp)
     return found
 
 
 @leaf
 def _follow_loosely(grasp, spring, tool, hand):
     """Put a tool that lies in something at the hand -> OPEN or NOT_KNOWN."""
-    follower, field, met, center = grasp.follower, grasp.field, grasp.met, grasp.shell.center
+    follower, center = grasp.follower, grasp.shell.center
     measure_pull(spring, tool, hand, tool.pose, center, follower)
     for axis in range(6):
         follower.step[axis] = follower.pull[axis]
@@ -169,12 +158,12 @@ def _follow_loosely(grasp, spring, tool, hand):
     found = look(grasp, tool.tried_pose, follower.astray + way, np.bool_(False))
     follower.astray = way
     if found == OPEN:
-        settle(follower, field, met)
+        settle(grasp)
         keep_pose(tool, follower, at)
         follower.n_active = 0
-        if least_distance(follower, field) >= FLOOR:
+        if least_distance(grasp) >= FLOOR:
             follower.is_loose = False
-            fix_onsets(follower, field, met)
+            fix_onsets(grasp)
     return found
 
 
@@ -191,7 +180,7 @@ def follow(grasp, spring, tool, hand):
         measure_pull(spring, tool, hand, tool.pose, grasp.shell.center, follower)
         brake = STOPPING * most / size if follower.is_braked else 0.0
         turn_brake = brake * spring.radius * spring.radius
-        solve_step(follower, grasp.field, grasp.met, size, stiffness, brake, turn_brake, ROUNDS)
+        solve_step(grasp, stiffness, brake, turn_brake, ROUNDS)
         way = way_of_step(follower, spring.radius, size)
         follower.is_bent = n >= BENT_FROM or follower.n_bends > 0
         if n == STEPS or follower.n_looks >= MOST_LOOKS or way == 0.0:
@@ -210,30 +199,30 @@ def follow(grasp, spring, tool, hand):
 
 
 @leaf
-def _record_felt(follower, field, met, size, stiffness, felt):
-    """Contacts at the tool's pose: indices into met[0], wrench on the tool and counts into felt.
+def _record_felt(grasp, stiffness, felt):
+    """Contacts at the tool's pose: indices into grasp.met, wrench on the tool and counts into felt.
 
     Hits are the near points that push or are about to; contacts are those that push.
     """
-    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
-    deepest = 0.0
+    follower, near, deepest = grasp.follower, grasp.near[grasp.follower.side], 0.0
     n_hits = n_contacts = 0
     for n in range(felt.shape[0]):
         felt[n] = 0.0
     if not follower.is_loose:
         for m in range(follower.n_near):
-            depth = size * (field[ONSETS, met[near, m]] - field[rows + U, m])
-            if depth <= 0.0 and field[ACTIVE, m] == 0.0:
+            one = near[m]
+            depth = depth_of(grasp, one)
+            if depth <= 0.0 and not one.is_active:
                 continue
-            met[0, n_hits] = met[near, m]
+            grasp.met[n_hits] = one.point
             n_hits += 1
             if depth > 0.0:
                 n_contacts += 1
                 deepest = max(deepest, depth)
                 for axis in range(3):
                     force = stiffness * depth
-                    felt[WRENCH + axis] += force * field[rows + ALONG + axis, m]
-                    felt[WRENCH + 3 + axis] += force * field[rows + ABOUT + axis, m]
+                    felt[WRENCH + axis] += force * one.along[axis]
+                    felt[WRENCH + 3 + axis] += force * one.about[axis]
     felt[HITS], felt[CONTACTS], felt[DEEPEST] = n_hits, n_contacts, deepest
 
 
@@ -271,7 +260,7 @@ def _push_hand(spring, tool, hand, center, follower, is_felt, dt, wrench):
 def finish(grasp, spring, servo, is_held, found, dt):
     """Send the wrench and the marks of the period; contacts into tool.felt."""
     flags, tool, hand, wrench = 0, servo.tool, servo.hand, servo.sent.wrench
-    follower, size = grasp.follower, grasp.place.size
+    follower = grasp.follower
     if is_held:
         follower.n_trail = 0  # a speed over a gap says nothing
     else:
@@ -282,8 +271,7 @@ def finish(grasp, spring, servo, is_held, found, dt):
         flags |= _push_hand(spring, tool, hand, grasp.shell.center, follower, is_felt, dt, wrench)
         for n in range(6):
             tool.kept[n] = wrench[n] if is_finite(wrench) else 0.0
-        stiffness = contact_stiffness(spring, size)
-        _record_felt(follower, grasp.field, grasp.met, size, stiffness, tool.felt)
+        _record_felt(grasp, contact_stiffness(spring, grasp.place.size), tool.felt)
         flags |= IS_DROPPED if is_over else (IS_CUT if found == SHUT else 0)
         flags |= IS_LOOSE if follower.is_loose else 0
     send(spring, servo, is_held, flags, dt)
@@ -297,7 +285,7 @@ def _move_tool(grasp, version, spring, tool, hand):
         if not _look_here(grasp, tool):
             return NOT_KNOWN
         tool.version = version
-    elif take_more_points(grasp.follower, grasp.field):
+    elif take_more_points(grasp):
         found = _look_at_more(grasp, tool)
     if found != OPEN:
         return found
@@ -311,7 +299,7 @@ def advance(grasp, version, spring, servo, dt):
     """Move the tool for one period of dt seconds, in a version of the cells.
 
     servo, a record of SERVO: `tool` is updated, `hand` is read, `sent` is written. The caller keeps
-    grasp.missed between periods. Follower, field and met are the coupling's own from period to
+    grasp.missed between periods. Follower, kept and near are the coupling's own from period to
     period; it starts anew, whatever they hold, while `tool.version` is 0. The caller may put the
     tool back to an earlier pose, but must not put back these three.
 
@@ -326,8 +314,8 @@ def advance(grasp, version, spring, servo, dt):
     force of min(k |x|, cap) against the way x from tool to hand, changed by the damper along it;
     the torque is that of this force at the tool's centre, and of the turning spring. It is exactly
     zero while no point touches or is held back. `tool.felt` has the contacts' wrench on the tool,
-    N and N m of the scene, and their counts. `sent.hits` points are in met[FELT_POINTS]: those that
-    push, which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
+    N and N m of the scene, and their counts. `sent.hits` points are in grasp.met: those that push,
+    which `sent.contacts` counts, and those about to. `sent.deepest`: onset less distance, m.
     """
     dt = max(dt, 0.0)
     tool, hand, sent, follower = servo.tool, servo.hand, servo.sent, grasp.follower

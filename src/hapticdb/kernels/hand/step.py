@@ -8,24 +8,14 @@ and the depths d_i = s (onset_i - u_i). psi is quadratic up to its cap and linea
 import math
 
 from hapticdb.kernels._jit import leaf
-from hapticdb.kernels.hand.near_points import (
-    ABOUT,
-    ACTIVE,
-    ALONG,
-    BEND_ROWS,
-    BENDS,
-    NEAR,
-    NEAR_POINTS,
-    NEAR_ROWS,
-    ONSETS,
-    U,
-)
+from hapticdb.kernels.hand.near_points import depth_of
 
 
 @leaf
-def _add_row(follower, weight, depth, jx, jy, jz, ax, ay, az):
-    """Add a row to the step's equations: weight J J^T to the lower triangle, weight d J."""
-    matrix, right, row = follower.matrix, follower.right, (jx, jy, jz, ax, ay, az)
+def _add_row(follower, weight, depth, along, about):
+    """Add a row J = (along, about) to the step's equations: weight J J^T, and weight d J."""
+    matrix, right = follower.matrix, follower.right
+    row = along[0], along[1], along[2], about[0], about[1], about[2]
     for n in range(6):
         weighed = weight * row[n]
         for m in range(n + 1):
@@ -80,78 +70,68 @@ def _begin_equations(follower, extra, turn_extra):
 
 
 @leaf
-def _predict_contacts(follower, field, met, size):
+def _predict_contacts(grasp):
     """Put the near points that the step leaves in depth into the contact set -> whether it changed.
 
     The depth after the step is d_i - J_i . step, metres.
     """
-    step = follower.step
+    follower, near, step = grasp.follower, grasp.near[grasp.follower.side], grasp.follower.step
     sx, sy, sz, tx, ty, tz = step[0], step[1], step[2], step[3], step[4], step[5]
-    base = NEAR + follower.side * NEAR_ROWS
-    near = NEAR_POINTS + follower.side
     n_changed = n_active = 0
     for m in range(follower.n_near):
-        depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
-        depth -= field[base + ALONG, m] * sx + field[base + ALONG + 1, m] * sy
-        depth -= field[base + ALONG + 2, m] * sz + field[base + ABOUT, m] * tx
-        depth -= field[base + ABOUT + 1, m] * ty + field[base + ABOUT + 2, m] * tz
-        active = 1.0 if depth > 0.0 else 0.0
-        if active != field[ACTIVE, m]:
-            n_changed += 1
-            field[ACTIVE, m] = active
-        n_active += depth > 0.0
+        one = near[m]
+        along, about, depth = one.along, one.about, depth_of(grasp, one)
+        depth -= along[0] * sx + along[1] * sy
+        depth -= along[2] * sz + about[0] * tx
+        depth -= about[1] * ty + about[2] * tz
+        is_active = depth > 0.0
+        n_changed += is_active != one.is_active
+        one.is_active = is_active
+        n_active += is_active
     follower.n_active = n_active
     return n_changed > 0
 
 
 @leaf
-def _add_bends(follower, weight, field, rows, m):
-    """Add the resistance of a hollow surface across the gradient of near point m.
+def _add_bends(follower, weight, bends):
+    """Add the resistance of a hollow surface across the gradient of a near point.
 
     It is the part of the energy's second derivative that Gauss-Newton leaves out, -K d u'', where
     it is positive. Without it steps in corners overshoot as soon as the force over the voxel size
     exceeds the spring's stiffness.
     """
     for bend in range(2):
-        row = rows + BENDS + bend * BEND_ROWS
-        if field[row, m] > 0.0:
-            _add_row(
-                follower, weight * field[row, m], 0.0,
-                field[row + 1, m], field[row + 2, m], field[row + 3, m],
-                field[row + 4, m], field[row + 5, m], field[row + 6, m],
-            )  # fmt: skip
+        curvature = bends.curvature[bend]
+        if curvature > 0.0:
+            _add_row(follower, weight * curvature, 0.0, bends.along[bend], bends.about[bend])
             follower.n_bends += 1
 
 
 @leaf
-def solve_step(follower, field, met, size, stiffness, extra, turn_extra, rounds):
+def solve_step(grasp, stiffness, extra, turn_extra, rounds):
     """Solve for the step (6,), m and rad about the centre, and its contact set.
 
-    follower: a record of FOLLOWER, of which pull has e and theta, and pulls their stiffnesses;
-    stiffness: of a contact, N/m; rounds: most times that the equations are solved until the contact
-    set stays the same.
+    grasp.follower has e and theta in `pull`, and their stiffnesses in `pulls`; stiffness: of a
+    contact, N/m; rounds: most times that the equations are solved until the contact set stays the
+    same.
     """
-    step = follower.step
-    base = NEAR + follower.side * NEAR_ROWS
-    near = NEAR_POINTS + follower.side
+    follower, near = grasp.follower, grasp.near[grasp.follower.side]
     follower.n_bends = 0
     for axis in range(6):
-        step[axis] = 0.0
-    _predict_contacts(follower, field, met, size)
+        follower.step[axis] = 0.0
+    _predict_contacts(grasp)
     for _ in range(rounds):
         _begin_equations(follower, extra, turn_extra)
         for m in range(follower.n_near):
-            if field[ACTIVE, m] == 0.0:
+            one = near[m]
+            if not one.is_active:
                 continue
-            depth = size * (field[ONSETS, met[near, m]] - field[base + U, m])
-            _add_row(
-                follower, stiffness, depth,
-                field[base + ALONG, m], field[base + ALONG + 1, m], field[base + ALONG + 2, m],
-                field[base + ABOUT, m], field[base + ABOUT + 1, m], field[base + ABOUT + 2, m],
-            )  # fmt: skip
-            if follower.is_bent and depth > 0.0:
-                _add_bends(follower, stiffness * depth / size, field, base, m)
+            depth = depth_of(grasp, one)
+            _add_row(follower, stiffness, depth, one.along, one.about)
+            if follower.is_bent and depth > 0.0 and one.is_hollow:
+                weight = stiffness * depth / grasp.place.size
+                _add_bends(follower, weight, grasp.bends[follower.side, m])
         _factor(follower)
         _solve(follower)
-        if not _predict_contacts(follower, field, met, size):
+        if not _predict_contacts(grasp):
             return

@@ -28,7 +28,6 @@ from hapticdb.kernels.law import TANGENT_PLANE
 from hapticdb.kernels.period.clock import now_ns, wait_until
 from hapticdb.kernels.period.following import follow_arrivals
 from hapticdb.kernels.period.memory import (
-    FELT,
     array_at,
     cells_of,
     grid_of,
@@ -83,9 +82,11 @@ def move_by_coupling(station, seat, pace):
     shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
     cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
     tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
-    _, _, missed, met, field = memory
     which = begin_frame(cells, station.reader)
-    grasp = Grasp(cells, which, shell, place, follower, field, met, missed)
+    grasp = Grasp(
+        cells, which, shell, place, follower, memory.kept, memory.near, memory.bends, memory.met,
+        memory.missed,
+    )  # fmt: skip
     is_anew = tool.version != cells.readers[at]
     advance(grasp, cells.readers[at], spring, servo, pace.dt)
     sent.marks |= IS_ANEW if is_anew else 0
@@ -94,8 +95,8 @@ def move_by_coupling(station, seat, pace):
     end_frame(cells, station.reader)
     if station.begun - station.shown_at >= SHOW_EVERY_NS:
         station.shown_at = station.begun
-        show_contacts(seat, shell, memory.pose, place, spring, follower, field, met)
-    station.touching, station.n_touching = list_touching(follower, field, met, sent.hits)
+        show_contacts(seat, grasp, memory.pose, spring)
+    station.n_touching = list_touching(grasp, sent.hits)
     return 0
 
 
@@ -111,14 +112,14 @@ _cells = chosen_by_type(
 
 @entry(from_dtype(STATION), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)
 def feel(station, which, laws):
-    """Compute the law's frame at `station.pose`, into `station.felt` and row FELT of its `met`.
+    """Compute the law's frame at `station.pose`, into `station.felt` and `station.met`.
 
     which: the directory that the frame reads; laws: a pointer to the law.
     """
     law, memory = laws[0], memory_of(station)
     felt(
         law, _cells(law, station), which, tool_of(station), memory.pose, grid_of(station),
-        memory.met[FELT], memory.missed, memory.felt,
+        memory.met, memory.missed, memory.felt,
     )  # fmt: skip
     return 0
 
@@ -169,21 +170,23 @@ def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
         end_frame(cells, station.reader)
     render(spring_of(station), tool_of(station).center, servo, memory.felt, pace.dt)
     pose_of_quaternion(*numbers_of(servo.tool), memory.pose)
-    station.touching, station.n_touching = FELT, sent.hits
+    station.n_touching = sent.hits
     return 0
 
 
 @leaf
-def _ask_objects(station, seat, session, shell, place, pose, touching, n_touching, heartbeat):
+def _ask_objects(station, seat, session, shell, place, memory, heartbeat):
     """Ask for the objects that are touched, and show those that were answered.
 
-    touching (n_touching,): the points that touch. A request that stays would be answered again at
-    each write, for voxels that are no longer touched. A request withdrawn at once would never be
-    answered by a slow database.
+    A request that stays would be answered again at each write, for voxels that are no longer
+    touched. A request withdrawn at once would never be answered by a slow database.
     """
     sent = station.servo.sent
     if sent.hits > 0 or sent.marks & IS_LOOSE:
-        name_voxels(session, shell, pose, place, station.bits, station.curve, touching, n_touching)
+        name_voxels(
+            session, shell, memory.pose, place, station.bits, station.curve, memory.met,
+            station.n_touching,
+        )  # fmt: skip
         station.asked_at = station.begun
     elif station.asked_at != 0 and heartbeat > station.asked_at + WITHDRAWN_NS:
         session.n_asked = station.asked_at = 0
@@ -226,10 +229,7 @@ def _run_period(station, seat, ring, pace):
         return
     if begun - station.looked_at >= ASK_EVERY_NS:
         station.looked_at = begun
-        _ask_objects(
-            station, seat, session, shell, place, memory.pose, memory.met[station.touching],
-            station.n_touching, heartbeat,
-        )  # fmt: skip
+        _ask_objects(station, seat, session, shell, place, memory, heartbeat)
     station.last = begun
     elapsed = 1e-9 * (now_ns(pace.moment) - begun)
     time = 1e-9 * (begun - station.began)

@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.field.lattice import CELL_VALUES
 from hapticdb.kernels.hand.device_spring import DeviceSpring
-from hapticdb.kernels.hand.near_points import FIELD_ROWS, MET_ROWS
-from hapticdb.kernels.records import MOST_MISSED, RESULTS
+from hapticdb.kernels.records import BENDS, MOST_MISSED, NEAR, POINT, RESULTS
 from hapticdb.kernels.resident.cells import (
     BUFFERS,
     CELL_WORDS,
@@ -28,10 +27,6 @@ from hapticdb.kernels.resident.cells import (
     Clusters,
     Place,
 )
-
-TOUCHING, FELT, PERIOD_ROWS = MET_ROWS, MET_ROWS + 1, MET_ROWS + 2
-"""Rows of a session's `met`, after those of the coupling: the indices of the points that lie in
-something; those of a frame that is rendered directly."""
 
 if config.DISABLE_JIT:
 
@@ -114,14 +109,17 @@ class Memory(NamedTuple):
     """Arrays that the parts of a period share.
 
     pose (4, 4): of the tool; felt (RESULTS,): the law's frame; missed (1 + MOST_MISSED,): unknown
-    cells, as `felt` fills it; met and field: rows for each point of the tool, `hand.near_points`.
+    cells, as `felt` fills it; met, kept, near, bends: of the tool's points, as `near_points.Grasp`
+    has them.
     """
 
     pose: NDArray[np.float64]
     felt: NDArray[np.float64]
     missed: NDArray[np.int64]
     met: NDArray[np.int64]
-    field: NDArray[np.float64]
+    kept: NDArray[np.void]
+    near: NDArray[np.void]
+    bends: NDArray[np.void]
 
 
 @leaf
@@ -132,8 +130,10 @@ def memory_of(station):
         array_at(station.pose, (4, 4), np.float64),
         array_at(station.felt, (RESULTS,), np.float64),
         array_at(station.missed, (1 + MOST_MISSED,), np.int64),
-        array_at(station.met, (PERIOD_ROWS, n_points), np.int64),
-        array_at(station.field, (FIELD_ROWS, n_points), np.float64),
+        array_at(station.met, (n_points,), np.int64),
+        array_at(station.kept, (n_points,), POINT),
+        array_at(station.near_points, (2, n_points), NEAR),
+        array_at(station.bends, (2, n_points), BENDS),
     )
 
 

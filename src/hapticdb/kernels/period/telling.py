@@ -8,18 +8,8 @@ from hapticdb.kernels._jit import leaf
 from hapticdb.kernels.curves import key_of
 from hapticdb.kernels.hand.device_spring import contact_stiffness
 from hapticdb.kernels.hand.holding import IS_FADING, IS_HELD
-from hapticdb.kernels.hand.near_points import (
-    ALONG,
-    FELT_POINTS,
-    FLOOR,
-    NEAR,
-    NEAR_POINTS,
-    NEAR_ROWS,
-    ONSETS,
-    U,
-)
+from hapticdb.kernels.hand.near_points import FLOOR, depth_of
 from hapticdb.kernels.hand.quasistatic import IS_ANEW, IS_LOOSE, IS_SOFTER
-from hapticdb.kernels.period.memory import TOUCHING
 from hapticdb.kernels.records import MOST_ASKED, MOST_SHOWN, TIME_BIN, TIME_BINS
 from hapticdb.kernels.resident.cells import LISTED, in_voxels
 from hapticdb.kernels.resident.fence import fence
@@ -78,21 +68,20 @@ def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
 
 
 @leaf
-def list_touching(follower, field, met, n_hits):
-    """Row of `met` with the points that touch, and their number.
+def list_touching(grasp, n_hits):
+    """Number of the points that touch, in grasp.met.
 
     Where the tool lies in something these are the points that are in it. Their voxels may be free:
     the fetching process looks around them.
     """
-    if not follower.is_loose:
-        return FELT_POINTS, n_hits
-    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
-    n_found = np.int64(0)
-    for m in range(follower.n_near):
-        if field[rows + U, m] < FLOOR:
-            met[TOUCHING, n_found] = met[near, m]
+    if not grasp.follower.is_loose:
+        return n_hits
+    near, n_found = grasp.near[grasp.follower.side], np.int64(0)
+    for m in range(grasp.follower.n_near):
+        if near[m].u < FLOOR:
+            grasp.met[n_found] = near[m].point
             n_found += 1
-    return TOUCHING, n_found
+    return n_found
 
 
 @leaf
@@ -167,42 +156,29 @@ def count_times(seat, lateness, elapsed):
 
 
 @leaf
-def _show_contact(seat, at, transform, x, y, z, fx, fy, fz):
-    """Write a contact at point (x, y, z) of the tool, with its force, world frame."""
-    row = seat.contacts[at]
-    row[0], row[1], row[2] = moved(transform, x, y, z)
-    row[3], row[4], row[5] = fx, fy, fz
-
-
-@leaf
-def show_contacts(seat, shell, pose, place, spring, follower, field, met):
-    """List the contacts on the board."""
-    rows, near = NEAR + follower.side * NEAR_ROWS, NEAR_POINTS + follower.side
-    points, transform = shell.points, transform_of(pose)
-    stiffness = contact_stiffness(spring, place.size)
+def show_contacts(seat, grasp, pose, spring):
+    """List the contacts on the board: their points and forces, world frame."""
+    follower, points, transform = grasp.follower, grasp.shell.points, transform_of(pose)
+    near, n_near = grasp.near[follower.side], 0 if follower.is_loose else follower.n_near
+    stiffness = contact_stiffness(spring, grasp.place.size)
     n_contacts = 0
-    if not follower.is_loose:
-        for m in range(follower.n_near):
-            n_contacts += field[ONSETS, met[near, m]] > field[rows + U, m]
+    for m in range(n_near):
+        n_contacts += depth_of(grasp, near[m]) > 0.0
     every = max((n_contacts + MOST_SHOWN - 1) // MOST_SHOWN, 1)
     seat.contacts_sequence += 1
     fence()
     n_met = n_shown = 0
-    if n_contacts > 0:
-        for m in range(follower.n_near):
-            n = met[near, m]
-            depth = place.size * (field[ONSETS, n] - field[rows + U, m])
-            if depth <= 0.0:
-                continue
-            n_met += 1
-            if (n_met - 1) % every == 0:
-                force = stiffness * depth
-                _show_contact(
-                    seat, n_shown, transform, points[n, 0], points[n, 1], points[n, 2],
-                    force * field[rows + ALONG, m], force * field[rows + ALONG + 1, m],
-                    force * field[rows + ALONG + 2, m],
-                )  # fmt: skip
-                n_shown += 1
+    for m in range(n_near):
+        n, depth = near[m].point, depth_of(grasp, near[m])
+        if depth <= 0.0:
+            continue
+        n_met += 1
+        if (n_met - 1) % every == 0:
+            row, force = seat.contacts[n_shown], stiffness * depth
+            row[0], row[1], row[2] = moved(transform, points[n, 0], points[n, 1], points[n, 2])
+            for axis in range(3):
+                row[3 + axis] = force * near[m].along[axis]
+            n_shown += 1
     seat.n_contacts = n_shown
     fence()
     seat.contacts_sequence += 1

@@ -24,7 +24,7 @@ from hapticdb.kernels.resident.near_voxels import mark_near_voxels
 from hapticdb.poses import rotation_of
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.held import spheres_of
-from hapticdb.session.stations import Station, Stations
+from hapticdb.session.states import PeriodClock, SessionState
 
 Floats = NDArray[np.float64]
 Distance = Callable[[Floats], Floats]
@@ -201,19 +201,19 @@ class Hand:
         reach = np.linalg.norm(self.shell.points[:, :3] - self.shell.center, axis=1).max()
         radius = max(float(reach), field.place.size)
         self.spring = SPRING._replace(radius=radius)._replace(**spring)
-        self._periods = Stations(DISTANCE)
-        self._station = Station(
+        self._periods = PeriodClock(DISTANCE)
+        self._state = SessionState(
             self._periods.rows, field.cells, 0, np.zeros((), SESSION), Grid(1.0, (0, 0, 0), 6), tool
         )
-        row = self._station.row
+        row = self._state.row
         row["place"], row["is_running"] = field.place, 1
-        self._station.set_spring(self.spring)
-        self._station.rest_at(np.concatenate([position, quaternion]))
-        self.servo, self.follower = self._station.servo, self._station.follower
+        self._state.set_spring(self.spring)
+        self._state.rest_at(np.concatenate([position, quaternion]))
+        self.servo, self.follower = self._state.servo, self._state.follower
         views = views_of(self.servo)
         self.tool, self.hand, self.sent = views.tool, views.hand, views.sent
-        self.kept, self.near = self._station.kept, self._station.near_points
-        self.bends, self.missed = self._station.bends, self._station.missed
+        self.kept, self.near = self._state.kept, self._state.near_points
+        self.bends, self.missed = self._state.bends, self._state.missed
         for array in (self.kept, self.near, self.bends):
             array.view(np.float64)[:] = np.nan
 

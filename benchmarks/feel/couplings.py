@@ -17,7 +17,7 @@ from hapticdb.kernels.records import pose_numbers
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.held import clusters_of
-from hapticdb.session.stations import Station, Stations
+from hapticdb.session.states import PeriodClock, SessionState
 
 Floats = NDArray[np.float64]
 
@@ -54,16 +54,16 @@ class CoupledHand:
     """
 
     def __init__(self, ground: Ground, shell: PointShell, pose: Floats, terms: Terms) -> None:
-        self._periods = Stations(DISTANCE)
-        self._station = Station(
-            self._periods.rows, ground.table.cells, 0, ground.table.desk.sessions[0, ...],
+        self._periods = PeriodClock(DISTANCE)
+        self._state = SessionState(
+            self._periods.rows, ground.table.cells, 0, ground.table.queue.sessions[0, ...],
             ground.residency.grid, clusters_of(shell, ground.size),
         )  # fmt: skip
-        self._hand, self._sent = self._station.servo["hand"], self._station.servo["sent"]
+        self._hand, self._sent = self._state.servo["hand"], self._state.servo["sent"]
         self._handle = Handle()
         self._period = 1.0 / terms.rate
         self._handle.start(Reading(pose, np.zeros(6), 0), self._hand)
-        self._station.rest_at(pose_numbers(self._hand).copy())
+        self._state.rest_at(pose_numbers(self._hand).copy())
         reach = float(np.linalg.norm(shell.points - shell.center, axis=1).max())
         lever = max(reach, ground.size)
         spring = DeviceSpring(
@@ -77,9 +77,9 @@ class CoupledHand:
             hold=0.02,
             fade=0.02,
         )
-        self._station.set_spring(spring)
-        self._station.row["is_running"] = True
-        self._station.row["staleness"] = np.iinfo(np.int64).max
+        self._state.set_spring(spring)
+        self._state.row["is_running"] = True
+        self._state.row["staleness"] = np.iinfo(np.int64).max
         for _ in range(round(REST / (self._period * RATE))):
             self.step(pose, np.zeros(6))
 

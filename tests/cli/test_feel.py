@@ -44,11 +44,11 @@ def feel(*args: object) -> tuple[object, ...]:
 
 @pytest.mark.usefixtures("scene")
 def test_a_path_without_times_is_said_to_be_played_at_a_speed(run: Run) -> None:
-    wish = feel("--device", "path.csv", "--seconds", 0.2)
-    out = succeeded(run(*wish))
+    request = feel("--device", "path.csv", "--seconds", 0.2)
+    out = succeeded(run(*request))
     assert re.search(r"^ *played at +0\.1 m/s: the path has no times", out, re.MULTILINE)
-    assert json.loads(run(*wish, "--json")[1])["path_speed"] == 0.1
-    assert json.loads(run(*wish, "--json", "--speed", 0.2)[1])["path_speed"] is None
+    assert json.loads(run(*request, "--json")[1])["path_speed"] == 0.1
+    assert json.loads(run(*request, "--json", "--speed", 0.2)[1])["path_speed"] is None
 
 
 def test_a_session_is_recorded_replayed_and_played_again(run: Run, scene: Path) -> None:
@@ -114,12 +114,12 @@ def test_what_a_large_tool_costs_is_said_in_a_line(
 
 @pytest.mark.usefixtures("scene")
 def test_a_terminal_sees_what_is_waited_for_and_how_long_it_took() -> None:
-    wish = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.6)
-    shown = on_terminal(*wish)
+    request = feel("--device", "path.csv", "--rate", 200, "--seconds", 0.6)
+    shown = on_terminal(*request)
     for doing in ("loading", "sampling the tool", "measuring an empty loop", "feeling; Ctrl-C"):
         assert doing in shown
     assert re.search(r"^ *took +[\d.]+ s in all\r?$", shown, re.MULTILINE)
-    assert "measuring" not in on_terminal(*wish, "--no-baseline")
+    assert "measuring" not in on_terminal(*request, "--no-baseline")
 
 
 @pytest.mark.usefixtures("scene")

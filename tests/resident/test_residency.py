@@ -339,7 +339,7 @@ def test_a_reader_that_died_in_a_frame_holds_the_writer_up_for_a_moment_only(
     env = full_of_voxels(tmp_path)
     residency = Residency(env.store, table)
     row = table.join()
-    table.desk.pids[row] = 2**22 + 1  # above the largest process id
+    table.queue.pids[row] = 2**22 + 1  # above the largest process id
     table.cells.readers[row * READER_STRIDE] = table.version
     cells = cells_of(env.grid)
     for at in range(0, 400, 50):

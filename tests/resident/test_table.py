@@ -30,7 +30,7 @@ def test_the_budget_is_used_and_never_exceeded(budget: int, distances: bool) -> 
         assert table.n_slots > 0.85 * budget / a_cell
         assert table.capacity >= 4 * table.n_slots
         arrays: list[np.ndarray[Any, Any]] = [
-            a for a in (*table.cells, *table.desk) if a is not None
+            a for a in (*table.cells, *table.queue) if a is not None
         ]
         ends = sorted((a.ctypes.data, a.ctypes.data + a.nbytes) for a in arrays)
         assert all(a[1] <= b[0] for a, b in itertools.pairwise(ends))
@@ -68,14 +68,14 @@ def test_readers_have_rows_of_their_own_and_the_next_is_refused() -> None:
         table.leave(7)
         with table.reading() as row:
             assert row == 7
-        assert table.desk.pids[7] == 0
+        assert table.queue.pids[7] == 0
 
 
 def test_a_row_says_nothing_of_who_had_it_before() -> None:
     """Nothing is left even if the former reader ended in the middle of a write."""
     with CellTable.create(LEAST_BUDGET) as table:
         row = table.join()
-        sessions = table.desk.sessions
+        sessions = table.queue.sessions
         sessions[row] = 3  # sets all fields of the row
         sessions["sequence"][row] = 5
         table.leave(row)
@@ -90,9 +90,9 @@ def test_a_reader_whose_process_has_ended_holds_nothing_but_its_row() -> None:
     with child([sys.executable, "-c", "pass"]) as gone, CellTable.create(LEAST_BUDGET) as table:
         until(lambda: not is_alive(gone.pid))  # the process is a zombie
         dead, alive = table.join(), table.join()
-        table.desk.pids[dead] = gone.pid
+        table.queue.pids[dead] = gone.pid
         table.cells.readers[[dead * READER_STRIDE, alive * READER_STRIDE]] = 9
-        is_active = table.desk.sessions["told"]["is_active"]
+        is_active = table.queue.sessions["told"]["is_active"]
         is_active[[dead, alive]] = True
         table.release_dead()
         assert np.flatnonzero(table.cells.readers).tolist() == [alive * READER_STRIDE]

@@ -14,7 +14,7 @@ from hapticdb.poses import poses_of
 from hapticdb.query.law import ForceLaw
 from hapticdb.recording.file import Recording
 from hapticdb.session.session import Session
-from hapticdb.session.stations import LARGE_FROM
+from hapticdb.session.states import LARGE_FROM
 from voxels import floor_voxels, write_voxels
 
 RATE = 500.0

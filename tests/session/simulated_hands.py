@@ -20,7 +20,7 @@ from hapticdb.kernels.gpu import looks as kernels
 from hapticdb.kernels.resident.cells import UNKNOWN, key_of_cell
 from hapticdb.recording.file import Recording
 from hapticdb.resident.table import CellTable
-from hapticdb.session import on_gpu
+from hapticdb.session import gpu_queries
 from hapticdb.session.replay import replay
 from hapticdb.session.session import Session
 from session.hands import at
@@ -31,7 +31,7 @@ Floats = NDArray[np.float64]
 SIZE = 0.005
 RUN = 8
 kernels.THREADS_OF_RUNS, kernels.THREADS, kernels.MOST_BLOCKS = 2, 2, 3
-on_gpu.ROOM = 4, 1 << 30
+gpu_queries.ROOM = 4, 1 << 30
 sys.setswitchinterval(1e-4)  # the simulator watches its threads without a pause
 
 
@@ -56,7 +56,7 @@ class Pair:
             cells=cells, n_slots=n_slots, capacity=cells.keys.shape[1], size_bytes=0,
             version=0, filled=np.ones(n_slots, dtype=np.int64),
         )  # fmt: skip
-        self.gpu = on_gpu.GpuLooks(self.hands[1]._station, cast("CellTable", self.table))
+        self.gpu = gpu_queries.GpuQueries(self.hands[1]._state, cast("CellTable", self.table))
         self.n_bent = 0
 
     def move(self, position: ArrayLike) -> None:

@@ -16,12 +16,12 @@ from hapticdb.devices.scripted import Player
 from hapticdb.errors import DeviceError
 from hapticdb.recording.frame import State
 from hapticdb.session import device_loop as subject
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.device_loop import DeviceRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells
 from hapticdb.session.report import LoopAnswer, counts_of
-from hapticdb.session.stations import SlotRequest
+from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.states import SlotRequest
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest, work
 from query.test_second_law import Penalty
@@ -61,7 +61,7 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
     with cells.table.reading() as row:
 
         def ran(device: Device, **options: object) -> Ran:
-            board = Board.create(1, N_RING)
+            shared = SharedTable.create(1, N_RING)
             rate = float(str(options.pop("rate", 500.0)))
             law = options.pop("law", TangentPlane())
             alone = DeviceRequest(
@@ -70,12 +70,12 @@ def run(cells: ResidentCells, sphere: PointShell, monkeypatch: pytest.MonkeyPatc
             )  # fmt: skip
             alone = dataclasses.replace(alone, **options)  # type: ignore[arg-type]
             heard = Heard()
-            work(WorkerRequest(board, Timing(rate), law, "direct", alone), heard)  # type: ignore[arg-type]
+            work(WorkerRequest(shared, Timing(rate), law, "direct", alone), heard)  # type: ignore[arg-type]
             (_, (word, answer)) = heard.said
             assert word == "done"
-            frames = board.rings[0, : answer.loop.frames].copy()
-            counts = counts_of(board.seats[0])
-            board.close()
+            frames = shared.rings[0, : answer.loop.frames].copy()
+            counts = counts_of(shared.slots[0])
+            shared.close()
             return Ran(answer, counts, frames)
 
         yield ran

@@ -24,10 +24,10 @@ from hapticdb.query.law import DistanceField, ForceLaw
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import HEARTBEAT, CellTable
 from hapticdb.session import device_loop as subject
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling, DirectRendering, rendering_of
 from hapticdb.session.device_loop import DeviceLoop, DeviceRequest
-from hapticdb.session.stations import SlotRequest, Stations
+from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.states import PeriodClock, SlotRequest
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest, work
 from session.hands import Heard, at
@@ -100,8 +100,8 @@ def requested(world: World, hand: Pressing, seconds: float = 1.0) -> WorkerReque
     shell = flat_tool(6, SIZE, np.eye(3), pitch=0.4)
     slot = SlotRequest(0, world.table.join(), world.grid, shell, coupling)
     alone = DeviceRequest(slot, world.table, hand, Handle(), seconds, staleness=1e9)
-    board = Board.create(1, N_RING)
-    return WorkerRequest(board, Timing(200.0), law, rendering_of(None, law), alone)
+    shared = SharedTable.create(1, N_RING)
+    return WorkerRequest(shared, Timing(200.0), law, rendering_of(None, law), alone)
 
 
 def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
@@ -112,7 +112,7 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
             super().apply(wrench)
             world.table.cells.control[HEARTBEAT] = time.monotonic_ns() + 2 * WITHDRAWN_NS
             if wrench.any():
-                self.n_asked = int(world.table.desk.sessions["n_asked"].max())
+                self.n_asked = int(world.table.queue.sessions["n_asked"].max())
             self.z = -0.004 if 5 < len(self.sent) <= 30 else 0.02
 
         @property
@@ -123,25 +123,25 @@ def test_a_loop_takes_back_what_it_asked_for(world: World) -> None:
     work(requested(world, hand, seconds=60.0), Heard())
     assert hand.n_asked > 0
     assert not hand.sent[-1].any()
-    assert not world.table.desk.sessions["n_asked"].any()
+    assert not world.table.queue.sessions["n_asked"].any()
 
 
 def test_a_first_frame_that_is_held_has_no_hits_of_the_warm_up(world: World) -> None:
     hand = Pressing(-0.004)
     request = requested(world, hand)
-    board = request.board
+    shared = request.shared
     assert request.alone is not None
-    stations = Stations(request.law, board.seats, board.rings, request.rendering)
-    loop = DeviceLoop(request.alone, request.timing, stations)
+    clock = PeriodClock(request.law, shared.slots, shared.rings, request.rendering)
+    loop = DeviceLoop(request.alone, request.timing, clock)
     loop.warm_up()
     assert loop.tool["felt"].any() or world.table.has_distances  # there the tool lies in the floor
     hand.z = 0.02
     loop._place()
-    loop.station.row["staleness"] = -(10**18)
-    loop.station.row["is_frame"] = True
+    loop.state.row["staleness"] = -(10**18)
+    loop.state.row["is_frame"] = True
     loop._step(1e-3)
-    noted = board.rings[0, 0]
-    assert noted["hits"] == board.seats["hit_frames"][0] == 0
+    noted = shared.rings[0, 0]
+    assert noted["hits"] == shared.slots["hit_frames"][0] == 0
     assert not noted["applied"].any()
 
 

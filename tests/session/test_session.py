@@ -210,7 +210,7 @@ def test_a_session_that_does_not_begin_leaves_no_recording(
     with pytest.raises(UsageError, match="is there already"):
         Session(cells, sphere, still(0.010), law="plane", record=path)
     assert path.read_text() == "mine"
-    assert not cells.table.desk.pids.any()
+    assert not cells.table.queue.pids.any()
 
 
 @pytest.mark.parametrize("step", ["open", "begin"])

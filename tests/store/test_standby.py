@@ -115,7 +115,7 @@ def test_a_session_reads_its_cells_and_its_lag_from_it(pair: Pair, *, is_standby
         assert isinstance(fetcher.store, MayLag)
         fetcher.warm_up()
         fetcher.round()
-        assert bool(table.desk.figures["lag"] > 0) == is_standby
+        assert bool(table.queue.figures["lag"] > 0) == is_standby
     finally:
         fetcher.close()
         table.close()

@@ -39,7 +39,7 @@ _PAGE = 4096
 _joining = threading.Lock()
 
 
-class Desk(NamedTuple):
+class RequestQueue(NamedTuple):
     """Messages between sessions and the fetching process; `kernels.records` defines the fields.
 
     sessions (R,) of SESSION, one row for each reader; pids (R,) int64: ids of the processes that
@@ -131,7 +131,7 @@ class CellTable(Closes):
     ----------
     cells : Cells
         The arrays that frames read; see `hapticdb.kernels.resident.cells`.
-    desk : Desk
+    queue : RequestQueue
         Messages between sessions and the fetching process.
     filled : (slots,) int64
         Version of the directory in which each slot's cell appeared, for copies of the table.
@@ -160,7 +160,7 @@ class CellTable(Closes):
             views[name] = np.ndarray(shape, dtype, self._memory, at)
             at += -(-views[name].nbytes // _PAGE) * _PAGE
         self.cells = kernels.Cells(**{n: views[n] for n in kernels.Cells._fields if n in views})  # type: ignore[arg-type]
-        self.desk = Desk(**{n: views[n] for n in Desk._fields})  # type: ignore[arg-type]
+        self.queue = RequestQueue(**{n: views[n] for n in RequestQueue._fields})  # type: ignore[arg-type]
         self.filled: NDArray[np.int64] = views["filled"]  # type: ignore[assignment]
 
     @classmethod
@@ -219,35 +219,35 @@ class CellTable(Closes):
             If the table has no free reader row.
         """
         with _joining:
-            free = np.flatnonzero(self.desk.pids == 0)
+            free = np.flatnonzero(self.queue.pids == 0)
             if len(free):
                 row = int(free[0])
                 self._clear(row)
-                sequence = self.desk.sessions["sequence"]
+                sequence = self.queue.sessions["sequence"]
                 sequence[row] += sequence[row] % 2  # odd if the last session died while it wrote
-                self.desk.pids[row] = os.getpid()
+                self.queue.pids[row] = os.getpid()
                 return row
         raise UsageError(f"a table of cells has {MOST_READERS} readers at most: end one first")
 
     def leave(self, row: int) -> None:
         """Stop being a reader."""
         self._clear(row)
-        self.desk.pids[row] = 0
+        self.queue.pids[row] = 0
 
     def release_dead(self) -> None:
         """Release the versions and sessions of readers that have died; their rows stay taken."""
-        pids = self.desk.pids
+        pids = self.queue.pids
         dead = [pid for pid in set(pids.tolist()) - {0} if not is_alive(pid)]  # one may own many
         if dead:
             for row in np.flatnonzero(np.isin(pids, dead)).tolist():
                 self.cells.readers[row * kernels.READER_STRIDE] = 0
-                self.desk.sessions["told"]["is_active"][row] = False
+                self.queue.sessions["told"]["is_active"][row] = False
 
     def _clear(self, row: int) -> None:
         self.cells.readers[row * kernels.READER_STRIDE] = 0
         for name in SESSION.names or ():
             if name != "sequence":
-                self.desk.sessions[name][row] = 0
+                self.queue.sessions[name][row] = 0
 
     @contextmanager
     def reading(self) -> Iterator[int]:

@@ -10,10 +10,10 @@ from numpy.typing import ArrayLike
 from hapticdb.closing import Closes
 from hapticdb.errors import HapticDBError
 from hapticdb.pointshell.shell import PointShell
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.hosted import Calls, HostedSession
 from hapticdb.session.processes.channel import Channel, Message
+from hapticdb.session.shared_table import SharedTable
 from hapticdb.store.finding import Words
 
 LOG = logging.getLogger("hapticdb.session")
@@ -35,7 +35,7 @@ class AttachedHost(Closes):
         except (EOFError, OSError, ValueError) as error:
             self._channel.close()
             raise HapticDBError("no host answers at the other end of the socket") from error
-        self._board = Board(descriptor)
+        self._shared = SharedTable(descriptor)
 
     def begin(
         self,
@@ -49,8 +49,8 @@ class AttachedHost(Closes):
     ) -> HostedSession:
         """Begin a session; as `SessionHost.begin`, with its errors."""
         options = {"where": where, "exclude": exclude, "coupling": coupling, "scale": scale}
-        seat, session = self._channel.ask("begin", shell, start, options)
-        return HostedSession(self._board, seat, session, self._call)
+        slot, session = self._channel.ask("begin", shell, start, options)
+        return HostedSession(self._shared, slot, session, self._call)
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
         return self._channel.ask("call", word, session, *content)
@@ -58,11 +58,11 @@ class AttachedHost(Closes):
     def close(self) -> None:
         """Leave the host; the sessions that this process has begun end."""
         self._channel.close()
-        self._board.close()
+        self._shared.close()
 
 
 def serve_attached(
-    sock: socket.socket, board: Board, begin: Callable[..., HostedSession], call: Calls
+    sock: socket.socket, shared: SharedTable, begin: Callable[..., HostedSession], call: Calls
 ) -> None:
     """Serve an `AttachedHost` until it leaves, by a host's methods; then end its sessions."""
     channel = Channel(sock)
@@ -73,12 +73,12 @@ def serve_attached(
             shell, start, options = ask.content
             session = begin(shell, start, **options)
             begun.add(session.id)
-            return session.seat, session.id
+            return session.slot, session.id
         word, number, *content = ask.content
         return call(word, number, *content)
 
     try:
-        channel.send(None, [board.descriptor])
+        channel.send(None, [shared.descriptor])
         while True:
             channel.reply(do)
     except (EOFError, OSError):

@@ -36,11 +36,11 @@ from hapticdb.resident.table import LOST, STOP, CellTable
 from hapticdb.session.coupling import Rendering
 from hapticdb.session.processes.process import LOOK_EVERY, MessageSender, parent_is_gone
 from hapticdb.session.report import LoopAnswer, LoopFigures
-from hapticdb.session.stations import SlotRequest, Stations
+from hapticdb.session.states import PeriodClock, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
 
 if TYPE_CHECKING:
-    from hapticdb.session.on_gpu import GpuLooks
+    from hapticdb.session.gpu_queries import GpuQueries
 
 EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
@@ -53,7 +53,7 @@ WARM_PATIENCE = 30.0
 class DeviceRequest:
     """Session of which the worker has the device: see `hapticdb.session.session.Session`."""
 
-    slot: SlotRequest
+    slot_request: SlotRequest
     table: CellTable
     device: Device
     handle: Handle
@@ -66,28 +66,28 @@ class DeviceRequest:
 class DeviceLoop:
     """The loop of a session whose device this process has. It is made, warmed up, and run once.
 
-    request : its slot and reader row are taken; timing : of the loop; stations : of its one slot.
+    request : its slot and reader row are taken; timing : of the loop; clock : of its one slot.
     """
 
-    def __init__(self, request: DeviceRequest, timing: Timing, stations: Stations) -> None:
-        self.request, self.timing, self.stations = request, timing, stations
+    def __init__(self, request: DeviceRequest, timing: Timing, clock: PeriodClock) -> None:
+        self.request, self.timing, self.clock = request, timing, clock
         self.device, self.table = request.device, request.table
         self.reader = Reader(request.device)
-        self.seat = stations.seats[request.slot.seat, ...]
-        self.station = stations.add(request.slot, request.table)
-        self.session = self.station.session
-        self.station.row["source"], self.station.row["is_running"] = DEVICE, True
-        self.station.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
-        self.gpu: GpuLooks | None = None
+        self.slot = clock.slots[request.slot_request.slot, ...]
+        self.state = clock.add(request.slot_request, request.table)
+        self.session = self.state.session
+        self.state.row["source"], self.state.row["is_running"] = DEVICE, True
+        self.state.row["staleness"] = round(min(request.staleness, 1e9) * 1e9)
+        self.gpu: GpuQueries | None = None
         if request.is_on_gpu:
-            from hapticdb.session import on_gpu  # noqa: PLC0415 - loads numba.cuda
+            from hapticdb.session import gpu_queries  # noqa: PLC0415 - loads numba.cuda
 
-            self.gpu = on_gpu.GpuLooks(self.station, self.table)
-            self.station.follower["merges_from"] = on_gpu.MERGES_FROM
-        self.tool, self.hand = self.station.servo["tool"], self.station.servo["hand"]
-        self.sent = views_of(self.station.servo["sent"])
-        self._reading = views_of(self.station.record["reading"])
-        self._is_asked_to_end = self.seat["is_asked_to_end"]
+            self.gpu = gpu_queries.GpuQueries(self.state, self.table)
+            self.state.follower["merges_from"] = gpu_queries.MERGES_FROM
+        self.tool, self.hand = self.state.servo["tool"], self.state.servo["hand"]
+        self.sent = views_of(self.state.servo["sent"])
+        self._reading = views_of(self.state.record["reading"])
+        self._is_asked_to_end = self.slot["is_asked_to_end"]
         self.bad_reading: str | None = None
         self.is_warm = False
         self._error: BaseException | None = None
@@ -126,9 +126,9 @@ class DeviceLoop:
         reading, handle = self._read(), self.request.handle
         self._take(reading)
         handle.start(reading, self.hand)
-        self.station.record["handle"] = handle.record
+        self.state.record["handle"] = handle.record
         # a held first frame must not report hits at an earlier place
-        self.station.rest_at(pose_numbers(self.hand).copy())
+        self.state.rest_at(pose_numbers(self.hand).copy())
 
     def _read(self) -> Reading:
         """Read the hand's pose; wait for a device that does not know it yet after its opening."""
@@ -163,7 +163,7 @@ class DeviceLoop:
 
     def _step(self, dt: float) -> None:
         """Run a period of `dt` s; `sent` then has the wrench for the device."""
-        self.stations.step(dt, time.monotonic_ns())
+        self.clock.step(dt, time.monotonic_ns())
         if self.gpu is not None:
             self.gpu.check()
 
@@ -177,13 +177,13 @@ class DeviceLoop:
 
     def run(self) -> LoopFigures:
         """Run frames until the time is over, the device's script ends, or a stop is requested."""
-        row = self.station.row
+        row = self.state.row
         called = self._called(self._read_hand), self._called(self._pusher())
         row["reads"], row["pushes"] = map(address_of, called)
         row["is_frame"] = True
         before = signal.signal(signal.SIGTERM, self._end)
         try:
-            seconds = self.stations.run(self.timing.rate, self.request.seconds)
+            seconds = self.clock.run(self.timing.rate, self.request.seconds)
         finally:
             signal.signal(signal.SIGTERM, before)
         if self._signal:
@@ -191,7 +191,7 @@ class DeviceLoop:
         if self._error is not None:
             raise self._error
         self.device.apply(np.zeros(6))
-        return LoopFigures.of_seat(self.seat, seconds)
+        return LoopFigures.of_slot(self.slot, seconds)
 
     def _end(self, number: int, _: object) -> None:
         """End the loop, and the call of a device that hangs.
@@ -199,7 +199,7 @@ class DeviceLoop:
         What is raised at the entrance of a kernel's call is lost; `run` then raises the signal.
         """
         self._signal = number
-        self.stations.stop()
+        self.clock.stop()
         raise SystemExit(128 + number)
 
     def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
@@ -222,7 +222,7 @@ class DeviceLoop:
         """Return what pushes the device and looks whether the loop ends."""
         device = self.device
         ends = device if isinstance(device, SupportsEnd) else None
-        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.seat["n_frames"]
+        applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.slot["n_frames"]
         look_every = max(round(LOOK_EVERY * self.timing.rate), 1)
 
         def push() -> bool:
@@ -252,19 +252,19 @@ def empty_loop(
 
     It ends at once if the process that started this one ends, or closes its channel.
     """
-    stations = Stations(law, rendering=rendering)
-    stations.rows["source"], stations.rows["is_running"] = NOBODY, True
+    clock = PeriodClock(law, rendering=rendering)
+    clock.rows["source"], clock.rows["is_running"] = NOBODY, True
 
     # sleeps meanwhile: the kernel holds no interpreter lock, and nothing else can end it
     def end() -> None:
         if parent_is_gone(seconds):
-            stations.stop()
+            clock.stop()
 
     watch = threading.Thread(target=end)
     watch.start()
-    took = stations.run(rate, seconds)
+    took = clock.run(rate, seconds)
     watch.join()
-    return LoopFigures.of_seat(stations.seats[0], took)
+    return LoopFigures.of_slot(clock.slots[0], took)
 
 
 def n_compiled() -> int:
@@ -273,20 +273,20 @@ def n_compiled() -> int:
 
 
 def run_device(
-    request: DeviceRequest, timing: Timing, stations: Stations, sender: MessageSender
+    request: DeviceRequest, timing: Timing, clock: PeriodClock, sender: MessageSender
 ) -> None:
     """Run the session of a device in this process, and send its results."""
-    loop = DeviceLoop(request, timing, stations)
+    loop = DeviceLoop(request, timing, clock)
     try:
         loop.warm_up()
         with undisturbed(timing.processor):
             empty = None
             if request.has_baseline:
                 seconds = min(EMPTY_SECONDS, request.seconds)
-                empty = empty_loop(stations.law, stations.rendering, timing.rate, seconds)
+                empty = empty_loop(clock.law, clock.rendering, timing.rate, seconds)
             loop.prepare()
             compiled = n_compiled()
-            sender.send("running", loop.station.state())
+            sender.send("running", loop.state.save())
             figures = loop.run()
             if n_compiled() != compiled:
                 raise HapticDBError("a kernel was compiled while the loop ran: report this")

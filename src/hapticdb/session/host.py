@@ -24,12 +24,12 @@ from hapticdb.poses import row_of_pose
 from hapticdb.query.law import DISTANCE, PLANE
 from hapticdb.resident.table import DEFAULT_BUDGET
 from hapticdb.session.attached import serve_attached
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling, Rendering, radius_of, rendering_of
 from hapticdb.session.hosted import HostedSession, Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
 from hapticdb.session.prefetch.tables import SharedTables
 from hapticdb.session.running import Running
+from hapticdb.session.shared_table import SharedTable
 from hapticdb.session.timing import Timing
 from hapticdb.session.workers import Workers
 from hapticdb.store.filtering import Filter
@@ -73,8 +73,8 @@ class SessionHost(Closes):
             raise UsageError(f"{processes} worker processes: give 1 or more")
         self.url, self.rate, self._rendering = url, rate, rendering
         self._tables = SharedTables(url, budget_bytes)
-        self._board = Board.create(MOST_SESSIONS)
-        self._workers = Workers(self._board, rate, processes or os.cpu_count() or 1)
+        self._shared = SharedTable.create(MOST_SESSIONS)
+        self._workers = Workers(self._shared, rate, processes or os.cpu_count() or 1)
         self._running: dict[int, Running] = {}
         self._ids = itertools.count(1)
         self._changing = threading.RLock()
@@ -109,7 +109,7 @@ class SessionHost(Closes):
         metres of the scene for a metre of the device, for the coupling alone: poses of the hand are
         the scene's.
 
-        Raises `UsageError` if a number is out of its range, no seat is free, or a hand is to be
+        Raises `UsageError` if a number is out of its range, no slot is free, or a hand is to be
         coupled where an object has no distances to its surfaces; `ObjectNotFoundError` if a word
         chooses nothing; `DatabaseError` if the environment cannot be opened.
         """
@@ -131,7 +131,7 @@ class SessionHost(Closes):
         coupling: Coupling | None,
         scale: float,
     ) -> HostedSession:
-        """Take seat, cells and worker for a session; all are given back if one is not to be had."""
+        """Take slot, cells and worker for a session; all are given back if one is not to be had."""
         number = next(self._ids)
         with ExitStack() as undo:
             cells = self._tables.take(felt)
@@ -144,12 +144,12 @@ class SessionHost(Closes):
                 rendering, SCRIPTED, self.rate, scale, radius_of(shell, cells.grid.voxel_size)
             )
             worker = self._workers.least_busy(law, rendering)
-            running = Running(number, self._board, cells, shell, settled, worker.number)
+            running = Running(number, self._shared, cells, shell, settled, worker.number)
             undo.callback(running.close)
             running.worker = worker
             hand = np.array(row_of_pose(pose))
-            self._board.seats["hand_pose"][running.seat] = hand
-            self._board.seats["is_held"][running.seat] = 1
+            self._shared.slots["hand_pose"][running.slot] = hand
+            self._shared.slots["is_held"][running.slot] = 1
             table = cells.table
             worker.ask(
                 "begin", running.request, hand, id(cells), table.n_slots,
@@ -157,12 +157,12 @@ class SessionHost(Closes):
             )  # fmt: skip
             self._running[number] = running
             undo.pop_all()
-        return HostedSession(self._board, running.seat, number, self._call)
+        return HostedSession(self._shared, running.slot, number, self._call)
 
     def sessions(self) -> list[HostedSession]:
         """Sessions that run now, by their ids."""
         running = sorted(self._running.items())
-        return [HostedSession(self._board, r.seat, number, self._call) for number, r in running]
+        return [HostedSession(self._shared, r.slot, number, self._call) for number, r in running]
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
         """Do what a session asks for; see `HostedSession`."""
@@ -183,7 +183,7 @@ class SessionHost(Closes):
             ends.callback(running.close)
             try:
                 if running.worker.is_alive:
-                    running.worker.ask("end", running.seat)
+                    running.worker.ask("end", running.slot)
             finally:
                 recorded = running.stop_recording()
         return recorded
@@ -193,7 +193,7 @@ class SessionHost(Closes):
         self._served.append(sock)
         threading.Thread(
             target=serve_attached,
-            args=(sock, self._board, self.begin, self._call),
+            args=(sock, self._shared, self.begin, self._call),
             daemon=True,
             name="attached",
         ).start()
@@ -210,7 +210,7 @@ class SessionHost(Closes):
                 if running.worker.is_alive:
                     running.take_frames()
                 else:
-                    self._board.lose(running.seat, running.session)
+                    self._shared.lose(running.slot, running.session)
 
     def _look_after_cells(self) -> None:
         """Start fetching processes again that have ended."""
@@ -251,7 +251,7 @@ class SessionHost(Closes):
             with suppress(RuntimeError):
                 thread.join()
         with self._changing, ExitStack() as ends:
-            ends.callback(self._board.close)
+            ends.callback(self._shared.close)
             ends.callback(self._tables.close)
             ends.callback(self._workers.close)
             for sock in self._served:

@@ -14,9 +14,9 @@ from hapticdb.kernels.hand.handle import FARTHEST
 from hapticdb.kernels.rigid import is_rigid
 from hapticdb.poses import row_of_pose
 from hapticdb.recording.frame import Frames, State
-from hapticdb.session.board import TAKEN, Board
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.report import LoopFigures, counts_of
+from hapticdb.session.shared_table import TAKEN, SharedTable
 
 
 class Recorded(NamedTuple):
@@ -36,25 +36,26 @@ class HostedSession:
     `move`, `latest`, `contacts`, `touched` and `figures` read and write shared memory and take
     microseconds; the others wait for the host, which `call` reaches.
 
-    id : number that no other session of the host ever has; seat : row of the board; lost_frames :
-    frames that this session's last recording lacks, known when this object has ended it.
+    id : number that no other session of the host ever has; slot : its row of the shared table;
+    lost_frames : frames that this session's last recording lacks, known when this object has ended
+    it.
     """
 
-    def __init__(self, board: Board, seat: int, session: int, call: Calls) -> None:
-        self._board, self.seat, self._call = board, seat, call
+    def __init__(self, shared: SharedTable, slot: int, session: int, call: Calls) -> None:
+        self._shared, self.slot, self._call = shared, slot, call
         self.id = session
         self.lost_frames = 0
 
     @property
     def is_over(self) -> bool:
         """Whether the session has ended: by `end`, or because its process died."""
-        seats = self._board.seats
-        return bool(seats["id"][self.seat] != self.id or seats["state"][self.seat] != TAKEN)
+        slots = self._shared.slots
+        return bool(slots["id"][self.slot] != self.id or slots["state"][self.slot] != TAKEN)
 
-    def _open_seat(self) -> int:
+    def _open_slot(self) -> int:
         if self.is_over:
             raise UsageError(f"the hosted session {self.id} is over: begin another")
-        return self.seat
+        return self.slot
 
     def move(self, pose: ArrayLike) -> None:
         """Put the hand at a pose (4, 4) of the scene, metres; the newest one counts.
@@ -72,25 +73,25 @@ class HostedSession:
             np.abs(row).max() <= FARTHEST and abs(math.hypot(*row[3:]) - 1.0) <= 1e-6
         ):
             raise UsageError("a hand moves to a pose (4, 4) that is a rigid transform")
-        self._board.put_hand(self._open_seat(), time.monotonic_ns(), row)
+        self._shared.put_hand(self._open_slot(), time.monotonic_ns(), row)
 
     def latest(self) -> Frames | None:
         """Latest frame, (1,) of `kernels.records.FRAME`; None before the first."""
-        return self._board.last_frame(self._open_seat())
+        return self._shared.last_frame(self._open_slot())
 
     def touched(self) -> tuple[int, ...]:
         """Ids of the objects that the tool touches now, or lies in; asked 100 times a second."""
-        seat = self._open_seat()
-        last = self._board.last_frame(seat)
+        slot = self._open_slot()
+        last = self._shared.last_frame(slot)
         if last is None or not (last["hits"][0] or last["state"][0] & State.IN_OBJECT):
             return ()
-        seats = self._board.seats
-        ids = seats["objects"][seat, : int(seats["n_objects"][seat])]
+        slots = self._shared.slots
+        ids = slots["objects"][slot, : int(slots["n_objects"][slot])]
         return tuple(sorted(set(ids.tolist())))
 
     def contacts(self) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
         """Points (n, 3) in contact, m, and forces there, N; world frame, n <= 64, 30 Hz."""
-        found = self._board.contacts(self._open_seat())
+        found = self._shared.contacts(self._open_slot())
         return found[:, :3], found[:, 3:]
 
     def set_coupling(self, coupling: Coupling | None) -> None:
@@ -120,13 +121,13 @@ class HostedSession:
 
     def figures(self) -> LoopFigures:
         """Frames of the session so far, and their times."""
-        return LoopFigures.of_seat(self._board.seats[self._open_seat()], 0.0)
+        return LoopFigures.of_slot(self._shared.slots[self._open_slot()], 0.0)
 
     def counts(self) -> dict[str, Any]:
         """Counts of frames and greatest forces so far, by their names in a `Report`."""
-        return counts_of(self._board.seats[self._open_seat()])
+        return counts_of(self._shared.slots[self._open_slot()])
 
     def end(self) -> None:
         """End the session and its recording; a second call does nothing."""
-        if self._board.seats["id"][self.seat] == self.id:
+        if self._shared.slots["id"][self.slot] == self.id:
             self._ended_recording("end")

@@ -20,8 +20,8 @@ from hapticdb.resident.held import clusters_of
 from hapticdb.resident.residency import Residency
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import radius_of
-from hapticdb.session.prefetch.tracking import Wish
-from hapticdb.session.stations import Station, Stations
+from hapticdb.session.prefetch.tracking import PrefetchRequest
+from hapticdb.session.states import PeriodClock, SessionState
 
 BLOCK = 256
 """Frames that are run at once, and again when they met a cell that was not in memory. Larger: fewer
@@ -121,34 +121,34 @@ def replay(recording: Recording, environment: Environment) -> Replayed:
 
 
 class _Again:
-    """The session's station, whose hand is the recorded one."""
+    """The session's state, whose hand is the recorded one."""
 
     def __init__(self, recording: Recording, residency: Residency, table: CellTable) -> None:
         header, self._residency, self._table = recording.header, residency, table
-        self._seats = np.zeros(1, SEAT)
+        self._slots = np.zeros(1, SEAT)
         self._ring = np.zeros((1, BLOCK), FRAME)
-        self._stations = Stations(header.law, self._seats, self._ring, header.rendering)
+        self._clock = PeriodClock(header.law, self._slots, self._ring, header.rendering)
         row = table.join()
-        self._station = station = Station(
-            self._stations.rows, table.cells, row, table.desk.sessions[row, ...], header.grid,
+        self._state = state = SessionState(
+            self._clock.rows, table.cells, row, table.queue.sessions[row, ...], header.grid,
             clusters_of(header.shell, header.grid.voxel_size),
         )  # fmt: skip
         try:
-            station.restore(header.start)
+            state.restore(header.start)
         except ValueError:
             raise UsageError(
                 f"{recording.path}: its state is of another build, {header.build}: record it again"
             ) from None
-        self._row = views_of(station.record)
-        self._hand = pose_numbers(station.servo["hand"])
+        self._row = views_of(state.record)
+        self._hand = pose_numbers(state.servo["hand"])
         self._row.is_frame[()] = self._row.is_running[()] = 1
         self._center = np.append(header.shell.center, 1.0)
         self._radius = radius_of(header.shell, header.grid.voxel_size)
 
     def run(self, frames: Frames) -> Frames:
         """Run frames with the inputs of the recorded ones."""
-        station, residency = self._station, self._residency
-        before, wanted = station.state(), self._around(frames)
+        state, residency = self._state, self._residency
+        before, wanted = state.save(), self._around(frames)
         residency.make_resident(wanted)
         while True:
             missed = self._run(frames)
@@ -158,7 +158,7 @@ class _Again:
                 raise HapticDBError(f"cells {missed[:3].tolist()} do not stay in memory")
             wanted = np.union1d(wanted, missed)
             residency.make_resident(wanted)
-            station.restore(before)
+            state.restore(before)
 
     def _around(self, frames: Frames) -> NDArray[np.int64]:
         """Cells around the recorded tools, as many as half the table holds."""
@@ -168,7 +168,7 @@ class _Again:
         if not np.isfinite(ways).all():
             return np.empty(0, np.int64)
         margin = float(np.linalg.norm(ways - ways[0], axis=1).max()) + LONGEST_REST + FAR
-        around = Wish(ways[0], np.zeros(3), self._radius / grid.voxel_size, margin)
+        around = PrefetchRequest(ways[0], np.zeros(3), self._radius / grid.voxel_size, margin)
         return np.sort(around.cells(grid)[0][: self._table.n_slots // 2])
 
     def _run(self, frames: Frames) -> NDArray[np.int64]:
@@ -180,7 +180,7 @@ class _Again:
             (state & bit != 0).tolist() for bit in (State.CLUTCH_OPEN, State.STALE, State.ANEW)
         )
         dt, unknown = frames["dt"].tolist(), self._ring[0]["unknown"]
-        self._seats["n_frames"] = 0
+        self._slots["n_frames"] = 0
         for n, frame in enumerate(frames):
             self._hand[:], hand.velocity[:] = frame["hand"], frame["hand_velocity"]
             hand.is_open[()] = is_open[n]
@@ -189,10 +189,10 @@ class _Again:
             row.reading.buttons[()] = frame["buttons"]
             if version:  # the cells seem to have changed where they did in the session
                 version[()] = -1 if is_anew[n] else self._table.cells.control[VERSION]
-            self._stations.step(dt[n], 0)
+            self._clock.step(dt[n], 0)
             if unknown[n]:
-                listed = self._station.missed[LISTED]
-                missed.append(self._station.missed[LISTED + 1 :][:listed])
+                listed = self._state.missed[LISTED]
+                missed.append(self._state.missed[LISTED + 1 :][:listed])
         return np.unique(np.concatenate(missed))
 
 

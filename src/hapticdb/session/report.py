@@ -24,7 +24,7 @@ class Spread(NamedTuple):
 
 
 def spread_of(counts: NDArray[np.int64], worst: float) -> Spread:
-    """Percentiles of a seat's histogram; zeros if it is empty.
+    """Percentiles of a slot's histogram; zeros if it is empty.
 
     counts (TIME_BINS + 1,): the last bin has all longer times; worst : the longest one, s.
     """
@@ -62,12 +62,12 @@ class LoopFigures:
         return self.frames / self.seconds if self.seconds else 0.0
 
     @classmethod
-    def of_seat(cls, seat: NDArray[np.void], seconds: float) -> Self:
-        """Timing of a session that ran for so long; seat : its row of `SEAT`."""
+    def of_slot(cls, slot: NDArray[np.void], seconds: float) -> Self:
+        """Timing of a session that ran for so long; slot : its row of `SEAT`."""
         spreads = [
-            spread_of(seat[name], float(seat[f"worst_{name}"])) for name in ("lateness", "elapsed")
+            spread_of(slot[name], float(slot[f"worst_{name}"])) for name in ("lateness", "elapsed")
         ]
-        return cls(int(seat["n_frames"]), seconds, int(seat["missed"]), *spreads)
+        return cls(int(slot["n_frames"]), seconds, int(slot["missed"]), *spreads)
 
 
 class LoopAnswer(NamedTuple):
@@ -181,10 +181,10 @@ class Report:
         )
 
 
-def counts_of(seat: NDArray[np.void]) -> dict[str, Any]:
-    """Counts of a session's seat, a row of `SEAT`, by their names in a `Report`."""
+def counts_of(slot: NDArray[np.void]) -> dict[str, Any]:
+    """Counts of a session's slot, a row of `SEAT`, by their names in a `Report`."""
     told = {one.name for one in fields(Report)}
-    names = [n for n in seat.dtype.names or () if n in told and not seat.dtype[n].shape]
-    counts = {name: seat[name].item() for name in names}
-    counts["ended_loose"] = bool(seat["ended_loose"])
-    return counts if seat["loose_frames"] else counts | {"first_loose_frame": -1}
+    names = [n for n in slot.dtype.names or () if n in told and not slot.dtype[n].shape]
+    counts = {name: slot[name].item() for name in names}
+    counts["ended_loose"] = bool(slot["ended_loose"])
+    return counts if slot["loose_frames"] else counts | {"first_loose_frame": -1}

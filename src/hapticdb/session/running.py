@@ -10,16 +10,16 @@ from hapticdb.errors import UsageError
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.recording.file import Recorder
 from hapticdb.recording.header import Start
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import Coupling, DirectRendering
 from hapticdb.session.hosted import Recorded
 from hapticdb.session.prefetch.resident_cells import ResidentCells
-from hapticdb.session.stations import SlotRequest
+from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.states import SlotRequest
 from hapticdb.session.workers import WorkerProcess
 
 
 class Running(Closes):
-    """A session that runs: its seat and reader row, until `close`; its worker; its recording.
+    """A session that runs: its slot and reader row, until `close`; its worker; its recording.
 
     session : its number; worker : its process, or the number of one that is still to start.
     """
@@ -27,23 +27,23 @@ class Running(Closes):
     def __init__(
         self,
         session: int,
-        board: Board,
+        shared: SharedTable,
         cells: ResidentCells,
         shell: PointShell,
         coupling: DirectRendering,
         worker: int = 0,
     ) -> None:
-        self.session, self.board, self.cells = session, board, cells
+        self.session, self.shared, self.cells = session, shared, cells
         self._worker: WorkerProcess | None = None
         self.recording: Recorder | None = None
         self._taking = threading.Lock()
         with ExitStack() as undo:
             reader = cells.table.join()
             undo.callback(cells.table.leave, reader)
-            self.seat = board.take(session, worker)
-            undo.callback(board.release, self.seat)
+            self.slot = shared.take(session, worker)
+            undo.callback(shared.release, self.slot)
             self.request = SlotRequest(
-                self.seat, reader, cells.grid, replace(shell, surface=None), coupling
+                self.slot, reader, cells.grid, replace(shell, surface=None), coupling
             )
             self._ends = undo.pop_all()
 
@@ -56,12 +56,12 @@ class Running(Closes):
     @worker.setter
     def worker(self, worker: WorkerProcess) -> None:
         self._worker = worker
-        self.cells.table.desk.pids[self.request.reader] = worker.pid
+        self.cells.table.queue.pids[self.request.reader] = worker.pid
 
     @property
     def n_frames(self) -> int:
         """Number of frames so far."""
-        return int(self.board.seats["n_frames"][self.seat])
+        return int(self.shared.slots["n_frames"][self.slot])
 
     def set_coupling(self, coupling: Coupling | None) -> None:
         """Replace the coupling between hand and tool, of a session without a device."""
@@ -69,7 +69,7 @@ class Running(Closes):
         settled = (coupling or Coupling()).of_session(
             of_worker.rendering, SCRIPTED, of_worker.timing.rate, before.scale, before.radius
         )
-        self.worker.ask("set_coupling", self.seat, settled)
+        self.worker.ask("set_coupling", self.slot, settled)
         self.request = replace(self.request, coupling=settled)
 
     def record(self, path: str, is_replaced: bool) -> None:  # noqa: FBT001 - of a call
@@ -81,7 +81,7 @@ class Running(Closes):
         recording = Recorder(path, replace=is_replaced)
         try:
             recording.open()
-            self.begin_recording(recording, *self.worker.ask("state", self.seat))
+            self.begin_recording(recording, *self.worker.ask("save", self.slot))
         except BaseException:
             recording.discard()
             raise
@@ -98,12 +98,12 @@ class Running(Closes):
         self.recording = recording
 
     def take_frames(self) -> None:
-        """Copy new frames from the board into the recording, if there is one; in any thread."""
+        """Copy new frames of the slot into the recording, if there is one; in any thread."""
         with self._taking:
             recording = self.recording
             if recording is not None:
                 try:
-                    recording.take(self.board.rings[self.seat], self.n_frames)
+                    recording.take(self.shared.rings[self.slot], self.n_frames)
                 except Exception:
                     recording.ended = "the recording ended early: the host failed at it"
                     raise
@@ -122,9 +122,9 @@ class Running(Closes):
     def end_worker(self) -> None:
         """End the worker of a session that runs alone, if it was started."""
         if self._worker is not None:
-            self.board.seats["is_asked_to_end"][self.seat] = True
+            self.shared.slots["is_asked_to_end"][self.slot] = True
             self._worker.end()
 
     def close(self) -> None:
-        """Give seat and reader row back."""
+        """Give slot and reader row back."""
         self._ends.close()

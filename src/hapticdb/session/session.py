@@ -16,7 +16,6 @@ from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.law import DISTANCE, ForceLaw, LawName, as_law, reads_distances
 from hapticdb.recording.file import DEFAULT_LIMIT, Recorder
 from hapticdb.recording.frame import Frames, State
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import (
     Coupling,
     Rendering,
@@ -27,7 +26,8 @@ from hapticdb.session.device_loop import DeviceRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells, without_distances
 from hapticdb.session.report import LoopAnswer, Report, counts_of
 from hapticdb.session.running import Running
-from hapticdb.session.stations import FOREVER
+from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.states import FOREVER
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 from hapticdb.session.workers import WorkerProcess
@@ -62,7 +62,7 @@ class Session(Closes):
     shell : PointShell
         The tool.
     device : Device
-        The device; it is sent to the loop's process, so its class must be importable there.
+        The device; it is sent to the worker process, so its class must be importable there.
     rate : float
         Frames a second, 10 to 20,000.
     seconds : float or None
@@ -185,14 +185,14 @@ class Session(Closes):
     def _begin(self, device: Device, staleness: float, seconds: float | None) -> None:
         if self._recording is not None:
             self._recording.open()
-        board = Board.create(1, max(int(RING_SECONDS * self.timing.rate), LEAST_RING))
+        shared = SharedTable.create(1, max(int(RING_SECONDS * self.timing.rate), LEAST_RING))
         try:
-            self._running = running = Running(1, board, self.cells, self.shell, self.coupling)
+            self._running = running = Running(1, shared, self.cells, self.shell, self.coupling)
         except BaseException:
-            board.close()
+            shared.close()
             raise
         alone = DeviceRequest(
-            slot=running.request,
+            slot_request=running.request,
             table=self.cells.table,
             device=device,
             handle=self.handle,
@@ -201,7 +201,7 @@ class Session(Closes):
             has_baseline=self._has_baseline,
             is_on_gpu=self.frames_on == "cuda",
         )
-        request = WorkerRequest(board, self.timing, self.law, self.rendering, alone)
+        request = WorkerRequest(shared, self.timing, self.law, self.rendering, alone)
         worker = running.worker = WorkerProcess(0, request)
         if self._recording is not None:
             running.begin_recording(self._recording, 0, worker.ready, self.frames_on)
@@ -254,7 +254,7 @@ class Session(Closes):
 
     def last(self) -> Frames | None:
         """Latest frame, (1,) of `FRAME`; None before the first."""
-        return self._open.board.last_frame(0)
+        return self._open.shared.last_frame(0)
 
     def wait(self, seconds: float | None = None) -> Report | None:
         """Supervise the session until it ends; returns its report, or None after `seconds`.
@@ -280,7 +280,7 @@ class Session(Closes):
 
     def ask_to_end(self) -> None:
         """Make the loop end after its next frame. `wait` then returns the report."""
-        self._open.board.seats["is_asked_to_end"][0] = True
+        self._open.shared.slots["is_asked_to_end"][0] = True
 
     def stop(self) -> Report:
         """End the session; returns its report."""
@@ -293,12 +293,13 @@ class Session(Closes):
     def _drain(self, running: Running) -> None:
         """Add the touched objects to the list, and record the new frames."""
         done = running.n_frames
-        ring, asked = running.board.rings[0], self.cells.table.desk.sessions[running.request.reader]
+        asked = self.cells.table.queue.sessions[running.request.reader]
+        ring = running.shared.rings[0]
         named = set(asked["objects"][: int(asked["n_objects"])].tolist())
         first = max(self._n_drained, done - len(ring))
         frames = ring[np.arange(first, done) % len(ring)]
         self._n_drained = done
-        last = running.board.last_frame(running.seat)
+        last = running.shared.last_frame(running.slot)
         if last is not None and last["state"][0] & State.IN_OBJECT:
             self._loose_objects |= named
             self._has_touched = False
@@ -332,7 +333,7 @@ class Session(Closes):
             law="distance" if reads_distances(self.law) else "plane",
             rendering=self.rendering,
             coupling=self.coupling,
-            **counts_of(self._open.board.seats[0]),
+            **counts_of(self._open.shared.slots[0]),
         )
 
     def _conditions(self) -> dict[str, str]:
@@ -357,7 +358,7 @@ class Session(Closes):
                 ends.callback(self._recording.close)
             running, self._running = self._running, None
             if running is not None:
-                ends.callback(running.board.close)
+                ends.callback(running.shared.close)
                 ends.callback(running.close)
                 ends.callback(self._drain, running)
                 ends.callback(running.end_worker)
@@ -373,7 +374,7 @@ def _check_choices(seconds: float | None, staleness: float) -> None:
 def _checked_frames(frames_on: "BatchDevice", rendering: Rendering) -> "BatchDevice":
     """Refuse a session whose frames cannot be computed there."""
     if frames_on != "cpu":
-        from hapticdb.session.on_gpu import check_frames  # noqa: PLC0415 - loads numba.cuda
+        from hapticdb.session.gpu_queries import check_frames  # noqa: PLC0415 - loads numba.cuda
 
         check_frames(frames_on, rendering)
     return frames_on

@@ -19,7 +19,6 @@ from hapticdb.errors import HapticDBError
 from hapticdb.query.law import ForceLaw
 from hapticdb.recording.header import Start
 from hapticdb.resident.table import CellTable
-from hapticdb.session.board import Board
 from hapticdb.session.coupling import DirectRendering, Rendering
 from hapticdb.session.device_loop import DeviceRequest, run_device
 from hapticdb.session.processes.channel import Message
@@ -29,7 +28,8 @@ from hapticdb.session.processes.process import (
     parent_is_gone,
     reply_to_parent,
 )
-from hapticdb.session.stations import SlotRequest, Station, Stations
+from hapticdb.session.shared_table import SharedTable
+from hapticdb.session.states import PeriodClock, SessionState, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
 
 LEAVE_PATIENCE = 5.0
@@ -38,12 +38,12 @@ LEAVE_PATIENCE = 5.0
 
 @dataclass(frozen=True)
 class WorkerRequest:
-    """Sessions of a worker: all of them share board, timing, law and rendering.
+    """Sessions of a worker, all with the same shared table, timing, law and rendering.
 
     alone : the only one, with a device; without it commands begin and end sessions.
     """
 
-    board: Board
+    shared: SharedTable
     timing: Timing
     law: ForceLaw
     rendering: Rendering
@@ -54,13 +54,13 @@ class Worker:
     """The sessions of one process and their loop.
 
     A session's memory is made beside the loop. The loop sees the session when `is_running` of its
-    station is set, which is done last, and leaves it between two periods when that is withdrawn.
+    state is set, which is done last, and leaves it between two periods when that is withdrawn.
     """
 
-    def __init__(self, board: Board, rate: float, stations: Stations) -> None:
-        self._board, self._rate, self._stations = board, rate, stations
+    def __init__(self, shared: SharedTable, rate: float, clock: PeriodClock) -> None:
+        self._shared, self._rate, self._clock = shared, rate, clock
         self._tables: dict[int, CellTable] = {}
-        self._running: dict[int, tuple[int, Station]] = {}  # table and state, by seat
+        self._running: dict[int, tuple[int, SessionState]] = {}  # table and state, by slot
 
     def obey(self) -> None:
         """Do what the parent says until it ends; the work of the thread beside the loop's."""
@@ -70,11 +70,11 @@ class Worker:
         except (EOFError, OSError):
             pass
         finally:
-            self._stations.stop()
+            self._clock.stop()
 
     def _do(self, ask: Message, descriptors: list[int]) -> object:
         known: dict[str, Callable[..., object]] = {
-            "begin": self._begin, "end": self._end, "state": self._state,
+            "begin": self._begin, "end": self._end, "save": self._save,
             "set_coupling": self._set_coupling,
         }  # fmt: skip
         return known[ask.word](*descriptors, *ask.content)
@@ -90,58 +90,58 @@ class Worker:
         """Begin a session whose hand and tool wait at a pose (7,); table : a name for its cells."""
         if table not in self._tables:
             self._tables[table] = CellTable(os.dup(descriptor), n_slots)
-        station = self._stations.add(request, self._tables[table])
-        station.rest_at(pose)
-        station.arrive_at(pose)
-        station.row["is_frame"] = True
-        station.row["began"] = station.row["last"] = time.monotonic_ns()
-        self._running[request.seat] = table, station
-        station.row["is_running"] = 1
+        state = self._clock.add(request, self._tables[table])
+        state.rest_at(pose)
+        state.arrive_at(pose)
+        state.row["is_frame"] = True
+        state.row["began"] = state.row["last"] = time.monotonic_ns()
+        self._running[request.slot] = table, state
+        state.row["is_running"] = 1
 
-    def _set_coupling(self, seat: int, coupling: DirectRendering) -> None:
-        self._running[seat][1].set_spring(coupling.spring())
+    def _set_coupling(self, slot: int, coupling: DirectRendering) -> None:
+        self._running[slot][1].set_spring(coupling.spring())
 
-    def _state(self, seat: int) -> tuple[int, Start]:
+    def _save(self, slot: int) -> tuple[int, Start]:
         """Number of a session's next frame, and its state before that frame."""
-        station = self._running[seat][1]
-        self._pause(station)
+        state = self._running[slot][1]
+        self._pause(state)
         try:
-            return int(self._board.seats["n_frames"][seat]), station.state()
+            return int(self._shared.slots["n_frames"][slot]), state.save()
         finally:
-            station.row["is_running"] = 1
+            state.row["is_running"] = 1
 
-    def _pause(self, station: Station) -> None:
+    def _pause(self, state: SessionState) -> None:
         """Take a session out of the loop."""
-        station.row["is_running"] = 0
-        periods = self._stations.pace["periods"]
+        state.row["is_running"] = 0
+        periods = self._clock.record["periods"]
         last, until = int(periods) + 2, time.monotonic() + LEAVE_PATIENCE
         while int(periods) < last:
             if time.monotonic() > until:
                 raise HapticDBError("a worker's loop hangs: end the host")
             time.sleep(0.5 / self._rate)
 
-    def _end(self, seat: int) -> None:
-        table, station = self._running[seat]
-        self._pause(station)
-        station.session["told"]["is_active"] = False
-        del self._running[seat]
+    def _end(self, slot: int) -> None:
+        table, state = self._running[slot]
+        self._pause(state)
+        state.session["told"]["is_active"] = False
+        del self._running[slot]
         if all(used != table for used, _ in self._running.values()):
             self._tables.pop(table).close()
 
     def run(self) -> None:
         """Run periods until the parent ends; the work of the loop's thread."""
         with undisturbed():
-            self._stations.run(self._rate)
+            self._clock.run(self._rate)
 
 
 def work(request: WorkerRequest, sender: MessageSender) -> None:
     """Run a worker; the work of the process."""
-    board, timing = request.board, request.timing
-    stations = Stations(request.law, board.seats, board.rings, request.rendering)
+    shared, timing = request.shared, request.timing
+    clock = PeriodClock(request.law, shared.slots, shared.rings, request.rendering)
     if request.alone is not None:
-        run_device(request.alone, timing, stations, sender)
+        run_device(request.alone, timing, clock, sender)
         return
-    worker = Worker(board, timing.rate, stations)
+    worker = Worker(shared, timing.rate, clock)
     looping = threading.Thread(target=worker.run, daemon=True)
     looping.start()
     sender.send("ready", None)

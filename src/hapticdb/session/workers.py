@@ -6,9 +6,9 @@ from typing import Any
 import numpy as np
 
 from hapticdb.query.law import ForceLaw
-from hapticdb.session.board import TAKEN, Board
 from hapticdb.session.coupling import Rendering
 from hapticdb.session.processes.process import Process
+from hapticdb.session.shared_table import TAKEN, SharedTable
 from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 
@@ -28,7 +28,7 @@ class WorkerProcess(Process):
 
     def __init__(self, number: int, request: WorkerRequest) -> None:
         self.number, self.request = number, request
-        descriptors = [request.board.descriptor]
+        descriptors = [request.shared.descriptor]
         if request.alone is not None:
             descriptors.append(request.alone.table.descriptor)
         super().__init__(WORK, request, descriptors, with_kernels=True)
@@ -43,8 +43,8 @@ class WorkerProcess(Process):
 class Workers:
     """Worker processes of a host, `most` at a time."""
 
-    def __init__(self, board: Board, rate: float, most: int) -> None:
-        self._board, self._timing, self._most = board, Timing(rate), most
+    def __init__(self, shared: SharedTable, rate: float, most: int) -> None:
+        self._shared, self._timing, self._most = shared, Timing(rate), most
         self._processes: list[WorkerProcess] = []
         self._next = 0
 
@@ -58,10 +58,11 @@ class Workers:
         for process in [process for process in self._processes if not process.is_alive]:
             self._processes.remove(process)
             process.end()
-        seats, request = self._board.seats, WorkerRequest(self._board, self._timing, law, rendering)
+        slots = self._shared.slots
+        request = WorkerRequest(self._shared, self._timing, law, rendering)
         alike = [process for process in self._processes if process.request == request]
         counts = [
-            int(np.count_nonzero((seats["state"] == TAKEN) & (seats["worker"] == process.number)))
+            int(np.count_nonzero((slots["state"] == TAKEN) & (slots["worker"] == process.number)))
             for process in alike
         ]
         if not counts or (min(counts) >= FILLED and len(self._processes) < self._most):

@@ -17,10 +17,10 @@ from hapticdb import Environment, PointShell
 from hapticdb.errors import HapticDBError
 from hapticdb.recording.file import Recorder
 from hapticdb.session.attached import serve_attached
-from hapticdb.session.board import Board
 from hapticdb.session.host import SessionHost
 from hapticdb.session.hosted import HostedSession
 from hapticdb.session.processes.channel import Channel
+from hapticdb.session.shared_table import SharedTable
 from session.hands import at
 
 ABOVE = at(0.0, 0.0, 0.02)
@@ -73,11 +73,11 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     begun = iter([1, 2])
 
     def begin(shell: object, _: object) -> SimpleNamespace:
-        return full() if shell is None else SimpleNamespace(id=next(begun), seat=0)
+        return full() if shell is None else SimpleNamespace(id=next(begun), slot=0)
 
     ours, theirs = socket.socketpair()
-    board = Board.create(1)
-    thread = threading.Thread(target=serve_attached, args=(ours, board, begin, call))
+    shared = SharedTable.create(1)
+    thread = threading.Thread(target=serve_attached, args=(ours, shared, begin, call))
     thread.start()
     channel = Channel(theirs)
     try:
@@ -89,18 +89,18 @@ def test_an_error_of_the_machine_is_answered_and_every_session_ends_even_if_one_
     finally:
         channel.close()
         joined(thread)
-        board.close()
+        shared.close()
     assert sorted(ended) == [1, 2]
     assert [record.exc_info is not None for record in caplog.records] == [True, True]
 
 
 def test_a_frame_that_is_never_finished_is_an_error() -> None:
-    board = Board.create(1)
-    row = board.take(7, 0)
-    board.seats["contacts_sequence"][row] = 1
+    shared = SharedTable.create(1)
+    row = shared.take(7, 0)
+    shared.slots["contacts_sequence"][row] = 1
     with pytest.raises(HapticDBError, match="stayed unfinished for 1 s"):
-        board.contacts(row)
-    board.close()
+        shared.contacts(row)
+    shared.close()
 
 
 def test_looking_after_sessions_survives_errors_and_logs_each_once(

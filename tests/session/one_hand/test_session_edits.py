@@ -15,7 +15,7 @@ from hapticdb.resident.held import clusters_of
 from hapticdb.resident.table import CellTable
 from hapticdb.session.coupling import Coupling
 from hapticdb.session.session import Session
-from hapticdb.session.stations import Station, Stations
+from hapticdb.session.states import PeriodClock, SessionState
 from session.hands import stroking
 from session.sessions import NEVER_STALE, RATE, felt_at, floored, recorded, until
 from session.worlds import make, move
@@ -27,16 +27,21 @@ def test_a_frame_is_noted_with_the_revision_of_the_cells_that_it_read(
     sphere: PointShell, *, reads_distances: bool
 ) -> None:
     """Others write just before its kernel begins, and again as soon as it has ended."""
-    grid, seats, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
+    grid, slots, rings = Grid(0.01, (0.0, 0.0, 0.0), 6), np.zeros(1, SEAT), np.zeros((1, 4), FRAME)
     with CellTable.create(8 << 20, distances=reads_distances) as table, table.reading() as row:
-        periods = Stations(DISTANCE if reads_distances else PLANE, seats, rings)
+        periods = PeriodClock(DISTANCE if reads_distances else PLANE, slots, rings)
         cells = table.cells if reads_distances else table.cells.without_distances()
-        station = Station(
-            periods.rows, cells, row, table.desk.sessions[row, ...], grid, clusters_of(sphere, 0.01)
+        state = SessionState(
+            periods.rows,
+            cells,
+            row,
+            table.queue.sessions[row, ...],
+            grid,
+            clusters_of(sphere, 0.01),
         )
-        station.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
-        station.servo["hand"]["quaternion"][0] = station.servo["tool"]["quaternion"][0] = 1.0
-        station.row["is_running"] = station.row["is_frame"] = True
+        state.set_spring(Coupling().direct(SCRIPTED, 1.0, 0.024).spring())
+        state.servo["hand"]["quaternion"][0] = state.servo["tool"]["quaternion"][0] = 1.0
+        state.row["is_running"] = state.row["is_frame"] = True
         for revision in (7, 8, 9):
             publish(table.cells.control, revision - 6, revision)
             periods.step(1e-3, 0)

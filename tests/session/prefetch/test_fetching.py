@@ -22,7 +22,7 @@ from hapticdb.kernels.resident.cells import LISTED, cell_key
 from hapticdb.resident.table import HEARTBEAT, LOST, CellTable
 from hapticdb.session.prefetch.fetching import CONFIRM_EVERY, Fetcher, FetchRequest
 from hapticdb.session.prefetch.resident_cells import ResidentCells
-from hapticdb.session.prefetch.tracking import Wish
+from hapticdb.session.prefetch.tracking import PrefetchRequest
 from naive_frame import touch_of_shell
 from session.troubled import refuse, refuse_strangely, troubled
 from session.worlds import Reader, block, ids_by_voxel, make, move, scatter
@@ -45,7 +45,7 @@ class Side:
         self.reader = Reader(table, grid, shell)
         self.grid = grid
         self.row = self.reader.row
-        self.session = table.desk.sessions[self.row, ...]
+        self.session = table.queue.sessions[self.row, ...]
 
     def be_at(
         self, pose: Pose, velocity: NDArray[np.float64] | None = None
@@ -170,9 +170,9 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
     handle = tool + rng.normal(0, 0.02, 3)
     velocity = rng.normal(0, 0.5, 3)
     lookahead, radius = float(rng.uniform(0.05, 0.2)), float(rng.uniform(0.0, 0.05))
-    wish = Wish.of_told(grid, told(tool, handle, velocity, radius), lookahead, 1.0)
-    assert wish is not None
-    cells, urgency = wish.cells(grid)
+    request = PrefetchRequest.of_told(grid, told(tool, handle, velocity, radius), lookahead, 1.0)
+    assert request is not None
+    cells, urgency = request.cells(grid)
     wanted = set(cells.tolist())
     assert len(wanted) == len(cells)
     assert (np.diff(urgency) >= 0).all()
@@ -194,9 +194,11 @@ def test_every_cell_that_a_tool_may_meet_is_wanted_nearest_first(seed: int) -> N
 def test_a_wish_too_large_keeps_what_is_near() -> None:
     grid = Grid(0.002, (0.0, 0.0, 0.0), 16)
     tool = np.array([grid.edge * 0.9, 0.1, grid.edge / 2])
-    wish = Wish.of_told(grid, told(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05), 0.5, 40.0)
-    assert wish is not None
-    cells, _ = wish.cells(grid)
+    request = PrefetchRequest.of_told(
+        grid, told(tool, tool, np.array([40.0, 0.0, 0.0]), 0.05), 0.5, 40.0
+    )
+    assert request is not None
+    cells, _ = request.cells(grid)
     assert 0 < len(cells) <= 1 << 15
     assert int(cell_key(*grid.voxels_of(tool[None])[0])) in cells.tolist()
 
@@ -207,7 +209,7 @@ def test_a_motion_that_is_none_wants_nothing() -> None:
     for broken in (np.nan, np.inf):
         nowhere = np.array([0.0, broken, 0.0])
         for motion in (told(rest, rest, nowhere, 0.0), told(rest, rest, rest, broken)):
-            assert Wish.of_told(grid, motion, 0.1, 1.0) is None
+            assert PrefetchRequest.of_told(grid, motion, 0.1, 1.0) is None
 
 
 # --- in lock step -------------------------------------------------------------------------------

@@ -169,7 +169,7 @@ def _begin_loop(force: ForceOptions, loop: LoopOptions) -> "Rendering":
 
     chosen = rendering_of(force.rendering, as_law(force.law) or DISTANCE)
     if loop.frames_on != "cpu":
-        from hapticdb.session.on_gpu import check_frames
+        from hapticdb.session.gpu_queries import check_frames
 
         check_frames(loop.frames_on, chosen)
 

@@ -23,7 +23,7 @@ from hapticdb.resident.table import (
     STOP,
     CellTable,
 )
-from hapticdb.session.prefetch.tracking import ObjectAnswers, SessionTracker, Wish
+from hapticdb.session.prefetch.tracking import ObjectAnswers, PrefetchRequest, SessionTracker
 from hapticdb.session.processes.process import MessageSender, parent_is_gone
 from hapticdb.store.base import NO_KEYS, Store
 from hapticdb.store.connect import open_store
@@ -103,13 +103,13 @@ class Fetcher:
         self.table = request.table
         self.tracker = SessionTracker(self.table, request.grid)
         self._clock = clock
-        self._figures = self.table.desk.figures
+        self._figures = self.table.queue.figures
         self._evicted_before = int(self._figures["evicted"])
         self._latencies: list[float] = [0.0]
         self.store = self._open()
         try:
             # if an earlier fetching process has died, sessions already use the table
-            self.tracker.read_desk(0.0, self.lookahead)
+            self.tracker.read_queue(0.0, self.lookahead)
             self.residency = Residency(
                 self.store, self.table, request.filter.exclude, where=request.filter.where,
                 urgent=self.tracker.urgent_cells(), clock=clock,
@@ -146,9 +146,9 @@ class Fetcher:
         grid = self.request.grid
         told = np.zeros((), TOLD)
         told["tool"] = told["handle"] = grid.origin
-        wish = Wish.of_told(grid, told, LOOKAHEAD, 0.0)
-        assert wish is not None  # noqa: S101 - the origin is finite
-        self.residency.load(self.residency.missing(wish.cells(grid)[0][:1]))
+        request = PrefetchRequest.of_told(grid, told, LOOKAHEAD, 0.0)
+        assert request is not None  # noqa: S101 - the origin is finite
+        self.residency.load(self.residency.missing(request.cells(grid)[0][:1]))
         self.residency.warm_up()
         self._answers.ids_of(self.store, np.zeros(1, dtype=np.int64))
 
@@ -188,7 +188,7 @@ class Fetcher:
             control[HEARTBEAT] = begun
 
     def _note_lag(self) -> None:
-        """Write to the desk how far a standby is behind."""
+        """Write to the request queue how far a standby is behind."""
         lag = self.store.lag() if isinstance(self.store, MayLag) else None
         self._figures["lag"] = np.nan if lag is None or lag.seconds is None else lag.seconds
 
@@ -203,7 +203,7 @@ class Fetcher:
 
     def _bring_in(self, elapsed: float) -> bool:
         """Fetch the most urgent missing cells of all sessions; returns whether any was fetched."""
-        has_moved = self.tracker.read_desk(elapsed, self.lookahead)
+        has_moved = self.tracker.read_queue(elapsed, self.lookahead)
         missing = NO_KEYS
         has_new_cells = self._version_seen != self.table.version
         if has_moved or has_new_cells or self.tracker.has_met_unknown_cells():
@@ -218,7 +218,7 @@ class Fetcher:
         return loaded.cells > 0
 
     def _record_figures(self, loaded: Loaded) -> None:
-        """Write the figures so far to the desk."""
+        """Write the figures so far to the request queue."""
         self._latencies = [*self._latencies[1 - BATCHES_REMEMBERED :], loaded.elapsed]
         figures, writer = self._figures, self.residency.writer
         figures["loaded"] += loaded.cells
@@ -291,7 +291,7 @@ def fetch(request: FetchRequest, sender: MessageSender) -> None:
                 sender.send("lost", str(error))  # first, so that who sees the mark finds the cause
                 table.cells.control[LOST] = 1
                 if fetcher is not None:
-                    table.desk.figures["losses"] += 1
+                    table.queue.figures["losses"] += 1
             is_lost = True
             time.sleep(patience)
             patience = min(2 * patience, at_most)

@@ -244,7 +244,7 @@ class ResidentCells(Closes):
 
     def figures(self) -> CacheFigures:
         """Figures of the fetching process so far."""
-        counted = self.table.desk.figures
+        counted = self.table.queue.figures
         shared = set(CacheFigures._fields) & set(FIGURES.names or ())
         told = {name: counted[name].item() for name in shared}
         wanted = counted["wanted"].item()

@@ -21,10 +21,10 @@ REACH_VOXELS = 500.0
 """Voxels a second that a hand may reach from rest: 1 m/s in voxels of 2 mm. A larger value fetches
 more cells around a resting hand."""
 SLACK_VOXELS = 1.0
-"""Voxels that a wish may move until its cells are computed again. A larger value computes less
+"""Voxels that a request may move until its cells are computed again. A larger value computes less
 often and fetches a wider margin."""
 MOST_CELLS_WANTED = 1 << 15
-"""Greatest number of cells of one wish: the box around a faster or larger tool is cut at its far
+"""Greatest number of cells of one request: the box around a faster or larger tool is cut at its far
 ends. A larger value serves larger tools and takes more time."""
 CELL = float(1 << CELL_BITS)
 """Voxels on a cell's edge."""
@@ -50,7 +50,7 @@ Ranked = tuple[Keys, NDArray[np.float64]]
 """Cells (n,) int64 and their urgency (n,), smallest first."""
 
 
-class Wish(NamedTuple):
+class PrefetchRequest(NamedTuple):
     """Where a tool is and may soon be, in voxels of the grid.
 
     start, move (3,): the bounding sphere's centre, and its displacement to the hand's expected
@@ -65,8 +65,8 @@ class Wish(NamedTuple):
     @classmethod
     def of_told(
         cls, grid: Grid, told: NDArray[np.void], lookahead: float, peak_speed: float
-    ) -> "Wish | None":
-        """Wish for what a loop tells of its tool, or None if not all of its numbers are finite.
+    ) -> "PrefetchRequest | None":
+        """Request for what a loop tells of its tool; None unless all of its numbers are finite.
 
         told () : of `kernels.records.TOLD`. The bounding sphere moves from the tool to the hand,
         and on with the hand's velocity for `lookahead` seconds. The margin is the greatest distance
@@ -85,8 +85,8 @@ class Wish(NamedTuple):
             margin,
         )
 
-    def is_near(self, other: "Wish") -> bool:
-        """Whether the cells of this wish can be used for the other wish."""
+    def is_near(self, other: "PrefetchRequest") -> bool:
+        """Whether the cells of this request can be used for the other request."""
         away = [
             *(self.start - other.start),
             *(self.start + self.move - other.start - other.move),
@@ -134,13 +134,13 @@ class Wish(NamedTuple):
 class _TrackedSession:
     """State of one session.
 
-    sequence : number of the desk's row at its last reading; wish : the wish whose cells were
+    sequence : number of the queue's row at its last reading; request : the one whose cells were
     computed; cells, urgency (n,) : most urgent first; speed : recent greatest speed of the hand,
     m/s; n_missing : wanted cells that were unknown at the last check.
     """
 
     sequence: int = 0
-    wish: Wish | None = None
+    request: PrefetchRequest | None = None
     cells: Keys = field(default_factory=lambda: NO_KEYS)
     urgency: NDArray[np.float64] = field(default_factory=lambda: np.empty(0))
     speed: float = 0.0
@@ -153,14 +153,14 @@ class SessionTracker:
     Parameters
     ----------
     table : CellTable
-        Sessions report on its desk where their tools are.
+        Sessions report on its request queue where their tools are.
     grid : Grid
         Grid of the environment.
 
     Attributes
     ----------
     sessions : dict
-        Sessions by their rows of the desk, ascending.
+        Sessions by their rows of the request queue, ascending.
     """
 
     def __init__(self, table: CellTable, grid: Grid) -> None:
@@ -168,13 +168,13 @@ class SessionTracker:
         self._grid = grid
         self.sessions: dict[int, _TrackedSession] = {}
 
-    def read_desk(self, elapsed: float, lookahead: float) -> bool:
+    def read_queue(self, elapsed: float, lookahead: float) -> bool:
         """Read where the tools are; returns whether any now wants other cells.
 
         elapsed : seconds since the last call; lookahead : seconds that cells are fetched ahead.
         """
-        desk = self._table.desk.sessions
-        active = set(np.flatnonzero(desk["told"]["is_active"]).tolist())
+        queue = self._table.queue.sessions
+        active = set(np.flatnonzero(queue["told"]["is_active"]).tolist())
         has_moved = active != set(self.sessions)
         self.sessions = {row: self.sessions.get(row, _TrackedSession()) for row in sorted(active)}
         for row, session in self.sessions.items():
@@ -184,27 +184,29 @@ class SessionTracker:
             speed = float(np.linalg.norm(told["velocity"]))
             if np.isfinite(speed):
                 session.speed = max(speed, session.speed * 0.5 ** (elapsed / SPEED_HALF_LIFE))
-            wish = Wish.of_told(self._grid, told, lookahead, session.speed)
-            if wish is None or (session.wish is not None and wish.is_near(session.wish)):
+            request = PrefetchRequest.of_told(self._grid, told, lookahead, session.speed)
+            if request is None or (
+                session.request is not None and request.is_near(session.request)
+            ):
                 continue
-            session.wish = wish
-            session.cells, session.urgency = wish.cells(self._grid)
+            session.request = request
+            session.cells, session.urgency = request.cells(self._grid)
             has_moved = True
         return has_moved
 
     def _read_told(self, row: int, session: _TrackedSession) -> NDArray[np.void] | None:
-        """Read a row of the desk completely; None if its loop died while it wrote the row."""
-        desk = self._table.desk.sessions
+        """Read a row of the queue completely; None if its loop died while it wrote the row."""
+        queue = self._table.queue.sessions
         for _ in range(READ_ATTEMPTS):
-            session.sequence = int(desk["sequence"][row])
-            told: NDArray[np.void] = desk["told"][row, ...].copy()
-            if session.sequence % 2 == 0 and session.sequence == desk["sequence"][row]:
+            session.sequence = int(queue["sequence"][row])
+            told: NDArray[np.void] = queue["told"][row, ...].copy()
+            if session.sequence % 2 == 0 and session.sequence == queue["sequence"][row]:
                 return told
         return None
 
     def has_met_unknown_cells(self) -> bool:
         """Whether any session's last frame has met cells that are not resident."""
-        return bool(self._table.desk.sessions["n_missed"][list(self.sessions)].any())
+        return bool(self._table.queue.sessions["n_missed"][list(self.sessions)].any())
 
     def urgent_cells(self) -> Keys:
         """Cells of all sessions, distinct, most urgent first."""
@@ -227,25 +229,25 @@ class SessionTracker:
         cells, slots = cells[:n_kept], slots[:n_kept]
         yield cells, session.urgency[:n_kept]
         unknown = cells[slots == UNKNOWN]
-        table.desk.figures["wanted"] += len(cells)
-        table.desk.figures["granted"] += len(cells) - len(unknown)
+        table.queue.figures["wanted"] += len(cells)
+        table.queue.figures["granted"] += len(cells) - len(unknown)
         session.n_missing = len(unknown)
-        n_missed = int(table.desk.sessions["n_missed"][row])
+        n_missed = int(table.queue.sessions["n_missed"][row])
         if n_missed:
-            missed = np.unique(table.desk.sessions["missed"][row, :n_missed])
+            missed = np.unique(table.queue.sessions["missed"][row, :n_missed])
             session.n_missing += int(np.count_nonzero(residency.slots_of(missed) == UNKNOWN))
             yield missed, np.full(len(missed), MET)
 
     def report_missing(self) -> None:
         """Report to each session how many of its cells are missing, and for which position."""
-        desk = self._table.desk.sessions
+        queue = self._table.queue.sessions
         for row, session in self.sessions.items():
-            desk["n_missing"][row] = session.n_missing
-            desk["heard"][row] = session.sequence
+            queue["n_missing"][row] = session.n_missing
+            queue["heard"][row] = session.sequence
 
 
 def ranked(wanted: Sequence[Ranked]) -> Keys:
-    """Distinct cells of several wishes, most urgent first."""
+    """Distinct cells of several requests, most urgent first."""
     if not wanted:
         return NO_KEYS
     cells = np.concatenate([cells for cells, _ in wanted])
@@ -257,7 +259,7 @@ def ranked(wanted: Sequence[Ranked]) -> Keys:
 
 
 class ObjectAnswers:
-    """Answers on the desk of a table: ids of the objects that are felt in the voxels asked for.
+    """Answers on the request queue: ids of the objects that are felt in the voxels asked for.
 
     These are the objects in the voxels; in a table with distances, those near the voxels, too.
 
@@ -270,7 +272,7 @@ class ObjectAnswers:
     """
 
     def __init__(self, table: CellTable, residency: Residency) -> None:
-        self._desk = table.desk.sessions
+        self._queue = table.queue.sessions
         self._residency = residency
         self._has_distances = table.has_distances
         self._answered: dict[int, bytes] = {}
@@ -283,16 +285,16 @@ class ObjectAnswers:
         """Answer the sessions in `rows` whose requests have changed since the last answer."""
         before, self._answered = self._answered, {}
         for row in rows:
-            n_asked = int(self._desk["n_asked"][row])
+            n_asked = int(self._queue["n_asked"][row])
             if n_asked <= 0:
-                self._desk["n_objects"][row] = 0
+                self._queue["n_objects"][row] = 0
                 continue
-            keys = np.unique(self._desk["asked"][row, :n_asked])
+            keys = np.unique(self._queue["asked"][row, :n_asked])
             question = keys.tobytes()
             if before.get(row) != question:
                 ids = self.ids_of(store, keys)[:MOST_ASKED]
-                self._desk["objects"][row, : len(ids)] = ids
-                self._desk["n_objects"][row] = len(ids)
+                self._queue["objects"][row, : len(ids)] = ids
+                self._queue["n_objects"][row] = len(ids)
             self._answered[row] = question
 
     def ids_of(self, store: Store, keys: Keys) -> Keys:

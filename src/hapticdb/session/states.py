@@ -1,4 +1,4 @@
-"""Stations: sessions in the form that the kernel of their periods reads (`kernels.period.loop`)."""
+"""Sessions in the form that the kernel of their periods reads, and the clock of the periods."""
 
 import time
 from dataclasses import dataclass
@@ -48,18 +48,18 @@ Record = NDArray[np.void]
 class SlotRequest:
     """Session that a worker process is to run.
 
-    seat : row of the board; reader : row of the table of cells; grid : of the cells; shell : the
-    tool, without triangles, which no frame reads; coupling : between hand and tool.
+    slot, reader : its rows of the shared table and of the table of cells; grid : of the cells;
+    shell : the tool, without triangles, which no frame reads; coupling : between hand and tool.
     """
 
-    seat: int
+    slot: int
     reader: int
     grid: Grid
     shell: PointShell
     coupling: DirectRendering
 
 
-class Station:
+class SessionState:
     """One session: its row of STATION, and the memory whose addresses the row has.
 
     Parameters
@@ -69,7 +69,7 @@ class Station:
     cells, reader : Cells, int
         The cells that the session reads, and its row there.
     session : array
-        (1,) of SESSION: its row on the desk.
+        (1,) of SESSION: its row on the request queue.
     grid : Grid
         Grid of the cells.
     clusters : Clusters
@@ -139,68 +139,68 @@ class Station:
         tool[()] = np.zeros((), tool.dtype)
         pose_numbers(tool)[:] = pose_numbers(hand)[:] = pose
 
-    def state(self) -> Start:
+    def save(self) -> Start:
         """What the next period depends on, beside its cells and the hand."""
         tool = self.servo["tool"]
         of_points = (self.kept, self.near_points, self.bends) if tool["version"] else ()
         parts = (self.servo, self.follower, *of_points)
         return Start(*(part.tobytes() for part in parts))
 
-    def restore(self, state: Start) -> None:
-        """Continue from a state that a station of this tool and this build has had."""
+    def restore(self, saved: Start) -> None:
+        """Continue from what `save` returned, for the same tool and build."""
         looker, parts = (
             self.follower["looker"].copy(),
             (self.servo, self.follower, self.kept, self.near_points, self.bends),
         )
-        for part, content in zip(parts, state, strict=True):
+        for part, content in zip(parts, saved, strict=True):
             if content:
                 part[...] = np.frombuffer(content, part.dtype).reshape(part.shape)
         self.follower["looker"] = looker
 
     def arrive_at(self, pose: NDArray[np.float64]) -> None:
-        """Take the hand from the board, where it has arrived at a pose (7,)."""
+        """Take the hand from the shared table, where it has arrived at a pose (7,)."""
         way = self.record["way"]
         way["start"], way["end"], way["seconds"] = pose, pose, 1e-9
         self.row["source"], self.row["gap"] = loop.BOARD, USUAL_GAP_NS
 
 
-class Stations:
-    """Stations of a process, and the call of their periods.
+class PeriodClock:
+    """Clock of all sessions of a process: runs their periods (`kernels.period.loop`).
 
-    law : that all sessions feel; seats, rings : of the board (`session.board.Board`), and for each
-    seat a station; unless given, of one session alone; rendering : as of `rendering_of`.
+    law : of all sessions; slots, rings : of the shared table, with a state for each slot; unless
+    given, of one session alone; rendering : as of `rendering_of`.
     """
 
     def __init__(
         self,
         law: ForceLaw,
-        seats: Record | None = None,
+        slots: Record | None = None,
         rings: Frames | None = None,
         rendering: Rendering | None = None,
     ) -> None:
         self.law, self.rendering = law, rendering_of(rendering, law)
-        self.seats = seats = np.zeros(1, SEAT) if seats is None else seats
+        self.slots = slots = np.zeros(1, SEAT) if slots is None else slots
         rings = np.zeros((1, 1), FRAME) if rings is None else rings
-        self.rows, self.pace = np.zeros(len(seats), STATION), np.zeros((), PACE)
+        self.rows, self.record = np.zeros(len(slots), STATION), np.zeros((), PACE)
         is_coupled = self.rendering == "coupled"
         mover = loop.move_by_coupling if is_coupled else loop.move_directly
-        self.pace["mover"] = address_of_kernel(mover, loop.MOVER)
+        self.record["mover"] = address_of_kernel(mover, loop.MOVER)
         if not is_coupled:
-            self.pace["feeler"], self.pace["law"], self._law = loop.feeler_of(law.for_kernels)
-        self._arguments = (self.rows, seats, rings, self.pace)
-        self._times = self.pace["due"], self.pace["begun"], self.pace["dt"]
+            self.record["feeler"], self.record["law"], self._law = loop.feeler_of(law.for_kernels)
+        self._arguments = (self.rows, slots, rings, self.record)
+        self._times = self.record["due"], self.record["begun"], self.record["dt"]
 
-    def add(self, request: SlotRequest, table: CellTable) -> Station:
+    def add(self, request: SlotRequest, table: CellTable) -> SessionState:
         """Make the state of a session; its periods run once `is_running` of its row is set."""
         cells = table.cells if reads_distances(self.law) else table.cells.without_distances()
         n = int(np.flatnonzero(self.rows["is_running"] == 0)[0])
-        station = Station(
-            self.rows[n : n + 1], cells, request.reader, table.desk.sessions[request.reader, ...],
+        state = SessionState(
+            self.rows[n : n + 1], cells, request.reader, table.queue.sessions[request.reader, ...],
             request.grid, clusters_of(request.shell, request.grid.voxel_size),
         )  # fmt: skip
-        station.row["seat"] = request.seat
-        station.set_spring(request.coupling.spring())
-        return station
+        state.row["seat"] = request.slot
+        state.set_spring(request.coupling.spring())
+        return state
 
     def run(self, rate: float, seconds: float = FOREVER) -> float:
         """Run periods at a rate until `stop` or for so long -> seconds that they took.
@@ -208,10 +208,10 @@ class Stations:
         A period that takes longer than its time misses the deadlines within it; the next one is due
         at the next deadline of the grid. It holds no interpreter lock.
         """
-        begun, pace = time.monotonic_ns(), self.pace
+        begun, record = time.monotonic_ns(), self.record
         self.rows["began"] = self.rows["last"] = begun
-        pace["period"], pace["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
-        pace["due"] = begun + pace["period"]
+        record["period"], record["most"] = round(1e9 / rate), max(round(seconds * rate), 1)
+        record["due"] = begun + record["period"]
         loop.run(*self._arguments)
         return 1e-9 * (time.monotonic_ns() - begun)
 
@@ -223,4 +223,4 @@ class Stations:
 
     def stop(self) -> None:
         """End `run` after its period."""
-        self.pace["is_over"] = 1
+        self.record["is_over"] = 1

@@ -1,4 +1,4 @@
-"""Looks of a session's coupling on a graphics processor, which the kernel of its periods calls."""
+"""Proximity queries of a session's coupling on a GPU, which the kernel of its periods calls."""
 
 from collections.abc import Callable
 from typing import Any
@@ -27,7 +27,7 @@ from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.mirror import CellMirror
 from hapticdb.resident.table import CellTable
-from hapticdb.session.stations import Station
+from hapticdb.session.states import SessionState
 
 ROOM = 1 << 17, 8
 """Near points for which there is room at first: so many, or all of a smaller tool's, or this part
@@ -90,15 +90,15 @@ class _Repeated:
         return answer[-1]
 
 
-class GpuLooks:
-    """The looks of a station's coupling on the GPU: same near points, in the same order.
+class GpuQueries:
+    """Proximity queries of one coupling on the GPU: same near points, in the same order.
 
     Parameters
     ----------
-    station : Station
-        Of a tool whose periods this process runs; from now on the GPU looks for it.
+    state : SessionState
+        Of a tool whose periods this process runs; from now on the GPU answers its queries.
     table : CellTable
-        Where the station reads its cells.
+        Cells of the session.
 
     Attributes
     ----------
@@ -106,14 +106,14 @@ class GpuLooks:
         Name of the GPU.
     """
 
-    def __init__(self, station: Station, table: CellTable) -> None:
+    def __init__(self, state: SessionState, table: CellTable) -> None:
         check_gpu()
         name = getattr(cuda.current_context().device, "name", "simulated")
         self.card = name.decode() if isinstance(name, bytes) else str(name)
-        self._station, self._table = station, table
-        self._follower = views_of(station.follower)
-        self._tried = station.servo["tool"]["tried_pose"]
-        self._place = Place(*station.record["place"].tolist())
+        self._state, self._table = state, table
+        self._follower = views_of(state.follower)
+        self._tried = state.servo["tool"]["tried_pose"]
+        self._place = Place(*state.record["place"].tolist())
         self._mirror = CellMirror(table, DISTANCE.for_kernels, side=None)
         self._n_looks, self._epoch = 0, 0
         self._error: BaseException | None = None
@@ -121,8 +121,8 @@ class GpuLooks:
         self._nothing = cuda.to_device(NOTHING)
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
         self._asked: NDArray[np.float64] = cuda.pinned_array(kernels.ASKED, np.float64)
-        self._sight = self._sight_of(station)
-        n_runs = self._sight.run_due.size
+        self._view = self._view_of(state)
+        n_runs = self._view.run_due.size
         self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
         self._of_points = min(n_runs, kernels.MOST_BLOCKS)
         self._kernel = kernels.look_at_runs(kernels.THREADS)
@@ -133,11 +133,11 @@ class GpuLooks:
         self._stream.synchronize()
         self._repeat()
         self._called = FUNCTION(self._answer)
-        station.follower["looker"] = address_of(self._called)
+        state.follower["looker"] = address_of(self._called)
 
-    def _sight_of(self, station: Station) -> kernels.Sight:
+    def _view_of(self, state: SessionState) -> kernels.Sight:
         """Memory of the GPU for a tool."""
-        clusters, table = station.clusters, self._table
+        clusters, table = state.clusters, self._table
         n_points = len(clusters.points)
         n_runs = -(-n_points // clusters.run)
         room = min(n_points, max(ROOM[0], n_points // ROOM[1]))
@@ -178,17 +178,17 @@ class GpuLooks:
 
     def _looked(self) -> int:
         """Look at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
-        follower, station = self._follower, self._station
-        self._mirror.update(int(station.cells.readers[station.reader * READER_STRIDE]))
+        follower, state = self._follower, self._state
+        self._mirror.update(int(state.cells.readers[state.reader * READER_STRIDE]))
         self._mirror.seen()  # in the arrays that the launches read
         if self._n_looks % USED_EVERY == 0:
             self._tell_used()
         self._epoch += int(follower.anew) == POINTS_ANEW
         most, half = int(follower.merges_from), 1 - int(follower.side)
-        near, bends = station.near_points[half], station.bends[half]
+        near, bends = state.near_points[half], state.bends[half]
         while True:
             n_due, n_near, n_unknown, least = self._look_once().tolist()
-            n, numbers = int(n_near), self._sight.points_near
+            n, numbers = int(n_near), self._view.points_near
             if n > numbers.size:
                 self._put_back(-1, n_due)
                 self._make_room(n)
@@ -206,7 +206,7 @@ class GpuLooks:
             self._put_back(shut, n_due)
             return SHUT
         order = np.argsort(numbers)
-        rows, first = self._sight.near[:, order].T, kernels.CURVATURE
+        rows, first = self._view.near[:, order].T, kernels.CURVATURE
         near["point"][:n], near["is_hollow"][:n] = numbers[order], rows[:, first] > 0.0
         near.view(np.float64).reshape(len(near), -1)[:n, -first:] = rows[:, :first]
         bends.view(np.float64).reshape(len(bends), -1)[:n] = rows[:, first:]
@@ -219,8 +219,8 @@ class GpuLooks:
         """First of the near points that may not be there; NOBODY if all may."""
         if not self._follower.is_walking:
             return NOBODY
-        before = self._station.kept[numbers]
-        u, bound = np.array(self._sight.near[:2, : len(numbers)])
+        before = self._state.kept[numbers]
+        u, bound = np.array(self._view.near[:2, : len(numbers)])
         is_shut = (u < FLOOR) & (u <= before["u"])
         is_shut |= (bound < LEAST_BOUND) & (bound <= before["bound"])
         return int(numbers[is_shut].min(initial=NOBODY))
@@ -230,7 +230,7 @@ class GpuLooks:
         follower = self._follower
         self._n_looks += 1
         asked = kernels.Look(
-            self._n_looks, self._epoch, self._station.clusters.run, follower.is_large,
+            self._n_looks, self._epoch, self._state.clusters.run, follower.is_large,
             follower.anew > 0, follower.is_bent, follower.merged, -1, 0, follower.travelled,
             follower.way, tuple(self._tried[:3].ravel().tolist()),
         )  # fmt: skip
@@ -248,20 +248,20 @@ class GpuLooks:
 
     def _launch_look(self) -> None:
         """Launches and copies of a look."""
-        place, stream, sight = self._place, self._stream, self._sight
-        seen = self._mirror.seen()._replace(used=sight.used)
-        sight.asked.copy_to_device(self._asked, stream=stream)
-        kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, sight)
+        place, stream, view = self._place, self._stream, self._view
+        seen = self._mirror.seen()._replace(used=view.used)
+        view.asked.copy_to_device(self._asked, stream=stream)
+        kernels.list_due_runs[self._of_runs, kernels.THREADS_OF_RUNS, stream](place, seen, view)
         self._kernel[self._of_points, kernels.THREADS, stream](
-            place, seen, self._mirror.arrays[-1], sight
+            place, seen, self._mirror.arrays[-1], view
         )
-        sight.found.copy_to_host(self._found, stream=stream)
-        sight.found.copy_to_device(self._nothing, stream=stream)
+        view.found.copy_to_host(self._found, stream=stream)
+        view.found.copy_to_device(self._nothing, stream=stream)
 
     def _launch_put_back(self) -> None:
         """Launch and copy of what puts back."""
-        self._sight.asked.copy_to_device(self._asked, stream=self._stream)
-        kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._sight)
+        self._view.asked.copy_to_device(self._asked, stream=self._stream)
+        kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._view)
 
     def _repeat(self) -> None:
         """Take both with the arrays that they have now."""
@@ -271,7 +271,7 @@ class GpuLooks:
     def _make_room(self, n: int) -> None:
         """Make room for n near points."""
         room = 1 << (n - 1).bit_length()
-        self._sight = self._sight._replace(
+        self._view = self._view._replace(
             points_near=cuda.mapped_array(room, np.int64),
             near=cuda.mapped_array((kernels.NEAR_NUMBERS, room), np.float64),
         )
@@ -279,7 +279,7 @@ class GpuLooks:
 
     def _tell_missed(self, n_unknown: int) -> None:
         """List the unknown cells that the look met, for the fetching process."""
-        missed, keys = self._station.missed, self._sight.missed
+        missed, keys = self._state.missed, self._view.missed
         missed[LISTED] = 0
         if n_unknown:
             found = keys.copy_to_host()
@@ -290,7 +290,7 @@ class GpuLooks:
 
     def _tell_used(self) -> None:
         """Mark the cells that were read in the table, which evicts others."""
-        used = self._sight.used
+        used = self._view.used
         found = used.copy_to_host()
         self._table.cells.used[found > 0] = 1
         used.copy_to_device(np.zeros_like(found))

@@ -1,6 +1,6 @@
-"""Files to parts: name, triangles or points in metres, placement.
+"""Mesh, CAD and point-cloud files as parts: name, triangles or points in metres, placement.
 
-Light to import: a format's libraries load in the child process that parses.
+Light to import: a format's libraries load only in the parser process.
 """
 
 from hapticdb.mesh.parse import READERS
@@ -9,6 +9,6 @@ from hapticdb.mesh.reader import parse_in_process, read_file
 from hapticdb.units import UNITS
 
 SUFFIXES = tuple(READERS)
-"""Suffixes of files that can be read, in lower case."""
+"""Supported suffixes, in lower case."""
 
 __all__ = ["SUFFIXES", "UNITS", "Defects", "MeshFile", "Part", "parse_in_process", "read_file"]

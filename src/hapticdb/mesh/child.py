@@ -1,7 +1,7 @@
-"""The process that parses one file, within limits of memory and processor time, and returns arrays.
+"""Parser process: reads one file within limits of memory and processor time, and returns arrays.
 
-The script is run by its path with a request on standard input (see `reader.py`), and answers on
-standard output. A parser that takes too much memory, crashes or hangs ends only this process.
+Run by its path, with a request on standard input (see `reader.py`) and the answer on standard
+output. Excess memory, a crash or a hang of a parser ends this process only.
 """
 
 # The package's own __init__ may import modules that parsing does not need. An empty package with
@@ -28,19 +28,18 @@ _PR_SET_PDEATHSIG = 1
 BASE_BYTES = 512 << 20
 BYTES_PER_BYTE = 64
 BYTES_PER_PACKED_BYTE = 500
-"""Memory limit of a file in bytes: a base, plus a number for each byte of the file, which is larger
-for packed formats.
+"""Memory limit of a file, bytes: a base, plus a factor times its size, larger for packed formats.
 Larger values let a damaged file take more memory before it is refused.
 
-Measured at a mesh of 327,680 triangles, bytes of resident memory per byte of the file: OBJ 12,
-OFF 12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 if all points
-differ only in their positions; STEP 114 (0.2 MB).
+Measured at a mesh of 327,680 triangles, bytes of resident memory per byte of the file: OBJ 12, OFF
+12, PLY 11 (text 15), STL 7 (text 5), GLB 12, 3MF 10, DAE 5; LAZ 21, and 101 if all points differ
+only in their positions; STEP 114 (0.2 MB).
 """
 _PACKED = {".3mf", ".ifc", ".laz", ".step", ".stp"}
 
 
 def main() -> None:
-    """Answer one request, and end."""
+    """Serve one request, then exit."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # the parent handles Ctrl-C and ends this process
     request = json.loads(sys.stdin.buffer.read())
     _die_with_parent(request["parent"])
@@ -53,7 +52,7 @@ def main() -> None:
 
 
 def _die_with_parent(parent: int) -> None:
-    """End when the parent ends, however it does (Linux; elsewhere the time limit ends it)."""
+    """End with the parent, however it ends (Linux only; elsewhere the time limit applies)."""
     if sys.platform == "linux":
         ctypes.CDLL(None).prctl(_PR_SET_PDEATHSIG, signal.SIGKILL)
     if os.getppid() != parent:
@@ -61,7 +60,7 @@ def _die_with_parent(parent: int) -> None:
 
 
 def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
-    """Parse and write: a line of JSON that describes the arrays, the placements, the arrays."""
+    """Parse, and write a JSON header, the placements, then the arrays."""
     import numpy as np  # noqa: PLC0415 - after sys.path
 
     from hapticdb.mesh.formats.gltf import bytes_beside  # noqa: PLC0415
@@ -115,12 +114,12 @@ def _answer(out: BinaryIO, path: Path, request: dict[str, Any]) -> None:
 
 
 def _memory_kind() -> int:
-    """Kind of limit: data on Linux, without reserved address space; elsewhere address space."""
+    """Kind of limit: on Linux data, without reserved address space; elsewhere address space."""
     return resource.RLIMIT_DATA if sys.platform == "linux" else resource.RLIMIT_AS
 
 
 def _bytes_in(file: str, key: str, otherwise: int) -> int:
-    """Memory that Linux tells under a key of a file; `otherwise` if it does not."""
+    """Bytes under a key of a file of Linux's /proc; `otherwise` if there is none."""
     with contextlib.suppress(OSError):
         for line in Path(file).read_text().splitlines():
             if line.startswith(key):
@@ -129,14 +128,14 @@ def _bytes_in(file: str, key: str, otherwise: int) -> int:
 
 
 def bytes_available() -> int:
-    """Memory that the machine can give without swapping; 2^62 bytes if this is not known."""
+    """Memory available without swapping, bytes; 2^62 if unknown."""
     return _bytes_in("/proc/meminfo", "MemAvailable:", 1 << 62)
 
 
 def allowance(path: Path, n_beside: int = 0) -> int:
-    """Bytes that parsing may take: in proportion to the file, limited by the machine's memory.
+    """Memory limit of parsing, bytes: by the file's size, at most 3/4 of the available memory.
 
-    n_beside: bytes of the files that it refers to.
+    n_beside : bytes of referenced files.
     """
     n_bytes = path.stat().st_size + n_beside
     factor = BYTES_PER_PACKED_BYTE if path.suffix.lower() in _PACKED else BYTES_PER_BYTE
@@ -144,7 +143,7 @@ def allowance(path: Path, n_beside: int = 0) -> int:
 
 
 def _limit_memory(allowed: int, limit: int | None) -> tuple[int, int]:
-    """Limit the memory to what is held already plus a number of bytes; returns the former limit."""
+    """Limit memory to its present use plus `limit`, or else `allowed`; returns the former limit."""
     kind = _memory_kind()
     before = resource.getrlimit(kind)
     held = _bytes_in("/proc/self/status", "VmData:", 0)  # counted as the limit counts it

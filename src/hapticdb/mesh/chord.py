@@ -1,14 +1,14 @@
 """Chord error of a tessellation, from positions and normals of the CAD surface at its vertices.
 
-OpenCASCADE puts vertices on the CAD surface and writes the surface's normals there. Over a triangle
-the surface is taken for the cubic patch with these corners and normals (Vlachos et al. 2001,
-"Curved PN triangles"); the greatest of its heights above the triangle, sampled, is the chord error.
-The mesher's tolerance proves nothing: one face of a real file exceeds it up to 13 times.
+OpenCASCADE puts vertices on the CAD surface, with the surface's normals. Over a triangle the
+surface is approximated by the cubic patch with these corners and normals (Vlachos et al. 2001,
+"Curved PN triangles"); its greatest sampled height above the triangle is the chord error. The
+mesher's tolerance proves nothing: one face of a real file exceeds it up to 13 times.
 
-Vertices of finer tessellations show at least how large it is: for 25 shapes at 2 tolerances it is
-1.18 to 1.4 times what these show, 2.2 at most. Without `MARGIN` the least is 0.94, of a spline of
-short waves. docs/decisions/0024 has the figures, and says why no second tessellation is made: it
-takes longer than the first, and shows nothing where it refines nothing.
+Vertices of finer tessellations give a lower bound. For 25 shapes at 2 tolerances the estimate is
+1.18 to 1.4 times that bound, 2.2 at most; without `MARGIN` the least is 0.94, of a spline of short
+waves. docs/decisions/0024 has the figures, and the case against a second tessellation: it takes
+longer than the first, and shows nothing where it refines nothing.
 """
 
 import math
@@ -26,34 +26,34 @@ from hapticdb.units import length_text
 Floats = NDArray[np.float64]
 
 DEFAULT = 1e-5
-"""Greatest chord error wanted of a STEP file unless given, metres. A smaller value: more triangles,
-and more time where surfaces are curved both ways."""
+"""Greatest chord error of a STEP file unless given, metres. A smaller value: more triangles, and
+more time where surfaces are curved both ways."""
 LEAST, MOST = 1e-7, 1.0
-"""Range of the chord error that may be asked for, metres. Below it a part of a few centimetres has
-millions of triangles, whose 32-bit positions are as coarse."""
+"""Range of a requested chord error, metres. Below it a part of a few centimetres has millions of
+triangles, and 32-bit positions are as coarse."""
 MARGIN = 1.25
-"""Factor on the height that the patches have: for what a cubic patch misses."""
+"""Factor on the patch heights, for the approximation error of a cubic patch."""
 
 _OVER = 1.05
-"""Times the wanted chord error from which on a larger one is told."""
+"""Ratio of the chord error to the requested one above which it is reported."""
 _STEPS = 6
-"""Steps of the lattice over a triangle where heights are sampled: halves and thirds are in it."""
+"""Subdivisions of the lattice of height samples on a triangle; it contains halves and thirds."""
 _STEEP = math.sin(math.pi / 3)
-"""Sine of the angle between an edge and the surface beyond which the normal is not believed. The
-mesher allows half a radian between neighbours."""
+"""Sine of the angle between an edge and the surface above which the normal is rejected. The mesher
+allows half a radian between neighbours."""
 _SMOOTH, _KNIFE = 0.9, 1e-4
 """Cosine of the angle between normals above which faces meet smoothly; least square of its sine."""
 _ROUNDED = 1e-7
-"""Rounding of a normal of 32-bit numbers, at most."""
+"""Greatest rounding error of a normal of 32-bit numbers."""
 _AT_ONCE = 1 << 16
-"""Triangles at once. A larger value takes more memory."""
+"""Triangles of a batch. A larger value takes more memory."""
 _NEXT, _LAST = (1, 2, 0), (2, 0, 1)
 _MIXERS = np.array([0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9], dtype=np.uint64)
-"""Odd numbers that spread the bits of a position over a hash."""
+"""Odd multipliers of a hash of positions."""
 
 
 def check_chord(metres: float | None) -> None:
-    """Raise UsageError if a chord error to ask for, metres, is out of range."""
+    """Raise UsageError for a chord error, metres, out of range."""
     if metres is not None and not LEAST <= metres <= MOST:
         raise UsageError(
             f"a chord error of {metres * 1e3:g} mm: give {LEAST * 1e3:g} mm to {length_text(MOST)}"
@@ -70,7 +70,7 @@ def measured(shape: Shape, wanted: float) -> Shape:
 
 
 def told_coarser(shapes: Sequence[Shape], wanted: float) -> list[str]:
-    """Note of how far tessellations are from the chord error that was wanted, metres."""
+    """Note of shapes with a chord error above the requested one, metres."""
     over = [one.chord for one in shapes if one.chord > _OVER * wanted]
     worst = length_text(max(over, default=0.0))
     words = "shape{s} {are} tessellated with a chord error of up to {worst}, not {wanted} as wanted"
@@ -83,17 +83,18 @@ def chord_error(
     faces: NDArray[np.int64],
     wanted: float,
 ) -> float:
-    """Greatest distance between triangles and the CAD surface that they stand for; 0 if it is flat.
+    """Greatest distance between triangles and their CAD surface; 0 if it is flat.
 
-    Where a surface ends, the curve of its border is in no normal: then, and without normals, it is
-    at least `wanted`, for which the mesher was given `wanted / MARGIN` (on circles it needs half).
+    No normal shows the curve of a free border. So with a free border, or without normals, the
+    result is at least `wanted`: the mesher's tolerance is `wanted / MARGIN` (on circles it needs
+    half).
 
     Parameters
     ----------
     vertices, normals, faces : arrays
-        Positions (V, 3) and unit normals (V, 3), of each CAD face its own; corners (F, 3).
+        Positions (V, 3) and unit normals (V, 3), separate for each CAD face; corners (F, 3).
     wanted : float
-        Chord error that the mesher was asked for, the vertices' unit.
+        Chord error requested of the mesher, the vertices' unit.
     """
     rounding = float(np.spacing(np.abs(vertices).max(initial=0.0)))
     if normals is None:
@@ -119,7 +120,7 @@ def _height(
     is_singular: NDArray[np.bool_],
     rounding: float,
 ) -> float:
-    """Greatest height of the patches above their triangles."""
+    """Greatest height of the cubic patches above their triangles."""
     corners = vertices[faces].astype(np.float64)
     sides = corners[:, _NEXT] - corners
     upright = normals[faces].astype(np.float64)
@@ -127,7 +128,7 @@ def _height(
     back, is_steep_back = _rise(-sides[:, _LAST], upright, rounding)
     unsure = is_singular[faces]
     lost = (unsure | is_steep) & ~unsure[:, _NEXT], (unsure | is_steep_back) & ~unsure[:, _LAST]
-    # Without a normal at one end, an edge is taken for an arc: as high there as at the other end.
+    # Without a normal at one end, assume an arc: the same height as at the other end.
     ahead, back = np.where(lost[0], back[:, _NEXT], ahead), np.where(lost[1], ahead[:, _LAST], back)
     middle = 1.5 * (ahead.sum(axis=1) + back.sum(axis=1)) / 6.0
     heights = np.concatenate([ahead, back, middle[:, None]], axis=1) @ _weights().T
@@ -137,8 +138,8 @@ def _height(
 def _rise(sides: Floats, normals: Floats, rounding: float) -> tuple[Floats, NDArray[np.bool_]]:
     """Heights (F, 3) of control points on sides (F, 3, 3), by the normals at the sides' starts.
 
-    With them whether a side is too steep for its normal to be one. On planes they are 0, whatever
-    the rounding of 32-bit positions and normals.
+    Also whether a side is too steep for a valid normal. Heights on planes are 0, whatever the
+    rounding of 32-bit positions and normals.
     """
     over = -np.einsum("fkd,fkd->fk", sides, normals)
     lengths = np.sqrt(np.einsum("fkd,fkd->fk", sides, sides))
@@ -151,7 +152,7 @@ def _rise(sides: Floats, normals: Floats, rounding: float) -> tuple[Floats, NDAr
 
 @cache
 def _weights() -> Floats:
-    """Shares (points, 7) of a patch's control heights at the points of the lattice."""
+    """Bernstein weights (points, 7) of a patch's control heights at the points of the lattice."""
     rows = []
     for i in range(_STEPS + 1):
         for j in range(_STEPS + 1 - i):
@@ -167,11 +168,11 @@ def _sag(
     is_singular: NDArray[np.bool_],
     rounding: float,
 ) -> float:
-    """Greatest distance of a curve where two CAD faces meet from the edge that stands for it.
+    """Greatest distance of a curve between two CAD faces from its edge.
 
     pairs (n, 2, 2) : the edge's ends on one face and on the other. On a sharp edge the curve may
-    leave both faces' triangles sideways, unseen by either normal: the shift has a component along
-    each of them, and is the shortest vector that has both. Faces that meet smoothly need none.
+    leave both faces' triangles sideways, invisible to either normal: its offset is the shortest
+    vector with the given components along both. Smooth edges need none.
     """
     greatest, positions = 0.0, vertices.astype(np.float64)
     for one, other in ((0, 1), (1, 0)):
@@ -193,9 +194,9 @@ def _sag(
 def _edges(
     vertices: NDArray[np.generic], faces: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], bool]:
-    """Ends (n, 2, 2) of edges on the two CAD faces that meet there, and whether some edge is free.
+    """Ends (n, 2, 2) of edges on their two CAD faces, and whether some edge is free.
 
-    Faces have vertices of their own, so edges meet by their positions, which are hashed.
+    CAD faces do not share vertices, so edges are matched by hashes of positions.
     """
     bits = (np.ascontiguousarray(vertices, dtype=np.float32) + np.float32(0)).view(np.uint32)
     mixed = (bits.astype(np.uint64) * _MIXERS).sum(axis=1, dtype=np.uint64)

@@ -1,4 +1,4 @@
-"""Checks every number that a reader found, counts what is wrong, and returns only sound parts."""
+"""Validation of a reader's output: drops and counts unsound geometry, converts to metres."""
 
 import unicodedata
 from dataclasses import replace
@@ -14,17 +14,18 @@ from hapticdb.units import length_text
 Scalar = TypeVar("Scalar", bound=np.generic)
 
 _FLAT = 1e-12
-"""A triangle is degenerate when twice its area is at most this times its longest edge squared:
-rounding errors of float64 edges are smaller. A larger value also counts thin triangles."""
+"""Degenerate triangle: twice its area is at most this times its longest edge squared. Rounding
+errors of float64 edges are smaller. A larger value also counts thin triangles."""
 
 _COARSE = 1e-3
-"""Steps between coordinates are told when they are larger than this share of a part's extent."""
+"""Share of a part's extent above which the step between 32-bit coordinates is reported."""
 
 
 def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
-    """Refuse and count geometry of the file `link` that cannot be used; the rest in metres.
+    """Sound parts of the file `link`, in metres; other geometry is dropped and counted.
 
-    metres : length of the unit of a file without a unit of its own; None if none was given.
+    metres : unit length of a file without a unit, or None. UnreadableError without usable geometry,
+    or for an invalid unit or transform.
     """
     if parsed.not_lengths is not None and metres is None:
         raise UnreadableError(parsed.not_lengths)
@@ -71,7 +72,7 @@ def clean(parsed: Parsed, metres: float | None, link: str) -> MeshFile:
 
 
 def _coarse(parsed: Parsed, scale: float) -> list[str]:
-    """Say where numbers of 32 bits are too far apart for the geometry that they place."""
+    """Notes of parts too far from the origin for 32-bit coordinates."""
     found = []
     for placement in {p.shape: p for p in reversed(parsed.placements)}.values():
         vertices = parsed.shapes[placement.shape].vertices
@@ -119,12 +120,12 @@ def _checked(
 
 
 def _of_sound(colours: NDArray[np.uint8] | None, is_sound: ArrayLike) -> NDArray[np.uint8] | None:
-    """Colours of the triangles or points that are kept, read-only."""
+    """Colours of the sound triangles or points, read-only."""
     return None if colours is None else read_only(colours[np.asarray(is_sound)])
 
 
 def read_only(array: NDArray[Scalar]) -> NDArray[Scalar]:
-    """Array itself, which parts share and nobody may write from now on."""
+    """The array itself, made read-only, as parts share it."""
     array.flags.writeable = False
     return array
 
@@ -138,9 +139,10 @@ def _metric(vertices: NDArray[np.generic], scale: float) -> NDArray[np.float64]:
 def _compact(
     vertices: NDArray[Scalar], faces: NDArray[np.int64]
 ) -> tuple[NDArray[Scalar], NDArray[np.int64]]:
-    """Drop the vertices that no face uses; their order stays.
+    """Drop unused vertices; the order stays.
 
-    Pieces of a file may share one large array of vertices: a small piece sorts its own indices.
+    Pieces of a file may share one large array of vertices: for a small piece, sort its indices
+    instead.
     """
     if faces.size * 8 < len(vertices):
         used, renumbered = np.unique(faces, return_inverse=True)
@@ -155,7 +157,7 @@ def _compact(
 def _count_degenerate(
     positions: NDArray[np.float64], faces: NDArray[np.int64], linear: NDArray[np.float64]
 ) -> int:
-    """Triangles without area once `linear` (3, 3) is applied."""
+    """Number of triangles of zero area under the linear map (3, 3)."""
     # Edges are computed before the transform: far from the origin they would lose digits.
     first = positions[faces[:, 0]]
     a = (positions[faces[:, 1]] - first) @ linear.T
@@ -176,7 +178,7 @@ def _squares(rows: NDArray[np.float64]) -> NDArray[np.float64]:
 def _worlds(
     placements: list[Placement], geometries: list[NDArray[np.float64]], scale: float
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
-    """Transforms (P, 4, 4) in metres, and whether all points of a placement are finite there."""
+    """Transforms (P, 4, 4) in metres, and whether all points of a placement are finite in it."""
     worlds = np.array([p.world_from_part for p in placements], dtype=np.float64).reshape(-1, 4, 4)
     is_finite = np.isfinite(worlds).all(axis=(1, 2))
     bent = np.flatnonzero(is_finite & (worlds[:, 3] != [0, 0, 0, 1]).any(axis=1))
@@ -194,14 +196,14 @@ def _worlds(
 
 
 def _are_flat(worlds: NDArray[np.float64]) -> NDArray[np.bool_]:
-    """Whether a transform flattens geometry, so that triangles may lose their areas."""
+    """Whether a transform is singular up to rounding, so triangles may lose their areas."""
     linear = worlds[:, :3, :3]
     lengths = np.sqrt(np.einsum("pij,pij->p", linear, linear))
     return np.asarray(np.abs(np.linalg.det(linear)) <= 1e-9 * lengths**3)
 
 
 def _printable(name: str) -> str:
-    """Name that any terminal, database and JSON reader accepts: no controls, no lone surrogates."""
+    """Name without control characters or lone surrogates: valid in terminals, databases, JSON."""
     if name.isascii() and name.isprintable():
         return name.strip() or "part"
     whole = name.encode("utf-8", "replace").decode("utf-8")
@@ -209,14 +211,14 @@ def _printable(name: str) -> str:
 
 
 class _Names:
-    """Makes names unique in the order of the file: 'wheel', 'wheel #2', 'wheel #3'."""
+    """Unique names in the order of the file: 'wheel', 'wheel #2', 'wheel #3'."""
 
     def __init__(self) -> None:
         self._taken: set[str] = set()
         self._count: dict[str, int] = {}
 
     def unique(self, name: str) -> str:
-        """Name, with a number if it was given before."""
+        """Name, with a number from its second use on."""
         candidate = name
         while candidate in self._taken:
             self._count[name] = self._count.get(name, 1) + 1

@@ -1,13 +1,13 @@
-"""Packs the geometry and colours of a part into bytes for a database, and unpacks it, bit for bit.
+"""Binary format of a part's surface in a database: geometry, colours, chord error; lossless.
 
-Bytes of equal weight stand side by side, of positions and of the differences from one triangle's
-corners to the next one's; zlib packs that. Measured on all shapes of three assemblies of 44,000 to
-180,000 triangles: 2.7, 3.5 and 4.8 bytes a triangle. Differences of positions would take 0.3 more,
-lzma 0.3 to 0.5 less and ten times as long; the distinct values of each axis, sorted, 0.8 to 0.9
-less and twice the code. Unpacking takes a quarter of a second for a million triangles.
+Byte planes (bytes of equal weight side by side) of the positions, and of the differences between
+the corners of successive triangles, compressed by zlib. Measured on all shapes of three assemblies
+of 44,000 to 180,000 triangles: 2.7, 3.5 and 4.8 bytes a triangle. Differences of positions would
+take 0.3 more, lzma 0.3 to 0.5 less and ten times as long; the distinct values of each axis, sorted,
+0.8 to 0.9 less and twice the code. Unpacking takes a quarter of a second for a million triangles.
 
-Colours follow as a zlib stream of their own, where there are some: a palette, and the number in it
-of each triangle. The chord error comes last, where there is one.
+Colours follow in a zlib stream of their own: a palette, and a palette index for each triangle. The
+chord error comes last. Both are optional.
 """
 
 import struct
@@ -23,14 +23,14 @@ Colours = NDArray[np.uint8]
 HEADER = struct.Struct("<QQ")
 """Numbers of vertices and of triangles; `CLOUD` instead of triangles for a point cloud."""
 COUNT = struct.Struct("<Q")
-"""Number of colours of the palette, before it."""
+"""Number of colours in the palette, before its zlib stream."""
 CHORD = struct.Struct("<d")
-"""Chord error, metres. A block of colours is longer, so what has this length is one."""
+"""Chord error, metres. A block of colours is longer, so a rest of this length is a chord error."""
 CLOUD = (1 << 64) - 1
 LEVEL = 6
-"""Level of zlib. Larger: hardly smaller, and much slower to pack."""
+"""zlib level. Larger: hardly smaller, and much slower to pack."""
 MOST_RATIO = 1032
-"""Bytes that a byte of zlib's can stand for, at most (https://zlib.net/zlib_tech.html)."""
+"""Greatest expansion of a zlib stream (https://zlib.net/zlib_tech.html)."""
 
 
 def pack(
@@ -50,7 +50,7 @@ def pack(
 
 
 def unpack(data: bytes) -> tuple[Vertices, Faces | None, Colours | None, float]:
-    """What `pack` was given, read-only; ValueError if the bytes cannot be that."""
+    """Inverse of `pack`, read-only arrays; ValueError for other bytes."""
     if len(data) < HEADER.size:
         raise ValueError("a surface that is cut off")
     n_vertices, n_faces = HEADER.unpack_from(data)
@@ -85,7 +85,7 @@ def _packed_chord(chord: float) -> bytes:
 
 
 def _unpacked_chord(data: bytes) -> float:
-    """Undo `_packed_chord`."""
+    """Inverse of `_packed_chord`."""
     if not data:
         return 0.0
     chord = float(CHORD.unpack(data)[0]) if len(data) == CHORD.size else 0.0
@@ -95,7 +95,7 @@ def _unpacked_chord(data: bytes) -> float:
 
 
 def _inflated(data: bytes, most: int) -> tuple[bytes, bytes]:
-    """A zlib stream of at most so many bytes, and what follows it."""
+    """Content of a zlib stream, at most `most` bytes, and the bytes after it; ValueError."""
     unpacking = zlib.decompressobj()
     try:
         found = unpacking.decompress(data, most)
@@ -107,7 +107,7 @@ def _inflated(data: bytes, most: int) -> tuple[bytes, bytes]:
 
 
 def _packed_colours(colours: Colours) -> bytes:
-    """Pack colours (n, 4): a palette and numbers in it, or all of them where few are alike."""
+    """Palette of colours (n, 4) and indices into it; all colours if over half are distinct."""
     whole = np.ascontiguousarray(colours).view("<u4").reshape(-1)
     palette, number = np.unique(whole, return_inverse=True)
     if 2 * len(palette) > len(whole):
@@ -119,7 +119,7 @@ def _packed_colours(colours: Colours) -> bytes:
 
 
 def _unpacked_colours(data: bytes, n: int) -> tuple[Colours, bytes]:
-    """Undo `_packed_colours` at the start of data; and what follows."""
+    """Inverse of `_packed_colours` at the start of `data`, and the bytes after it."""
     (n_palette,) = COUNT.unpack_from(data)
     if n_palette > n:
         raise ValueError("a surface with more colours than triangles")
@@ -142,35 +142,35 @@ def _unpacked_colours(data: bytes, n: int) -> tuple[Colours, bytes]:
 
 
 def _number_type(n_palette: int) -> str:
-    """Type of a number in a palette."""
+    """Integer type of a palette index."""
     return "u1" if n_palette <= 1 << 8 else "<u2" if n_palette <= 1 << 16 else "<u4"
 
 
 def _width(n_vertices: int) -> int:
-    """Bytes that hold the difference of two indices of vertices and its sign."""
+    """Bytes of a difference of two vertex indices, with its sign."""
     return n_vertices.bit_length() // 8 + 1
 
 
 def _differences(values: NDArray[np.int64]) -> NDArray[np.uint64]:
-    """Each row minus the row before, modulo 2^64, with the sign moved to the lowest bit."""
+    """Differences of successive rows, modulo 2^64, zigzag-encoded: sign in the lowest bit."""
     steps = np.diff(values, axis=0, prepend=np.zeros_like(values[:1]))
     return ((steps << 1) ^ (steps >> 63)).view(np.uint64)
 
 
 def _sums(steps: NDArray[np.uint64]) -> NDArray[np.int64]:
-    """Undo `_differences`."""
+    """Inverse of `_differences`."""
     signed = ((steps >> np.uint64(1)) ^ -(steps & np.uint64(1))).view(np.int64)
     return np.cumsum(signed, axis=0)
 
 
 def _planes(values: NDArray[np.uint64], width: int) -> bytes:
-    """Bytes 0 .. width - 1 of values (n, 3): the lowest of all in a column first."""
+    """Byte planes 0 .. width - 1 of each column of values (n, 3), lowest byte first."""
     columns = np.ascontiguousarray(values.T, dtype="<u8").view(np.uint8).reshape(3, -1, 8)
     return np.ascontiguousarray(columns[:, :, :width].swapaxes(1, 2)).tobytes()
 
 
 def _numbers(planes: bytes, width: int) -> NDArray[np.uint64]:
-    """Undo `_planes`."""
+    """Inverse of `_planes`."""
     columns = np.frombuffer(planes, np.uint8).reshape(3, width, -1)
     values = np.zeros((columns.shape[2], 3, 8), np.uint8)
     values[:, :, :width] = columns.transpose(2, 0, 1)

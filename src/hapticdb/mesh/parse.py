@@ -1,4 +1,4 @@
-"""Picks the reader of a format, and turns any reader's failure into one line of plain words."""
+"""Reader of each format; any failure of a reader becomes one line of plain words."""
 
 import functools
 import importlib
@@ -30,18 +30,18 @@ READERS = {
     ".stl": "stl",
     ".stp": "step",
 }
-"""Module of the reader, by suffix in lower case."""
+"""Reader's module in `formats`, by suffix in lower case."""
 
 
 def is_tessellated(path: str | os.PathLike[str]) -> bool:
-    """Whether a file's triangles stand for CAD surfaces, by its suffix."""
+    """Whether the triangles of a format approximate CAD surfaces, by the file's suffix."""
     return READERS.get(Path(path).suffix.lower()) in {"ifc", "step"}
 
 
 def reader_of(path: Path, chord: float | None = None) -> Callable[[Path], Parsed]:
-    """Reader of a format. Its import loads only the libraries of this format.
+    """Reader of a format; imports the libraries of this format only.
 
-    chord : greatest chord error wanted of a tessellation, metres; None for the format's own.
+    chord : greatest chord error of a tessellation, metres; None for the format's default.
     """
     module = importlib.import_module(f"hapticdb.mesh.formats.{READERS[path.suffix.lower()]}")
     reader: Callable[..., Parsed] = module.read
@@ -50,10 +50,9 @@ def reader_of(path: Path, chord: float | None = None) -> Callable[[Path], Parsed
 
 
 def parse(path: Path, metres: float | None, chord: float | None = None) -> MeshFile:
-    """Sound parts of a file, read in this process; every failure is an `UnreadableError`.
+    """Sound parts of a file, parsed in this process; any failure is an `UnreadableError`.
 
-    metres : length of the unit of a file without a unit of its own; None if none was given; chord :
-    as for `reader_of`.
+    metres : unit length of a file without a unit, or None; chord : as for `reader_of`.
     """
     read = reader_of(path, chord)
     try:
@@ -66,7 +65,7 @@ def parse(path: Path, metres: float | None, chord: float | None = None) -> MeshF
 
 
 def cause_of(error: BaseException) -> str:
-    """Cause of a library's failure, in words for a reader who does not know the library."""
+    """Cause of a library's failure, in plain words."""
     detail = " ".join(str(error).split())
     if isinstance(error, MemoryError):
         return (
@@ -95,7 +94,7 @@ def cause_of(error: BaseException) -> str:
 
 
 def _shown(error: KeyError) -> str:
-    """Name of what was missing, if it can be printed."""
+    """Name of a missing key, if printable."""
     key = error.args[0] if error.args else None
     if isinstance(key, str) and key.isprintable() and key.strip():
         return f"'{key}'"

@@ -1,4 +1,4 @@
-"""What a mesh file holds once read: parts, their placements, and what was wrong with them."""
+"""Contents of a mesh file: parts, their placements, defects."""
 
 import hashlib
 from dataclasses import dataclass, field
@@ -21,15 +21,15 @@ class Defects:
     """Counts of the defects of a file or a part; `+` adds them."""
 
     degenerate: int = 0
-    """Triangles without area after placement. They are kept and mark the voxels that they touch."""
+    """Triangles of zero area after placement. They stay, and mark the voxels that they touch."""
     non_finite: int = 0
-    """Triangles and points with a coordinate that is NaN or infinite. Refused."""
+    """Triangles and points with a NaN or infinite coordinate. Dropped."""
     out_of_range: int = 0
-    """Triangles with an index outside the vertices. Refused."""
+    """Triangles with a vertex index out of range. Dropped."""
     incomplete: int = 0
-    """Faces of fewer than three corners. Refused."""
+    """Faces of fewer than three corners. Dropped."""
     unsupported: int = 0
-    """Pieces of a kind that has no surface or is not read: lines, triangle fans, curves."""
+    """Pieces without a surface or of an unsupported kind: lines, curves, points among triangles."""
     empty: int = 0
     """Nodes, solids and meshes without any triangle or point."""
 
@@ -44,7 +44,7 @@ class Defects:
         return {name: getattr(self, name) for name in _WORDS}
 
     def describe(self) -> str:
-        """Put the counts above zero in words, '12 degenerate, 3 non-finite'; '' without defects."""
+        """Format the counts above zero, '12 degenerate, 3 non-finite'; '' without defects."""
         return ", ".join(f"{n} {_WORDS[name]}" for name, n in self.as_dict().items() if n)
 
 
@@ -65,15 +65,15 @@ class Part:
     """(4, 4) affine transform, metres; it may mirror, scale or flatten."""
     defects: Defects = field(default_factory=Defects)
     shared: dict[str, str] = field(default_factory=dict, repr=False)
-    """Digests, once they are computed; instances of one mesh share the dictionary."""
+    """Cache of the digest; instances of one mesh share the dictionary."""
     colours: NDArray[np.uint8] | None = None
     """(F, 4) red, green, blue (sRGB) and opacity of each triangle, or (V, 4) of each point of a
     cloud; None if the file has none."""
     chord: float = 0.0
-    """Chord error, metres, part frame: greatest distance between the triangles and the CAD surface
-    that they stand for; 0.0 where the triangles are the shape."""
+    """Chord error, metres, part frame: greatest distance between the triangles and the tessellated
+    CAD surface; 0.0 for exact triangles."""
     attributes: dict[str, str] = field(default_factory=dict)
-    """What the file says of the part beside its name: class, identifier, storey."""
+    """Attributes from the file: class, identifier, storey."""
 
     @property
     def placed_chord(self) -> float:
@@ -83,7 +83,7 @@ class Part:
 
     @property
     def is_cloud(self) -> bool:
-        """Whether the part is points and not triangles."""
+        """Whether the part is a point cloud."""
         return self.faces is None
 
     @property
@@ -114,38 +114,38 @@ class Part:
         return self.world_points(world_from_part)[self.faces]
 
     def surface(self) -> NDArray[np.float64]:
-        """Corners (F, 3, 3) of the placed triangles; a cloud's points are ones without area."""
+        """Corners (F, 3, 3) of the placed triangles; a cloud's points as triangles of zero area."""
         if self.faces is None:
             return np.repeat(self.world_points()[:, None], 3, axis=1)
         return self.triangles()
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Box (2, 3) of the placed part, with the surface that its triangles stand for, metres."""
+        """AABB (2, 3) of the placed part, metres, enlarged by the chord error."""
         points, chord = self.world_points(), self.placed_chord
         return np.stack([points.min(axis=0) - chord, points.max(axis=0) + chord])
 
 
 @dataclass(frozen=True, eq=False)
 class MeshFile:
-    """All usable parts of one file, in the order of the file; at least one."""
+    """All usable parts of one file, at least one, in the order of the file."""
 
     link: str
     """Absolute path of the file, symbolic links resolved."""
     parts: list[Part]
     defects: Defects
-    """Sum over the parts, and over refused or empty geometry that became no part."""
+    """Sum over the parts, and over dropped or empty geometry outside of them."""
     names_unit: bool = False
-    """Whether the file names the unit of its lengths."""
+    """Whether the file gives or suggests its unit of length."""
     up: str | None = None
-    """Axis that points up, x, y or z; None if neither the format nor the file says it."""
+    """Up axis, x, y or z; None if neither the format nor the file defines it."""
     notes: tuple[str, ...] = ()
-    """What the file holds that is not read, or not as it is meant; a line each."""
+    """Content not read, or read otherwise than meant; a line each."""
     named: tuple[str, ...] = ()
-    """Names of the files beside it that `read_file` looked for: buffers, materials, pictures."""
+    """Names of the referenced files searched by `read_file`: buffers, materials, pictures."""
 
     @property
     def bounds(self) -> NDArray[np.float64]:
-        """Least and greatest corner (2, 3) of all parts, metres, world frame."""
+        """AABB (2, 3) of all parts, metres, world frame."""
         boxes = np.stack([part.bounds for part in self.parts])
         return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)])

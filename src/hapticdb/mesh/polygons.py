@@ -1,6 +1,7 @@
-"""Triangles of polygons, strips and fans.
+"""Triangulation of polygons, strips and fans.
 
-A polygon becomes a fan where that is right; mapbox_earcut cuts the others (decision 0003).
+A polygon becomes a fan if its fan stays inside; ear clipping by mapbox_earcut (decision 0003)
+otherwise.
 """
 
 from collections.abc import Mapping, Sequence
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 Faces = NDArray[np.int64]
 
 _FOLD = 1e-6
-"""A fan is right unless one of its triangles turns against the polygon by more than this share of
-the polygon's area. Positions that were float32 make collinear corners turn by 1e-7."""
+"""Tolerance of the fan test: a fan is wrong if a triangle turns against the polygon by more than
+this share of the polygon's area. Rounding of float32 positions turns collinear corners by 1e-7."""
 
 
 def triangulated(
@@ -21,13 +22,13 @@ def triangulated(
     polygons: Sequence[Sequence[int]],
     holes: Mapping[int, Sequence[int]] | None = None,
 ) -> tuple[Faces, int]:
-    """Triangles (F, 3) of polygons, and how many polygons had fewer than three corners.
+    """Triangles (F, 3) of polygons, and the number of polygons of fewer than three corners.
 
     Parameters
     ----------
     vertices : (V, 3) positions.
-    polygons : indices of vertices, which may lie outside of them.
-    holes : for the number of a polygon with holes, where in it each hole's corners begin.
+    polygons : vertex indices, possibly out of range.
+    holes : by the number of a polygon with holes, offsets of the holes' first corners in it.
     """
     by_size: dict[int, list[Sequence[int]]] = {}
     pieces = [np.empty((0, 3), dtype=np.int64)]
@@ -43,7 +44,7 @@ def triangulated(
 
 
 def triangulated_equal(vertices: NDArray[np.generic], polygons: Faces) -> Faces:
-    """Triangles (F, 3) of polygons (P, k), k >= 3."""
+    """Triangles (F, 3) of polygons (P, k) of equal size, k >= 3."""
     if polygons.shape[1] == 3 or not len(vertices):
         return fan(polygons)
     folded = np.flatnonzero(_are_folded(vertices, polygons))
@@ -56,7 +57,7 @@ def triangulated_equal(vertices: NDArray[np.generic], polygons: Faces) -> Faces:
 
 
 def strip(corners: Faces) -> Faces:
-    """Triangles (k - 2, 3) of a strip of corners (k,)."""
+    """Triangles (k - 2, 3) of a triangle strip (k,)."""
     found = np.stack([corners[:-2], corners[1:-1], corners[2:]], axis=1)
     found[1::2] = found[1::2, ::-1]  # every other triangle of a strip is wound the other way
     return found
@@ -71,7 +72,7 @@ def fan(polygons: Faces) -> Faces:
 
 
 def _are_folded(vertices: NDArray[np.generic], polygons: Faces) -> NDArray[np.bool_]:
-    """Whether the fan of each polygon (P, k) leaves it; False for indices outside the vertices."""
+    """Whether the fan of each polygon (P, k) leaves it; False for indices out of range."""
     inside = ((polygons >= 0) & (polygons < len(vertices))).all(axis=1, keepdims=True)
     known = np.where(inside, polygons, 0)
     first = np.asarray(vertices[known[:, 0]], dtype=np.float64)
@@ -84,7 +85,7 @@ def _are_folded(vertices: NDArray[np.generic], polygons: Faces) -> NDArray[np.bo
 
 
 def _cut(vertices: NDArray[np.generic], polygon: Faces, starts: Sequence[int]) -> Faces:
-    """Triangles of one polygon (k,), whose holes begin at `starts`, in its mean plane."""
+    """Ear clipping of one polygon (k,), holes from `starts` on, in its mean plane; else its fan."""
     import mapbox_earcut  # noqa: PLC0415 - few files need it
 
     as_fan = fan(polygon)

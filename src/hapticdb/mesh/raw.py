@@ -1,4 +1,4 @@
-"""Results of a format's reader: shapes as the file has them, and their placements."""
+"""Unchecked output of the format readers: shapes, placements, notes; parsing common to formats."""
 
 import re
 import warnings
@@ -19,31 +19,31 @@ Node = TypeVar("Node", bound=Hashable)
 _COMMA = re.compile(r"[-+]?\d+,\d+([eE][-+]?\d+)?")
 _ONE = {"s": "", "es": "", "ies": "y", "are": "is", "begin": "begins", "come": "comes",
         "hold": "holds", "refer": "refers"}  # fmt: skip
-"""Endings and verbs, and what they are for one thing."""
+"""Plural endings and verbs in messages, and their singular."""
 HIDDEN = "node{s} {are} hidden in it, and {come} in like any other"
 ANIMATED = "node{s} {are} moved by animations, which are not read"
 _MOST_NAMES, _LONGEST_NAME = 3, 60
-"""Missing files that are named, and their last characters."""
+"""Missing files listed in a note, and the last characters of each name."""
 MAX_NODES = 2_000_000
-"""Most placements in a file: placements of nested assemblies multiply. A larger value lets a small
-file take more memory and time."""
+"""Most placed nodes in a file: placements of nested assemblies multiply. A larger value lets a
+small file take more memory and time."""
 MOST_CHARACTERS = 50_000_000
-"""Most characters in the names of all placements: with nodes nested deeply, names grow as the depth
+"""Most characters in the names of all placements: names of deeply nested nodes grow as the depth
 squared. A larger value lets a small file take more memory."""
 
 
 class UnreadableError(Exception):
-    """Reason why a file cannot be read. The text needs neither the file's name nor a traceback."""
+    """Cause of an unreadable file, in plain words, without the file's name."""
 
 
 @dataclass(frozen=True)
 class Shape:
     """Geometry as read: indices may be out of range, coordinates may be NaN.
 
-    vertices (V, 3), the file's unit, any number type; faces (F, 3) of any integer type, or None for
-    a point cloud; defects : what the reader itself dropped; colours : (F, 4) of the triangles or
-    (V, 4) of a cloud's points, as `Part` has them, None if the file has none; normals : (V, 3), or
-    None; chord : chord error, the file's unit, 0 where triangles are the shape.
+    vertices (V, 3), the file's unit, any number type; faces (F, 3), any integer type, or None for a
+    point cloud; defects : pieces dropped by the reader; colours : (F, 4) of triangles or (V, 4) of
+    a cloud's points, as in `Part`, or None; normals : (V, 3), or None; chord : chord error, the
+    file's unit, 0 for exact triangles.
     """
 
     vertices: NDArray[np.generic]
@@ -68,9 +68,10 @@ class Placement:
 class Parsed:
     """A file's contents before any check.
 
-    `metres` is the length of the file's unit, None if the format has none. `likely_metres` is the
-    length of a unit that the file only suggests, such as the unit of its reference system; an
-    option overrides it. `up` is the axis that points up, None if the file does not say.
+    metres : length of the file's unit, None without one; likely_metres : length of a suggested
+    unit, such as the reference system's, overridden by the option `unit`; up : up axis, None if
+    undefined; not_lengths : error message for coordinates without a length unit, such as degrees,
+    else None.
     """
 
     shapes: list[Shape]
@@ -84,13 +85,13 @@ class Parsed:
 
 
 class NameBudget:
-    """Joins names of nodes to names of parts; raises an error if their total is too long."""
+    """Joins node names to part names, up to `MOST_CHARACTERS` in total."""
 
     def __init__(self) -> None:
         self._left = MOST_CHARACTERS
 
     def joined(self, names: Sequence[str]) -> str:
-        """Name of a part: the names of the nodes that lead to it, joined by '/'."""
+        """Part name: the node names on its path, joined by '/'; UnreadableError over the budget."""
         name = "/".join(names)
         self._left -= len(name)
         if self._left < 0:
@@ -102,26 +103,26 @@ class NameBudget:
 
 
 def require(is_read: bool, what: str) -> None:  # noqa: FBT001 - what is asked
-    """Refuse a file that requires what is not read."""
+    """Raise UnreadableError for a required feature, `what`, without support."""
     if not is_read:
         raise UnreadableError(f"it requires the {what}, which is not read: save it without")
 
 
 def told(n: int, words: str, **named: str) -> list[str]:
-    """Note of so many things, in the singular for one; none of none.
+    """Note with a count, in the singular for one; empty for zero.
 
-    words : with the endings and verbs of `_ONE`, and what else is named, in braces.
+    words : template with the forms of `_ONE` and the keys of `named` in braces.
     """
     forms = _ONE if n == 1 else {many: many for many in _ONE}
     return [f"{n:,} {words.format(**forms, **named)}"] if n > 0 else []
 
 
 NAMED: set[str] = set()
-"""Names by which this process has looked for files beside those that it reads."""
+"""Names of referenced files that this process has searched."""
 
 
 def beside(folder: Path, name: str) -> Path | None:
-    """File that another one names, as written or with percent-encoding such as %20 resolved."""
+    """Path of a referenced file, its name as written or percent-decoded (%20); None if missing."""
     NAMED.add(name)
     for candidate in (name, unquote(name), unquote(name).replace("\\", "/")):
         try:
@@ -133,7 +134,7 @@ def beside(folder: Path, name: str) -> Path | None:
 
 
 def told_missing(folder: Path, names: Iterable[str], *more: str) -> list[str]:
-    """Note of the files of colours and pictures, of `names`, that are not there; and of `more`."""
+    """Note of missing files with colours or pictures: those absent of `names`, and `more`."""
     plain = (name.removeprefix("file://") for name in names if name[:5] != "data:")
     gone = (name for name in plain if beside(folder, name) is None)
     missing = list(dict.fromkeys([*more, *gone]))
@@ -154,7 +155,7 @@ def placed_once(
 
 
 def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.generic]:
-    """Parse all numbers of a text, separated by white space; anything else is an error."""
+    """Numbers of a text, separated by white space; UnreadableError for any other word."""
     if not text or text.isspace():
         return np.empty(0, dtype=dtype)
     with warnings.catch_warnings():
@@ -172,7 +173,7 @@ def numbers(text: str, dtype: type[np.float64] | type[np.int64]) -> NDArray[np.g
 
 
 def indices(words: Iterable[str]) -> list[int]:
-    """Whole numbers of a face."""
+    """Integers of a face; UnreadableError for any other word."""
     try:
         return [int(word) for word in words]
     except ValueError:
@@ -180,7 +181,7 @@ def indices(words: Iterable[str]) -> list[int]:
 
 
 def positions(lines: Sequence[str]) -> NDArray[np.float64]:
-    """Positions (V, 3) that lines begin with; what follows the coordinates is left out."""
+    """Positions (V, 3) in the first three columns of lines; UnreadableError for fewer columns."""
     words = [line.split(None, 3)[:3] for line in lines]
     if any(len(three) < 3 for three in words):
         raise UnreadableError("a vertex has fewer than three coordinates")
@@ -202,10 +203,11 @@ def walk(
     roots: Iterable[tuple[Node, NDArray[np.float64]]],
     children: Callable[[Node], Iterable[tuple[Node, NDArray[np.float64]]]],
 ) -> Iterator[tuple[list[Node], NDArray[np.float64]]]:
-    """Every placement of every node under `roots`: path from the root, and world_from_node.
+    """Depth-first traversal of all placed nodes: path from the root, and world_from_node.
 
-    Depth first, in the order of the file; a node on two paths comes twice. The yielded list is used
-    again, so copy it to keep it. The walk is not recursive, so deep nesting takes no stack.
+    In the order of the file; a node on two paths is yielded twice. The yielded list is reused, so
+    copy it. Iterative: deep nesting takes no stack. UnreadableError for a cycle, or beyond
+    `MAX_NODES`.
     """
     path: list[Node] = []
     on_path: set[Node] = set()

@@ -1,7 +1,7 @@
-"""Reads a file in a child process: the parent's side.
+"""Files read in a parser process: the parent's side.
 
-The child is started by its path and not by `multiprocessing`, which would run the user's main
-module again. It sends each array once, however many parts share it.
+The child is started by its path: `multiprocessing` would run the user's main module again. An array
+shared by several parts is sent once.
 """
 
 import importlib.util
@@ -36,12 +36,12 @@ _CHILD = Path(__file__).with_name("child.py")
 _SECONDS = 20.0
 _SECONDS_PER_MIB = 5.0
 _SECONDS_PER_MIB_OF = {"ifc": 20.0, "step": 20.0, "threemf": 10.0}
-"""Limit of a file's processor time, seconds: a base, plus a number for each MiB. It is at least ten
-times the time of sound files. STEP and IFC files are tessellated, and 3MF files unpack to a
-multiple of their size. Larger values let a damaged file take longer before it is refused."""
+"""Limit of a file's processor time, seconds: a base, plus a number for each MiB; at least ten times
+the time of sound files. STEP and IFC files are tessellated, and 3MF files unpack to a multiple of
+their size. Larger values let a damaged file take longer before it is refused."""
 _WAITING = 10.0
-"""Times the limit of processor time after which a parser is ended by the clock: it waits for
-something that does not come. Smaller: a busy machine may refuse a sound file."""
+"""Wall-clock limit in multiples of the processor time limit, for a parser in an endless wait.
+Smaller: a busy machine may refuse a sound file."""
 _LIBRARIES = {
     "step": ("OpenCASCADE", "save it anew as STEP AP214 or AP242, or as glTF or STL"),
     "ifc": ("IfcOpenShell", "save it anew as IFC4, or as glTF"),
@@ -49,7 +49,7 @@ _LIBRARIES = {
 }
 """Libraries that may crash on a damaged file, by reader: name, and advice for the user."""
 _LONGEST_CAUSE = 300
-"""Characters of a message's cause; longer ones are cut."""
+"""Longest cause in a message, characters."""
 _MORE_TIME = "if it is sound, give more: import --time-limit, read_file(time_limit=...)"
 
 
@@ -63,32 +63,32 @@ def read_file(
 ) -> MeshFile:
     """All usable parts of a mesh, CAD or point-cloud file, in metres.
 
-    The file is parsed in a child process of bounded memory and processor time, so that no file can
-    bring down or hang its reader.
+    Parsed in a child process of bounded memory and processor time: no file can crash or hang its
+    reader.
 
     Parameters
     ----------
     path : str or path
         GLB, glTF, OBJ, STL, PLY, 3MF, OFF, DAE; STEP (extra `step`); IFC (extra `ifc`); LAS, LAZ
-        (extra `pointcloud`). The suffix says which.
+        (extra `pointcloud`). The suffix selects the format.
     unit : str, optional
-        One of `hapticdb.mesh.UNITS`: the unit of a file that has none of its own (OBJ, STL, PLY,
-        OFF, LAS, LAZ). By default that of the reference system of a LAS or LAZ file, or the one
-        that a comment names, else metres.
+        One of `hapticdb.mesh.UNITS`, for a file without a unit of its own (OBJ, STL, PLY, OFF, LAS,
+        LAZ). By default that of the reference system of a LAS or LAZ file, or of a comment, else
+        metres.
     memory_limit : int, optional
-        Bytes that parsing may take; by default in proportion to the file, see `child.allowance`.
+        Bytes of memory for parsing; by default in proportion to the file, see `child.allowance`.
     time_limit : float, optional
-        Seconds of processor time that parsing may take; by default in proportion to the file. A
-        parser that waits is ended after ten times as long.
+        Seconds of processor time for parsing; by default in proportion to the file. A parser that
+        waits is ended after ten times as long.
     chord : float, optional
-        Greatest chord error wanted of the tessellation of a STEP file, 0.00001 m by default, or of
-        an IFC file, 0.0001 m. What it is became `Part.chord`. Other files have none.
+        Greatest chord error of the tessellation of a STEP file, 0.00001 m by default, or of an IFC
+        file, 0.0001 m; no effect on other files. The resulting one is `Part.chord`.
 
     Raises
     ------
     FileError
-        If the file is missing, damaged, of an unknown kind, or holds no usable triangle or point;
-        one line that names file and cause.
+        If the file is missing, damaged, of an unknown kind, or contains no usable triangle or
+        point; one line with file and cause.
     MissingExtraError
         If the format needs an extra that is not installed.
     UsageError
@@ -117,7 +117,7 @@ def read_file(
 def parse_in_process(
     path: str | os.PathLike[str], *, unit: str | None = None, chord: float | None = None
 ) -> MeshFile:
-    """`read_file` without a child process and without limits, for files known to be sound."""
+    """`read_file` without a child process and without limits, for trusted files."""
     check_chord(chord)
     metres, file = _checked(path, unit)
     try:
@@ -132,7 +132,7 @@ def _seconds_for(file: Path) -> float:
 
 
 def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | None, Path]:
-    """Length of the given unit, and the file's path; refuses what needs no parsing to refuse."""
+    """Length of the given unit, and the resolved path; raises all errors that need no parsing."""
     metres = None if unit is None else metres_of(unit)
     file = Path(path)
     try:
@@ -147,7 +147,7 @@ def _checked(path: str | os.PathLike[str], unit: str | None) -> tuple[float | No
 
 
 def _refusal(file: Path) -> str | None:
-    """Reason to refuse a file before it is parsed."""
+    """Reason to refuse a file before parsing; None without one."""
     if file.is_dir():
         return "it is a directory; name the files in it"
     if not file.exists():
@@ -162,14 +162,14 @@ def _refusal(file: Path) -> str | None:
 
 
 def _require_extra(reader: str, suffix: str) -> None:
-    """Raise an error that names a missing extra, before a child fails without it."""
+    """Raise MissingExtraError before a child process fails without the extra."""
     extra, modules = _EXTRAS.get(reader, ("", ()))
     if any(importlib.util.find_spec(module) is None for module in modules):
         raise MissingExtraError(f"{suffix} files need more packages: {pip_line(extra)}")
 
 
 def _one_line(path: str | os.PathLike[str], cause: object) -> str:
-    """One printable line that names file and cause."""
+    """One printable line of file and cause."""
     words = " ".join(str(cause).split())
     if len(words) > _LONGEST_CAUSE:
         words = words[: _LONGEST_CAUSE - 3] + "..."
@@ -178,7 +178,7 @@ def _one_line(path: str | os.PathLike[str], cause: object) -> str:
 
 
 def _ask_child(request: dict[str, Any], seconds: float) -> MeshFile:
-    """Start a child, send the request, take its answer; no child outlives this call."""
+    """Run a request in a child process; no child outlives this call."""
     # One arena and one thread: memory reserved per thread would count as the file's.
     settings = {
         "OPENBLAS_NUM_THREADS": "1",
@@ -224,7 +224,7 @@ def _end(child: subprocess.Popen[bytes], late: threading.Event) -> None:
 
 
 def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> MeshFile | None:
-    """Send the request and take the answer; None if the child ended before it had answered."""
+    """Send the request and receive the answer; None if the child ended before its answer."""
     if child.stdin is None or child.stdout is None:  # both are pipes: for the type checker
         return None
     try:
@@ -240,7 +240,7 @@ def _talk(child: subprocess.Popen[bytes], request: dict[str, Any]) -> MeshFile |
 
 
 def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
-    """Answer of the child: parts from its head, arrays from the stream behind it."""
+    """Parts from the header of an answer, and the arrays after it."""
     if "error" in head:
         raise UnreadableError(head["error"])
     worlds = _filled(((len(head["parts"]), 4, 4), "f8"), stream)
@@ -259,7 +259,7 @@ def _received(head: dict[str, Any], stream: IO[bytes], link: str) -> MeshFile:
 
 
 def _filled(described: tuple[tuple[int, ...], str], stream: IO[bytes]) -> NDArray[Any]:
-    """Array of a shape and type, with the next bytes; nobody may write it afterwards."""
+    """Read-only array of a shape and type, from the next bytes of a stream."""
     array = np.empty(*described)
     if stream.readinto(array.reshape(-1).view(np.uint8)) < array.nbytes:  # type: ignore[attr-defined]
         raise EOFError
@@ -267,7 +267,7 @@ def _filled(described: tuple[tuple[int, ...], str], stream: IO[bytes]) -> NDArra
 
 
 def _why_ended(returncode: int, words: IO[bytes], path: str) -> str:
-    """Reason why a child ended without an answer."""
+    """Reason for the end of a child without an answer."""
     if returncode < 0:
         name = signal.Signals(-returncode).name
         reader = READERS[Path(path).suffix.lower()]

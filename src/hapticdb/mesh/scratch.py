@@ -1,7 +1,7 @@
-"""Folders for the files of parsers, which cannot remove them when they are killed.
+"""Temporary folders of parser processes, removed also after a kill.
 
-A process locks its folder for as long as it runs. So a folder without a lock is left from a process
-that was killed, and the next one removes it.
+A process locks its folder (flock) during its life. An unlocked folder belonged to a killed process;
+the next process removes it.
 """
 
 import contextlib
@@ -15,12 +15,12 @@ from pathlib import Path
 
 PREFIX = "hapticdb-parser-"
 YOUNG_S = 60.0
-"""Age up to which a folder may be without a lock because it was made just now."""
+"""Age, seconds, up to which an unlocked folder may be a new one, before its lock."""
 
 
 @contextlib.contextmanager
 def scratch_folder() -> Iterator[str]:
-    """Folder of a parser, removed at the end; also removes those of processes that were killed."""
+    """Temporary folder, removed on exit; also removes the folders of killed processes."""
     _remove_left()
     with tempfile.TemporaryDirectory(prefix=PREFIX, ignore_cleanup_errors=True) as folder:
         lock = os.open(folder, os.O_RDONLY)
@@ -32,7 +32,7 @@ def scratch_folder() -> Iterator[str]:
 
 
 def _remove_left() -> None:
-    """Remove this user's folders that are not locked."""
+    """Remove this user's unlocked folders older than `YOUNG_S`."""
     for folder in Path(tempfile.gettempdir()).glob(f"{PREFIX}*"):
         with contextlib.suppress(OSError):
             lock = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)

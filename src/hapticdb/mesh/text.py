@@ -1,4 +1,4 @@
-"""Text of files in any of the encodings that programs write: UTF-8, UTF-16, GB18030, Latin-1."""
+"""Decoding of text files (UTF-8, UTF-16, UTF-32, GB18030, Windows-1252); units named in text."""
 
 import codecs
 import re
@@ -15,10 +15,11 @@ _MARKS = (
 )
 _DECLARED = re.compile(rb"<\?xml[^>]*encoding=[\"']([\w.-]+)")
 _SAMPLE = 64
-"""Bytes that tell UTF-16 without a mark."""
+"""Leading bytes checked for UTF-16 without a byte order mark."""
 _NOT_ASCII = re.compile(rb"[\x80-\xff]+")
 _COMMON = re.compile(rb"(?:[\xb0-\xd7][\xa1-\xfe])+")
-"""Common Chinese characters in GB18030: in words of Latin-1 few such pairs of bytes stand alone."""
+"""Common Chinese characters in GB18030. In Latin-1 text few words consist of such byte pairs
+alone."""
 
 _UNIT = re.compile(
     r"\bunits?(?: used in this file)?[ \t]*(?:[=:]|\b(?:in|is|are)\b)[ \t]*(?:in[ \t]+)?"
@@ -26,14 +27,14 @@ _UNIT = re.compile(
     r"|\buses ([a-z]+) as units\b",
     re.IGNORECASE,
 )
-"""As Maya, SketchUp and others name it in a comment, or in a sentence such as 'the units are in
-metres'; neither a name such as 'foot unit' nor units of areas or speeds such as mm/s."""
+"""Unit in a comment, as by Maya and SketchUp, or in a sentence such as 'the units are in metres'.
+Neither a name such as 'foot unit' nor units of areas or speeds such as mm/s match."""
 _LENGTHS = UNITS | {"inch": UNITS["in"], "foot": UNITS["ft"]}
 _LENGTHS |= {word: UNITS[sign] for sign, name in NAMES.items() for word in (name, name[:-1])}
 
 
 def unit_in(text: str) -> tuple[str, float | None]:
-    """Words of a text that name a unit, and its length, metres; '' and None without."""
+    """Unit statement in a text, and the unit's length, metres; '' and None without one."""
     for found in _UNIT.finditer(text):
         length = unit_length(found[1] or found[2])
         if length is not None:
@@ -42,12 +43,12 @@ def unit_in(text: str) -> tuple[str, float | None]:
 
 
 def unit_length(word: str) -> float | None:
-    """Length of the unit that a word names, metres; None for other words."""
+    """Length, metres, of a unit by its name or symbol; None for other words."""
     return _LENGTHS.get(word.lower().replace("meter", "metre"))
 
 
 def recoded(content: bytes) -> bytes:
-    """Content without a byte order mark, in UTF-8 if it was UTF-16 or UTF-32."""
+    """Content without a byte order mark, UTF-16 and UTF-32 as UTF-8; other content unchanged."""
     for mark, name in _MARKS:
         if content.startswith(mark):
             return content.decode(name, "replace").encode()
@@ -60,7 +61,7 @@ def recoded(content: bytes) -> bytes:
 
 
 def xml_of(content: bytes) -> bytes:
-    """XML in UTF-8, by the encoding that it declares; if that is wrong, as `text_of` has it."""
+    """XML as UTF-8, decoded by its declared encoding, or by `text_of` if that fails."""
     plain = recoded(content)
     declared = _DECLARED.match(plain)
     if plain is content and declared is not None:
@@ -72,7 +73,7 @@ def xml_of(content: bytes) -> bytes:
 
 
 def text_of(content: bytes) -> str:
-    """Text of a file; bytes that are not UTF-8 are GB18030 if they look so, else Windows-1252."""
+    """Decoded text: UTF-8; else GB18030 if most runs of other bytes fit it, else Windows-1252."""
     plain = recoded(content)
     try:
         return plain.decode()

@@ -1,1 +1,1 @@
-"""One reader a format: a file in, what it holds out, unchecked."""
+"""Readers, one for each format: from a file to shapes and placements, unchecked."""

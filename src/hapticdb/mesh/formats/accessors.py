@@ -1,7 +1,7 @@
-"""Numbers of a glTF file: its buffers, each distinct one read once, and the arrays in them.
+"""Buffers and accessors of a glTF file; each distinct buffer is read once.
 
-This module does not use trimesh, which reads an external file once for each buffer that names it,
-makes arrays of all accessors even if no mesh uses them, and takes half a second to import.
+trimesh is not used: it reads an external file once for each of its buffers, makes arrays of all
+accessors, used or not, and takes half a second to import.
 """
 
 import base64
@@ -30,7 +30,7 @@ def objects_of(tree: dict[str, Any], key: str) -> list[dict[str, Any]]:
 
 
 def whole(value: object, what: str, least: int = 0) -> int:
-    """Check that a value is a whole number, `least` or more, as 1 and 1.0; true and 1.5 are not."""
+    """Check for an integer of `least` or more, also as a float 1.0; true and 1.5 are none."""
     if type(value) is float and value.is_integer():
         value = int(value)
     if type(value) is not int or not least <= value < 2**53:
@@ -39,7 +39,7 @@ def whole(value: object, what: str, least: int = 0) -> int:
 
 
 def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, Any]:
-    """Item of a list, by the number that refers to it."""
+    """Item of a list by its index; UnreadableError out of range."""
     n = whole(number, f"the number of {what}")
     if n >= len(items):
         raise UnreadableError(f"it is damaged: it refers to {what} {n} of {len(items)}")
@@ -47,14 +47,14 @@ def item(items: list[dict[str, Any]], number: object, what: str) -> dict[str, An
 
 
 def extension_of(owner: dict[str, Any], name: str) -> dict[str, Any] | None:
-    """Extension of an object; some programs write an empty list where none is."""
+    """Extension of an object, or None; some programs write an empty list instead of none."""
     extensions = owner.get("extensions")
     found = extensions.get(name) if isinstance(extensions, dict) else None
     return found if isinstance(found, dict) else None
 
 
 def _external_name(buffer: dict[str, Any]) -> str | None:
-    """File that holds a buffer; None if the glTF file itself holds it."""
+    """File name of a buffer; None for an embedded one."""
     name = buffer.get("uri")
     if name is not None and not isinstance(name, str):
         raise UnreadableError("it is damaged: the 'uri' of a buffer is no text")
@@ -62,7 +62,7 @@ def _external_name(buffer: dict[str, Any]) -> str | None:
 
 
 def external_bytes(tree: dict[str, Any], folder: Path) -> int:
-    """Size of the existing files that a glTF file refers to; each file counts once."""
+    """Total size of the existing files that a glTF file refers to; each file counts once."""
     sizes: dict[tuple[int, int], int] = {}
     for name in {_external_name(buffer) for buffer in objects_of(tree, "buffers")} - {None}:
         file = beside(folder, str(name))
@@ -88,10 +88,10 @@ def chunks_of(content: bytes) -> list[memoryview]:
 
 
 class Accessors:
-    """Arrays of a glTF file's accessors: made when they are needed, and views if possible.
+    """Arrays of a glTF file's accessors: made on demand, and views if possible.
 
     tree : the file's JSON; chunks : binary chunks, the n-th is the n-th buffer without a URI;
-    folder : of the files that the glTF refers to.
+    folder : of the referenced files.
     """
 
     def __init__(self, tree: dict[str, Any], chunks: list[memoryview], folder: Path) -> None:
@@ -108,7 +108,7 @@ class Accessors:
         return item(self._accessors, number, "accessor")
 
     def array(self, number: int) -> NDArray[np.generic]:
-        """Numbers (count, width) of an accessor, read-only."""
+        """Values (count, width) of an accessor, shared: do not write them."""
         if number not in self._arrays:
             self._arrays[number] = self._made(self.entry(number), f"accessor {number}")
         return self._arrays[number]
@@ -145,7 +145,7 @@ class Accessors:
     def _sparse(
         self, accessor: dict[str, Any], found: NDArray[Any], what: str
     ) -> NDArray[np.generic]:
-        """Numbers of an accessor that lists those that differ from others; `found` : zeros."""
+        """Values of a sparse accessor: base values with replacements; `found` : zeros."""
         sparse = accessor["sparse"]
         plain = accessor | {"sparse": None, "normalized": False}
         if "bufferView" in accessor:
@@ -184,7 +184,7 @@ class Accessors:
         return self._contents[key]
 
     def _within(self, number: int, buffer: dict[str, Any]) -> bytes | memoryview:
-        """Bytes of a buffer that the file itself holds."""
+        """Bytes of an embedded buffer."""
         if "uri" in buffer:
             head, found, text = str(buffer["uri"]).partition("base64,")
             if not found:
@@ -200,7 +200,7 @@ class Accessors:
 
 
 def _normal(whole_numbers: NDArray[Any]) -> NDArray[Any]:
-    """Fractions, -1 to 1 or 0 to 1, that whole numbers stand for; others as they are."""
+    """Normalised integers as fractions, -1 to 1 or 0 to 1; floats unchanged."""
     if whole_numbers.dtype.kind == "f":
         return whole_numbers
     return np.maximum(whole_numbers / np.iinfo(whole_numbers.dtype).max, -1.0)

@@ -1,8 +1,8 @@
-"""COLLADA: one part for each placed geometry, named along its nodes.
+"""COLLADA: one part for each placed geometry, named by its node path.
 
-This module does not use pycollada, which rounds positions and turns to 32 bits, makes 0 of NaN,
-passes over skews and the matrices of skins, loses a geometry for one index out of range or one
-empty piece, and a placement for a damaged material; nor trimesh, which loses the nodes' names.
+pycollada is not used: it rounds positions and rotations to 32 bits, makes 0 of NaN, ignores skews
+and the matrices of skins, loses a geometry for one index out of range or one empty piece, and a
+placement for a damaged material. Nor is trimesh: it loses the nodes' names.
 """
 
 from collections import Counter
@@ -37,17 +37,18 @@ from hapticdb.poses import rotation_of
 
 Floats = NDArray[np.float64]
 _Palette = dict[str, tuple[float, ...]]
-"""Colours and opacity, 0 to 1, by the symbol that triangles name."""
+"""Colours and opacity, 0 to 1, by material symbol."""
 _Geometry = tuple[ET.Element, _Palette]
 _UP_AXES = {"X_UP": "x", "Y_UP": "y", "Z_UP": "z"}
 _PIECES = {"triangles", "tristrips", "trifans", "polylist", "polygons"}
 _OF_A_MESH = _PIECES | {"lines", "source", "vertices", "extra"}
 _UNREAD = "piece{s} of the kind '{kind}' {are} not read"
 _ROUNDED = 0.01
-"""Share by which a unit's length may differ from that of its name. Larger: fewer are told."""
+"""Tolerated relative difference of a unit's length from that of its name. Larger: fewer are
+reported."""
 _LUMINANCE = (0.212671, 0.715160, 0.072169)  # of red, green and blue, by COLLADA 1.4.1
 _MOST_CONTROLLERS = 4
-"""Controllers of controllers that are followed: a skin of a morph is two."""
+"""Longest chain of controllers: a skin of a morph is two."""
 _INSTANCES: dict[str, tuple[str, ...]] = {
     "instance_geometry": ("geometry",),
     "instance_controller": ("controller",),
@@ -80,7 +81,7 @@ def read(path: Path) -> Parsed:
                 geometries.append((geometry, palette))
             names = [*filter(None, (node.get("name") or node.get("id") for node in nodes))]
             name = budget.joined(names) or geometry.get("name", geometry.get("id", ""))
-            # A skin is where it is bound, whatever its node says.
+            # The bind transform places a skin; the transform of its node has no effect.
             world = world_from_node if bound is None else bound
             placements.append(Placement(name, shapes[key], world))
     read_shapes, lost = _shapes(geometries)
@@ -96,9 +97,9 @@ def read(path: Path) -> Parsed:
 
 
 def _metres(root: ET.Element) -> tuple[float | None, list[str]]:
-    """Length of the document's unit, and what is said if its name is that of another.
+    """Unit length of the document, and a note if it contradicts the unit's name.
 
-    1 m if it names none; None if what it names is no number.
+    1 m without a unit; None if its length is no number.
     """
     unit = root.find("asset/unit")
     if unit is None:
@@ -127,13 +128,13 @@ class _Document:
             self._known.setdefault((element.tag, element.get("id")), element)
 
     def referred(self, one: ET.Element | None, *kinds: str, key: str = "url") -> ET.Element | None:
-        """Element of a kind that the attribute `key` of an element refers to."""
+        """Target of the reference in the attribute `key`, of one of the kinds; None if missing."""
         name = "" if one is None else unquote(one.get(key, "")).removeprefix("#")
         found = (self._known.get((kind, name)) for kind in kinds)
         return next((element for element in found if element is not None), None)
 
     def links(self, node: ET.Element) -> list[tuple[ET.Element, Floats]]:
-        """Nodes below a node, with their transforms; an instance of a node counts as that node."""
+        """Child nodes with their transforms; an instance of a node counts as that node."""
         below = [
             child if child.tag == "node" else self.referred(child, "node")
             for child in node
@@ -142,12 +143,12 @@ class _Document:
         return [(one, self._parent_from_node(one)) for one in below if one is not None]
 
     def _parent_from_node(self, node: ET.Element) -> Floats:
-        """Transform (4, 4) of a node: its steps, one behind the other."""
+        """Transform (4, 4) of a node: the product of its steps."""
         steps = (self._transform(step) for step in node if step.tag in _STEPS)
         return reduce(np.matmul, steps, np.eye(4))
 
     def _transform(self, step: ET.Element) -> Floats:
-        """Transform (4, 4) of a node's step or a skin; of NaN, and counted, if it is damaged."""
+        """Transform (4, 4) of a node's step or a skin; of NaN, and counted, if damaged."""
         whole = np.eye(4)
         try:
             with np.errstate(over="raise", invalid="raise", divide="raise"):
@@ -159,13 +160,13 @@ class _Document:
         return whole
 
     def geometries(self, node: ET.Element) -> list[tuple[ET.Element, _Palette, Floats | None]]:
-        """Geometries of a node itself, colours, and where the skin of one is bound."""
+        """Geometries of a node itself, their colours, and bind transforms of skins."""
         placing = [one for one in node if one.tag in {"instance_geometry", "instance_controller"}]
         found = [(*self._geometry(one), self._palette(one)) for one in placing]
         return [(one, palette, bound) for one, bound, palette in found if one is not None]
 
     def _geometry(self, instance: ET.Element) -> tuple[ET.Element | None, Floats | None]:
-        """Geometry or node that an element places, also through skins, and where it is bound."""
+        """Geometry or node placed by an element, also through skins, and its bind transform."""
         inner: ET.Element | None = instance
         key, kinds = "url", _INSTANCES.get(instance.tag, ())
         bound: Floats | None = None
@@ -181,7 +182,7 @@ class _Document:
         return None, None
 
     def _palette(self, instance: ET.Element) -> _Palette:
-        """Colours of the materials that a placement binds to the symbols of its triangles."""
+        """Colours of the materials bound by a placement, by the symbols of its triangles."""
         found: _Palette = {}
         for binding in instance.iter("instance_material"):
             material = self.referred(binding, "material", key="target")
@@ -196,9 +197,9 @@ class _Document:
         return found
 
     def notes(self, placed: set[int]) -> list[str]:
-        """Say what of the file did not become parts, or not in the place that it has when it moves.
+        """Notes of content without parts, and of hidden, animated or deformed content.
 
-        placed : `id` of the geometries that are.
+        placed : `id` of the placed geometries.
         """
         root = self._root
         strange = Counter(
@@ -234,12 +235,12 @@ class _Document:
 
 
 def _floats(text: str | None) -> Floats:
-    """Numbers of a text, none of None."""
+    """Numbers of a text; none for None."""
     return np.asarray(numbers(text or "", np.float64), dtype=np.float64)
 
 
 def _opacity(effect: ET.Element) -> float:
-    """Opacity of an effect, above 0 to 1: exporters that write 0 mean 1."""
+    """Opacity of an effect, above 0 to 1: exporters write 0 for 1."""
     clear = float(effect.findtext(".//transparency/float") or 1)
     by = next(effect.iter("transparent"), ET.Element("transparent"))
     kind = by.get("opaque", "A_ONE")
@@ -250,7 +251,7 @@ def _opacity(effect: ET.Element) -> float:
 
 
 def _turn(values: Floats) -> Floats:
-    """Rotation by an axis and degrees."""
+    """Rotation about an axis, by an angle in degrees."""
     half = np.radians(values[3]) / 2
     length = np.linalg.norm(values[:3])
     axis = np.sin(half) * values[:3] / (length or 1.0)
@@ -259,7 +260,7 @@ def _turn(values: Floats) -> Floats:
 
 
 def _look(values: Floats) -> Floats:
-    """Frame at a point that looks along -z at another, with y up."""
+    """Frame of a 'lookat' step: at a point, -z towards another one, y up."""
     eye, interest, up = values.reshape(3, 3)
     x = np.cross(interest - eye, up)
     y = np.cross(x, interest - eye)
@@ -275,11 +276,11 @@ _STEPS: dict[str, Callable[[Floats], Floats]] = {
     "rotate": _turn,
     "lookat": _look,
 }
-"""Upper left (n, m) of a transform (4, 4), by the numbers of a step."""
+"""Upper left (n, m) of a transform (4, 4), from the numbers of a step."""
 
 
 def _shapes(geometries: list[_Geometry]) -> tuple[list[Shape], list[str]]:
-    """Shapes of geometries, those that cannot be read without triangles, and what is told then."""
+    """Shapes of geometries, empty for unreadable ones, and a note of these."""
     found, lost = [], {}
     for geometry, palette in geometries:
         try:
@@ -337,13 +338,13 @@ def _shape(geometry: ET.Element, palette: _Palette) -> Shape:
 
 
 def _inputs(holder: ET.Element) -> dict[str, tuple[int, str]]:
-    """Offset and source of the first input of each kind."""
+    """Offset and source of the first input of each semantic."""
     found = reversed(holder.findall("input"))
     return {i.get("semantic", ""): (int(i.get("offset", 0)), i.get("source", "")) for i in found}
 
 
 def _values(source: ET.Element) -> Floats:
-    """Numbers of a source, row by row: those that its accessor names, three or more."""
+    """Rows (n, 3 or 4) of a source: the columns named by its accessor."""
     found = _floats(source.findtext("float_array"))
     accessor = source.find("technique_common/accessor")
     columns = [] if accessor is None else accessor.findall("param")
@@ -361,10 +362,10 @@ def _values(source: ET.Element) -> Floats:
 def _faces(
     piece: ET.Element, width: int, at: int, vertices: Floats
 ) -> tuple[NDArray[np.int64], NDArray[np.int64], int]:
-    """Indices of a piece's corners, its triangles, and how many polygons are too small.
+    """Indices of a piece's corners, its triangles, and the number of too small polygons.
 
-    at : the column of the indices (C, width) that has the vertex of a corner. The triangles (F, 3)
-    name corners. A polygon of fewer than three corners has none.
+    at : vertex column of the indices (C, width). Triangles (F, 3) refer to corners. A polygon of
+    fewer than three corners has none.
     """
 
     def row(text: ET.Element) -> NDArray[np.int64]:

@@ -1,8 +1,7 @@
-"""glTF and GLB: one part for each placed mesh, its pieces joined, named along its nodes.
+"""glTF and GLB: one part for each placed mesh, its primitives joined, named by its node path.
 
-This module does not use trimesh, whose scene graph names the pieces of one mesh at random, drops
-nodes below a camera, and keeps one of several placements of a node. `accessors` says why trimesh
-does not read the numbers, either.
+trimesh is not used: its scene graph names the primitives of one mesh at random, drops nodes below a
+camera, and keeps one of several placements of a node. See `accessors` for the arrays.
 """
 
 import json
@@ -70,9 +69,9 @@ def read(path: Path) -> Parsed:
 
 
 def parsed(content: bytes, path: Path, *, normals: bool = False) -> Parsed:
-    """Parts of a file's content; files that it refers to are beside `path`.
+    """Parts of a file's content; referenced files are in the folder of `path`.
 
-    normals : whether shapes come with the normals at their vertices, if all have some.
+    normals : whether shapes get the normals at their vertices, if all have some.
     """
     tree = _load_tree(content, path.suffix.lower())
     chunks = chunks_of(content) if content[:4] == _MAGIC else []
@@ -108,7 +107,7 @@ def parsed(content: bytes, path: Path, *, normals: bool = False) -> Parsed:
 
 
 def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]], folder: Path) -> list[str]:
-    """Say what is left out of the scene or not read, and what the file hides."""
+    """Notes of content outside the scene, not read, or hidden."""
     nodes = objects_of(tree, "nodes")
     outside = sum("mesh" in node for n, node in enumerate(nodes) if n not in worlds)
     found: Counter[str] = Counter()
@@ -145,7 +144,7 @@ def _notes(tree: dict[str, Any], worlds: dict[int, NDArray[np.float64]], folder:
 
 
 def _up_axis(tree: dict[str, Any]) -> str:
-    """Axis that points up: y by the specification, unless the file says that it differs."""
+    """Up axis: y by the specification, unless the asset's extras differ."""
     extras = tree.get("asset", {}).get("extras") if isinstance(tree.get("asset"), dict) else None
     up = extras.get("up_axis") if isinstance(extras, dict) else None
     return up if isinstance(up, str) and up in {"x", "y", "z"} else "y"
@@ -183,7 +182,7 @@ def _load_tree(content: bytes, suffix: str) -> dict[str, Any]:
 
 
 def bytes_beside(path: Path) -> int:
-    """Size of the existing files that a glTF file refers to; 0 if parsing will fail."""
+    """Total size of the existing files that a glTF file refers to; 0 if parsing will fail."""
     with suppress(UnreadableError, ValueError, RecursionError):
         return external_bytes(_load_tree(path.read_bytes(), path.suffix.lower()), path.parent)
     return 0
@@ -198,7 +197,7 @@ def _shape(
     *,
     normals: bool,
 ) -> Shape:
-    """One shape from a mesh's pieces; vertices that pieces share are kept once."""
+    """One shape of a mesh's primitives; shared vertices occur once."""
     vertices: dict[object, NDArray[np.generic]] = {}
     upright: list[NDArray[np.generic]] = []
     offsets: dict[object, int] = {}
@@ -244,7 +243,7 @@ def _shape(
 
 
 def _base_colours(tree: dict[str, Any]) -> _Materials:
-    """Base colour of each material, amounts of light and opacity; None if a texture has it."""
+    """Base colour of each material, linear light and opacity; None if a texture gives it."""
     found: _Materials = []
     materials = tree.get("materials")
     for material in materials if isinstance(materials, list) else []:
@@ -266,7 +265,7 @@ def _base_colours(tree: dict[str, Any]) -> _Materials:
 def _paint(
     piece: dict[str, Any], faces: NDArray[np.int64], accessors: Accessors, materials: _Materials
 ) -> Colours | None:
-    """Colours (F, 4) of a piece's triangles, or (1, 4) for all; None if it has none."""
+    """Colours (F, 4) of a primitive's triangles, or (1, 4) for all; None if it has none."""
     base = None
     if "material" in piece:
         with suppress(UnreadableError):
@@ -284,14 +283,14 @@ def _paint(
 
 
 def _one(arrays: list[Any]) -> NDArray[Any]:
-    """Join arrays. A single array is not copied, because thousands of meshes may share it."""
+    """Concatenate arrays; a single one is not copied, because thousands of meshes may share it."""
     return np.asarray(arrays[0] if len(arrays) == 1 else np.concatenate(arrays))
 
 
 def _corners(
     piece: dict[str, Any], mode: int, n_vertices: int, accessors: Accessors, number: int
 ) -> NDArray[np.int64]:
-    """Corners (F, 3) of a piece's triangles: listed, or the vertices in turn."""
+    """Corners (F, 3) of a primitive's triangles: indexed, or successive vertices."""
     if "indices" in piece:
         listed = accessors.array(whole(piece["indices"], "the 'indices' of a mesh"))
         if listed.dtype.kind == "f":
@@ -309,7 +308,7 @@ def _corners(
 def _placements(
     tree: dict[str, Any], accessors: Accessors
 ) -> tuple[list[Placement], list[Pose], dict[int, NDArray[np.float64]], int]:
-    """What the default scene places: shapes, their poses, its nodes, and how many hold nothing."""
+    """Placements, poses, node transforms and number of empty nodes of the default scene."""
     nodes, meshes = objects_of(tree, "nodes"), objects_of(tree, "meshes")
     budget = NameBudget()
     placements: list[Placement] = []
@@ -335,7 +334,7 @@ def _placements(
                 names[-1] = str(meshes[mesh]["name"])
             pose = pose_of(node, mesh, meshes[mesh])
             shape = poses.setdefault(pose, len(poses))
-            # A skin's joints say where the mesh is, whatever its node says.
+            # Joints place a skinned mesh; the transform of its node has no effect.
             world = world_from_node if pose.skin is None else np.eye(4)
             for node_from_part in instances(node, accessors):
                 placed_at = world if node_from_part is None else world @ node_from_part
@@ -346,7 +345,7 @@ def _placements(
 
 
 def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
-    """Nodes without a parent, of the default scene or else of the file."""
+    """Nodes without a parent, of the default scene, or of the file if it has none."""
     scenes = objects_of(tree, "scenes")
     listed: Sequence[int] = range(len(nodes))
     if scenes:
@@ -361,7 +360,7 @@ def _roots(tree: dict[str, Any], nodes: list[dict[str, Any]]) -> list[int]:
 
 
 def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
-    """Nodes that a node or scene names, each once; refuses missing nodes."""
+    """Distinct node indices in a node or scene; UnreadableError out of range."""
     found = holder.get(key, [])
     if not isinstance(found, list):
         raise UnreadableError(f"it is damaged: the '{key}' of a node or scene are no list")
@@ -372,5 +371,5 @@ def _numbers(holder: dict[str, Any], key: str, n_nodes: int) -> list[int]:
 
 
 def _name(node: dict[str, Any], number: int) -> str:
-    """Name of a node, or its number if it has no name."""
+    """Name of a node, or its index if it has no name."""
     return str(node.get("name") or number)

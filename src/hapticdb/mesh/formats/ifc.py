@@ -1,4 +1,4 @@
-"""IFC through IfcOpenShell (OpenCASCADE): each product at its place, in metres, z up."""
+"""IFC through IfcOpenShell (OpenCASCADE): each placed product, in metres, z up."""
 
 from collections import Counter
 from collections.abc import Iterable, Iterator
@@ -19,19 +19,19 @@ _LEFT_OUT = {
     "opening": ("IfcFeatureElementSubtraction",),
     "space": ("IfcSpace", "IfcSpatialZone", "IfcVirtualElement"),
 }
-"""Classes of products without a body of their own; openings are cut out of their hosts."""
+"""Classes of products without a body of their own; openings are subtracted from their hosts."""
 _FACETS = ("IfcTessellatedItem", "IfcFacetedBrep")
-"""Classes of representation items made of exact polygons."""
+"""Classes of representation items of exact polygons."""
 _CHORD = 1e-4
-"""Greatest chord error wanted unless given, metres. A bend of a pipe of 0.1 m (0.4 m across) has
-22,000 triangles and takes 0.2 s; at 1e-5 it has 220,000 and takes 42 s."""
+"""Greatest chord error unless given, metres. A bend of a pipe of 0.1 m (0.4 m across) has 22,000
+triangles and takes 0.2 s; at 1e-5 it has 220,000 and takes 42 s."""
 _END, _BYTES_OF_END = b"END-ISO-10303-21", 1024
 
 
 def read(path: Path, chord: float = _CHORD) -> Parsed:
     """Products of an IFC file with a shape, with class, GlobalId and storey.
 
-    chord : greatest chord error wanted of curved faces, metres.
+    chord : greatest chord error of curved faces, metres.
     """
     model = ifcopenshell.open(path)
     left_out: Counter[str] = Counter()
@@ -60,7 +60,7 @@ def read(path: Path, chord: float = _CHORD) -> Parsed:
 
 
 def _products(model: ifcopenshell.file, left_out: Counter[str]) -> Iterator[entity_instance]:
-    """Products with a shape, by their numbers; counts those left out, by kind."""
+    """Products with a shape, ascending by id; counts the omitted ones by kind."""
     for product in sorted(model.by_type("IfcProduct"), key=entity_instance.id):
         kinds = (what for what, of in _LEFT_OUT.items() if any(map(product.is_a, of)))
         if kind := next(kinds, None):
@@ -70,7 +70,7 @@ def _products(model: ifcopenshell.file, left_out: Counter[str]) -> Iterator[enti
 
 
 def _named(products: Iterable[entity_instance]) -> Iterator[tuple[int, str, dict[str, str]]]:
-    """Number of each product, its path of names below the project, and its attributes."""
+    """Id of each product, its name path below the project, and its attributes."""
     budget = NameBudget()
     parents: dict[int, entity_instance | None] = {}
     for product in products:
@@ -90,7 +90,7 @@ def _named(products: Iterable[entity_instance]) -> Iterator[tuple[int, str, dict
 
 
 def _shape(model: ifcopenshell.file, geometry: triangulation, chord: float) -> Shape:
-    """Triangles of a product, with their chord error; chord : the one wanted, metres."""
+    """Triangles of a product, with their chord error; chord : the requested one, metres."""
     vertices = np.frombuffer(geometry.verts_buffer).reshape(-1, 3)
     normals = np.frombuffer(geometry.normals_buffer).reshape(-1, 3)
     faces = np.frombuffer(geometry.faces_buffer, np.int32).reshape(-1, 3)

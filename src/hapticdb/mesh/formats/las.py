@@ -16,40 +16,40 @@ from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, placed_once, told
 from hapticdb.units import length_text
 
 _MODEL, _LINEAR_UNIT, _VERTICAL_SYSTEM, _VERTICAL_UNIT = 1024, 3076, 4096, 4099
-"""Numbers of GeoTIFF keys."""
+"""Ids of GeoTIFF keys."""
 _GEOGRAPHIC = 2
 _FULL_TURN = 360.0
 _LEAST = 1e-3
-"""Shortest unit, metres, that a reference system is believed to have; the longest is 1 / this."""
+"""Shortest plausible unit of a reference system, metres; the longest is 1 / this."""
 _NO_LENGTHS = (
     "which are no lengths: project it to a system in metres, for instance with PDAL's "
     "filters.reprojection, or name the unit (--unit) if its system is wrong"
 )
 _ENDS = np.iinfo(np.int32).min, np.iinfo(np.int32).max
 _MOST_STUCK = 0.01
-"""Share of a file's points that may be stuck at an end of the integers on an axis. A larger value
-accepts more lost places."""
+"""Share of a file's points that may be saturated at an end of the integers on an axis. A larger
+value accepts more lost positions."""
 _COARSE = 0.3
-"""Steps between coordinates, metres, from which on they are told: whole metres, and whole feet."""
+"""Step between coordinates, metres, from which on it is reported: whole metres, and whole feet."""
 _COLOURS = ("red", "green", "blue")
 _BYTE = 255
 _HEADER = 227
 _HEADER_1_4 = 375
 _RECORD, _LONG_RECORD = 54, 60
-"""Bytes of the header of a variable-length record, and of an extended one."""
+"""Header bytes of a variable-length record, and of an extended one."""
 _VARIABLE = 0xFFFFFFFF
-"""Chunk size in a LAZ header that stands for chunks of any size."""
+"""Chunk size in a LAZ header of chunks of variable size."""
 _LAYERED = 3
 _BYTES = 14
 _LAYERS = {10: 9, 11: 1, 12: 2, 13: 1}
 """Layers of each kind of item of a point; extra bytes have one layer each (LASzip, laszip.hpp)."""
 _POINTS_AT_ONCE = 50_000, 1_000_000
-"""Points that are read at a time: one for each byte of the file, but at least and at most these.
-laspy allocates memory for all of them before it reads the first."""
+"""Least and greatest number of points of a batch; between them, one for each byte of the file.
+laspy allocates memory for the whole batch before it reads a point."""
 
 
 def read(path: Path) -> Parsed:
-    """Points of a LAS or LAZ file, in the unit of its coordinates, z up if that is known."""
+    """Points of a LAS or LAZ file, in the unit of its coordinates, z up unless geocentric."""
     _check_header(path)
     pieces: list[NDArray[np.float64]] = []
     painted: list[NDArray[np.uint16]] = []
@@ -86,7 +86,7 @@ def read(path: Path) -> Parsed:
 
 
 def _refuse_cut(promised: int, found: int) -> None:
-    """Refuse a file with fewer points than its header promises."""
+    """Raise UnreadableError for a file with fewer points than its header promises."""
     if found < promised:
         raise UnreadableError(
             f"it is cut short: its header promises {promised:,} points, {found:,} are there"
@@ -94,7 +94,7 @@ def _refuse_cut(promised: int, found: int) -> None:
 
 
 def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
-    """Colours (N, 4) from 16 bits a channel, or the 8 of some programs; None if all are black."""
+    """Colours (N, 4) of 16-bit channels, or 8-bit ones of some programs; None if all are black."""
     most = max((int(some.max()) for some in painted), default=0)
     if not most:
         return None
@@ -105,7 +105,7 @@ def _screen(painted: list[NDArray[np.uint16]]) -> Colours | None:
 
 
 class _Places:
-    """Integers that stand for the coordinates: where they have lost the points' places.
+    """Integer coordinates of points: counts the saturated ones, and checks the resolution.
 
     scales (3,) : steps of the integers, in the file's unit; metres : of that unit, None if unknown.
     """
@@ -121,14 +121,14 @@ class _Places:
             )
 
     def count(self, integers: NDArray[np.int32]) -> None:
-        """Count those (n, 3) that are stuck at an end."""
+        """Count the integers (n, 3) at an end of their range."""
         self._n_stuck += [np.count_nonzero(integers == end, axis=0) for end in _ENDS]
         self._low = np.minimum(self._low, integers.min(axis=0))
         self._high = np.maximum(self._high, integers.max(axis=0))
 
     def notes(self, n_points: int) -> list[str]:
-        """Say what was lost; refuse a file that has lost more than `_MOST_STUCK`."""
-        # not with a scale chosen by the extent, whose points begin at one end, or 0, and end at one
+        """Notes of lost positions; UnreadableError above `_MOST_STUCK`."""
+        # a scale fitted to the extent is no fault: its points span one end, or 0, to the other end
         is_chosen = np.isin(self._high - self._low, (_ENDS[1], _ENDS[1] - _ENDS[0]))
         stuck = np.where(is_chosen, 0, self._n_stuck.sum(axis=0))
         found = []
@@ -150,11 +150,10 @@ class _Places:
 
 
 class _Lengths(NamedTuple):
-    """What a file's reference system says of its numbers.
+    """Units of a file's coordinates, by its reference system.
 
-    metres : of their unit, None if unknown; rise : how much longer that of heights is; notes : what
-    is told; not_lengths : why they are no lengths; up : the axis that points up, None around the
-    whole earth.
+    metres : unit length, None if unknown; rise : ratio of the height unit to it; not_lengths :
+    error message for coordinates in degrees, or None; up : up axis, None for a geocentric system.
     """
 
     metres: float | None = None
@@ -165,7 +164,7 @@ class _Lengths(NamedTuple):
 
 
 def _lengths(header: laspy.LasHeader) -> _Lengths:
-    """Lengths by the reference system that the file's records name."""
+    """Units by the reference system in the file's records."""
     records = [*header.vlrs, *(header.evlrs or ())]
     directories = [one.geo_keys for one in records if isinstance(one, GeoKeyDirectoryVlr)]
     keys = {key.id: key.value_offset for one in directories for key in one}
@@ -215,7 +214,7 @@ def _check_chunks(header: laspy.LasHeader) -> None:
 
 
 def _check_layers(path: Path, header: laspy.LasHeader) -> None:
-    """Refuse layers longer than their chunk: lazrs allocates what a chunk promises.
+    """Refuse layers longer than their chunk: lazrs allocates the promised length.
 
     A chunk in layers begins with one unpacked point, the number of points and the length of each
     layer (LASzip's compressor 3, for point formats from 6 on).
@@ -243,7 +242,7 @@ def _check_layers(path: Path, header: laspy.LasHeader) -> None:
 
 
 def _check_header(path: Path) -> None:
-    """Refuse counts that the file cannot hold: laspy would read records beyond the file's end."""
+    """Refuse counts beyond the file's size: laspy would read records after its end."""
     n_bytes = path.stat().st_size
     with path.open("rb") as stream:
         header = stream.read(_HEADER_1_4)

@@ -20,11 +20,11 @@ from hapticdb.mesh.raw import (
 from hapticdb.mesh.text import text_of
 
 _KEYWORD = re.compile(r"(?:ST)?C?N?OFF(?![A-Z])", re.IGNORECASE)
-"""Also where the counts follow it without a space, as in the files of ModelNet40."""
+"""Also directly before the counts, without a space, as in the files of ModelNet40."""
 
 
 def read(path: Path) -> Parsed:
-    """Faces of an OFF file, polygons cut into triangles."""
+    """Faces of an OFF file, polygons triangulated."""
     text = text_of(path.read_bytes())
     lines = [line.split("#", 1)[0].strip() for line in text.splitlines()]
     lines = [line for line in lines if line]
@@ -54,7 +54,7 @@ def read(path: Path) -> Parsed:
 
 
 def _polygon(line: str) -> list[int]:
-    """Corners of one face; its first word says how many."""
+    """Corners of one face; its first word is their number."""
     words = line.split()
     (size,) = indices(words[:1])
     corners = indices(words[1 : size + 1])

@@ -1,6 +1,6 @@
-"""Colours as `Part` has them: red, green and blue as a screen shows them (sRGB), and opacity.
+"""Colours as in `Part`: 8-bit sRGB and opacity.
 
-A colour that cannot be read never loses the geometry: the part then has none, or `PLAIN`.
+An unreadable colour never loses the geometry: the part then has none, or `PLAIN`.
 """
 
 from collections.abc import Sequence
@@ -12,11 +12,11 @@ from numpy.typing import ArrayLike, NDArray
 Colours = NDArray[np.uint8]
 
 PLAIN = (200, 202, 205, 255)
-"""Colour of triangles without one, beside others that have one."""
+"""Colour of triangles without one, among coloured ones."""
 
 
 def rgba(values: ArrayLike) -> Colours:
-    """Colours (n, 4) from numbers 0 to 1 (n, 3) or (n, 4); without a fourth they are opaque."""
+    """Colours (n, 4) of numbers 0 to 1, (n, 3) or (n, 4); without a fourth they are opaque."""
     found = np.nan_to_num(np.atleast_2d(np.asarray(values, dtype=np.float64)), nan=1.0)
     colours = np.full((len(found), 4), 255, dtype=np.uint8)
     width = min(found.shape[1], 4)
@@ -25,7 +25,7 @@ def rgba(values: ArrayLike) -> Colours:
 
 
 def of_light(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Numbers of a screen (n, 4) from amounts of light (n, 4), 0 to 1; the opacity stays."""
+    """Values (n, 4) of sRGB from linear light (n, 4), 0 to 1; the opacity is unchanged."""
     light = np.clip(np.nan_to_num(values, nan=1.0), 0.0, 1.0)
     seen = np.where(light <= 0.0031308, 12.92 * light, 1.055 * light ** (1 / 2.4) - 0.055)
     seen[:, 3:] = light[:, 3:]
@@ -33,7 +33,7 @@ def of_light(values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def mean_of_corners(values: NDArray[Any], faces: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Means (F, k) of values (V, k) at the corners of faces (F, 3), which may be out of range."""
+    """Means (F, k) of values (V, k) at the corners of faces (F, 3); indices are clipped."""
     total = np.zeros((len(faces), values.shape[1]))
     for corner in range(3):
         at = np.clip(faces[:, corner], 0, len(values) - 1)
@@ -42,7 +42,7 @@ def mean_of_corners(values: NDArray[Any], faces: NDArray[np.int64]) -> NDArray[n
 
 
 def joined(pieces: Sequence[tuple[Colours | None, int]]) -> Colours | None:
-    """Colours of pieces, each with its number of triangles, as one; None if none has any."""
+    """Concatenated colours of pieces, each with its number of triangles; None if none has any."""
     if all(colours is None for colours, _ in pieces):
         return None
     plain = np.array([PLAIN], dtype=np.uint8)

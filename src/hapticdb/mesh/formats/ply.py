@@ -1,7 +1,7 @@
-"""PLY, text and binary: a mesh, or a point cloud where the file holds no faces.
+"""PLY, text and binary: a mesh, or a point cloud if the file has no faces.
 
-This module does not use trimesh, which refuses binary files with faces of different sizes and cuts
-polygons into fans; plyfile reads them, but is under the GPL.
+trimesh is not used: it refuses binary files with faces of different sizes and cuts polygons into
+fans. plyfile reads them, but is under the GPL.
 """
 
 import re
@@ -20,7 +20,7 @@ from hapticdb.mesh.raw import Parsed, Shape, UnreadableError, numbers, placed_on
 from hapticdb.mesh.text import recoded
 
 Column = NDArray[Any] | list[NDArray[Any]]
-"""Values (n,) of a property; for lists (n, k), or an array for each row if they differ in size."""
+"""Values (n,) of a property; for lists (n, k), or an array for each row if sizes differ."""
 
 _HEADER = re.compile(
     rb"ply[^\r\n]*(\r\n?|\n)(.*?[\r\n])[ \t]*end_header[ \t]*(?:\1|\r?\n)",
@@ -38,7 +38,7 @@ _CORNERS = ("vertex_indices", "vertex_index")
 
 @dataclass
 class _Property:
-    """A property: its name, numpy's code of its type, and that of a list's count."""
+    """A property: its name, and numpy codes of its type and of a list's count."""
 
     name: str
     code: str
@@ -47,7 +47,7 @@ class _Property:
 
 @dataclass
 class _Element:
-    """A kind of rows: its name, their number, and what is in each."""
+    """An element: its name, number of rows, and properties."""
 
     name: str
     n: int
@@ -79,7 +79,7 @@ def read(path: Path) -> Parsed:
 
 
 def tables_of(content: bytes) -> dict[str, dict[str, Column]]:
-    """Columns of each element by their names, rows in the order of the file."""
+    """Columns of each element by name, rows in the order of the file."""
     header = _HEADER.match(content)
     if header is None:
         raise UnreadableError("it is cut short or damaged: its header has no 'end_header'")
@@ -105,7 +105,7 @@ def tables_of(content: bytes) -> dict[str, dict[str, Column]]:
 
 
 def _header(text: str) -> tuple[str, list[_Element]]:
-    """Order of bytes, '' for text, and the elements."""
+    """Byte order, '' for text, and the elements."""
     order: str | None = None
     elements: list[_Element] = []
     for line in text.splitlines():
@@ -130,7 +130,7 @@ def _code(kind: str) -> str:
 
 
 def _rows(content: bytes, at: int, order: str, element: _Element) -> tuple[dict[str, Column], int]:
-    """Columns of an element whose rows begin at byte `at`, and the byte behind them."""
+    """Columns of an element with rows from byte `at` on, and the byte after them."""
     if not element.properties or element.n <= 0:
         return {}, at
     first, _ = _row(content, at, order, element)
@@ -155,7 +155,7 @@ def _rows(content: bytes, at: int, order: str, element: _Element) -> tuple[dict[
 
 
 def _row(content: bytes, at: int, order: str, element: _Element) -> tuple[list[NDArray[Any]], int]:
-    """Values of each property in the row that begins at byte `at`, and the byte behind it."""
+    """Values of each property in the row at byte `at`, and the byte after it."""
     row: list[NDArray[Any]] = []
     try:
         for prop in element.properties:
@@ -196,12 +196,12 @@ def _faces(
 
 
 def _split(whole: NDArray[np.int64]) -> list[NDArray[np.int64]]:
-    """Strips of a row, which -1 separates."""
+    """Strips of a row, separated by -1."""
     return [piece[piece >= 0] for piece in np.split(whole, np.flatnonzero(whole < 0))]
 
 
 def _corners(table: dict[str, Column]) -> Column:
-    """Column that lists the vertices of each face or strip."""
+    """Column of the vertex indices of faces or strips."""
     found = next((table[name] for name in _CORNERS if name in table), None)
     if found is None:
         raise UnreadableError(f"it is damaged: its faces have none of {', '.join(_CORNERS)}")
@@ -209,7 +209,7 @@ def _corners(table: dict[str, Column]) -> Column:
 
 
 def _whole(rows: NDArray[Any]) -> NDArray[np.int64]:
-    """Whole numbers, which a text has as fractions."""
+    """Integers, read as floats from text; UnreadableError for fractions."""
     if rows.dtype.kind == "f" and (rows % 1).any():
         raise UnreadableError("it is damaged: a face refers to a vertex by a fraction")
     return rows.astype(np.int64)

@@ -1,4 +1,4 @@
-"""Where a glTF file's scene has the vertices of a mesh: morph weights, skins and instances."""
+"""Vertex positions of a glTF scene: morph weights, skins and instances."""
 
 from itertools import count
 from typing import Any, NamedTuple
@@ -15,7 +15,7 @@ INSTANCING = "EXT_mesh_gpu_instancing"
 
 
 class Pose(NamedTuple):
-    """What shapes a mesh beside its own positions: weights of its targets, and its node's skin."""
+    """Deformation of a mesh: weights of its morph targets, and its node's skin."""
 
     mesh: int
     weights: tuple[float, ...]
@@ -54,14 +54,14 @@ def instances(node: dict[str, Any], accessors: Accessors) -> list[Floats | None]
     columns = {name.lower(): accessors.array(number) for name, number in attributes.items()}
     if len({len(column) for column in columns.values()}) > 1:
         raise UnreadableError("the attributes of its instances are not of one length")
-    rows = zip(*columns.values(), strict=True)  # what is no place, such as _ID, changes nothing
+    rows = zip(*columns.values(), strict=True)  # other attributes, such as _ID, have no effect
     return [parent_from_node(dict(zip(columns, row, strict=True))) for row in rows]
 
 
 def joints_of(
     tree: dict[str, Any], skin: int, worlds: dict[int, Floats], accessors: Accessors
 ) -> Floats:
-    """Transforms (J, 4, 4) of a skin's joints, from where the mesh is bound to where they are."""
+    """Joint matrices (J, 4, 4) of a skin: world transform times inverse bind matrix."""
     found = item(objects_of(tree, "skins"), skin, "skin")
     if any(joint not in worlds for joint in found["joints"]):
         raise UnreadableError(f"a joint of its skin {skin} is not in its scene")
@@ -75,7 +75,7 @@ def joints_of(
 def positions(
     piece: dict[str, Any], pose: Pose, joints: Floats | None, accessors: Accessors
 ) -> NDArray[Any]:
-    """Positions (V, 3) of a piece in a pose."""
+    """Positions (V, 3) of a primitive in a pose, morphed and skinned."""
     attributes = piece["attributes"]
     found: NDArray[Any] = accessors.array(attributes["POSITION"])
     if found.shape[1] != 3:

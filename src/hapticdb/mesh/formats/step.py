@@ -1,4 +1,4 @@
-"""STEP through cascadio (OpenCASCADE): tessellated to GLB, in metres, names kept."""
+"""STEP through cascadio (OpenCASCADE): tessellated to GLB, in metres, with names."""
 
 import re
 from dataclasses import replace
@@ -16,26 +16,26 @@ from hapticdb.units import UNITS
 
 _POINT = re.compile(r"(CARTESIAN_POINT\s*\(\s*(?:'(?:[^']|'')*'|\$)\s*,\s*\()([^()]*)(?=\))")
 _WORDS = re.compile(r"('(?:[^']++|'')*+')|/\*.*?(?:\*/|\Z)", re.DOTALL)
-"""A string, group 1, or a comment, whose letters may stand in the other, too."""
+"""A string, group 1, or a comment: each may contain the other's delimiters."""
 _LONGEST = 8_000
-"""Characters of a string that are kept, with its quotes: OpenCASCADE refuses longer words."""
+"""Longest string, characters with its quotes: OpenCASCADE refuses longer words."""
 _END = "END-ISO-10303-21"
 _NO_END = f"it seems cut short: '{_END}' does not stand at its end"
 _FINE = 1e-5
-"""Steps between positions of 32 bits that do no harm, as a share of the extent."""
+"""Step between 32-bit positions that does no harm, as a share of the extent."""
 _SAME = 1e-5
-"""Relative difference up to which a length is that of a known unit."""
+"""Greatest relative difference of a length from that of a known unit."""
 
 
 def read(path: Path, chord: float = DEFAULT) -> Parsed:
-    """Parts of a STEP assembly, each solid's surface as triangles, with their chord errors.
+    """Parts of a STEP assembly: the surface of each solid as triangles, with its chord error.
 
-    chord : greatest chord error wanted, metres.
+    chord : greatest chord error, metres.
     """
     cut: list[int] = []
 
     def short(found: re.Match[str]) -> str:
-        """String without its end if it is too long; a blank instead of a comment."""
+        """Truncate a long string; replace a comment by a blank."""
         word = found[1] or " "
         if len(word) <= _LONGEST:
             return word
@@ -60,7 +60,7 @@ def _tessellated(text: str, path: Path, chord: float) -> Parsed:
     """Tessellate a file's text.
 
     The tolerance is in millimetres, whatever the file's unit (measured in inches, metres, microns
-    with cascadio 0.1.1). The default of half a radian between neighbours only refines.
+    with cascadio 0.1.1). The default angular tolerance, half a radian, only refines.
     """
     glb = cascadio.load(text.encode(), "step", tol_linear=1e3 * chord / MARGIN)
     if not glb:
@@ -71,7 +71,7 @@ def _tessellated(text: str, path: Path, chord: float) -> Parsed:
 
 
 def _is_coarse(found: Parsed) -> bool:
-    """Whether a shape lies so far from its origin that cascadio's 32 bits round it."""
+    """Whether a shape is so far from its origin that cascadio's 32-bit positions round it."""
     for shape in found.shapes:
         if len(shape.vertices):
             low, high = shape.vertices.min(axis=0), shape.vertices.max(axis=0)
@@ -82,10 +82,10 @@ def _is_coarse(found: Parsed) -> bool:
 
 
 def _nearer(found: Parsed, text: str, path: Path, chord: float) -> Parsed:
-    """Tessellate anew around the middle of the file's points, and place the result where it was.
+    """Tessellate anew around the median of the file's points, then move the result back.
 
-    One vector is taken from all points that are far away. That moves all solids by this vector,
-    unless an assembly brings far ones near; so the result is compared with the first one.
+    The median is subtracted from all far points. That shifts all solids by the same vector, unless
+    an assembly brings far ones near; so the result is compared with the first tessellation.
     """
     points = [_numbers(match[2]) for match in _POINT.finditer(text)]
     middle = np.median([point for point in points if len(point) == 3] or np.zeros((1, 3)), axis=0)
@@ -103,7 +103,7 @@ def _nearer(found: Parsed, text: str, path: Path, chord: float) -> Parsed:
     length = (before - after)[0, along] / middle[along] if middle[along] else 0.0
     metres = next((unit for unit in UNITS.values() if abs(length - unit) <= _SAME * unit), 0.0)
     if before.shape != after.shape or np.abs(before - after - metres * middle).max() > 4 * step:
-        return found  # `clean` tells what is lost
+        return found  # `clean` reports the loss
     offset = np.eye(4)
     offset[:3, 3] = metres * middle
     placements = [
@@ -117,7 +117,7 @@ def _numbers(text: str) -> NDArray[np.float64]:
 
 
 def _corners(found: Parsed) -> NDArray[np.float64]:
-    """Least and greatest position of each placed shape, one below the other."""
+    """Least and greatest position of each placed shape, in successive rows."""
     corners = []
     for one in found.placements:
         vertices = np.asarray(found.shapes[one.shape].vertices, dtype=np.float64)

@@ -1,7 +1,7 @@
-"""STL, binary and text. Each solid of a text file is a part of its own.
+"""STL, binary and text; one part for each solid of a text file.
 
-This module does not use trimesh, which drops empty solids and an unfinished last solid without an
-error, and takes the word 'solid' in the name after 'endsolid' for the start of another solid.
+trimesh is not used: it drops empty solids and an unfinished last solid without an error, and takes
+the word 'solid' in the name after 'endsolid' for the start of another solid.
 """
 
 import re
@@ -16,7 +16,7 @@ _FACET = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute
 _HEADER = 84
 _BORDER = re.compile(r"^[ \t]*(end[ \t]*solid|solid\b)[ \t]*(.*)$", re.MULTILINE | re.IGNORECASE)
 _NO_COUNT = {0, 0xFFFFFFFF}
-"""Counts of programs that write the header before they know the number of triangles."""
+"""Placeholder counts of programs that write the header before the triangles."""
 _STRANGE = re.compile(
     r"^[ \t]*(?!(?:end[ \t]*)?(?:solid|facet|loop)|outer\b|vertex\b|color\b)\S",
     re.MULTILINE | re.IGNORECASE,
@@ -28,7 +28,7 @@ _VERTEX = re.compile(r"\bvertex\s+(\S+\s+\S+\s+\S+)", re.IGNORECASE)
 
 
 def read(path: Path) -> Parsed:
-    """Solids of an STL file, named as in the file, or after the file."""
+    """Solids of an STL file, with their own names or the file's."""
     content = path.read_bytes()
     n_facets = int.from_bytes(content[80:_HEADER], "little") if len(content) >= _HEADER else 0
     head = content[:80].decode("latin-1")
@@ -55,7 +55,7 @@ def read(path: Path) -> Parsed:
 
 
 def _joined(content: bytes, stem: str) -> Parsed:
-    """Binary files one behind the other, and the bytes that some exporters write at the end."""
+    """Concatenated binary files, and the trailing bytes of some exporters."""
     solids: list[tuple[str, Shape]] = []
     at = 0
     while at + _HEADER <= len(content):
@@ -70,16 +70,17 @@ def _joined(content: bytes, stem: str) -> Parsed:
 
 
 def _binary(content: bytes, at: int, n_facets: int) -> Shape:
-    """Triangles behind the binary header at byte `at`."""
+    """Triangles after the binary header at byte `at`."""
     facets = np.frombuffer(content, dtype=_FACET, count=n_facets, offset=at + _HEADER)
     corners = facets["corners"].reshape(-1, 3)
     return Shape(corners, np.arange(len(corners), dtype=np.int64).reshape(-1, 3))
 
 
 def _text(text: str, stem: str) -> Parsed:
-    """Solids of a text file. Where files were joined, 'endsolid a' and 'solid b' may be one line.
+    """Solids of a text file.
 
-    Triangles behind a line with 'endsolid' are a solid, too; a line with 'solid' may be doubled.
+    In concatenated files 'endsolid a' and 'solid b' may share a line. Triangles after a line with
+    'endsolid' are a solid, too; a line with 'solid' may be doubled.
     """
     text = text.replace("\r\n", "\n").replace("\r", "\n")
     if "\n" not in text.strip():

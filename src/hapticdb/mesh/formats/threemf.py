@@ -1,7 +1,7 @@
-"""3MF: one part a build item and component, named along the objects that hold it.
+"""3MF: one part for each build item and component, named by its object path.
 
-This module does not use trimesh, which stops without an error after (edges times nodes) steps, so
-nested assemblies lose instances, and keeps one of two build items of the same part number.
+trimesh is not used: it stops without an error after (edges times nodes) steps, so nested assemblies
+lose instances, and keeps one of two build items of the same part number.
 """
 
 import array
@@ -44,23 +44,24 @@ _METRES = {
 }
 _PIECE = 1 << 20
 _UNPACKED, _INFLATION = 32 << 20, 40
-"""Bytes that models may unpack to: so many, plus so many for each byte of the file. Sound meshes
-unpack to five to eight times their size. Larger values let a damaged file take more memory."""
+"""Limit of the unpacked size of models: base bytes, plus a multiple of the file's size. Sound
+meshes unpack to five to eight times their size. Larger values let a damaged file take more
+memory."""
 _MOST_KINDS = 3
-"""Kinds of elements that are told of an extension."""
+"""Kinds of elements listed in a note about an extension."""
 _HARMLESS = re.compile("/(material|production|trianglesets)/")
 _KNOWN = re.compile(f"{_HARMLESS.pattern}|/(beamlattice|slice)/")
-"""Also those beside meshes that are whole without them: told. A model that requires another is
-refused, as 3MF's core specification asks (3.4, Model)."""
+"""Also extensions without effect on meshes, reported as unread. A model that requires another one
+is refused, as demanded by 3MF's core specification (3.4, Model)."""
 _SETTINGS = ("metadata/slic3r_pe_model.config", "metadata/model_settings.config")
 _MODIFIER = re.compile(
     rb'\b(?:value|subtype)="'
     rb'(NegativeVolume|ParameterModifier|Support\w+|(?:negative|modifier)_part|support_\w+)"'
 )
-"""Kinds of volumes that are no models, in the settings that slicers write beside the model."""
+"""Kinds of volumes other than models, in the settings files of slicers in the archive."""
 _EXTENSION = re.compile(r"/([^/]+)/\d{4}/\d{2}$")
 Key = tuple[str, str]
-"""An object: the model file inside the archive, and its id there."""
+"""An object: its model file in the archive, and its id in that file."""
 Link = tuple[Key, NDArray[np.float64]]
 
 
@@ -70,39 +71,39 @@ class _Object:
 
     name: str
     group: str = ""
-    """Its group of colours."""
+    """Id of its colour group."""
     corners: "array.array[float]" = field(default_factory=lambda: array.array("d"))
     indices: "array.array[int]" = field(default_factory=lambda: array.array("q"))
     components: list[Link] = field(default_factory=list)
     paints: "array.array[int]" = field(default_factory=lambda: array.array("q"))
-    """Number of each triangle's colour in `_Model.colours`; -1 without."""
+    """Index of each triangle's colour in `_Model.colours`; -1 without one."""
 
 
 @dataclass
 class _Model:
-    """All model files of an archive that the build needs."""
+    """All model files of an archive needed by the build."""
 
     objects: dict[Key, _Object] = field(default_factory=dict)
     items: list[Link] = field(default_factory=list)
     placed: set[Key] = field(default_factory=set)
-    """Objects that the build reaches."""
+    """Objects reachable from the build."""
     metres: float = 1e-3
     colours: list[tuple[int, ...]] = field(default_factory=list)
     number_of: dict[tuple[str, str, str], int] = field(default_factory=dict)
-    """Numbers of colours by model file, group and place in the group."""
+    """Colour indices by model file, group and index in the group."""
     packed: int = 0
     unpacked: int = 0
     types: Counter[str] = field(default_factory=Counter)
-    """Numbers of objects that are no models, by their types."""
+    """Numbers of objects other than models, by type."""
     unread: dict[str, Counter[str]] = field(default_factory=lambda: defaultdict(Counter))
-    """Numbers of elements that are not read, by extension and name."""
+    """Numbers of unread elements, by extension and name."""
 
     def links(self) -> list[Link]:
-        """All that the build and components place."""
+        """All placements by the build and by components."""
         return [*self.items, *(c for thing in self.objects.values() for c in thing.components)]
 
     def notes(self) -> list[str]:
-        """Say what is not read, or not as it is meant."""
+        """Notes of content not read, or read otherwise than meant."""
         outside = sum(
             bool(thing.indices) and key not in self.placed for key, thing in self.objects.items()
         )
@@ -117,7 +118,7 @@ class _Model:
 
 
 def read(path: Path) -> Parsed:
-    """Parts of a 3MF file's build, in the unit that it names (millimetres if none)."""
+    """Parts of a 3MF file's build, in its unit (millimetres without one)."""
     try:
         with zipfile.ZipFile(path) as archive:
             model = _read_archive(archive, path.stat().st_size)
@@ -139,7 +140,7 @@ def read(path: Path) -> Parsed:
 
 
 def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
-    """Name of the root model: the archive's relationships say it, or it is the usual one."""
+    """Name of the root model, from the archive's relationships, or else the usual one."""
     usual = "3d/3dmodel.model"
     content = _beside(archive, members.get("_rels/.rels"))
     try:
@@ -151,7 +152,7 @@ def _root(archive: zipfile.ZipFile, members: dict[str, str]) -> str:
 
 
 def _beside(archive: zipfile.ZipFile, name: str | None) -> bytes:
-    """Content of a small member beside the models; nothing where it cannot be read."""
+    """Content of a small member of the archive; empty if unreadable or above `_PIECE`."""
     with suppress(zipfile.BadZipFile, zlib.error, NotImplementedError, RuntimeError, EOFError):
         if name is not None and archive.getinfo(name).file_size <= _PIECE:
             return archive.read(name)
@@ -159,12 +160,12 @@ def _beside(archive: zipfile.ZipFile, name: str | None) -> bytes:
 
 
 def _member(name: str) -> str:
-    """One spelling of a member: programs escape names, and mix their letters, on either side."""
+    """Canonical name of a member: programs differ in escapes and in upper and lower case."""
     return posixpath.normpath(unquote(name).replace("\\", "/")).lower().strip("/")
 
 
 def _read_archive(archive: zipfile.ZipFile, n_bytes: int) -> _Model:
-    """Root model, and the models that hold its components."""
+    """Root model, and the models of its components."""
     members = {_member(name): name for name in archive.namelist()}
     root = _root(archive, members)
     if root not in members:
@@ -272,20 +273,20 @@ def _refuse_doctype(*_: object) -> None:
 
 
 def _metres(unit: str) -> float:
-    """Length of a 3MF unit."""
+    """Length of a 3MF unit, metres."""
     if unit not in _METRES:
         raise UnreadableError(f"its unit '{unit}' is none of {', '.join(_METRES)}")
     return _METRES[unit]
 
 
 def _index(word: str) -> int:
-    """Parse the number of a vertex; one that int64 cannot hold becomes -1, out of range."""
+    """Vertex index; -1, out of range, for a negative or huge one."""
     value = int(word)
     return value if 0 <= value < 2**62 else -1
 
 
 def _link(attributes: dict[str, str], member: str) -> Link:
-    """Object that a component or build item places, and its transform."""
+    """Object and transform of a component or build item."""
     file = next((v for k, v in attributes.items() if k.endswith(" path")), member)
     key = (_member(file), attributes["objectid"])
     transform = np.eye(4)
@@ -309,7 +310,7 @@ def _colour(word: str | None) -> tuple[int, ...]:
 
 
 def _shape(thing: _Object, colours: list[tuple[int, ...]]) -> Shape:
-    """Arrays of an object's mesh."""
+    """Shape of an object's mesh."""
     corners = np.frombuffer(thing.corners, dtype=np.float64) if thing.corners else np.empty(0)
     indices = np.frombuffer(thing.indices, dtype=np.int64) if thing.indices else np.empty(0, int)
     paints = np.array(thing.paints, dtype=np.int64)

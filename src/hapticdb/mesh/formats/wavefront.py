@@ -1,8 +1,8 @@
-"""OBJ: each object and group of a Wavefront file a part, named 'object/group'.
+"""OBJ (Wavefront): one part for each object and group, named 'object/group'.
 
-This module does not use trimesh, which joins both names by '_', counts negative indices from the
-end of the file instead of from the line that holds them, takes index 0 for the first vertex, and
-refuses the whole file for one face out of range.
+trimesh is not used: it joins both names by '_', counts negative indices from the end of the file
+instead of from their own line, takes index 0 for the first vertex, and refuses the whole file for
+one face out of range.
 """
 
 import posixpath
@@ -41,7 +41,7 @@ _NO_SURFACE = {"l", "p", "curv", "curv2", "surf"}
 _BLANKS = " \t\0\xa0"
 _FACE = {"f", "fo"}
 _NUMBERS = {"v", *_FACE}
-# Lines that say how surfaces look, or belong to curves, which `_NO_SURFACE` counts.
+# Lines about appearance, or of curves, which `_NO_SURFACE` counts.
 _NO_SHAPE = {
     "", "vt", "vn", "vp", "s", "mg", "usemap", "maplib", "bevel", "c_interp",
     "d_interp", "lod", "shadow_obj", "trace_obj", "cstype", "deg", "bmat", "step", "parm", "trim",
@@ -50,11 +50,11 @@ _NO_SHAPE = {
 _PICTURES = {"map_kd", "map_d", "map_ka"}
 _OUTSIDE = -1
 _WITH_COLOUR = 6
-"""Numbers of a vertex with a colour."""
+"""Least count of numbers on a vertex line with a colour."""
 MOST_BYTES = 16 << 20
-"""Of a file of materials: no more is read. A larger value may take more memory."""
+"""Bytes of a material file, read up to this. A larger value may take more memory."""
 _MOST_WORDS, _LONGEST_WORD = 3, 20
-"""Words of unknown lines that are told, and their characters."""
+"""Unknown words listed in a note, and their characters."""
 
 
 @dataclass
@@ -65,11 +65,11 @@ class _Group:
     n_before: list[int] = field(default_factory=list)
     unsupported: int = 0
     materials: list[str] = field(default_factory=list)
-    """Name of each line's material."""
+    """Material of each line, by name."""
 
 
 def read(path: Path) -> Parsed:
-    """Objects and groups of an OBJ file; if there are none, one part named after the file."""
+    """Objects and groups of an OBJ file; without any, one part named after the file."""
     text = text_of(path.read_bytes())
     vertex_lines: list[str] = []
     groups: dict[tuple[str, str], _Group] = {}
@@ -125,7 +125,7 @@ def read(path: Path) -> Parsed:
 
 
 def _content(folder: Path, name: str) -> str | None:
-    """Text of a file of materials in the OBJ file's own folder; None if it cannot be read."""
+    """Text of a material file in the OBJ file's own folder; None if unreadable."""
     plain = posixpath.normpath(unquote(name).replace("\\", "/"))
     file = None if "/" in plain else beside(folder, name)
     with suppress(OSError):
@@ -134,7 +134,7 @@ def _content(folder: Path, name: str) -> str | None:
 
 
 def _materials(content: str, pictures: list[str]) -> Iterator[tuple[str, Colours]]:
-    """Names and colours (1, 4) of materials; `pictures` gets the files that they refer to."""
+    """Names and colours (1, 4) of materials; appends their texture files to `pictures`."""
     material, values = None, np.ones(4)
     for line in [*content.splitlines(), "newmtl"]:
         word, _, rest = line.strip().replace("\t", " ").partition(" ")
@@ -153,7 +153,7 @@ def _materials(content: str, pictures: list[str]) -> Iterator[tuple[str, Colours
 
 
 def _painted(lines: list[str]) -> Colours | None:
-    """Colours (V, 4) that follow the coordinates of vertices; None if not all have one."""
+    """Colours (V, 4) after the coordinates of vertices; None unless all have one."""
     words = [line.split()[3:6] for line in lines if len(line.split()) >= _WITH_COLOUR]
     if not lines or len(words) != len(lines):
         return None
@@ -170,7 +170,7 @@ def _coloured(
     palette: dict[str, Colours],
     painted: Colours | None,
 ) -> Shape:
-    """One group's triangles with their colours, material after material where those are known."""
+    """One group's triangles with colours, material after material if materials have colours."""
     if not palette.keys() & set(group.materials):
         shape = _shape(group, vertices)
         if painted is None or shape.faces is None:
@@ -208,7 +208,7 @@ def _shape(group: _Group, vertices: NDArray[np.float64]) -> Shape:
 
 
 def _polygon(line: str, n_before: int) -> list[int]:
-    """Corners of one face, counted from 0; a negative index counts back from its own line."""
+    """Corners of one face, 0-based; a negative index counts back from its own line."""
     found = [n + n_before + 1 if n < 0 else n for n in indices(line.split())]
     # An index that is still not above 0 is out of range, whether it was absolute or relative.
     return [n - 1 if 0 < n < 2**62 else _OUTSIDE for n in found]

@@ -1,1 +1,1 @@
-"""The haptic query: a PointShell at a pose in, a wrench with hits and objects out."""
+"""The haptic query: contact force of a PointShell at a pose, with hits and objects."""

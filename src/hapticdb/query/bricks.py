@@ -20,10 +20,10 @@ from hapticdb.store.base import (
 from hapticdb.store.parsing import damaged
 
 LEAST_ENTRIES = 1 << 10
-"""Entries of the directory of a few bricks. It grows with them: pages of memory that are written to
-for the first time, here and there in a large table, would cost a first visit more than its keys."""
+"""Entries of the smallest directory. It grows with the bricks: first writes to pages here and there
+in a large table would cost a first visit more than its keys."""
 MOST_FRAMES = 256
-"""Frames after which those that nobody holds any more are forgotten."""
+"""Frames after which dead weak references are dropped."""
 
 Records = NDArray[np.void]
 Found = tuple["contact.Located", Rows, NDArray[np.uint8] | None]
@@ -31,9 +31,9 @@ Found = tuple["contact.Located", Rows, NDArray[np.uint8] | None]
 
 
 class RowsInMemory:
-    """Rows of the bricks of one frame: those in memory, and copies once these are dropped.
+    """Rows of one frame's bricks: resident ones, and copies once these are dropped.
 
-    placed, asked : as the frame's kernel left them.
+    placed, asked : outputs of the frame's kernel.
     """
 
     __slots__ = ("__weakref__", "_asked", "_bricks", "_copies", "_placed")
@@ -76,12 +76,12 @@ class RowsInMemory:
 
 
 class BrickMemory:
-    """Bricks of one revision, by key, those without a row included.
+    """Hash table of decoded bricks of one revision, by key, empty ones included.
 
-    All are dropped when the objects are others, and when a frame needs more than fits.
+    All are dropped for other objects, and for a frame that does not fit.
 
     directory (C,) of `BRICK`, at most half full; decoded () of `OCCUPIED` or `MEASURED`; n_kept :
-    bricks; most_rows : slots; number : of the filter that `choose` was given last.
+    bricks; most_rows : slots; number : of the filter last given to `choose`.
     """
 
     def __init__(self, url: str) -> None:
@@ -94,14 +94,14 @@ class BrickMemory:
         self._allocate(reads=False)
 
     def _allocate(self, *, reads: bool) -> None:
-        """Make room for rows. The system gives pages of memory as they are written to."""
+        """Allocate slots for rows. The system backs pages with memory at their first write."""
         self._reads = reads
         self.decoded: Records = np.zeros((), MEASURED if reads else OCCUPIED)
         self.most_rows = len(self.decoded["id"])
         self.clear()
 
     def clear(self) -> None:
-        """Drop all bricks; frames that somebody still holds get copies of theirs."""
+        """Drop all bricks; live frames copy their rows first."""
         for held in self._frames:
             if (frame := held()) is not None:
                 frame.copied()
@@ -110,9 +110,9 @@ class BrickMemory:
         self._used, self.n_kept = 1, 0
 
     def choose(self, objects: Mapping[int, Object], exclude: Keys, *, reads: bool) -> None:
-        """Keep bricks of these objects alone, with distances if they are read, for a filter.
+        """Restrict the memory to bricks of these objects, with distances if read, for a filter.
 
-        objects : of one revision, replaced as a whole when they are others.
+        objects : of one revision; another mapping for other objects.
         """
         if objects is not self._objects:
             self._objects = objects
@@ -125,12 +125,12 @@ class BrickMemory:
         self._exclude = exclude
 
     def absent(self, keys: Keys) -> Keys:
-        """Those of ascending keys (U,) whose bricks are not there."""
+        """Keys without a brick here, of ascending keys (U,)."""
         found = np.empty_like(keys)
         return found[: kernels.absent_bricks(self.directory, keys, found)]
 
     def enter(self, keys: Keys, rows: Rows) -> bool:
-        """Enter bricks (U,) that are not there, ascending, with their rows; whether they fit."""
+        """Insert absent bricks (U,), ascending, with their rows; returns whether they fit."""
         most = self._used + len(rows) + len(rows) // 2
         n_kept = self.n_kept + len(keys)
         if most > self.most_rows or 2 * n_kept > ENTRIES_A_ROW * self.most_rows:
@@ -152,7 +152,7 @@ class BrickMemory:
         return True
 
     def rows(self, placed: NDArray[np.float64], asked: NDArray[np.int64]) -> RowsInMemory:
-        """Rows of a frame, placed and asked as its kernel left them."""
+        """Rows of a frame; placed, asked : outputs of its kernel."""
         frame = RowsInMemory((self.directory, self.decoded), placed, asked)
         if len(self._frames) >= MOST_FRAMES:
             self._frames = [held for held in self._frames if held() is not None]

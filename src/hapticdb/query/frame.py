@@ -29,9 +29,9 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.shell import PointShell
 
 MOST_POINTS = 1 << 17
-"""Most shell points, summed over the poses that one statement serves: 12 MB."""
+"""Shell points of one statement, summed over its poses, at most: 12 MB."""
 LEAST_GROUPED = 1024
-"""Distinct keys of a frame from which `auto` groups, on engines that set no number of their own.
+"""Distinct keys of a frame from which `auto` groups, on engines without a number of their own.
 
 Measured on SQLite: beyond it a lookup is up to 1.1 times slower than ranges."""
 KEYS_PER_RANGE = 2
@@ -39,12 +39,12 @@ KEYS_PER_RANGE = 2
 NOTHING_EXCLUDED = np.empty(0, dtype=np.int64)
 
 Asked = tuple[str, int, int, int]
-"""Fields of `Query` without the last, which is known only at the end of a frame."""
+"""Fields of `Query` without the time, which is measured at the end of a frame."""
 NOTHING_ASKED: Asked = ("array", 0, 0, 0)
 Source = Callable[[bool], Found]
-"""Gives the rows of a frame, with distances if they are read."""
+"""Returns the rows of a frame, with distances if they are read."""
 Group = Callable[[Keys, bool], Ranges]
-"""Groups the row keys (U,) of a frame into ranges; whether their distances are read, too."""
+"""Groups the row keys (U,) of a frame into ranges; the flag: whether distances are read, too."""
 
 
 class Form(Protocol):
@@ -53,13 +53,13 @@ class Form(Protocol):
     def touch(
         self, located: "contact.Located", exclude: Keys, law: ForceLaw, started: int
     ) -> Touch:
-        """Touch of a located shell; started : when the frame began, ns."""
+        """Touch of a located shell; started : begin of the frame, ns."""
 
 
 class HapticQuery:
     """Runs frames against one store.
 
-    group : groups frames of many keys by cost; without it, all keys are looked up; known : objects
+    group : groups frames of many keys by cost; without it, all keys are looked up. known : objects
     of the last frame's revision; grid : the environment's. Bricks stay decoded in memory.
     """
 
@@ -81,7 +81,7 @@ class HapticQuery:
         law: ForceLaw | None = None,
         form: Form | None = None,
     ) -> Touch:
-        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        """Touch of a shell at one pose; see `hapticdb.environment.Environment.touch`."""
         known, asked = self.known, (shell, pose, form)
         try:
             touch = None
@@ -99,9 +99,9 @@ class HapticQuery:
         return touch
 
     def _is_newest(self, touch: Touch, form: Form | None) -> bool:
-        """Whether nothing was committed since the known objects were read, as far as it was read.
+        """Whether no commit came between the listing of the cached objects and this frame's reads.
 
-        A frame over bricks has looked after each statement; without one it looks now.
+        A frame over bricks has compared versions after each statement; without one it does so now.
         """
         if form is not None or not self._has_bricks:
             return self.store.version() == self.known.version
@@ -115,7 +115,7 @@ class HapticQuery:
         felt: Filter,
         law: ForceLaw | None,
     ) -> Touch:
-        """Look a shell up in a snapshot, whose objects are loaded first."""
+        """Touch in a snapshot, after a refresh of its objects."""
         known = self.known
         with self.store.snapshot():
             chosen = known.law_of_newest(law)
@@ -124,20 +124,20 @@ class HapticQuery:
         return touch
 
     def law_now(self, law: ForceLaw | None) -> ForceLaw:
-        """The law of a frame at the newest revision, whose objects are loaded."""
+        """Force law of a frame at the newest revision; refreshes the objects."""
         try:
             with self.store.snapshot():
                 return self.known.law_of_newest(law)
-        except ConnectionLostError:  # inside a snapshot all is repeated, once
+        except ConnectionLostError:  # a lost snapshot is repeated, once
             with self.store.snapshot():
                 return self.known.law_of_newest(law)
 
     def _frame(
         self, shell: "PointShell", pose: ArrayLike, form: Form | None, exclude: Keys, law: ForceLaw
     ) -> Touch | None:
-        """Look a shell up; the result names the objects that are known.
+        """Touch with the cached objects.
 
-        None if bricks were read for it that are of another revision than those objects.
+        None if bricks were read for it at another revision than theirs.
         """
         reads = laws.reads_distances(law.for_kernels)
         started = time.perf_counter_ns()
@@ -158,7 +158,7 @@ class HapticQuery:
         reads: bool,  # noqa: FBT001 - private
         started: int,
     ) -> Touch | None:
-        """Look a shell up in memory, after reading what is missing there; None as for `_frame`."""
+        """Touch from decoded bricks, after reading absent ones; None as for `_frame`."""
         memory, known, asked = self._memory_for(exclude, reads), self.known, NOTHING_ASKED
         total = len(shell.points)
         placed, at = np.empty((total + 1, 6)), np.empty((2, total), dtype=np.int64)
@@ -191,17 +191,17 @@ class HapticQuery:
         )  # fmt: skip
 
     def _memory_for(self, exclude: Keys, reads: bool) -> BrickMemory:  # noqa: FBT001 - private
-        """Bricks of the known objects; made at the first frame, which loads kernels."""
+        """Bricks of the cached objects; made at the first frame, because it loads kernels."""
         if self._memory is None:
             self._memory = BrickMemory(self.store.url)
         self._memory.choose(self.known.by_id, exclude, reads=reads)
         return self._memory
 
     def _fetched(self, keys: Keys, reads: bool) -> tuple[Rows, Asked]:  # noqa: FBT001 - private
-        """Rows of keys (U,), and how they were asked for."""
+        """Rows of keys (U,), and the figures of their query."""
         ranges = None
         if len(keys) >= self._least_grouped and self._group is not None:
-            ranges = self._group(keys, reads)  # by these keys alone, not by frames before
+            ranges = self._group(keys, reads)  # independent of earlier frames
         if ranges is None or KEYS_PER_RANGE * len(ranges.lows) > len(keys):
             rows = self.store.lookup(keys, distances=reads)
             return rows, ("array", 1, len(keys), len(rows.keys))
@@ -217,7 +217,7 @@ class HapticQuery:
         law: ForceLaw,
         started: int,
     ) -> Touch:
-        """Result of a frame from its rows, decoded for it alone."""
+        """Touch from the rows of a frame, decoded for it alone."""
         reads = laws.reads_distances(law.for_kernels)
         payload = self.distances_of(rows, located.keys) if reads else None
         return self.refined(located, rows, payload, exclude, law, asked, started)
@@ -246,7 +246,7 @@ class HapticQuery:
         asked: Asked,
         started: int,
     ) -> Touch:
-        """Result of a frame from its rows, among which rows of other poses may lie.
+        """Touch from the rows of a frame, possibly mixed with rows of other poses.
 
         payload : distances (R, 1000) of the rows, if the law reads any; started : of the frame, ns.
         """
@@ -273,9 +273,9 @@ class HapticQuery:
     def _pairs_of(
         self, source: Source, exclude: Keys, law: ForceLaw, points: NDArray[np.int64]
     ) -> NDArray[np.int64]:
-        """Every (point, object) pair (P, 2) of points of a frame that a law has felt."""
+        """All pairs (P, 2) of a point and an object in contact under a law, of some points."""
         reads = laws.reads_distances(law.for_kernels)
-        law = law if reads else PLANE  # every law that reads none feels the objects of hits
+        law = law if reads else PLANE  # laws without distances touch the objects of hits
         located, (keys, ids, occupancy, _), payload = source(reads)
         return refining.pairs_of_points(  # type: ignore[no-any-return]
             *located, keys, ids, occupancy, payload, exclude, self.grid, law.for_kernels, points
@@ -284,7 +284,7 @@ class HapticQuery:
     def run_many(
         self, shell: "PointShell", poses: NDArray[np.float64], exclude: Keys, law: ForceLaw
     ) -> Iterator[Touch]:
-        """Touches at rigid poses (n, 4, 4), in a snapshot; a statement reads for many of them."""
+        """Touches at rigid poses (n, 4, 4), in a snapshot; one statement reads for many of them."""
         self.known.learn()
         most = max(MOST_POINTS // max(len(shell), 1), 1)
         for start in range(0, len(poses), most):
@@ -300,7 +300,7 @@ class HapticQuery:
                 yield touch
 
     def _read_ahead(self, keys: Keys, exclude: Keys, law: ForceLaw) -> None:
-        """Read bricks (U,) into memory, unless they are there or do not fit."""
+        """Read absent bricks of keys (U,) into memory, if they fit."""
         reads = laws.reads_distances(law.for_kernels)
         memory = self._memory_for(exclude, reads)
         absent = memory.absent(keys)
@@ -316,7 +316,7 @@ class HapticQuery:
         for located in batch:
             low = high = 0
             if located.keys.size:
-                # methods, since numpy's functions of the same name take twice as long, 1 us each
+                # methods: numpy's functions of the same name take twice as long, 1 us each
                 low = int(fetched.keys.searchsorted(located.keys[0], "left"))
                 high = int(fetched.keys.searchsorted(located.keys[-1], "right"))
             rows = fetched.part(low, high)
@@ -327,9 +327,9 @@ class HapticQuery:
 def locate(
     shell: "PointShell", pose: NDArray[np.float64], grid: NDArray[np.void]
 ) -> "contact.Located":
-    """Place a shell at a rigid pose, else UsageError, and find its row keys; grid of `GRID`."""
+    """Place a shell at a rigid pose, else UsageError, and compute its row keys; grid of `GRID`."""
     total = len(shell.points)
-    # an array that a kernel returns costs twice as much as one that it is given
+    # an array returned by a kernel costs twice as much as an argument
     placed, asked = np.empty((total + 1, 6)), np.empty((2, total), dtype=np.int64)
     keys = np.empty(total, dtype=np.int64)
     count = contact.locate(
@@ -345,7 +345,7 @@ def _not_rigid() -> UsageError:
 
 
 def as_pose(pose: ArrayLike) -> NDArray[np.float64]:
-    """A pose as an array (4, 4) of float64; refuses other shapes."""
+    """A pose as an array (4, 4) of float64; UsageError for other shapes."""
     given = as_floats(pose, "a pose")
     if given.shape != (4, 4):
         raise UsageError(f"a pose of shape {given.shape}: give a 4 x 4 matrix, world_from_tool")
@@ -353,7 +353,7 @@ def as_pose(pose: ArrayLike) -> NDArray[np.float64]:
 
 
 def as_poses(poses: ArrayLike) -> NDArray[np.float64]:
-    """Poses as an array (n, 4, 4) of float64; refuses other shapes."""
+    """Poses as an array (n, 4, 4) of float64; UsageError for other shapes."""
     given = as_floats(poses, "poses")
     if given.size == 0 and given.ndim < 3:  # an empty list
         given = given.reshape(0, 4, 4)
@@ -366,7 +366,7 @@ def as_poses(poses: ArrayLike) -> NDArray[np.float64]:
 
 
 def as_id(object_id: int) -> int:
-    """An object's id as a plain int; refuses what is not an integer."""
+    """An object's id as a plain int; UsageError for other types."""
     try:
         if isinstance(object_id, bool):
             raise TypeError  # noqa: TRY301 - a bool is an int to Python, but no id

@@ -1,4 +1,4 @@
-"""The objects, by id, of the revision that the last frame read."""
+"""Cache of the objects, by id, at the revision of the last frame."""
 
 import contextlib
 
@@ -15,12 +15,12 @@ MOST_READ = 16
 
 
 class KnownObjects:
-    """Objects of a store at one revision, so that a frame need not ask the database.
+    """Objects of a store at one revision, so that a frame need not query them.
 
     by_id : the objects; replaced as a whole, never changed
     have_distances : whether there is an object, and every object has distances
-    own_law : the law of a frame that is given none: the distance one where they have distances
-    version : the store's version when the objects were listed, or None
+    own_law : default law of a frame: the distance law if they have distances, else tangent-plane
+    version : the store's version at the listing, or None
     """
 
     def __init__(self, store: Store) -> None:
@@ -33,13 +33,13 @@ class KnownObjects:
         self._last: Change | None = None
 
     def newest(self) -> list[Object]:
-        """All objects, ordered by id; only those written since the last time are read."""
+        """All objects, ordered by id; only those written since the last listing are read."""
         self.forget()
-        self.learn()  # in no snapshot, which asks servers that have rows alone, too
+        self.learn()  # outside a snapshot, so PostgreSQL is queried again
         return [*self.by_id.values()]
 
     def law_of_newest(self, law: ForceLaw | None) -> ForceLaw:
-        """The law of a frame in this snapshot: the given one, or its objects' own.
+        """Law of a frame in this snapshot: the given one, or the objects' default.
 
         Raises `UsageError` if the law reads distances, and an object has none.
         """
@@ -49,15 +49,15 @@ class KnownObjects:
         return law or self.own_law
 
     def learn(self) -> None:
-        """List the objects, unless this revision is known already."""
-        revision = self._store.revision()  # `version` then tells of this read
-        version = self._store.version()  # before they are read: another may write meanwhile
+        """List the objects, unless this revision is cached already."""
+        revision = self._store.revision()  # `version` is then the version of this read
+        version = self._store.version()  # before the read, because of concurrent writes
         if version != self.version:
             self._list(revision)
             self.version = version
 
     def _list(self, revision: int) -> None:
-        """Read the objects that were written since the last time; all if that is not known."""
+        """Read the objects written since the last listing; all of them if the log is no guide."""
         log, last = self._writes_since(revision)
         if log == []:
             return
@@ -70,7 +70,7 @@ class KnownObjects:
                 with contextlib.suppress(ObjectNotFoundError):
                     found[object_id] = self._store.object(object_id)
             self.by_id = dict(sorted(found.items()))
-        self._last = last  # only now, since a read may fail
+        self._last = last  # last, since a read may fail
         self._unfelt = {}
         objects = self.by_id.values()
         self.have_distances = bool(objects) and all(obj.has_distances for obj in objects)
@@ -79,7 +79,7 @@ class KnownObjects:
     def _writes_since(self, revision: int) -> tuple[list[Change] | None, Change | None]:
         """Writes since the last listing, and the last of all; revision : the newest, or an older.
 
-        None for too many, or if the log is another one by now.
+        None for too many writes, or another log than at the last listing.
         """
         known = self._last
         is_near = known is not None and 0 <= revision - known.revision <= MOST_READ
@@ -89,23 +89,23 @@ class KnownObjects:
         return (log[1:] if is_same else None), (log[-1] if log else None)
 
     def forget(self) -> None:
-        """Make the next frame list the objects again."""
+        """Invalidate the cache."""
         self.version = None
 
     def left_out(self, felt: Filter) -> Keys:
-        """Ids (E,) of the objects that a filter leaves out, ascending; of those known now."""
+        """Ids (E,) of the cached objects excluded by a filter, ascending."""
         return felt.fixed_ids if felt.is_fixed else self._left_out_by(felt).ids
 
     def check_words(self, felt: Filter) -> None:
-        """Raise `ObjectNotFoundError` for the first word of a filter that chooses no object."""
+        """Raise `ObjectNotFoundError` for the first word of a filter without an object."""
         if not self._left_out_by(felt).missing:
             return
-        self._list(self._store.revision())  # frames without a query learn nothing
+        self._list(self._store.revision())  # frames without a query did not refresh it
         for error in self._left_out_by(felt).missing:
             raise error
 
     def _left_out_by(self, felt: Filter) -> Unfelt:
-        """What a filter leaves out of these objects; kept until they are others."""
+        """Exclusions of a filter, cached until the objects change."""
         found = self._unfelt.get(felt)
         if found is None:
             found = felt.left_out([*self.by_id.values()], self._store.url)
@@ -113,11 +113,11 @@ class KnownObjects:
         return found
 
     def fits(self, law: ForceLaw) -> bool:
-        """Whether the objects have what the law reads."""
+        """Whether the objects have the data of the law."""
         return self.have_distances or not laws.reads_distances(law.for_kernels)
 
     def _check_distances(self) -> None:
-        """Refuse a law that reads distances where an object has none."""
+        """Refuse a law that reads distances if an object has none."""
         url, layout = self._store.url, self._store.layout
         if layout != "brick":
             raise UsageError(
@@ -134,6 +134,6 @@ class KnownObjects:
 
 
 def _are_equal(one: Change, other: Change) -> bool:
-    """Whether two rows of the log are one: a server that lost its last commits wrote others."""
+    """Whether two rows of the log are equal: a server rewrites revisions after losing commits."""
     same = (one.revision, one.action, one.id) == (other.revision, other.action, other.id)
     return same and np.array_equal(one.ranges, other.ranges)

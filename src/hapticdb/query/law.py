@@ -1,4 +1,4 @@
-"""The force law for users (the paper, section 3); its arithmetic is in `hapticdb.kernels.law`."""
+"""Force laws of the API (the paper, section 3); their arithmetic is in `hapticdb.kernels.law`."""
 
 from dataclasses import dataclass
 from functools import cached_property
@@ -15,12 +15,12 @@ MOST_STIFFNESS = 1e9
 
 
 def inset_of(voxel_size: float, law: LawName) -> float:
-    """How far a tool's points are drawn inward, metres, for contact to begin at its surface."""
+    """Inward offset of a tool's points, metres, for contact to begin at its surface."""
     return float(field.ONSET * voxel_size) if law == "distance" else 0.0
 
 
 class ForceLaw(Protocol):
-    """A force law: its stiffness, and its numbers for kernels."""
+    """A force law: its stiffness, and its parameters for kernels."""
 
     @property
     def stiffness(self) -> float:
@@ -28,7 +28,7 @@ class ForceLaw(Protocol):
 
     @property
     def for_kernels(self) -> Any:  # noqa: ANN401 - a NamedTuple of a type of its own
-        """NamedTuple for which `hapticdb.kernels.law` has functions; made once, read by frames."""
+        """NamedTuple with functions in `hapticdb.kernels.law`; made once, read by frames."""
 
 
 @dataclass(frozen=True)
@@ -48,10 +48,10 @@ class _Stiff:
 class TangentPlane(_Stiff):
     """Tangent-plane law of VPS (McNeely, Puterbaugh and Troy, SIGGRAPH 1999).
 
-    Through the centre c of the voxel that holds the shell point p goes a plane with the point's
-    inward normal n: d = max(0, (c - p) . n), F = K d n, tau = (p - x_cm) x F. With N >= 10 hits
-    force and torque are divided by N / 10. The force jumps where a point crosses a voxel's border:
-    a property of the law.
+    The plane of a shell point p goes through the centre c of its voxel, with the point's inward
+    normal n: d = max(0, (c - p) . n), F = K d n, tau = (p - x_cm) x F. With N >= 10 hits force and
+    torque are divided by N / 10. The force jumps as a point crosses a voxel's border: a property of
+    the law.
     """
 
     name: ClassVar[str] = "plane"
@@ -64,7 +64,7 @@ class TangentPlane(_Stiff):
 
 @dataclass(frozen=True)
 class DistanceField(_Stiff):
-    """Penalty on the distance field: a point is felt by its distance u to the nearest surface.
+    """Penalty on the distance field: the force of a point depends on its distance u to a surface.
 
     After Barbic and James 2008.
 
@@ -78,7 +78,7 @@ class DistanceField(_Stiff):
     into the tool. Without it the two sides of a thin wall would cancel: their normals are opposite
     and their distances almost equal.
 
-    Only an environment in which every object has distances can be felt by this law.
+    The law needs distances of every object in the environment.
     """
 
     name: ClassVar[str] = "distance"

@@ -1,4 +1,4 @@
-"""Result of the haptic query: what a tool felt at one pose."""
+"""Result of the haptic query at one pose."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -12,11 +12,12 @@ from hapticdb.store.base import Object
 from hapticdb.units import notebook_html
 
 PairsOf = Callable[[ForceLaw, NDArray[np.int64]], NDArray[np.int64]]
-"""Every (point, object id) pair (P, 2) of some points (C,) of a frame that a law has felt."""
+"""All pairs (P, 2) of a point and an object id in contact under a law, of points (C,) of a
+frame."""
 
 
 class Query(NamedTuple):
-    """How a frame asked the database.
+    """Figures of a frame's database query.
 
     strategy : the strategy used, never `auto`; statements : SQL statements run, 0 if all bricks
     were in memory; ranges : index ranges, single keys included; rows : rows read, false hits
@@ -32,7 +33,7 @@ class Query(NamedTuple):
 
 @dataclass(eq=False, repr=False, slots=True)
 class Touch:
-    """What a tool felt in one frame."""
+    """Contact force, hits and objects of a tool in one frame."""
 
     force: NDArray[np.float64]
     """(3,) N, world frame, on the tool."""
@@ -41,22 +42,22 @@ class Touch:
     hits: NDArray[np.int64]
     """Indices (H,) of the shell's points inside a voxel, ascending."""
     depths: NDArray[np.float64]
-    """Depth (H,) of each hit in metres, 0 where the law does not feel it."""
+    """Depth (H,) of each hit in metres, 0 for a hit without a force."""
     ids: list[int]
     """Ids of `objects`."""
     law: ForceLaw
-    """The force law that was felt."""
+    """The force law."""
     query: Query
-    """How the database was asked."""
+    """Figures of the database query."""
     _apart: tuple[NDArray[np.int64], NDArray[np.float64]]
-    """Points that are felt although they are no hits, and their depths, above 0."""
+    """Contacts that are no hits, and their depths, above 0."""
     _placed: NDArray[np.float64]
     _pairs_of: PairsOf
     _known: Mapping[int, Object]
 
     @property
     def contacts(self) -> NDArray[np.int64]:
-        """Indices (C,) of the shell's points that the law feels, ascending."""
+        """Indices (C,) of the shell's points with a force, ascending."""
         return self._felt()[0]
 
     @property
@@ -66,24 +67,24 @@ class Touch:
 
     @property
     def contact_points(self) -> NDArray[np.float64]:
-        """Places (C, 3) of the contacts, metres, world frame."""
+        """Positions (C, 3) of the contacts, metres, world frame."""
         return self._placed[self.contacts, :3]
 
     @property
     def contact_normals(self) -> NDArray[np.float64]:
-        """Unit normals (C, 3) of the contacts, which point into the tool, world frame."""
+        """Unit normals (C, 3) of the contacts, into the tool, world frame."""
         return self._placed[self.contacts, 3:]
 
     @property
     def contact_pairs(self) -> NDArray[np.int64]:
-        """Every contact with every object that it touches, (P, 2): index of the point, id."""
+        """Every contact with every object in contact there, (P, 2): index of the point, id."""
         return self._pairs_of(self.law, self.contacts)
 
     @property
     def objects(self) -> list[Object]:
-        """Objects of all hits and, under `DistanceField`, those that contacts touch, by id.
+        """Objects of all hits and, under `DistanceField`, of contacts, by id.
 
-        A contact touches the objects that it would feel alone, or the nearest one.
+        The objects of a contact are those with a force by themselves, or the nearest one.
         """
         return [self._known[i] for i in self.ids]
 
@@ -104,7 +105,7 @@ class Touch:
         return points, depths
 
     def _repr_html_(self) -> str:
-        """Force, torque and what is touched, for notebooks."""
+        """Force, torque and objects, for notebooks."""
         return notebook_html(self, ((one.id, one.name) for one in self.objects))
 
     def __repr__(self) -> str:

@@ -1,1 +1,1 @@
-"""Batches: one tool at many poses, against cells in memory, with all processors."""
+"""Batches: one tool at many poses, against cells in memory, in parallel."""

@@ -1,4 +1,4 @@
-"""Exact distances of a tool's surface from those of objects, at many poses."""
+"""Exact distances of a tool's surface from surfaces of objects, at many poses."""
 
 from collections.abc import Callable, Sequence
 
@@ -23,7 +23,7 @@ def exact_clearance(
     reach: float,
     progress: Callable[[int, int], None] | None,
 ) -> ClearanceBatch:
-    """Distances at poses (B, 4, 4), rigid; broad phase by boxes; UsageError without a surface."""
+    """Distances at rigid poses (B, 4, 4); broad phase by AABBs; UsageError without a surface."""
     from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second
 
     tool = MovingSurface(shell)

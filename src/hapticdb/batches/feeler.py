@@ -1,4 +1,4 @@
-"""Feeler: a tool whose cells stay in memory, asked at batches of poses."""
+"""Feeler: a tool with resident cells for batches of poses."""
 
 from collections.abc import Callable, Iterator
 from contextlib import closing
@@ -30,9 +30,9 @@ if TYPE_CHECKING:
     from hapticdb.batches.on_gpu import GpuFrames
 
 PIECE_CHUNKS = 32
-"""Chunks of poses, for each thread, in a piece: between pieces cells are fetched."""
+"""Chunks of poses, for each thread, in a piece; cells are fetched between pieces."""
 PIECE, TASK = 1 << 18, 1 << 16
-"""Poses of a long batch that are computed at once here, 60 MB, and by one task of a worker."""
+"""Poses of a long batch in one piece here, 60 MB, and in one task of a worker."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -40,17 +40,17 @@ Bools = NDArray[np.bool_]
 PoseCallback = Callable[[int, int], None]
 """Called after each piece with the poses done and their total."""
 BatchDevice = Literal["cpu", "cuda"]
-"""What computes: the processors, or a graphics processor."""
+"""The processors, or a GPU."""
 _Answer = TypeVar("_Answer")
 
 
 class Feeler(Closes):
-    """A tool in an environment, with cells in memory from one batch of poses to the next.
+    """A tool in an environment, with resident cells from one batch of poses to the next.
 
     `Environment.feeler` makes one, on the environment's connection and for its thread. It is also a
     context manager. Each call reads one committed revision, the newest.
 
-    shell : the tool; law : law of every touch.
+    shell : the tool; law : force law of all touches.
     """
 
     def __init__(
@@ -110,12 +110,12 @@ class Feeler(Closes):
 
     @property
     def n_loaded(self) -> int:
-        """Number of cells that were read from the database so far, repeated ones included."""
+        """Number of cells read from the database so far, repeated ones included."""
         return self._residency.n_loaded
 
     @property
     def size_bytes(self) -> int:
-        """Size of the memory for cells, bytes: never more than the budget."""
+        """Size of the memory for cells, bytes: at most the budget."""
         return self._table.size_bytes
 
     def touch(
@@ -123,8 +123,8 @@ class Feeler(Closes):
     ) -> TouchBatch:
         """Force and torque at many poses; bit for bit those of `Environment.touch` at each pose.
 
-        A GPU sums the points in another order, and may fuse multiplications with additions. It
-        repeats bit for bit.
+        A GPU sums the points in another order, and may fuse multiplications with additions. Its
+        results are reproducible bit for bit.
 
         poses (B, 4, 4) : world_from_tool, rigid, metres, in any order; a mapped array is read piece
             by piece
@@ -145,7 +145,7 @@ class Feeler(Closes):
     ) -> ClearanceBatch:
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
-        reach : greatest distance that is searched, metres; 32 voxels unless given.
+        reach : greatest distance of the search, metres; 32 voxels unless given.
 
         Raises errors as for `touch`; also if the reach is not positive, or needs too many cells.
         """
@@ -190,7 +190,7 @@ class Feeler(Closes):
         return self._at_one_revision(searched)
 
     def _at_one_revision(self, work: Callable[[], _Answer]) -> _Answer:
-        """Result of `work` in a snapshot of the newest revision; once more after a lost one."""
+        """Result of `work` in a snapshot of the newest revision; repeated once after a lost one."""
         try:
             return self._in_snapshot(work)
         except ConnectionLostError:
@@ -199,7 +199,7 @@ class Feeler(Closes):
     def _in_snapshot(self, work: Callable[[], _Answer]) -> _Answer:
         if self._is_closed:
             raise UsageError("this feeler is closed: make another by env.feeler")
-        if self._is_torn:  # an error or Ctrl-C came while cells were read
+        if self._is_torn:  # an error or Ctrl-C interrupted the reading of cells
             self._residency.reopened(self._store)
             self._known_revision = None
         self._is_torn = True
@@ -249,7 +249,7 @@ class Feeler(Closes):
         return felt
 
     def _feel(self, poses: Floats) -> Floats:
-        """Results (B, RESULTS) of frames at poses; first where all cells are in memory."""
+        """Results (B, RESULTS) of frames at poses; poses with all cells resident come first."""
         out = np.zeros((len(poses), RESULTS))
         self._run(poses, out)
         pending = np.flatnonzero(out[:, UNKNOWNS] > 0.0)
@@ -274,7 +274,7 @@ class Feeler(Closes):
         self._threads.run(work, len(poses))
 
     def _name(self, places: Floats, chosen: Ints, felt: TouchBatch, ids: list[list[int]]) -> None:
-        """Enter the ids of the objects at the chosen poses, as a touch names them."""
+        """Store the ids of the objects at the chosen poses, as for a touch."""
         touching = chosen[(felt.hits[chosen] > 0) | (felt.n_contacts[chosen] > 0)]
         exclude = self._residency.exclude
         answers = self._query.run_many(self.shell, places[touching], exclude, self.law)
@@ -282,7 +282,7 @@ class Feeler(Closes):
             ids[n] = answer.ids
 
     def _search(self, reach: float) -> NearestSearch:
-        """Search of the nearest voxels within a reach, voxels."""
+        """Search for the nearest voxels within a reach, voxels."""
         if self._gpu is None:
             return NearestSearch(self._frames, self._threads, reach)
         from hapticdb.batches.on_gpu import GpuNearest  # noqa: PLC0415 - loads numba.cuda
@@ -290,7 +290,7 @@ class Feeler(Closes):
         return GpuNearest(self._frames, self._threads, reach, self._gpu)
 
     def _order_of(self, places: Floats) -> Ints:
-        """Order in which the processors compute poses; the GPU takes them as they come."""
+        """Order of computation on the processors; empty for the GPU, which uses the given order."""
         if self._gpu is not None:
             return np.empty(0, dtype=np.int64)
         return order_of(places, self.shell.center, self._residency.grid)
@@ -299,7 +299,7 @@ class Feeler(Closes):
 def touch_at(
     there: Whereabouts, shell: PointShell, felt: Filter, law: ForceLaw, poses: Floats
 ) -> TouchBatch:
-    """Touch at a piece: the task of a worker, which runs one for each of its threads."""
+    """Touch at a piece: the task of a worker, one for each of its threads."""
     with (
         closing(there.open()) as store,
         Feeler(HapticQuery(store), shell, felt, law, jobs=1) as feeler,
@@ -308,7 +308,7 @@ def touch_at(
 
 
 def reach_of(reach: float | None, voxel_size: float) -> float:
-    """Greatest distance that is searched, metres; UsageError if it is not above 0."""
+    """Greatest distance of the search, metres; UsageError unless above 0."""
     limit = DEFAULT_REACH * voxel_size if reach is None else reach
     if not (np.isfinite(limit) and limit > 0.0):
         raise UsageError(f"clearance up to {limit} m: give a finite length above 0")

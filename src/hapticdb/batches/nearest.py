@@ -1,4 +1,4 @@
-"""Distances at many poses: kernels search resident cells, and name those that they miss."""
+"""Distances at many poses: kernels search resident cells, and report missing ones."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,17 +15,17 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 DEFAULT_REACH = 32
-"""Distance that is searched unless another is given, voxels. Larger: more cells are fetched."""
+"""Default reach of the search, voxels. Larger: more cells are fetched."""
 CLOSE = 1.5, 4.0
 """Radii of runs, voxels, up to which points are in cubes of 1 and of 2 voxels, otherwise of 4."""
 CELL = 32
 """Voxels of a cell on each axis."""
 RUN = 16
-"""Points of a run, which has one bounding sphere; with 64 a search takes a third longer."""
+"""Points of a run, the unit of bounding spheres; with 64 a search takes a third longer."""
 
 
 def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) -> Ints:
-    """Find a point (B,) that hits at each of poses, in cells that are in memory."""
+    """Index (B,) of a point with a hit at each pose, or a negative number, in resident cells."""
     found = np.empty(len(poses), dtype=np.int64)
     cells, place = frames.residency.table.cells.without_distances(), frames.residency.place
 
@@ -39,12 +39,12 @@ def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) 
 
 
 class NearestSearch:
-    """Searches the voxels nearest to a shell, within a reach in voxels.
+    """Search for the voxels nearest to a shell, within a reach in voxels.
 
-    frames : of the shell; cells around its points are fetched into their table; threads : of the
-    same frames.
+    frames : of the shell, with the table for the cells around its points; threads : of the same
+    frames.
 
-    Raises `UsageError` if the cells within reach of one point are more than the table can hold.
+    Raises `UsageError` if the cells within reach of one point exceed the table.
     """
 
     def __init__(self, frames: ResidentFrames, threads: BatchThreads, reach: float) -> None:
@@ -71,7 +71,7 @@ class NearestSearch:
     def search(self, poses: Floats) -> tuple[Floats, Ints]:
         """Distances (B,) in voxels and nearest points (B,), -1 for none, at rigid poses (B, 4, 4).
 
-        A pose that lacks a cell goes on after the cells around its points have been fetched.
+        A pose without one of its cells resumes after the cells around its points have been fetched.
         """
         n_poses, n_points = len(poses), len(self._frames.shell)
         squares = np.full(n_poses, self._reach**2)

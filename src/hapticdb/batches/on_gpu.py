@@ -1,4 +1,4 @@
-"""Batches of poses on a graphics processor: copies are under way beside kernels."""
+"""Batches of poses on a GPU, with copies overlapping kernels."""
 
 from collections.abc import Callable, Iterator
 from concurrent.futures import ThreadPoolExecutor
@@ -21,24 +21,24 @@ from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.mirror import CellMirror
 
 PIECE_POINTS = 1 << 25
-"""Points placed by one launch. A larger value makes fewer launches, and takes more memory."""
+"""Points of one launch. Larger: fewer launches, more memory."""
 PIECE_POSES = 1 << 16
-"""Most poses of one launch, 14 MB with their results. Larger: likewise."""
+"""Poses of one launch, at most, 14 MB with their results. Larger: likewise."""
 LANES = 2
-"""Launches under way: while one computes, poses and results of the other are copied."""
+"""Concurrent launches: one computes while poses and results of the other are copied."""
 MOST_BLOCKS = 1 << 13
-"""Most blocks of a launch; each takes several poses if there are more."""
+"""Blocks of a launch, at most; a block computes several poses of a larger launch."""
 COPIERS = 4
-"""Threads that copy poses and results between the caller's memory and the GPU's."""
+"""Threads for copies between the caller's memory and the GPU's."""
 LEAST_COPIED = 1 << 12
-"""Poses that a thread copies at once, at least: fewer are done before it begins."""
+"""Poses of one thread's copy, at least; smaller batches are copied without threads."""
 config.CUDA_LOW_OCCUPANCY_WARNINGS = 0  # a frame of a small tool needs few blocks, and no warning
 
 Floats = NDArray[np.float64]
 
 
 def check_gpu() -> None:
-    """Refuse where numba finds no GPU."""
+    """Raise `MissingExtraError` where numba finds no GPU."""
     if not cuda.is_available():
         raise MissingExtraError(
             "device 'cuda': numba finds no GPU that it can use; it takes one of NVIDIA with its "
@@ -58,7 +58,7 @@ class RawFrames(NamedTuple):
 
 
 class GpuNearest(NearestSearch):
-    """The same search on the GPU, whose table is that of the processors' frames.
+    """Nearest-voxel search on the GPU, over a mirror of the processors' table.
 
     frames, threads, reach : as for `NearestSearch`; gpu : frames of the same shell.
     """
@@ -70,7 +70,10 @@ class GpuNearest(NearestSearch):
         self._gpu = gpu
 
     def search(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """As `NearestSearch.search`; a pose whose cells do not fit together is searched there."""
+        """As `NearestSearch.search`, also for a pose with too many cells for the table.
+
+        The processors search at such a pose.
+        """
         squares, points = self._gpu.nearest(poses, self._reach)
         left = np.flatnonzero(points == searches.UNDECIDED)
         while len(left):
@@ -87,7 +90,7 @@ class GpuNearest(NearestSearch):
 
 
 class _Lane:
-    """Memory for one launch, here and on the GPU, and the stream in which it runs."""
+    """Buffers of one launch, here and on the GPU, and its stream."""
 
     def __init__(self, n_poses: int, shares: int) -> None:
         self.stream = cuda.stream()
@@ -102,7 +105,7 @@ class _Lane:
         )
 
     def begin(self, n: int, launch: Callable[..., None]) -> None:
-        """Begin to copy n poses that are in `poses`, to compute, and to copy the results back."""
+        """Enqueue the copy of the first n of `poses`, the kernel, and the copy of its results."""
         poses, sums, ended, out = self.on_gpu
         if n < len(poses):
             poses, out = poses[:n], out[: n * RESULTS]
@@ -111,7 +114,7 @@ class _Lane:
         out.copy_to_host(self.out[: n * RESULTS], stream=self.stream)
 
     def results(self) -> RawFrames:
-        """Results, when they are there; they are overwritten by the next `begin`."""
+        """Wait for the results; the next `begin` overwrites them."""
         self.stream.synchronize()
         n = self.part.stop - self.part.start
         rows = self.out[: n * RESULTS].reshape(RESULTS, n)
@@ -122,7 +125,7 @@ class _Lane:
 
 
 class GpuFrames:
-    """Frames of one shell on the GPU; those of the processor, `frames`, fetch the cells."""
+    """Frames of one shell on the GPU; `frames`, of the processor, fetch the cells."""
 
     def __init__(self, frames: ResidentFrames) -> None:
         check_gpu()
@@ -152,8 +155,8 @@ class GpuFrames:
     def feel(self, pose: Floats) -> Floats:
         """Results (RESULTS,) of a frame at a rigid pose (4, 4), else UsageError, in resident cells.
 
-        The pose travels with the launch, and the results come without a copy: a tenth of the time
-        of `run` for one pose.
+        The pose is an argument of the launch, and the results are in mapped memory: a tenth of the
+        time of `run` for one pose.
         """
         if rigid.first_not_rigid(pose[None]) == 0:
             raise not_rigid(0)
@@ -168,7 +171,7 @@ class GpuFrames:
     def touch(
         self, poses: Floats, felt: TouchBatch, progress: Callable[[int, int], None] | None
     ) -> None:
-        """Feel poses (B, 4, 4), into `felt`; first where all cells are in memory."""
+        """Results at poses (B, 4, 4), into `felt`; poses with all cells resident come first."""
         pending: list[NDArray[np.int64]] = []
         for part, found in self.run(poses):
             self._put(felt, part, found)
@@ -210,7 +213,7 @@ class GpuFrames:
                 lane.stream.synchronize()
 
     def nearest(self, poses: Floats, reach: float) -> tuple[Floats, NDArray[np.int64]]:
-        """Squares (B,) of distances, voxels, and nearest points (B,), or `NO_POINT`, `UNDECIDED`.
+        """Squared distances (B,), voxels, and nearest points (B,), or `NO_POINT`, `UNDECIDED`.
 
         poses (B, 4, 4), rigid; reach: voxels.
         """
@@ -249,7 +252,7 @@ class GpuFrames:
         self._divide(len(poses), lambda part: np.copyto(to[part], poses[part]))
 
     def _put(self, felt: TouchBatch, at: slice | NDArray[np.int64], found: RawFrames) -> None:
-        """Enter results into a batch, at those of its poses."""
+        """Store results in a batch, at the indices of its poses."""
 
         def put(part: slice) -> None:
             to = (
@@ -264,7 +267,7 @@ class GpuFrames:
         self._divide(len(found.hits), put)
 
     def _divide(self, n: int, work: Callable[[slice], None]) -> None:
-        """Do work on n rows in several threads."""
+        """Run work on n rows in several threads."""
         step = max(LEAST_COPIED, -(-n // COPIERS))
         parts = [slice(start, min(start + step, n)) for start in range(0, n, step)]
         for _ in self._copiers.map(work, parts) if len(parts) > 1 else map(work, parts):

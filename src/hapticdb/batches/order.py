@@ -1,6 +1,6 @@
-"""The order in which the poses of a batch are computed: neighbours in space follow one another.
+"""Order of computation of a batch: along the grid's space-filling curve.
 
-So the cells that are in memory serve many poses before others take their place.
+So resident cells serve many poses before their eviction.
 """
 
 import numpy as np
@@ -11,11 +11,11 @@ from hapticdb.grid import Grid
 from hapticdb.kernels import rigid
 
 AT_ONCE = 1 << 14
-"""Poses that are copied at once to be checked, 2 MB. A larger value takes more memory."""
+"""Poses copied together for the check, 2 MB. Larger: more memory."""
 
 
 def not_rigid(pose: int) -> UsageError:
-    """Build the error for a pose of that number that is not rigid."""
+    """Error for a pose that is not rigid, with its number."""
     return UsageError(
         f"pose {pose}: a pose that is no rigid transform: give finite numbers and a rotation"
     )
@@ -24,7 +24,7 @@ def not_rigid(pose: int) -> UsageError:
 def order_of(
     poses: NDArray[np.float64], center: NDArray[np.float64], grid: Grid
 ) -> NDArray[np.int64]:
-    """Indices (B,) of poses (B, 4, 4), along the grid's curve, by the place of the tool's centre.
+    """Indices (B,) of poses (B, 4, 4) along the grid's curve, by the tool's centre.
 
     The poses may lie in a mapped file. center (3,), tool frame, metres. `UsageError` names the
     first pose that is not rigid.

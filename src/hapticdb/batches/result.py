@@ -1,4 +1,4 @@
-"""Results of batches: an entry for each pose, in the order in which the poses were given."""
+"""Results of batches: an entry for each pose, in the given order."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -16,7 +16,7 @@ Ints = NDArray[np.int64]
 
 
 class Named(NamedTuple):
-    """Objects that the poses of a batch touch.
+    """Objects in contact at the poses of a batch.
 
     offsets (B + 1,) int64; ids (P,) int64: those of pose n are ids[offsets[n]:offsets[n + 1]],
     ascending; known : the environment's objects by id, at the batch's revision.
@@ -28,15 +28,15 @@ class Named(NamedTuple):
 
 
 class TouchBatch:
-    """What a tool felt at B poses, all of them at one committed revision.
+    """Contact forces of a tool at B poses, all of them at one committed revision.
 
     forces (B, 3) float64 : N, world frame, on the tool
     torques (B, 3) float64 : N m about the tool's centre of mass, world frame
-    hits, n_contacts (B,) int64 : number of the shell's points inside a voxel, and number of the
-        points that the law feels. Under `DistanceField` a contact need not be a hit.
+    hits, n_contacts (B,) int64 : numbers of the shell's points inside a voxel, and of its points
+        with a force. Under `DistanceField` a contact need not be a hit.
     deepest (B,) float64 : depth of the deepest contact in metres, 0 without contacts
-    law : the force law that was felt
-    revision : revision of the environment that was felt
+    law : the force law
+    revision : revision of the environment
     """
 
     def __init__(self, n_poses: int, law: ForceLaw) -> None:
@@ -61,7 +61,7 @@ class TouchBatch:
         )
 
     def _repr_html_(self) -> str:
-        """What the pose with the greatest of each felt, for notebooks."""
+        """Greatest force, torque and depth, each with its pose, for notebooks."""
         measures = {
             "force, N": np.linalg.norm(self.forces, axis=1),
             "torque, N m": np.linalg.norm(self.torques, axis=1),
@@ -76,19 +76,19 @@ class TouchBatch:
 
     @property
     def offsets(self) -> Ints:
-        """Where each pose's ids begin in `ids`, and the end of the last ones, (B + 1,)."""
+        """Start of each pose's ids in `ids`, and the end of the last ones, (B + 1,)."""
         return self._named().offsets
 
     @property
     def ids(self) -> Ints:
         """Ids (P,) of the objects of hits and contacts, pose after pose, ascending for each.
 
-        Raises `UsageError` if objects were not asked for.
+        Raises `UsageError` for a batch without objects.
         """
         return self._named().ids
 
     def ids_at(self, pose: int) -> list[int]:
-        """Ids of the objects that one pose touches, ascending."""
+        """Ids of the objects in contact at one pose, ascending."""
         named = self._named()
         pose = range(len(self))[pose]  # raises IndexError; a negative one counts from the end
         found: list[int] = named.ids[named.offsets[pose] : named.offsets[pose + 1]].tolist()
@@ -96,7 +96,7 @@ class TouchBatch:
 
     @property
     def objects(self) -> list[Object]:
-        """Objects that any of the poses touches, ordered by id."""
+        """Objects in contact at any pose, ordered by id."""
         named = self._named()
         return [named.known[i] for i in np.unique(named.ids).tolist()]
 
@@ -110,11 +110,11 @@ class ClearanceBatch:
     """Distances of a tool's points from the environment at B poses, at one committed revision.
 
     distances (B,) float64 : metres from the nearest of the shell's points to the nearest occupied
-        voxel's box: 0 for a pose with a hit, `reach` where nothing is nearer, never more than to a
+        voxel's box: 0 for a pose with a hit, `reach` with nothing nearer, never more than to a
         surface. If exact: from the tool's surface to the nearest surface of an object.
-    points (B,) int64 : index of a nearest point, -1 where nothing is within reach
-    reach : greatest distance that was searched, metres
-    revision : revision of the environment that was searched
+    points (B,) int64 : index of a nearest point, -1 with nothing within reach
+    reach : greatest distance of the search, metres
+    revision : revision of the environment
     """
 
     def __init__(self, n_poses: int, reach: float) -> None:

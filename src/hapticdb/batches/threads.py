@@ -1,4 +1,4 @@
-"""Threads that share the poses of a batch: each reads the same cells, with memory of its own."""
+"""Threads for the poses of a batch, over shared cells, each with scratch memory of its own."""
 
 import os
 import queue
@@ -17,17 +17,17 @@ from hapticdb.resident.frames import ResidentFrames
 from hapticdb.resident.table import MOST_READERS
 
 CHUNK_POINTS = 1 << 18
-"""Points placed by one call of a kernel, after which Ctrl-C is noticed; but at least one pose."""
+"""Points of one call of a kernel, after which Ctrl-C is handled; but at least one pose."""
 CHUNK_POSES = 1024
-"""Most poses of one call of a kernel. A larger value makes fewer calls, which share less evenly."""
+"""Poses of one call of a kernel, at most. Larger: fewer calls, a less even load."""
 CUBES = 1 << 19
 """Cubes of space in a thread's cache of nearest voxels, a power of two; 32 bytes each."""
 MOST_JOBS = MOST_READERS - 2
-"""Most threads: each is a reader of the table, beside the shell's own and one more."""
+"""Threads, at most: each is a reader of the table, next to the shell's own and one more."""
 
 
 class ThreadMemory(NamedTuple):
-    """What a kernel that runs in a thread writes to: its row of the table, and its scratch."""
+    """Memory written by a kernel in a thread: its row of the table, and scratch."""
 
     row: int
     clusters: Clusters
@@ -37,11 +37,11 @@ class ThreadMemory(NamedTuple):
 
 
 ChunkWork = Callable[[ThreadMemory, slice], None]
-"""Computes the poses of a slice; runs in a thread, and spends its time in a kernel."""
+"""Computes the poses of a slice in a thread, mostly inside a kernel."""
 
 
 def available_jobs(jobs: int | None) -> int:
-    """Number of threads: 1 to `MOST_JOBS`, or one for each processor that this process may use."""
+    """Number of threads: 1 to `MOST_JOBS`, or one for each processor available to this process."""
     if jobs is None:
         able = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count()
         return min(able or 1, MOST_JOBS)
@@ -84,15 +84,15 @@ class BatchThreads:
         self._rows = []
 
     def forget(self) -> None:
-        """Forget what is known of cubes of space; no thread may run. It is called before `run`."""
+        """Clear the caches of nearest voxels; before the first `run`; no thread may run."""
         for memory in [self._free.get_nowait() for _ in range(self.jobs)]:
             memory.cubes[:] = NOT_KNOWN
             self._free.put(memory)
 
     def run(self, work: ChunkWork, n_poses: int) -> None:
-        """Run `work` on slices that cover all poses, and return when all are done.
+        """Run `work` on slices of all poses, and return after the last one.
 
-        After an error, or Ctrl-C, no further slice is begun, and the running ones end first.
+        After an error, or Ctrl-C, no further slice begins, and the running ones end first.
         """
         slices = [slice(at, at + self.chunk) for at in range(0, n_poses, self.chunk)]
         if self.jobs == 1 or len(slices) == 1:

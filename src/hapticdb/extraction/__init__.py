@@ -1,1 +1,1 @@
-"""Extraction: searches for a path on which a part comes out, and says what blocks it."""
+"""Extraction: proved removal paths of parts, and the objects in the way."""

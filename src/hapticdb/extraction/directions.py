@@ -1,4 +1,4 @@
-"""Directions in which a part may be pulled: axes, those that contacts suggest, random ones."""
+"""Candidate directions of straight pulls: axes, contact directions, random ones."""
 
 from itertools import combinations
 
@@ -8,22 +8,22 @@ from numpy.typing import NDArray
 Floats = NDArray[np.float64]
 
 N_RANDOM = 40
-"""Number of random directions. Larger: oblique ways are found more often, a slower search."""
+"""Random directions. Larger: more oblique paths, a slower search."""
 MOST_NORMALS = 5
-"""Greatest number of groups of contact normals whose directions are tried."""
+"""Groups of contact normals, at most."""
 ALIKE = 0.998
-"""Cosine above which two directions are one: 3.6 degrees. Larger: more directions."""
+"""Cosine of two directions that count as one, 3.6 degrees at most. Larger: more directions."""
 AGAINST = -0.2
-"""Cosine of direction and contact normal below which the contact is opposed to the direction."""
+"""Cosine of direction and contact normal below which the contact opposes the direction."""
 AXES = np.concatenate([np.eye(3), -np.eye(3)])
 
 
 def likely_directions(normals: Floats, own: Floats) -> Floats:
-    """Unit directions (D, 3) that a part's own axes (n, 3) and its contacts suggest, and the axes.
+    """Unit directions (D, 3) of a part's own axes (n, 3), of its contacts, and of the world's axes.
 
-    normals (C, 3) : unit normals of the contacts at the start, into the part, so away from what
-    blocks it. Of these: the groups, their mean, and the directions along two groups at once, as a
-    drawer slides along its walls. A part's own axes are exact where those of contacts are not.
+    normals (C, 3) : unit normals of the contacts at the start, into the part. They give the means
+    of their groups, the sum of these, and the cross products of two of them (a drawer slides along
+    two walls). Own axes are exact; contact normals are not.
     """
     groups = grouped(normals)
     mean = groups.sum(axis=0, keepdims=True)
@@ -33,14 +33,14 @@ def likely_directions(normals: Floats, own: Floats) -> Floats:
 
 
 def candidate_directions(normals: Floats, own: Floats, seed: int) -> Floats:
-    """Likely and random unit directions (D, 3), those that fewest contacts oppose first."""
+    """Likely and random unit directions (D, 3), in the order of the share of opposing contacts."""
     random = np.random.default_rng(seed).normal(size=(N_RANDOM, 3))
     found = distinct(np.concatenate([likely_directions(normals, own), random]))
     return found[np.argsort(np.round(opposed_shares(found, normals), 2), kind="stable")]
 
 
 def grouped(normals: Floats) -> Floats:
-    """Mean unit normals (G, 3) of the largest groups of like normals, the largest group first."""
+    """Mean unit normals (G, 3) of the largest groups of similar normals, largest group first."""
     if not len(normals):
         return np.empty((0, 3))
     cells, which, counts = np.unique(
@@ -53,7 +53,7 @@ def grouped(normals: Floats) -> Floats:
 
 
 def distinct(directions: Floats) -> Floats:
-    """Unit vectors (D, 3) of vectors (n, 3), without zeros and without those like earlier ones."""
+    """Unit vectors (D, 3) of vectors (n, 3), without zeros and duplicates (`ALIKE`)."""
     lengths = np.linalg.norm(directions, axis=1)
     units = directions[lengths > 1e-6] / lengths[lengths > 1e-6, None]
     kept: list[Floats] = []
@@ -64,7 +64,7 @@ def distinct(directions: Floats) -> Floats:
 
 
 def opposed_shares(directions: Floats, normals: Floats) -> Floats:
-    """Share (D,) of the contacts, 0 .. 1, that each direction (D, 3) presses against."""
+    """Share (D,) of the contacts, 0 .. 1, opposed to each direction (D, 3)."""
     if not len(normals):
         return np.zeros(len(directions))
     return np.asarray((directions @ normals.T < AGAINST).mean(axis=1))

@@ -1,7 +1,7 @@
-"""Searches an order in which parts come out: what blocks them first, each step proved.
+"""Disassembly: a sequence of removals, each on a proved path, so that parts come out.
 
-An object is taken off once sweeps prove its path, with what was taken off before left out. A step
-that no later step needs is dropped at the end. No order is claimed to be the shortest.
+An object is removed after a sweep has proved its path among the objects still in place. Steps
+without use for later ones are dropped at the end. The sequence need not be the shortest.
 """
 
 import math
@@ -25,23 +25,23 @@ from hapticdb.store.finding import Words
 from hapticdb.verdicts import PathVerdict
 
 DEFAULT_ORDER_SECONDS = 600.0
-"""Default time of the search for an order."""
+"""Default time of the search for a sequence."""
 DEFAULT_DEPTH = 3
-"""Default number of objects in a chain of which each has to go before the one before it."""
+"""Default length of the longest chain of objects, each of them blocking the one before."""
 MOST_BLOCKERS = 12
-"""Greatest number of objects tried that block one part. Larger: more orders are found, and more
-time is spent where there is none."""
+"""Objects tried of those in the way of one part, at most. Larger: more sequences, and more time on
+parts without one."""
 LEAST = 0.1
-"""Seconds of a search for which no time is left: it tries one pull."""
+"""Seconds of a search after the deadline: enough for one pull."""
 SHARE = 0.25
 """Greatest share of the whole time for one search. Larger: fewer searches, each more thorough."""
 
 
 class Removal(NamedTuple):
-    """A step: parts that come out while others are gone.
+    """A step: parts removed together.
 
-    found : the search with its proved path; excluded : ids of the objects that are not felt in this
-    step: the parts themselves, what the caller left out, and what earlier steps took off.
+    found : the search with its proved path; excluded : ids of the objects absent in this step: the
+    parts, the caller's exclusions, and the objects of earlier steps.
     """
 
     found: Extraction
@@ -49,16 +49,16 @@ class Removal(NamedTuple):
 
     @property
     def ids(self) -> tuple[int, ...]:
-        """Ids of what comes out."""
+        """Ids of the removed parts."""
         return ids_of(self.found.parts)
 
 
 class FailedSearch(NamedTuple):
-    """A search that proved no path.
+    """A search without a proved path.
 
-    parts : what was to come out; n_gone : number of steps before it; verdict : of the search, or
-    None if the parts cannot be moved at all; blockers : what stops pulls, most pulls first; reason
-    : why the parts cannot be moved, else empty.
+    parts : to be removed; n_gone : number of steps before it; verdict : of the search, or None for
+    parts that cannot be moved at all; blockers : objects that stop pulls, most pulls first;
+    reason : why the parts cannot be moved, else empty.
     """
 
     parts: tuple[Object, ...]
@@ -70,21 +70,21 @@ class FailedSearch(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class Disassembly:
-    """Result of a search for an order.
+    """Result of the search for a sequence of removals.
 
-    The order is one in which each step is proved. It may be longer than necessary.
+    Each step is proved. The sequence may be longer than necessary.
 
     Attributes
     ----------
     parts : tuple of Object
-        What was to come out, as one rigid body.
+        The parts to be removed, as one rigid body.
     steps : tuple of Removal
-        In the order in which parts come out. If an order was found, the last step is `parts`. If
-        not, the steps are what was taken off in vain.
+        In the order of removal. After success, the last step removes `parts`; otherwise the steps
+        were in vain.
     failed : tuple of FailedSearch
-        Searches that proved no path, in the order in which they were made.
+        Searches without a proved path, in their order.
     is_out_of_time : bool
-        Whether the time ended the search.
+        Whether the deadline ended the search.
     seconds : float
         Time of all searches with their proofs.
     seed : int
@@ -99,12 +99,12 @@ class Disassembly:
 
     @property
     def is_found(self) -> bool:
-        """Whether the parts come out at the end of the steps."""
+        """Whether the last step removes the parts."""
         return bool(self.steps) and self.steps[-1].ids == ids_of(self.parts)
 
     @property
     def verdict(self) -> PathVerdict:
-        """Each step is proved on its whole path, or but for overlaps where its parts stand.
+        """Comes out, or overlaps if a step begins with one; otherwise no order, or not decided.
 
         "no order found" proves nothing.
         """
@@ -115,7 +115,7 @@ class Disassembly:
 
     @property
     def blockers(self) -> tuple[Blocker, ...]:
-        """What stopped most pulls of the parts in their last search that failed."""
+        """Objects in the way of the parts in their last failed search, most stopped pulls first."""
         for failed in reversed(self.failed):
             if ids_of(failed.parts) == ids_of(self.parts):
                 return failed.blockers
@@ -140,34 +140,35 @@ def disassemble(
     progress: Progress | None = None,
     on: str | None = None,
 ) -> Disassembly:
-    """Search an order in which objects are taken off so that parts come out.
+    """Search for a sequence of removals after which parts come out.
 
-    If the parts have no proved way out, the objects that block them are tried, those that stop most
-    pulls first, and what blocks these. Each object goes alone, and only on a path that is proved as
-    `extract` proves it. Then the parts are tried again.
+    If the parts have no proved removal path, the objects in their way are tried, most stopped pulls
+    first, and then the objects in the way of these. Each object is removed alone, on a path proved
+    as in `extract`. Then the parts are tried again.
 
     Parameters
     ----------
     env, words, where, exclude, out, screw, contact, overlap, seed, budget_bytes, progress
+        As for `extract`.
     seconds : float
         Time of all searches together; one search has a quarter of it at most.
     motions : int
-        Motions that the planner may ask about in one search; 0: straight pulls only. Objects that
-        block are first tried by straight pulls alone.
+        Motion queries of the planner in one search, at most; 0: straight pulls only. Objects in
+        the way are first tried by straight pulls alone.
     depth : int
-        Length of the longest chain of objects that block one another; 0: as `extract`.
+        Length of the longest chain of objects in the way of one another; 0: as `extract`.
     keep : iterable of int or str
-        Objects that are never taken off, but are felt: what stands on the ground, for example.
+        Objects that collide but are never removed, such as a base plate.
     on : str or None
-        Scheduler of dask.distributed, ``tcp://host:8786``, whose workers search at the same time
-        for all that may go next; `progress` is then called with the searches done, and known of.
+        Scheduler of dask.distributed, ``tcp://host:8786``. Its workers search for all next
+        candidates in parallel; `progress` then gets the numbers of searches: done, and in all.
 
     Raises
     ------
     ObjectNotFoundError, UsageError
-        As for `extract`, about the parts. Other objects whose files are gone are not taken off.
+        As for `extract`, about the parts. Other objects without their files are not removed.
     MissingExtraError
-        If straight pulls lead to no order, and the planner is not installed.
+        If straight pulls give no sequence, and the planner is not installed.
     """
     began = time.monotonic()
     if not (math.isfinite(seconds) and seconds > 0.0) or depth < 0:
@@ -185,7 +186,7 @@ def disassemble(
 
 
 def _ordered(env: Environment, asked: "_Asked", depth: int, workers: Cluster | None) -> Disassembly:
-    """Search by straight pulls of what blocks, then with the planner; without the time it took."""
+    """Search by straight pulls of the objects in the way, then with the planner; `seconds` is 0."""
     search = _OrderSearch(env, asked, time.monotonic() + asked.seconds, workers)
     is_found = False
     for motions in dict.fromkeys((0, asked.motions)):
@@ -205,9 +206,9 @@ def _ordered(env: Environment, asked: "_Asked", depth: int, workers: Cluster | N
 class _Asked(NamedTuple):
     """Options of all searches.
 
-    parts : what is to come out in the end; exclude : ids of what the caller does not feel, none of
-    `parts`, which block what comes out before them; keep : ids of what is never taken off; options
-    : of `extract`, the same for each search.
+    parts : to be removed in the end; exclude : ids of the caller's exclusions but for `parts`,
+    which do block the objects removed before them; keep : ids of objects never removed; options :
+    of `extract`, the same for each search.
     """
 
     parts: tuple[Object, ...]
@@ -219,13 +220,13 @@ class _Asked(NamedTuple):
 
 
 def _search_there(there: Whereabouts, ids: tuple[int, ...], options: dict[str, Any]) -> Extraction:
-    """Search a way out: the task of a worker."""
+    """Search for a removal path: the task of a worker."""
     with Environment(there.open()) as env:
         return extract(env, *ids, **options)
 
 
 class _Known(NamedTuple):
-    """A failed search: steps before it, motions of its planner, ids that its pulls depend on."""
+    """A failed search: steps before it, planner's motions, ids of objects its pulls depend on."""
 
     n_gone: int
     motions: int
@@ -234,12 +235,12 @@ class _Known(NamedTuple):
 
 
 class _OrderSearch:
-    """One search for an order.
+    """State of one search for a sequence.
 
-    steps : what was taken off so far; failed : searches that proved no path; motions_of_others :
-    motions of the planner for objects that block; missing : the planner's, if it was wanted and is
-    not installed: then there are straight pulls only; is_spent : whether a search was left out
-    because the time was over.
+    steps : removals so far; failed : searches without a proved path; motions_of_others : motion
+    queries of the planner for objects in the way; missing : error of a planner that is not
+    installed (straight pulls only from then on); is_spent : whether the deadline prevented a
+    search.
     """
 
     def __init__(
@@ -257,10 +258,10 @@ class _OrderSearch:
         self._n_searched = 0
 
     def clear(self, parts: tuple[Object, ...], depth: int, waiting: frozenset[int]) -> bool:
-        """Take parts off, if necessary after what blocks them; returns whether they are off.
+        """Remove parts, if necessary after the objects in their way; return success.
 
-        depth : length of the chains of other objects that may go first; waiting : ids of what is to
-        come out after these parts, which are not tried again.
+        depth : length of the chains of other objects that may go first; waiting : ids of the
+        objects to be removed after these parts, not tried again.
         """
         waiting |= {*ids_of(parts)}
         while True:
@@ -271,7 +272,7 @@ class _OrderSearch:
                 return False
 
     def _clear_one_of(self, failed: FailedSearch, depth: int, waiting: frozenset[int]) -> bool:
-        """Take off something of what blocks; what comes out at once goes first."""
+        """Remove one object in the way, shorter chains first."""
         before = len(self.steps)
         for less in range(depth):
             if self._workers is not None and less == 0:
@@ -285,8 +286,8 @@ class _OrderSearch:
     def _search_ahead(
         self, workers: Cluster, failed: FailedSearch, waiting: frozenset[int]
     ) -> None:
-        """Have workers search ways out for all that block, instead of one after the other."""
-        workers.cancel(self._ahead.values())  # what was taken off since lets them through
+        """Submit the searches for all objects in the way to the workers."""
+        workers.cancel(self._ahead.values())  # they ran before the last removal
         motions = 0 if self.missing is not None else self.motions_of_others
         wanted = [(obj.id,) for obj in self._candidates(failed, waiting)]
         self._ahead = {
@@ -308,15 +309,15 @@ class _OrderSearch:
         return self.is_spent
 
     def _gone(self) -> frozenset[int]:
-        """Ids of what was taken off so far."""
+        """Ids of the objects removed so far."""
         return frozenset(i for step in self.steps for i in step.ids)
 
     def _excluded(self) -> tuple[int, ...]:
-        """Ids of all that is not felt now."""
+        """Ids of all objects absent now."""
         return (*self._asked.exclude, *sorted(self._gone()))
 
     def _take_off(self, parts: tuple[Object, ...]) -> FailedSearch | None:
-        """Search a way out, and take the parts off if it is proved; else say what failed."""
+        """Search for a removal path, and remove the parts on it; return the failure without one."""
         ids = ids_of(parts)
         is_wanted = ids == ids_of(self._asked.parts)
         motions = self._asked.motions if is_wanted else self.motions_of_others
@@ -344,10 +345,10 @@ class _OrderSearch:
         return failed
 
     def _still_holds(self, known: _Known, motions: int) -> bool:
-        """Whether a search would fail again, with what was taken off since.
+        """Whether a search would fail again, after the removals since.
 
-        A pull ends at the first object in its way. So if none of these objects is gone, pulls end
-        where they ended before. A plan may depend on any object.
+        A pull ends at the first object in its way. While all these objects stand, pulls end at the
+        same hits. A plan may depend on any object.
         """
         if known.failed.verdict is None:
             return True
@@ -358,9 +359,9 @@ class _OrderSearch:
         return not any(known.met & {*step.ids} for step in self.steps[known.n_gone :])
 
     def _check_something_stands(self, excluded: set[int]) -> None:
-        """Refuse to take off the last object beside the parts that are wanted.
+        """Refuse to remove the last object other than the requested parts.
 
-        Then two bodies are left, and each comes out of the other or neither does.
+        Of two bodies, each comes out of the other or neither does.
         """
         excluded |= {*ids_of(self._asked.parts)}
         if all(obj.id in excluded for obj in self._env.objects()):
@@ -393,13 +394,13 @@ class _OrderSearch:
         return self._asked.options | now
 
     def _given(self, workers: Cluster, ids: tuple[int, ...], motions: int) -> Any:  # noqa: ANN401 - dask's future
-        """A search that was given to a worker."""
+        """Submit a search to the workers."""
         there = Whereabouts.of(self._env.store, self._env.address)
         options = self._options(motions) | {"progress": None}
         return workers.submit(partial(_search_there, there, ids, options))
 
     def drop_needless(self) -> None:
-        """Drop steps without which all later steps are proved as well, the latest ones first."""
+        """Drop steps without which all later ones are proved as well, from last to first."""
         for n in range(len(self.steps) - 2, -1, -1):
             if time.monotonic() > self._until:
                 return
@@ -408,9 +409,9 @@ class _OrderSearch:
                 self.steps[n:] = kept
 
     def _proved_with(self, n: int) -> list[Removal] | None:
-        """Steps after step n, proved anew with what it takes off in its place; None if not all are.
+        """Steps after step n, proved again with its objects in place; None if one fails.
 
-        The last step is looked at first: it is mostly the reason why step n was made.
+        The last step comes first, as the likeliest reason for step n.
         """
         proved: list[Removal] = []
         for step in reversed(self.steps[n + 1 :]):

@@ -1,10 +1,10 @@
-"""Whether poses are free, many at once, against resident cells.
+"""Collision checks of many poses against resident cells.
 
-A pose is free if no point of the shell lies in an occupied voxel; in a wide room, if no point a
-voxel outside the surface does either. The search believes this; the proof is that of a sweep.
+A pose is free if no shell point is in an occupied voxel; in the wide space, nor any point one voxel
+outside the surface. The search relies on this; proofs are by sweeps.
 
-A part that touches something at its start is in no free pose there, because surfaces that touch
-share voxels. What it does there is left to sweeps.
+Touching surfaces share voxels, so a part in contact is not free at its start. Its motion there is
+checked by sweeps.
 """
 
 from contextlib import ExitStack, closing
@@ -24,18 +24,17 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 STEP = 0.5
-"""Voxels that a part moves at most from pose to pose. Larger: thin things are missed."""
+"""Greatest motion between two poses, voxels. Larger: thin objects are missed."""
 AT_ONCE = 32
-"""Poses of a motion that are looked at together. Larger: fewer calls; more poses of motions that
-turn out blocked."""
+"""Poses of a motion in one check. Larger: fewer calls, more poses of blocked motions."""
 FIRST_AT_ONCE = 4
-"""The same for the first ones, which refuse most of the blocked motions; twice as many follow."""
+"""Poses of the first check, which refutes most blocked motions; the number doubles from then on."""
 
 
 class Room:
-    """Where the points of one shell are free.
+    """Free space of one shell.
 
-    n_poses : number of poses looked at so far.
+    n_poses : number of poses checked so far.
     """
 
     def __init__(self, frames: ResidentFrames, problem: Problem) -> None:
@@ -43,22 +42,22 @@ class Room:
         self._frames, self._problem = frames, problem
 
     def ways(self, path: ToolPath) -> Floats:
-        """Ways (n,) on a path, by `STEP` voxels at most from one to the next."""
+        """Path parameters (n,), at most `STEP` voxels apart."""
         steps = path.length / (STEP * self._problem.voxel_size)
         return np.linspace(0.0, path.length, 1 + max(int(np.ceil(steps)), 1))
 
     def hits(self, poses: Floats) -> Ints:
-        """Numbers of points (n,) in occupied voxels at poses (n, 4, 4)."""
+        """Numbers (n,) of points in occupied voxels at poses (n, 4, 4)."""
         self.n_poses += len(poses)
         return self._frames.feel(poses).hits
 
     def are_free(self, poses: Floats) -> NDArray[np.bool_]:
-        """Whether poses (n, 4, 4) have no hits; much sooner than `hits` where they have some."""
+        """Whether poses (n, 4, 4) have no hits; ends at the first hit, so faster than `hits`."""
         self.n_poses += len(poses)
         return ~self._frames.collides(poses)
 
     def _between(self, ends: Floats) -> Floats:
-        """Poses (n, 4, 4) between two poses (2, 4, 4), as in `ways`; sooner without a turn."""
+        """Poses (n, 4, 4) between two poses (2, 4, 4), as in `ways`; faster without a turn."""
         if not np.array_equal(ends[0, :3, :3], ends[1, :3, :3]):
             path = self._problem.path(ends)
             return path.at(self.ways(path))
@@ -72,7 +71,7 @@ class Room:
     def farthest(self, ends: Floats) -> Floats:
         """Last displacement (4, 4) before the first hit between two poses (2, 4, 4).
 
-        The first pose is taken for free.
+        The first pose is assumed free.
         """
         poses = self._between(ends)
         for begin in range(1, len(poses), AT_ONCE):
@@ -84,17 +83,17 @@ class Room:
     def is_motion_free(self, ends: Floats) -> bool:
         """Whether all poses between two poses (2, 4, 4) are free.
 
-        The end comes first, then poses far apart: a blocked motion is mostly refused by few.
+        The end comes first, then poses far apart: few checks refute most blocked motions.
         """
         poses = self._between(ends)
         return all(self.are_free(poses[some]).all() for some in _from_coarse_to_fine(len(poses)))
 
 
 class FreeSpace(Closes):
-    """Rooms of a problem's parts. It is also a context manager.
+    """Free space of a problem's parts; a context manager.
 
-    room, wide : where the parts are free, and where they keep `GUARD` voxels of clearance; start :
-    what is near the parts at the start: points are in its voxels.
+    room : without clearance; wide : with `GUARD` voxels of clearance; start : contacts at the
+    start, of points in occupied voxels.
     """
 
     def __init__(self, problem: Problem, budget_bytes: int) -> None:
@@ -115,11 +114,11 @@ class FreeSpace(Closes):
 
     @property
     def n_poses(self) -> int:
-        """Number of poses looked at so far."""
+        """Number of poses checked so far."""
         return self.room.n_poses + self.wide.n_poses
 
     def touch(self, pose: Floats) -> Touch:
-        """What is near the parts at a pose (4, 4)."""
+        """Contacts of the parts at a pose (4, 4)."""
         problem = self._problem
         return problem.env.touch(
             problem.shell, pose, where=problem.where, exclude=problem.exclude, law="plane"
@@ -127,7 +126,7 @@ class FreeSpace(Closes):
 
 
 def _from_coarse_to_fine(n: int) -> list[Ints]:
-    """Indices 0 .. n - 1 in blocks, each once: the last one, then those that are far apart."""
+    """Indices 0 .. n - 1 in blocks, each once: the last one, then from coarse to fine strides."""
     order: list[int] = [n - 1]
     seen = {n - 1}
     stride = 1 << max(n - 1, 1).bit_length()

@@ -1,8 +1,8 @@
-"""Places that the planner tries to reach: those from which a straight way leads out, or to a pose.
+"""Goals of the planner: poses outside with a free straight path out, or one given pose.
 
-Beyond the convex hull of what stops the straight pulls nothing of it is in the way. A place there
-counts if the straight way from it out is free. The part is then pushed back in from there, as far
-as it goes: the end is the goal. Other turns of the part reach places that no pull shows.
+Beyond the convex hull of the objects that stop straight pulls, none of them blocks. A pose there
+counts if its straight path out is free. The part is then pushed back in until a hit; the last free
+pose is the goal. Other rotations of the part give goals that no pull reaches.
 """
 
 import time
@@ -22,45 +22,45 @@ from hapticdb.grid import corners_of
 Floats = NDArray[np.float64]
 
 MOST_GOALS = 6
-"""Greatest number of places for each turn of the part. Larger: more ways are tried
-together, more poses before the planner begins."""
+"""Goals for each rotation of the part, at most. Larger: more alternatives for the planner, more
+poses before it begins."""
 MOST_BLOCKERS = 8
-"""Number of objects in the hull, those that stop most pulls."""
+"""Objects in the hull: those that stop most pulls."""
 AROUND = 4.0
-"""Half of the edge of the cube around the part in which the hull is taken, radii of the part.
-Larger: the hull of large objects reaches farther than what the part meets."""
+"""Half edge of the cube around the part to which the hull's objects are clipped, radii of the part.
+Larger: hulls of large objects extend beyond the part's surroundings."""
 FEW = 4
-"""Number of places outside the hull below which the planner also seeks those that are out of all.
-Larger: the planner's room is larger."""
+"""Goals outside the hull below which goals outside all objects are added, too. Larger: a larger
+configuration space for the planner."""
 N_RANDOM = 18
-"""Random directions beside the axes. Larger: more places are looked at."""
+"""Random directions after the axes. Larger: more candidate goals."""
 ROOM = 2.0
 """Distance from the hull, voxels."""
 RETREAT = 4.0
-"""Length of the ways back from a pose that is not free, radii of the part. Larger: longer bores."""
+"""Length of the retreats from a pose that is not free, radii of the part. Larger: longer bores."""
 ASIDE = 2.0
-"""Radii of the part around all that stands in which the planner seeks a way to a pose."""
+"""Margin of the planner's box around all standing objects, for a given pose, radii of the part."""
 SAME = 1e-9
-"""Greatest difference of numbers in two poses that are one."""
+"""Greatest difference of the entries of two equal poses."""
 
 
 class Goals(Protocol):
-    """Places that the planner tries to reach.
+    """Goals of the planner.
 
-    corners (n, 3) : the planner's room holds them, beside starts and goals.
+    corners (n, 3) : points within the planner's box, in addition to starts and goals.
     """
 
     corners: Floats
 
     def poses(self, room: Room, turns: Floats, *, is_turning: bool) -> Floats:
-        """Displacements (G, 4, 4) that are free; turns (k, 3, 3) : those of the starts first."""
+        """Free displacements (G, 4, 4); turns (k, 3, 3) : rotations, of the starts first."""
 
     def beyond(self, pose: Floats) -> Floats:
-        """Displacements (n, 4, 4) that lead on from one of these places; there may be none."""
+        """Displacements (n, 4, 4) on from one of the goals; n may be 0."""
 
 
 class GoalsOutside:
-    """Goals from which the parts come out, the same for the same seed."""
+    """Goals from which the parts come out, deterministic for a seed."""
 
     def __init__(self, problem: Problem, leaving: Exit, pulls: Pulls, seed: int) -> None:
         self._problem, self._leaving, self._pulls, self._seed = problem, leaving, pulls, seed
@@ -68,7 +68,7 @@ class GoalsOutside:
         self.corners = np.empty((0, 3))
 
     def poses(self, room: Room, turns: Floats, *, is_turning: bool) -> Floats:  # noqa: ARG002
-        """Displacements (G, 4, 4), turned by each of (k, 3, 3): outside the hull, and out."""
+        """Displacements (G, 4, 4) with rotations (k, 3, 3): outside the hull, and fully out."""
         corners = self._hull()
         rng = np.random.default_rng(self._seed)
         random = rng.normal(size=(N_RANDOM, 3))
@@ -89,7 +89,7 @@ class GoalsOutside:
     def _around(
         self, room: Room, corners: Floats, directions: Floats, aside: Floats, turn: Floats
     ) -> list[Floats]:
-        """Places outside the hull with a free way out, (4, 4) each; remembers where these end."""
+        """Poses (4, 4) outside the hull with a free path out; stores the ends of these paths."""
         found: list[Floats] = []
         lengths = self._leaving.distances(directions)
         for direction, length, shift in zip(directions, lengths, aside, strict=True):
@@ -101,7 +101,7 @@ class GoalsOutside:
             way = float((center - self._problem.center) @ direction)
             out = self._placed(turn, center - self._problem.center + (length - way) * direction)
             if way >= length or not self._leaving.is_out(self._problem.shift(out)[None])[0]:
-                continue  # the hull reaches as far as everything else
+                continue  # the hull extends as far as all objects
             if room.is_motion_free(np.stack([place, out])):
                 deepest = place.copy()
                 deepest[:3, 3] -= way * direction
@@ -111,7 +111,7 @@ class GoalsOutside:
         return found
 
     def _outside(self, corners: Floats, direction: Floats, across: Floats, turn: Floats) -> Floats:
-        """Displacement (4, 4) to where the part lies beyond the hull in a direction."""
+        """Displacement (4, 4) of the part beyond the hull in a direction."""
         problem = self._problem
         placed = (problem.shell.points - problem.center) @ (turn.T @ direction)
         reach = float((corners @ direction).max()) + ROOM * problem.voxel_size - float(placed.min())
@@ -119,13 +119,13 @@ class GoalsOutside:
         return self._placed(turn, across + way * direction)
 
     def _placed(self, turn: Floats, shift: Floats) -> Floats:
-        """Displacement (4, 4) that turns the part about its middle, and then shifts it."""
+        """Displacement (4, 4): a rotation about the part's centre, then a shift."""
         pose = shifted(shift + self._problem.center - turn @ self._problem.center)
         pose[:3, :3] = turn
         return pose
 
     def _hull(self) -> Floats:
-        """Points (n, 3) whose convex hull holds what blocks near the part: corners of its boxes."""
+        """Corners (n, 3) of the clipped AABBs of the objects that stop most pulls."""
         problem = self._problem
         counts = Counter(i for pull in self._pulls.done for i in pull.blockers)
         ids = [i for i, _ in sorted(counts.items(), key=lambda one: (-one[1], one[0]))]
@@ -141,7 +141,7 @@ class GoalsOutside:
 
 
 class GoalPose:
-    """One pose, or where straight ways back from it are free, if it is not free itself."""
+    """A given pose, or poses with free straight paths to it, if it is not free itself."""
 
     def __init__(self, problem: Problem, space: FreeSpace, goal: Floats, until: float) -> None:
         self._problem, self._space, self._goal, self._until = problem, space, goal, until
@@ -150,7 +150,7 @@ class GoalPose:
         self.corners = problem.box + aside * np.array([[-1.0], [1.0]])
 
     def poses(self, room: Room, turns: Floats, *, is_turning: bool) -> Floats:
-        """The pose, or places before it; none if its turn is not the first one of (k, 3, 3)."""
+        """The pose, or poses before it; none if its rotation is not the first one of (k, 3, 3)."""
         if not is_turning and not np.allclose(self._goal[:3, :3], turns[0], atol=SAME):
             return np.empty((0, 4, 4))
         if room.are_free(self._goal[None])[0]:
@@ -159,11 +159,11 @@ class GoalPose:
         return np.array([place for place, _ in self._ways]).reshape(-1, 4, 4)
 
     def beyond(self, pose: Floats) -> Floats:
-        """The pose itself, if the place is before it."""
+        """The given pose (1, 4, 4), for a pose before it."""
         return _led_on(pose, self._ways)
 
     def _retreats(self, room: Room) -> list[Floats]:
-        """Places (4, 4), free, from which surfaces let the part pass straight to the pose."""
+        """Free poses (4, 4) with a straight path to the given pose, proved by a sweep."""
         goal, found = self._goal, list[Floats]()
         own = self._problem.own_axes @ goal[:3, :3].T
         normals = self._space.touch(goal).contact_normals
@@ -178,7 +178,7 @@ class GoalPose:
 
 
 def _led_on(pose: Floats, ways: list[tuple[Floats, Floats]]) -> Floats:
-    """The rest (n, 4, 4) of the way that begins at a pose (4, 4); empty if none does."""
+    """The rest (n, 4, 4) of the path that begins at a pose (4, 4); empty without one."""
     for place, rest in ways:
         if np.allclose(place, pose, atol=SAME):
             return rest

@@ -1,4 +1,4 @@
-"""One sweep of the part's surface judges a path, as any other path."""
+"""Proof of a path by one sweep of the part's surface."""
 
 import math
 import time
@@ -15,13 +15,13 @@ from hapticdb.extraction.result import How, WayOut
 Floats = NDArray[np.float64]
 
 LEAST = 0.1
-"""Seconds that each sweep has."""
+"""Seconds of each sweep, at least."""
 BACK = 0.1
-"""Voxels from the first hit at which a motion ends. Larger: less of a narrow way is used."""
+"""Voxels from the first hit to the end of a motion. Larger: less use of a narrow path."""
 
 
 def judge(problem: Problem, poses: Floats, how: How, until: float = math.inf) -> WayOut:
-    """Sweep the parts along a path of displacements (M, 4, 4), until a time of `monotonic`."""
+    """Sweep the parts along displacements (M, 4, 4), until a time of `time.monotonic`."""
     left = max(min(problem.until, until) - time.monotonic(), LEAST)
     found = sweep(
         problem.env, problem.shell, poses, where=problem.where, exclude=problem.exclude,
@@ -33,8 +33,8 @@ def judge(problem: Problem, poses: Floats, how: How, until: float = math.inf) ->
 class Passed(NamedTuple):
     """The part of a motion before its first hit.
 
-    given (M, 4, 4), at (M,) : the poses of the motion, and the metres before each; poses (n, 4, 4),
-    ways (n,) : poses along it before the hit, and the metres before each.
+    given (M, 4, 4), at (M,) : poses of the motion and their path parameters, metres; poses
+    (n, 4, 4), ways (n,) : samples before the hit, and their path parameters.
     """
 
     given: Floats
@@ -43,12 +43,12 @@ class Passed(NamedTuple):
     ways: Floats
 
     def until(self, n: int) -> Floats:
-        """Poses (K, 4, 4) of the motion to the n-th of `poses`."""
+        """Poses (K, 4, 4) of the motion up to the n-th of `poses`."""
         return np.concatenate([self.given[self.at < self.ways[n]], self.poses[n : n + 1]])
 
 
 def passed(problem: Problem, room: Room, poses: Floats, until: float) -> Passed:
-    """Sweep the parts along a path of displacements (M, 4, 4) to shortly before the first hit."""
+    """Sweep the parts along displacements (M, 4, 4), and return the part before the first hit."""
     way = judge(problem, poses, "pull", until)
     path = way.swept.path
     ways = room.ways(path)

@@ -1,8 +1,7 @@
-"""Ways out of straight legs along the axes, from places where a part is free.
+"""Removal paths of straight legs along the axes, from free poses of a part.
 
-A part that stands in a room often leaves it as furniture does: up from its place, along to the
-door, and out. A planner draws its places at random and seldom finds the few that are in line with
-the door.
+A part in a room often leaves it as furniture does: up, along to the door, and out. The random
+samples of a planner seldom hit the few poses in line with the door.
 """
 
 import math
@@ -21,22 +20,21 @@ from hapticdb.extraction.problem import Exit, Problem
 Floats = NDArray[np.float64]
 
 STOPS = (1, 2, 4)
-"""Numbers of places of a leg at which the next one may begin, tried one after another. More:
-narrower doors are found, by the square of as many motions."""
+"""Numbers of stops on a leg for the start of the next one, tried in turn. More: narrower doors, at
+the square of the number of motions."""
 BETWEEN, MOST_STOPS = 0.5, 8
-"""The second leg has so many more places that they lie this near to one another, radii of the part;
-and their greatest number."""
+"""Spacing of the second leg's stops, radii of the part, and their greatest number."""
 MOST_MOTIONS = 3000
-"""Greatest number of motions that are looked at."""
+"""Motions checked, at most."""
 MOST_STARTS = 12
-"""Greatest number of starts. Larger: fewer places along each of them."""
+"""Starts, at most. Larger: fewer stops on each."""
 
 
 class Legs(NamedTuple):
-    """Searches ways of one problem's parts.
+    """Search by legs for one problem.
 
-    problem, room, leaving : what is to come out, where it is free, where it is out; until : time of
-    `time.monotonic` at which the search ends.
+    problem, room, leaving : the parts, their free space, their exit; until : end of the search,
+    `time.monotonic`.
     """
 
     problem: Problem
@@ -45,10 +43,10 @@ class Legs(NamedTuple):
     until: float
 
     def search(self, starts: list[Loosened]) -> tuple[Loosened, Floats] | None:
-        """A start, and the way (M, 4, 4) to its end or a place before, and out by one or two legs.
+        """A start, and a path (M, 4, 4) to its end or a stop before it, then one or two legs out.
 
-        From all ends by one leg, then by two; then also from places of the way to each start.
-        Starts that lie along an axis come first.
+        One leg from all ends comes first, then two legs, then also stops on the path to each start.
+        Starts along an axis precede others.
         """
         first = sorted(starts, key=lambda one: not _is_along_axis(one))[:MOST_STARTS]
         tried: set[bytes] = set()
@@ -65,7 +63,7 @@ class Legs(NamedTuple):
         return None
 
     def _tries(self, starts: list[Loosened]) -> Iterator[tuple[Loosened, Floats, Floats]]:
-        """Starts, ways (M, 4, 4) from there to a place, and axes (3,) that may lead out."""
+        """Starts, paths (M, 4, 4) to a stop, and axes (3,) of the last leg."""
         for start in starts:
             for axis in AXES:
                 yield start, start.poses, axis
@@ -80,7 +78,7 @@ class Legs(NamedTuple):
                                 yield start, longer, out
 
     def _end(self, here: Floats, axis: Floats) -> Floats:
-        """Displacement (4, 4) straight on along an axis to where the part is out."""
+        """Displacement (4, 4) straight on along an axis until the part is out."""
         shift = self.problem.shift(here)
         way = float(self.leaving.distances(axis[None])[0]) - float(shift @ axis)
         out = here.copy()
@@ -88,7 +86,7 @@ class Legs(NamedTuple):
         return out
 
     def _along(self, here: Floats, axis: Floats, n_stops: int) -> Floats:
-        """Places (n, 4, 4) along an axis as far as it is free; none if it is not for a voxel."""
+        """Stops (n, 4, 4) on the free leg along an axis; none if it is shorter than a voxel."""
         ends = np.stack([here, self._end(here, axis)])
         last = self.room.farthest(ends)
         way = float(np.linalg.norm(last[:3, 3] - here[:3, 3]))
@@ -98,7 +96,7 @@ class Legs(NamedTuple):
         return _between(here, last, max(n_stops, min(wanted, MOST_STOPS)))
 
     def _stops(self, begin: Floats, end: Floats, n_stops: int) -> Floats:
-        """Places (n, 4, 4) of the last leg to a start at which the part is free; with its end."""
+        """Free stops (n, 4, 4) on the last leg to a start, its end included."""
         if not np.array_equal(begin[:3, :3], end[:3, :3]):
             return end[None]
         stops = _between(begin, end, n_stops)
@@ -106,13 +104,13 @@ class Legs(NamedTuple):
 
 
 def _is_along_axis(start: Loosened) -> bool:
-    """Whether the last leg to a start lies along an axis."""
+    """Whether the last leg to a start is parallel to an axis."""
     shift = start.poses[-1, :3, 3] - start.poses[-2, :3, 3]
     return bool(np.abs(shift).max() >= 0.999 * np.linalg.norm(shift))
 
 
 def _between(begin: Floats, end: Floats, n: int) -> Floats:
-    """Displacements (n, 4, 4) that shift from one to another, evenly spaced; the last one first."""
+    """Displacements (n, 4, 4), evenly spaced shifts from the second one back to the first."""
     stops = np.tile(end, (n, 1, 1))
     shares = np.linspace(1.0, 0.0, n, endpoint=False)[:, None]
     stops[:, :3, 3] = begin[:3, 3] + shares * (end[:3, 3] - begin[:3, 3])

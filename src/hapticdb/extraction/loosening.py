@@ -1,8 +1,7 @@
-"""Motions with turns: small ones by which a part leaves what it touches, and screws.
+"""Motions with turns: small ones out of contact, and screws.
 
-Voxels of two surfaces that touch are shared, so a part that touches something is not free at its
-start. A sweep says how far each motion out of contact goes: sliding along a surface, not cutting
-into it.
+Touching surfaces share voxels, so a part in contact is not free at its start. A sweep bounds each
+motion out of contact: the part may slide along a surface, but not cut into it.
 """
 
 import heapq
@@ -30,24 +29,24 @@ from hapticdb.poses import rotation_of
 Floats = NDArray[np.float64]
 
 FARTHEST = 4.0
-"""Length of a shift in contact, radii of the part. Larger: longer slots are left, more poses."""
+"""Length of a shift in contact, radii of the part. Larger: longer slots, more poses."""
 WIDEST = 2.0
-"""Angle of a turn in contact, radians. Larger: wider turns are found, more poses."""
+"""Angle of a turn in contact, radians. Larger: wider turns, more poses."""
 ARC = 0.17
-"""Angle of a step of a turn, radians. Smaller: turns about places far from the part's middle are
+"""Angle of a step of a turn, radians. Smaller: turns about points far from the part's centre are
 followed more exactly, by more poses."""
 MOST_SHIFTS = 24
-"""Greatest number of shifts tried from a place. Larger: oblique ways are found, a slower search."""
+"""Shifts tried from a pose, at most. Larger: oblique paths, a slower search."""
 MOST_TURNED = 12
-"""Greatest number of turns about a centre, to the right or to the left."""
+"""Turns about a centre, at most: each axis counts once for each sense."""
 APART = 2.0
-"""Motion, voxels, between two places from which motions are tried. Larger: fewer places."""
+"""Least motion between two poses from which motions are tried, voxels. Larger: fewer poses."""
 
 
 class Loosened(NamedTuple):
-    """A way out of contact: displacements (M, 4, 4) from the start to a place that is free.
+    """A path out of contact: displacements (M, 4, 4) from the start to a free pose.
 
-    is_wide : whether that place is free in the wide room.
+    is_wide : whether the end is free in the wide space.
     """
 
     poses: Floats
@@ -57,8 +56,8 @@ class Loosened(NamedTuple):
 class Twist(NamedTuple):
     """A small motion: shift (3,) or turn (3,) about `center` (3,), metres a unit of motion.
 
-    The part's middle or its farthest point moves about one metre a unit. opposed : share of the
-    contacts that the motion presses against.
+    The part's centre or its farthest point moves about one metre a unit. opposed : share of the
+    opposing contacts.
     """
 
     shift: Floats
@@ -69,7 +68,7 @@ class Twist(NamedTuple):
     def along(self, pose: Floats, farthest: float, widest: float = WIDEST) -> Floats:
         """Displacements (M, 4, 4) from a first one on: by `farthest` metres, or `widest` radians.
 
-        Between two of them a part moves straight while it turns: a turn has steps of `ARC`.
+        Between two of them the part's centre moves straight; a turn has steps of `ARC`.
         """
         speed = float(np.linalg.norm(self.turn))
         amount = min(farthest, widest / speed) if speed > 0.0 else farthest
@@ -87,7 +86,7 @@ class Twist(NamedTuple):
 
 
 class Loosening:
-    """Searches motions out of contact, shifts and turns one after another, best places first.
+    """Best-first search for motions out of contact, of shifts and turns in sequence.
 
     n_motions : number of motions tried so far.
     """
@@ -97,7 +96,7 @@ class Loosening:
         self.n_motions = 0
 
     def search(self, most_motions: int, until: float) -> list[Loosened]:
-        """Ways out of contact, those to the wide room first; ends at a time of `monotonic`."""
+        """Paths out of contact, into the wide space first; until a time of `time.monotonic`."""
         found: list[Loosened] = []
         places = [np.eye(4)]
         waiting: list[tuple[int, int, Floats]] = [(0, 0, np.eye(4)[None])]
@@ -121,7 +120,7 @@ class Loosening:
     def _follow(
         self, way: Floats, twist: Twist, until: float
     ) -> tuple[list[Loosened], list[tuple[int, Floats]]]:
-        """Move on until a hit: ways that end free, or (M, 4, 4) in contact with their hits."""
+        """Follow a twist to its first hit: paths with a free end, or in contact with their hits."""
         room, farthest = self._space.room, FARTHEST * self._problem.radius
         moved = passed(self._problem, room, twist.along(way[-1], farthest), until)
         if len(moved.poses) < 2:
@@ -140,7 +139,7 @@ class Loosening:
         return [], [(int(counts[n]), longer(n)) for n in sorted(ends)]
 
     def _free(self, poses: Floats) -> tuple[list[int], bool]:
-        """Middle and end of free poses (n, 4, 4): of those in the wide room, if any are."""
+        """Middle and last index of free poses (n, 4, 4), preferably in the wide space."""
         first, last = first_run(self._space.wide.are_free(poses))
         is_wide = first < last
         if not is_wide:
@@ -148,7 +147,7 @@ class Loosening:
         return sorted({(first + last) // 2, last - 1}), is_wide
 
     def _is_new(self, pose: Floats, places: list[Floats]) -> bool:
-        """Whether a displacement differs from all others by more than `APART`, about."""
+        """Whether a displacement differs from all others by more than `APART`, estimated."""
         others = np.array(places)
         turns = np.linalg.norm(pose[:3, :3] - others[:, :3, :3], axis=(1, 2)) / np.sqrt(2.0)
         shifts = (pose[:3, :3] - others[:, :3, :3]) @ self._problem.center
@@ -157,7 +156,7 @@ class Loosening:
         return bool((motions > APART * self._problem.voxel_size).all())
 
     def _twists(self, pose: Floats) -> list[Twist]:
-        """Shifts and turns to try at a displacement: those that fewest contacts oppose first."""
+        """Shifts and turns at a displacement, in the order of their shares of opposing contacts."""
         problem, felt = self._problem, self._space.touch(pose)
         points, normals = felt.contact_points, felt.contact_normals
         center, still = pose[:3, :3] @ problem.center + pose[:3, 3], np.zeros(3)
@@ -179,7 +178,7 @@ class Loosening:
 
 
 def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals: Floats) -> float:
-    """Share of the contacts, 0 .. 1, that a motion presses against."""
+    """Share of the contacts, 0 .. 1, opposed to a motion."""
     if not len(points):
         return 0.0
     speeds = shift + np.cross(turn, points - about)
@@ -188,10 +187,10 @@ def _opposed(shift: Floats, turn: Floats, about: Floats, points: Floats, normals
 
 
 def unscrewed(problem: Problem, leaving: Exit, pitch: float, until: float) -> WayOut | None:
-    """First screw motion that is not refuted, along the part's axes and the world's, of both hands.
+    """First screw motion not refuted, along the part's axes and the world's, of both hands.
 
-    pitch : metres a turn. The axis goes through the middle of the part. A bolt turns for its own
-    length, a nut until it is past what its box meets; then either goes straight.
+    pitch : metres a turn. The axis is through the part's centre. A bolt turns for its own length, a
+    nut until it is past the objects in its box; then the part moves straight.
     """
     low, high = problem.corners.min(axis=0), problem.corners.max(axis=0)
     boxes = [obj.bounds for obj in problem.standing]

@@ -1,7 +1,6 @@
-"""Searches a path round corners and with turns, by a planner in a process of its own.
+"""Planned paths round corners and with turns; the planner runs in a process of its own.
 
-The search answers the planner's questions whether a motion is free. It ends the process at its
-deadline.
+The search answers the planner's motion queries, and ends the process at its deadline.
 """
 
 import time
@@ -25,40 +24,39 @@ from hapticdb.session.processes.process import Process
 Floats = NDArray[np.float64]
 
 MOST_STARTS = 12
-"""Greatest number of pulls at whose ends the planner starts. Larger: more directions are tried
-together."""
+"""Starts of the planner, at most. Larger: more directions in one plan."""
 LEAVING = 2.0
-"""Voxels in contact up to which voxels tell how far a pull goes; of a longer one a sweep has to.
-Larger: more starts on the far side of thin walls."""
+"""Longest contact, voxels, of a pull trusted without a sweep. Larger: more starts on the far side
+of thin walls."""
 STRIDE = 0.5
-"""Greatest distance of two neighbouring states, in radii of the part. Larger: fewer questions in
-the open, more of them refused in narrow places."""
+"""Greatest distance of neighbouring states, radii of the part. Larger: fewer queries in open space,
+more of them refused in narrow passages."""
 SHARE_OF_WIDE = 0.6
-"""Share of the questions and of the time for ways that keep clearance; the rest is for narrower
-ones, of which more are refused by the proof."""
+"""Share of queries and time for paths with clearance; narrower paths, refuted more often by sweeps,
+have the rest."""
 SHARE_OF_SHIFTS = 0.3
-"""Share of the questions and of the time that go to shifts without turns, which need far fewer."""
+"""Share of queries and time for plans without turns, which need far fewer queries."""
 SHARE_OF_LEGS = 0.3
-"""Greatest share of the time that goes to straight legs along the axes. Their motions are no
-questions of the planner, and not counted as such."""
+"""Greatest share of the time for straight legs along the axes. Their motions are no queries of the
+planner, and not counted as such."""
 SHARE_OF_LOOSENING = 0.2
-"""Share of the questions and of the time that go to motions out of contact, where no pull is free.
-Larger: longer ways out of contact are found, less is left for what follows."""
+"""Share of queries and time for motions out of contact, if no pull is free. Larger: longer paths
+out of contact, less for the planner."""
 MOST_TURNS = 8
-"""Greatest number of turns at which goals are sought. Larger: more places to reach, each one looked
-at before the planner begins."""
+"""Rotations for which goals are searched, at most. Larger: more goals, and more checks before the
+planner begins."""
 QUARTERS = np.array(
     [[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
      [[0, -1, 0], [1, 0, 0], [0, 0, 1]]], dtype=np.float64,
 )  # fmt: skip
-"""Quarter turns about the axes: the planner seeks places outside also with these."""
+"""Quarter turns about the axes, for further rotations of goals outside."""
 ENDING = 1.0
-"""Seconds that a process that has closed its pipe has to end. Larger: its end is told later."""
+"""Seconds for the exit of a process after it closed its pipe. Larger: its end is reported later."""
 WORK = "hapticdb.extraction.planner_child:plan"
 
 
 class _Share(NamedTuple):
-    """A share of a search: the questions that it may ask, and when it ends."""
+    """Budget of a part of the search: motion queries, and its end (`time.monotonic`)."""
 
     motions: int
     until: float
@@ -67,10 +65,9 @@ class _Share(NamedTuple):
 class Planner:
     """Plans for one problem.
 
-    problem, space : what is to come out, and where it is free. pulls : tried before; planning
-    starts where they end. goals : what is to be reached. leaving : where the parts are out; None
-    where they are to reach a pose. seed, most_motions, until : of the planner; questions that it
-    may ask; time of `time.monotonic` at which it ends.
+    problem, space : the parts and their free space. pulls : done before; plans start at their ends.
+    goals : to reach. leaving : the exit; None for a goal pose. seed : of the planner;
+    most_motions : motion queries, at most; until : end, `time.monotonic`.
     """
 
     def __init__(
@@ -94,18 +91,18 @@ class Planner:
 
     @property
     def can_refuse(self) -> bool:
-        """Whether another start is left beside that of the last path, with questions and time."""
+        """Whether another start remains after that of the last path, with queries and time."""
         is_left = self._starts is not None and len(self._starts) > 1
         return is_left and self.n_motions < self._most and time.monotonic() < self._until
 
     def refuse(self) -> None:
-        """Do not start again where the last path did, because its way there is refuted."""
+        """Drop the start of the last path, because its first part is refuted."""
         self._starts = [one for one in self._starts or [] if one is not self._used]
 
     def search(self) -> Floats | None:
         """Path (M, 4, 4) of displacements from the start to the goal, or None.
 
-        Searched in the wide room first, and by shifts alone; then in all that is free.
+        The wide space is searched first, and in each space shifts alone before turns.
 
         Raises `MissingExtraError` if OMPL is not installed.
         """
@@ -126,7 +123,7 @@ class Planner:
         return None
 
     def _by_legs(self, leaving: Exit, wide: list[Loosened]) -> Floats | None:
-        """Path (M, 4, 4) out by straight legs along axes, from starts in the wide room if any."""
+        """Path (M, 4, 4) out by straight legs along axes, from starts in the wide space if any."""
         room = self._space.wide if wide else self._space.room
         until = self._part(SHARE_OF_LEGS).until
         found = Legs(self._problem, room, leaving, until).search(wide or self._starts or [])
@@ -136,12 +133,12 @@ class Planner:
         return path
 
     def _part(self, share: float) -> _Share:
-        """A share of the questions and of the time that are left."""
+        """A share of the remaining queries and time."""
         now, left = time.monotonic(), max(self._most - self.n_motions, 0)
         return _Share(max(int(share * left), 1), now + share * (self._until - now))
 
     def _in_room(self, room: Room, starts: list[Loosened], part: _Share) -> Floats | None:
-        """Path from one of the starts, in one room: by shifts, and by turns, too."""
+        """Path from one of the starts, in one space: by shifts alone, then with turns."""
         now, asked = time.monotonic(), self.n_motions
         soon = _Share(
             max(int(SHARE_OF_SHIFTS * part.motions), 1), now + SHARE_OF_SHIFTS * (part.until - now)
@@ -153,10 +150,11 @@ class Planner:
         return self._ask(room, starts[:MOST_STARTS], self._problem.radius, left)
 
     def _found_starts(self) -> list[Loosened]:
-        """Ways to where the planner starts: pulls; where none ends in the wide room, others, too.
+        """Paths to the planner's starts: pulls; if none ends in the wide space, others, too.
 
-        Of each pull that goes anywhere, the farthest place; the longest pulls first. If a pose is
-        to be reached, the start itself, where it is free.
+        The start of a pull is the end of its first free run; the longest pulls come first. The
+        others are motions out of contact. For a goal pose, the parts' own pose is the only start if
+        it is free in the wide space.
         """
         here = np.eye(4)[None]
         if self._leaving is None and self._space.wide.are_free(here)[0]:
@@ -188,9 +186,10 @@ class Planner:
     def _ask(
         self, room: Room, starts: list[Loosened], turning: float, part: _Share
     ) -> Floats | None:
-        """Let a process plan; returns displacements (M, 4, 4) from the start, or None.
+        """Plan in a process; returns displacements (M, 4, 4) from the start, or None.
 
-        Without turns, those starts take part that are turned as the first one is.
+        turning : weight of a turn, metres a radian; 0 for shifts alone, from those starts with the
+        rotation of the first one.
         """
         turn = starts[0].poses[-1][:3, :3] if turning == 0.0 else None
         if turn is not None:
@@ -215,7 +214,7 @@ class Planner:
     def _answer(
         self, room: Room, request: PlanRequest, turn: Floats | None, until: float
     ) -> Floats | None:
-        """Answer a planner's questions until it has a path: its states (n, 7), or None."""
+        """Answer the planner's queries until its path: states (n, 7), or None."""
         with Process(WORK, request, ()) as process:
             while True:
                 message = process.receive(until - time.monotonic())
@@ -233,12 +232,12 @@ class Planner:
                 process.send(room.is_motion_free(self._poses(rows, turn)))
 
     def _rows(self, poses: Floats) -> Floats:
-        """States (n, 7) of displacements (n, 4, 4): place of the part's middle, and its turn."""
+        """States (n, 7) of displacements (n, 4, 4): position of the part's centre, quaternion."""
         places = poses[:, :3, :3] @ self._problem.center + poses[:, :3, 3]
         return np.hstack([places, quaternion_of(poses[:, :3, :3])])
 
     def _poses(self, rows: Floats, turn: Floats | None) -> Floats:
-        """Displacements (n, 4, 4) of states (n, 7), turned as `turn` (3, 3) says if it is given."""
+        """Displacements (n, 4, 4) of states (n, 7); `turn` (3, 3) replaces their rotations."""
         poses = np.tile(np.eye(4), (len(rows), 1, 1))
         if turn is None:
             turns = rows[:, 3:] / np.linalg.norm(rows[:, 3:], axis=1)[:, None]
@@ -251,7 +250,7 @@ class Planner:
     def _path(
         self, rows: Floats, turn: Floats | None, starts: list[Loosened], first: Floats
     ) -> Floats:
-        """Whole path of displacements (M, 4, 4): to where the planner began, and to the end."""
+        """Whole path of displacements (M, 4, 4): to the planner's start, along its states, on."""
         off = np.abs(first[:, :3] - rows[0, :3]).max(axis=1)
         if turn is None:
             signs = np.sign((first[:, 3:] * rows[0, 3:]).sum(axis=1))[:, None]
@@ -265,7 +264,7 @@ class Planner:
 
 
 def _distinct_turns(turns: Floats) -> Floats:
-    """Rotations (k, 3, 3) of rotations (n, 3, 3), each once, the first ones first."""
+    """Distinct rotations (k, 3, 3) of rotations (n, 3, 3), in their order."""
     kept: list[Floats] = []
     for turn in turns:
         if not any(np.allclose(turn, other, atol=SAME) for other in kept):

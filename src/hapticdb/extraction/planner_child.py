@@ -1,7 +1,7 @@
-"""The planner's process: RRT-Connect of OMPL, which asks the search whether motions are free.
+"""The planner's process: OMPL's RRT-Connect, with motion queries sent to the search.
 
-OMPL stays in this process, because it prints reports when it is unloaded, and so that it can be
-ended at any time. The process neither reads the database nor loads numba.
+OMPL prints reports when it is unloaded, and must end at a deadline: hence a process. It neither
+reads the database nor loads numba.
 """
 
 import os
@@ -16,16 +16,16 @@ from hapticdb.session.processes.process import MessageSender, receive_from_paren
 Floats = NDArray[np.float64]
 
 SHORTCUTS = 60
-"""Attempts to shorten a found path. Larger: shorter paths with fewer poses, more motions asked."""
+"""Attempts to shorten a path. Larger: shorter paths with fewer poses, more motion queries."""
 
 
 class PlanRequest(NamedTuple):
-    """What the planner is asked.
+    """Request to the planner.
 
     States are rows of position (m) and unit quaternion, scalar first. starts (S, 7), goals (G, 7);
-    low, high (3,) : box of the positions; turning : weight of a turn of one radian, metres, or 0 to
-    only shift; stride : greatest distance of two neighbouring states; seed; most_motions : motions
-    to ask at most.
+    low, high (3,) : box of the positions; turning : weight of a turn, metres a radian, or 0 for
+    shifts alone; stride : greatest distance of neighbouring states; seed; most_motions : motion
+    queries, at most.
     """
 
     starts: Floats
@@ -39,7 +39,7 @@ class PlanRequest(NamedTuple):
 
 
 def plan(request: PlanRequest, sender: MessageSender) -> None:
-    """Search a path and send it: the word ``motion`` asks, ``path`` ends.
+    """Search for a path and send it: a message ``motion`` is a query, ``path`` is the last one.
 
     Raises `MissingExtraError` if OMPL is not installed.
     """
@@ -54,7 +54,7 @@ def plan(request: PlanRequest, sender: MessageSender) -> None:
 
 
 class _Search:
-    """One search: the state space, the questions, the planner."""
+    """State space, motion queries and planner of one search."""
 
     def __init__(self, request: PlanRequest, sender: MessageSender) -> None:
         from ompl import base, util  # noqa: PLC0415
@@ -80,7 +80,7 @@ class _Search:
         self._info.setup()
 
     def path(self) -> Floats | None:
-        """States (n, 7) of a path, shortened; None if none was found."""
+        """States (n, 7) of a shortened path; None without one."""
         from ompl import geometric  # noqa: PLC0415
 
         problem = self._base.ProblemDefinition(self._info)
@@ -99,8 +99,8 @@ class _Search:
             return None
         found = problem.getSolutionPath()
         shorter = geometric.PathSimplifier(self._info)
-        self.n_motions -= self._request.most_motions  # the path is there: as many once more
-        # numbers of steps, no seconds: the same seed gives the same path
+        self.n_motions -= self._request.most_motions  # as many queries again for shortcuts
+        # limits of steps, not of seconds: the same seed gives the same path
         shorter.reduceVertices(found, SHORTCUTS, SHORTCUTS)
         shorter.partialShortcutPath(found, SHORTCUTS, SHORTCUTS)
         shorter.collapseCloseVertices(found, SHORTCUTS, SHORTCUTS)
@@ -120,7 +120,7 @@ class _Search:
         return AskingValidator(self._info)
 
     def _is_free(self, start: Any, end: Any) -> bool:  # noqa: ANN401
-        """Ask the search whether a motion is free; no, when all questions are spent."""
+        """Query the search whether a motion is free; False once the queries are spent."""
         if self._is_spent:
             return False
         self.n_motions += 1

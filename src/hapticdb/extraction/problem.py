@@ -1,4 +1,4 @@
-"""What is to come out, and what stands around it."""
+"""The problem of a search: moving parts, standing objects, and the exit."""
 
 import math
 from collections.abc import Sequence
@@ -19,24 +19,23 @@ from hapticdb.store.finding import Words
 Floats = NDArray[np.float64]
 
 SPACING = 0.5
-"""Voxels from point to point of what the search moves. Larger: more paths that the proof refuses, a
-faster search."""
+"""Spacing of the search's points, voxels. Larger: a faster search, more refuted paths."""
 MOST_POINTS = 40_000
-"""Greatest number of these points; as for `SPACING`."""
+"""Number of these points, at most; as for `SPACING`."""
 GUARD = 1.0
-"""Clearance, voxels, that the planner wants first: points, voxels and steps are coarser than
-surfaces. Larger: fewer paths that the proof refuses, wider ways."""
+"""Clearance of the planner's first plans, voxels, since points, voxels and steps are coarser than
+surfaces. Larger: fewer paths refuted by the proof, narrow passages missed."""
 
 
 class Problem(NamedTuple):
-    """Parts that are to come out as one rigid body, and the objects that stand.
+    """Parts to be removed as one rigid body, and the standing objects.
 
-    parts : the objects that move, at their places; where, exclude : words of what is felt,
-    `exclude` with the parts' ids; contact, overlap : of the sweeps that prove paths; standing : the
-    objects that are felt; box (2, 3) : corners of their bounding box, metres; shell : points of the
-    parts' surface, world frame, so that its poses are displacements; corners (8, 3), center (3,) :
+    parts : the moving objects at their poses; where, exclude : filter of the objects that collide,
+    `exclude` with the parts' ids; contact, overlap : tolerances of the proving sweeps; standing :
+    the objects that collide; box (2, 3) : corners of their bounding box, metres; shell : points of
+    the parts' surface, world frame, so its poses are displacements; corners (8, 3), center (3,) :
     of the surface's bounding box; radius : greatest distance of the surface from there, metres;
-    until : time of `time.monotonic` at which the search ends, with its sweeps.
+    until : end of the search with its sweeps, `time.monotonic`.
     """
 
     env: Environment
@@ -60,17 +59,17 @@ class Problem(NamedTuple):
 
     @property
     def own_axes(self) -> Floats:
-        """Axes (6, 3) of the first part's frame, and the principal ones of the surface."""
+        """Axes (6, 3): of the first part's frame, and principal axes of the surface."""
         corners = self.shell.outline
         _, principal = np.linalg.eigh(np.cov(corners.T))
         return np.concatenate([self.parts[0].transform[:3, :3].T, principal.T])
 
     def shift(self, pose: Floats) -> Floats:
-        """How far (3,) a displacement (4, 4) shifts the part's middle."""
+        """Shift (3,) of the part's centre by a displacement (4, 4)."""
         return np.asarray(pose[:3, :3] @ self.center + pose[:3, 3] - self.center)
 
     def path(self, poses: Floats) -> ToolPath:
-        """Motion through displacements (M, 4, 4), as in a sweep; it bounds that of each place."""
+        """Motion through displacements (M, 4, 4), as in a sweep, with its bound for each point."""
         return ToolPath.of(poses, self.corners, self.center)
 
 
@@ -78,7 +77,7 @@ def problem_of(
     env: Environment, words: Words, where: Words, exclude: Words, *, seed: int, contact: float,
     overlap: float,
 ) -> Problem:  # fmt: skip
-    """Read the parts that words choose, and look up what stands.
+    """Problem of the parts and the standing objects chosen by words.
 
     Raises `ObjectNotFoundError` if a word chooses nothing. Raises `UsageError` if no word is given,
     a part is a point cloud, or nothing else stands.
@@ -109,7 +108,7 @@ def _box_of(standing: Sequence[Object]) -> Floats:
 
 
 def guarded_shell(shell: PointShell, voxel_size: float) -> PointShell:
-    """Add to the points of a shell the same points, `GUARD` voxels outside the surface."""
+    """Shell with a second point `GUARD` voxels outside the surface for each point."""
     outside = shell.points - GUARD * voxel_size * shell.normals
     pairs = np.stack([shell.points, outside], axis=1).reshape(-1, 3)
     return PointShell(
@@ -118,11 +117,11 @@ def guarded_shell(shell: PointShell, voxel_size: float) -> PointShell:
 
 
 class Exit(NamedTuple):
-    """Where a part counts as out.
+    """Region outside: a part within it is removed.
 
-    low, high (3,) : corners of the box of all that stands; center (3,) : middle of the part at its
-    start; radius : of its bounding sphere with a margin; out : distance from the start at which
-    it counts as out in any case, or None. Metres.
+    low, high (3,) : corners of the box of all standing objects; center (3,) : centre of the part at
+    its start; radius : of its bounding sphere with a margin; out : distance from the start at which
+    the part is out in any case, or None. Metres.
     """
 
     low: Floats
@@ -141,7 +140,7 @@ class Exit(NamedTuple):
         return np.asarray(ways if self.out is None else np.minimum(ways, self.out))
 
     def is_out(self, shifts: Floats) -> NDArray[np.bool_]:
-        """Whether the part is out with its middle shifted by (n, 3) metres."""
+        """Whether the part is out after shifts (n, 3) of its centre, metres."""
         middles = self.center + shifts
         gaps = np.maximum(np.maximum(self.low - middles, middles - self.high), 0.0)
         is_clear = gaps.max(axis=1) >= (1.0 - 1e-9) * self.radius
@@ -150,5 +149,5 @@ class Exit(NamedTuple):
         return np.asarray(is_clear | (np.linalg.norm(shifts, axis=1) >= (1.0 - 1e-9) * self.out))
 
     def goals(self, directions: Floats) -> Floats:
-        """Shifts (D, 3) at which the part is out, one along each unit direction (D, 3)."""
+        """Shifts (D, 3) until the part is out, along unit directions (D, 3)."""
         return np.asarray(directions * self.distances(directions)[:, None])

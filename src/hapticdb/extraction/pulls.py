@@ -1,4 +1,4 @@
-"""Straight pulls: how far a part goes in each direction before something is in the way."""
+"""Straight pulls: free length of a part in each direction, and the objects in its way."""
 
 import time
 from collections.abc import Iterator
@@ -24,28 +24,27 @@ from hapticdb.store.base import Progress
 Floats = NDArray[np.float64]
 
 GROWTH = 1.2
-"""A part slides along what it touches at its start while it has at most so many times the hits of
-its start. Larger: more pulls that the proof refuses."""
+"""Factor of the hits at the start up to which a part still slides along its contacts. Larger: more
+pulls refuted by the proof."""
 MOST_OPPOSED = 0.1
-"""Greatest share of the contacts at the start that a pull may press against. Larger: more pulls
-that the proof refuses."""
+"""Greatest share of opposing contacts at the start of a pull. Larger: more refuted pulls."""
 MOST_LIKELY = 24
-"""Greatest number of pulls that are swept, of those that the part's axes or contacts suggest.
-Larger: more oblique bores are left, at the price of a sweep each."""
+"""Pulls along likely directions that are swept, at most. Larger: more oblique bores, more
+sweeps."""
 SHARE_OF_PULL = 0.5
-"""Share of the time left that the sweep of one of them has."""
+"""Share of the remaining time for the sweep of one of them."""
 BLOCKS = (8, 64)
-"""Poses that are looked at together: at first, since most pulls are blocked soon, and at most; each
-block is twice as long as the one before."""
+"""Poses of the first check, since most pulls are blocked soon, and of the largest; each check has
+twice as many as the one before."""
 
 
 class Pull(NamedTuple):
     """A straight pull.
 
     direction (3,) : unit vector; length : metres until the part is out; touching : metres in
-    contact with what it touches at its start; free : metres until the first other hit, `length` if
-    there is none; blockers : ids of the objects at the first hit in the way; is_swept : whether a
-    sweep says so, not voxels.
+    contact with the objects touched at the start; free : metres until the first other hit, `length`
+    without one; blockers : ids of the objects at the first hit; is_swept : measured by a sweep, not
+    by voxels.
     """
 
     direction: Floats
@@ -57,7 +56,7 @@ class Pull(NamedTuple):
 
     @property
     def is_out(self) -> bool:
-        """Whether nothing is in the way until the part is out."""
+        """Whether the pull is free until the part is out."""
         return self.free >= self.length
 
     def poses(self, ways: Floats) -> Floats:
@@ -68,7 +67,7 @@ class Pull(NamedTuple):
 class Pulls:
     """Pulls in all candidate directions, until a deadline.
 
-    done : in the order in which they were tried: those that are swept first.
+    done : in the order of trial, swept ones first.
     """
 
     def __init__(self, problem: Problem, space: FreeSpace, leaving: Exit, seed: int) -> None:
@@ -86,7 +85,7 @@ class Pulls:
         self._opposed = opposed_shares(self._directions, normals)
 
     def run(self, until: float, progress: Progress | None) -> None:
-        """Try other directions by voxels, one at least; stops at a time of `time.monotonic`."""
+        """Try the other directions by voxels, at least one; until a time of `time.monotonic`."""
         total = len(self._directions)
         for n in range(total):
             if n in self._swept:
@@ -98,9 +97,9 @@ class Pulls:
                 progress(len(self.done), total)
 
     def sweep(self, until: float) -> WayOut | None:
-        """Sweep likely pulls until one is free; None if none is, or at a time of `monotonic`.
+        """Sweep likely pulls until one is free; None without one, or at a time of `time.monotonic`.
 
-        Those along axes come first, then those that fewest contacts oppose, the shortest first.
+        Axes come first, then directions with few opposing contacts, shorter pulls first.
         """
         likely = np.flatnonzero(self._is_likely)
         order = np.lexsort(
@@ -114,7 +113,7 @@ class Pulls:
             poses = poses_along(direction, np.array([0.0, length]))
             way = judge(self._problem, poses, "pull", now + SHARE_OF_PULL * max(until - now, 0.0))
             if not (way.in_way or way.swept.is_free):
-                continue  # the time was over
+                continue  # undecided: out of time
             self._swept.add(n)
             blockers = ids_of(way.in_way[:1])  # it ends at the first
             free = way.free_share * length
@@ -126,10 +125,10 @@ class Pulls:
     def _pull(self, n: int) -> Pull:
         direction, length = self._directions[n], float(self._lengths[n])
         touching, free, blockers = 0.0, 0.0, self._opposing(direction)
-        if self._opposed[n] <= MOST_OPPOSED:  # else it is blocked where it starts
+        if self._opposed[n] <= MOST_OPPOSED:  # else blocked at the start
             ways = np.linspace(0.0, length, int(np.ceil(length / self._step)) + 1)
             contact, end = self._followed(direction, ways)
-            if contact == len(ways):  # still in contact where it should be out
+            if contact == len(ways):  # in contact all the way
                 touching, blockers = length, ids_of(self._space.start.objects)
             else:
                 touching = float(ways[contact]) if contact < end else 0.0
@@ -141,7 +140,7 @@ class Pulls:
         return Pull(direction, length, touching, free, blockers)
 
     def _followed(self, direction: Floats, ways: Floats) -> tuple[int, int]:
-        """Number of the first poses after (n,) metres in contact, and of those before a hit."""
+        """Numbers of the poses in contact from the start and before a hit, after (n,) metres."""
         contact, most, room = 0, -1.0, self._space.room
         for first, end in _blocks(len(ways)):
             poses = poses_along(direction, ways[first:end])
@@ -160,7 +159,7 @@ class Pulls:
         return contact, len(ways)
 
     def _opposing(self, direction: Floats) -> tuple[int, ...]:
-        """Ids of the objects whose contacts at the start a direction presses against."""
+        """Ids of the objects with contacts at the start opposed to a direction."""
         start = self._space.start
         against = start.contacts[start.contact_normals @ direction < AGAINST]
         pairs = start.contact_pairs[np.isin(start.contact_pairs[:, 0], against)]
@@ -176,7 +175,7 @@ def _blocks(n: int) -> Iterator[tuple[int, int]]:
 
 
 def first_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
-    """First and last + 1 index of the first run of true flags (n,); equal if there is none."""
+    """First and last + 1 index of the first run of true flags (n,); equal without one."""
     if not flags.any():
         return 0, 0
     first = int(np.argmax(flags))
@@ -185,12 +184,12 @@ def first_run(flags: NDArray[np.bool_]) -> tuple[int, int]:
 
 
 def shifted(shift: Floats) -> Floats:
-    """Pose (4, 4) that shifts by (3,) metres."""
+    """Pose (4, 4) of a shift (3,), metres."""
     return np.asarray(poses_along(shift, np.ones(1))[0])
 
 
 def poses_along(direction: Floats, ways: Floats) -> Floats:
-    """Poses (n, 4, 4) that shift by (n,) metres in a direction (3,)."""
+    """Poses (n, 4, 4) of shifts by (n,) metres in a direction (3,)."""
     poses = np.tile(np.eye(4), (len(ways), 1, 1))
     poses[:, :3, 3] = ways[:, None] * direction
     return poses

@@ -1,4 +1,4 @@
-"""Results of a search for a way out, in metres and displacements."""
+"""Results of a search for a removal path, in metres and displacements."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -24,7 +24,7 @@ def ids_of(parts: Sequence[Object]) -> tuple[int, ...]:
 
 
 class Blocker(NamedTuple):
-    """An object in the way: pulls : number of the straight pulls that it stops."""
+    """An object in the way; pulls : number of straight pulls it stops."""
 
     object: Object
     pulls: int
@@ -32,14 +32,14 @@ class Blocker(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class WayOut:
-    """A path on which the parts leave, with the sweep that judges it.
+    """A removal path, with the sweep that judges it.
 
     Attributes
     ----------
     poses : (M, 4, 4) float64
         Displacements of the parts, world frame; the first is the identity.
     how : {'pull', 'screw', 'plan'}
-        Whether it is one straight pull, a screw motion, or the planner found it.
+        One straight pull, a screw motion, or a planned path.
     swept : Swept
         Sweep of the whole path.
     """
@@ -50,7 +50,7 @@ class WayOut:
 
     @property
     def verdict(self) -> PathVerdict:
-        """What is proved: of a path that is refuted, nothing."""
+        """Proved result; NOT_DECIDED for a refuted path."""
         if self.swept.verdict is PathVerdict.OVERLAPS:
             return PathVerdict.OVERLAPS
         if self.swept.comes_out:
@@ -59,24 +59,24 @@ class WayOut:
 
     @property
     def in_way(self) -> tuple[Object, ...]:
-        """Objects that refute the path, the first one first: they are enclosed, or hit."""
+        """Objects that refute the path, the first one first: enclosed or hit."""
         return (*self.swept.enclosed, *(one.object for one in self.swept.hits))
 
     @property
     def free_share(self) -> float:
-        """Share of the path's motion that is proved to be free before the first hit."""
+        """Share of the path's motion before the first hit, proved free."""
         if self.swept.enclosed or self.swept.is_stopped:
             return 0.0
         return min((one.fraction for one in self.swept.hits), default=1.0)
 
     @property
     def length(self) -> float:
-        """Metres that the farthest-moving point moves at most."""
+        """Metres: upper bound of the motion of any point."""
         return self.swept.path.length
 
     @property
     def gap(self) -> float | None:
-        """Proved distance of the surfaces where nothing is touched, metres; None if none is."""
+        """Proved distance of the surfaces outside contacts, metres; None without a free path."""
         return self.swept.gap.at_least if self.swept.is_free else None
 
 
@@ -87,25 +87,25 @@ class Extraction:
     Attributes
     ----------
     parts : tuple of Object
-        What was to come out, as one rigid body.
+        The parts, as one rigid body.
     shell : PointShell
-        Its surface, world frame, and the points that the search moved.
+        Their surface, world frame, and the points of the search.
     to : (4, 4) float64 or None
-        The displacement that was to be reached; None: out.
+        Goal displacement; None: out.
     way : WayOut or None
-        The best path found.
+        The best path.
     near : tuple of Object
         Objects within about a voxel of the parts at the start.
     blockers : tuple of Blocker
         Objects that stop straight pulls, most pulls first.
     pulls, motions : int
-        Straight pulls tried; motions that the planner asked about.
+        Straight pulls tried; motion queries of the planner.
     poses : int
-        Poses looked at.
+        Poses checked.
     is_planned : bool
         Whether the planner was used.
     is_out_of_time : bool
-        Whether the time ended the search before it found a path.
+        Whether the deadline ended the search before a path.
     seconds : float
         Time of the search with its proofs.
     seed : int
@@ -131,7 +131,7 @@ class Extraction:
         return f"Extraction({names}: {way}, pulls tried: {self.pulls}, {self.seconds:.2f} s)"
 
     def _repr_html_(self) -> str:
-        """What refutes the way, and what stops straight pulls, for notebooks."""
+        """Objects in the way of the path and of straight pulls, for notebooks."""
         met = () if self.way is None else self.way.in_way
         rows = [*((obj.name, "in the way") for obj in met)]
         rows += [(one.object.name, f"stops {one.pulls} pulls") for one in self.blockers]
@@ -139,12 +139,15 @@ class Extraction:
 
     @property
     def verdict(self) -> PathVerdict:
-        """Proved result, or that no way was found: which is no proof that there is none."""
+        """Verdict of the path; without one NO_PATH, or NOT_DECIDED at the deadline.
+
+        NO_PATH is no proof of the absence of a path.
+        """
         if self.way is not None:
             return self.way.verdict
         return PathVerdict.NOT_DECIDED if self.is_out_of_time else PathVerdict.NO_PATH
 
     @property
     def is_free(self) -> bool:
-        """Whether a path is proved on which nothing is hit."""
+        """Whether a path without hits is proved."""
         return self.way is not None and self.way.swept.is_free

@@ -1,7 +1,7 @@
-"""Searches a way out for parts, or a way to a pose: straight pulls first, then a planner.
+"""Search for a removal path of parts, or a path to a pose: straight pulls, then a planner.
 
-A sweep judges each path that is found. That no path is found proves nothing: the result then names
-what is in the way of the straight pulls.
+Each path is judged by a sweep. The lack of a path proves nothing: the result then names the objects
+in the way of the straight pulls.
 """
 
 import math
@@ -35,18 +35,18 @@ Floats = NDArray[np.float64]
 DEFAULT_SECONDS = 60.0
 """Default time of a search."""
 DEFAULT_MOTIONS = 20_000
-"""Default number of motions that the planner may ask about."""
+"""Default number of the planner's motion queries."""
 MOST_OUT = 8
-"""Greatest number of straight pulls that are judged of those that lead out by voxels."""
+"""Straight pulls judged of those that lead out by voxels, at most."""
 SHARE_OF_LIKELY = 0.3
-"""Greatest share of the time for sweeps of likely pulls, before voxels say what else leads out."""
+"""Greatest share of the time for sweeps of likely pulls, before pulls by voxels."""
 SHARE_OF_PROOF = 0.2
-"""Share of the time that is left for sweeps of what pulls by voxels and the planner find."""
+"""Share of the time reserved for sweeps of paths by voxels and of planned ones."""
 MOST_PLANS = 3
-"""Greatest number of planned paths that are judged, until one is not refuted. Larger: more ways are
-found past places that the search overlooks."""
+"""Planned paths judged until one is not refuted, at most. Larger: more paths past obstacles that
+the search's voxels miss."""
 FARTHEST = 1e3
-"""Greatest way to a pose, lengths of all that stands: a farther one is in a wrong unit."""
+"""Longest path to a pose, sizes of the standing objects' box: a longer one has a wrong unit."""
 MOST_SEED = 1 << 31
 
 
@@ -66,7 +66,7 @@ def extract(
     budget_bytes: int = DEFAULT_BUDGET,
     progress: Progress | None = None,
 ) -> Extraction:
-    """Search a path on which parts come out of what stands around them, or to a pose.
+    """Search for a path on which parts come out, or to a pose.
 
     Parameters
     ----------
@@ -74,20 +74,20 @@ def extract(
     words : int or str
         Parts that move together, as for `Environment.find`.
     where, exclude, contact, overlap
-        As for `hapticdb.sweep`; the parts themselves are not felt.
+        As for `hapticdb.sweep`; the parts themselves do not collide.
     to : (4, 4) array or None
-        Displacement that the parts are to reach, rigid, metres; out unless given.
+        Goal displacement of the parts, rigid, metres; out unless given.
     out : float or None
-        Metres from the start at which the parts count as out; unless given, where their bounding
-        sphere has left the box of all that stands.
+        Metres from the start at which the parts count as out; unless given, their bounding sphere
+        has to leave the box of all standing objects.
     screw : float or None
         Pitch of a thread, metres a turn: screw motions of both hands are tried after the pulls.
     seconds : float
         Time of the search with the sweeps that judge its paths, which have a fifth of it at least.
     seed : int
-        The same seed gives the same path, unless the time ends the search.
+        The same seed gives the same path, unless the deadline ends the search.
     motions : int
-        Motions that the planner may ask about; 0: straight pulls only.
+        Motion queries of the planner, at most; 0: straight pulls only.
     budget_bytes : int, as for `Environment.feeler`
     progress : callable or None
         Called after each straight pull with the pulls tried and their total.
@@ -99,7 +99,7 @@ def extract(
     MissingExtraError
         If no straight pull leads out, and the planner is not installed.
     UsageError
-        If a number is out of range, or nothing stands beside the parts.
+        If a number is out of range, or no other object stands.
     """
     asked = _Asked(None, seconds, seed, motions, out, screw, budget_bytes)
     asked.check()
@@ -112,7 +112,7 @@ def extract(
 
 
 class _Asked(NamedTuple):
-    """Options of a search, as `extract` takes them; to : checked."""
+    """Options of a search, as for `extract`; to : checked."""
 
     to: Floats | None
     seconds: float
@@ -136,7 +136,7 @@ class _Asked(NamedTuple):
 
 
 def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
-    """The pose (4, 4) to reach; UsageError if it is none, or far from everything."""
+    """The goal pose (4, 4); UsageError if it is not rigid, or too far away."""
     if asked.out is not None or asked.screw is not None:
         raise UsageError("a way to a pose: give neither out nor screw")
     goal = np.asarray(checked_poses(np.asarray(to)[None])[0])
@@ -150,7 +150,7 @@ def _checked_goal(problem: Problem, to: ArrayLike, asked: _Asked) -> Floats:
 
 
 def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Extraction:
-    """Pull, plan if no pull is proved, and collect the result, without its time."""
+    """Pull, plan if no pull is proved, and return the result; its `seconds` is 0."""
     leaving = Exit(
         problem.box[0],
         problem.box[1],
@@ -207,9 +207,9 @@ def _searched(problem: Problem, asked: _Asked, progress: Progress | None) -> Ext
 
 
 def _best_pull(problem: Problem, pulls: Pulls) -> WayOut | None:
-    """First that is proved of the straight pulls that lead out by voxels; else an undecided one.
+    """First proved one of the straight pulls that lead out by voxels; else an undecided one.
 
-    Of the pulls that are judged, surfaces then say how far they are free, and what stops them.
+    Sweeps then replace the free lengths and blockers of the judged pulls.
     """
     outs = [n for n, pull in enumerate(pulls.done) if pull.is_out]
     outs.sort(key=lambda n: (pulls.done[n].touching, pulls.done[n].length))
@@ -231,9 +231,9 @@ def _best_pull(problem: Problem, pulls: Pulls) -> WayOut | None:
 
 
 def _planned(problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls) -> WayOut | None:
-    """Plan, and judge what is planned; returns the better one of that and the way so far.
+    """Plan and judge; returns the better of the planned path and the path so far.
 
-    A path that the sweep refutes is planned once more from another start, `MOST_PLANS` in all.
+    After a refuted path, the planner starts elsewhere, `MOST_PLANS` times in all.
     """
     for _ in range(MOST_PLANS):
         poses = _poses_of(problem, planner, way, pulls)
@@ -251,7 +251,7 @@ def _planned(problem: Problem, planner: Planner, way: WayOut | None, pulls: Pull
 def _poses_of(
     problem: Problem, planner: Planner, way: WayOut | None, pulls: Pulls
 ) -> Floats | None:
-    """Poses of a planned path; a missing planner is an error unless there is a way already."""
+    """Poses of a planned path; a missing planner is an error unless a path exists already."""
     try:
         return planner.search()
     except MissingExtraError as error:
@@ -265,7 +265,7 @@ def _poses_of(
 def _blockers(pulls: Pulls, *refuting: Object) -> list[tuple[int, int]]:
     """Ids of the objects that stop pulls, with the number of pulls, largest number first.
 
-    refuting : what stops the straight motion to a pose.
+    refuting : objects in the way of the straight motion to a pose.
     """
     counts = Counter(i for pull in pulls.done if not pull.is_out for i in pull.blockers)
     counts.update(obj.id for obj in refuting)

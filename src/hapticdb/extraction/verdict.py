@@ -16,7 +16,7 @@ from hapticdb.verdicts import PathVerdict
 
 
 def extraction_line(found: Extraction) -> str:
-    """Say in one line whether the parts come out, how, and what is proved; or what blocks them."""
+    """Verdict, path and proof of a search, or the objects in the way, in one line."""
     way = found.way
     if way is None:
         return _no_way(found)
@@ -31,7 +31,7 @@ def extraction_line(found: Extraction) -> str:
 
 
 def _proved(way: WayOut) -> str:
-    """Say how near surfaces come, and what is touched until when."""
+    """Least distance of the surfaces, and touched objects with the ends of their contacts."""
     swept, gap = way.swept, gap_text(way.swept)
     said = [f"{one.object.name} {until_text(one.until)}" for one in swept.touching[:MOST_NAMED]]
     apart = "" if gap == "-" else f", surfaces {gap} apart"
@@ -56,7 +56,7 @@ def _no_way(found: Extraction) -> str:
 
 
 def disassembly_line(found: Disassembly) -> str:
-    """Say in one line after what the parts come out, or what blocks them and what was tried."""
+    """Objects removed first and the last removal, or the objects in the way, in one line."""
     if not found.is_found:
         return _no_order(found)
     last = extraction_line(found.steps[-1].found)
@@ -65,7 +65,7 @@ def disassembly_line(found: Disassembly) -> str:
 
 
 def failed_line(failed: FailedSearch) -> str:
-    """Say in one line why a search proved no path."""
+    """Reason of a failed search, in one line."""
     if failed.reason:
         return failed.reason
     who = names_of([one.object for one in failed.blockers])

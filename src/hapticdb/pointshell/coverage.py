@@ -1,4 +1,4 @@
-"""Spacing of points on a surface, pieces of it, and which positions it encloses."""
+"""Point spacing on a surface, bisection of triangles, membership in closed bodies."""
 
 from copy import copy
 from typing import TYPE_CHECKING, NamedTuple
@@ -16,17 +16,17 @@ Floats = NDArray[np.float64]
 
 
 def spacing_of(area: float, n_points: int) -> float:
-    """Distance of neighbours, metres, for a hexagonal lattice of `n_points` on an area (m^2)."""
+    """Spacing, metres, of a hexagonal lattice of `n_points` on an area (m^2)."""
     return float(np.sqrt(2.0 * area / (np.sqrt(3.0) * n_points)))
 
 
 def points_for(area: float, spacing: float) -> int:
-    """Number of points of a hexagonal lattice on an area; the inverse of `spacing_of`."""
+    """Number of points of a hexagonal lattice on an area (m^2); the inverse of `spacing_of`."""
     return int(np.ceil(2.0 * area / (np.sqrt(3.0) * spacing**2)))
 
 
 def halves(triangles: Floats) -> Floats:
-    """Cut triangles (F, 3, 3) across their longest sides, (2 F, 3, 3)."""
+    """Bisect triangles (F, 3, 3) at their longest sides, (2 F, 3, 3)."""
     lengths = np.linalg.norm(triangles - np.roll(triangles, -1, axis=1), axis=2)
     turned = (np.argmax(lengths, axis=1)[:, None] + np.arange(3)) % 3
     a, b, c = np.take_along_axis(triangles, turned[:, :, None], axis=1).swapaxes(0, 1)
@@ -41,7 +41,7 @@ class Ball(NamedTuple):
 
 
 class Interior:
-    """The inside of the closed bodies of a result of `orient`, or of a ball.
+    """Inside of the closed bodies of a result of `orient`, or of a ball.
 
     Open bodies enclose nothing, and a void is outside. solid : the bodies, about `origin` (3,),
     metres.
@@ -69,9 +69,9 @@ class Interior:
         return self._ball is not None or len(self.solid.bodies) > 0
 
     def moved(self, by: Floats) -> "Interior":
-        """The inside after the corners of the surface's triangles have moved by (F, 3, 3) metres.
+        """The inside after a motion of the triangles' corners by (F, 3, 3) metres.
 
-        A ball's has none; the bodies stay closed, whatever moves.
+        Not for a ball. Bodies stay closed under any motion.
         """
         found, reach = copy(self), float(np.abs(by).max(initial=0.0))
         solid, larger = self.solid, np.array([[-reach], [reach]])
@@ -81,9 +81,9 @@ class Interior:
         return found
 
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
-        """Whether each of the positions (Q, 3), metres, surface's frame, is inside: (Q,).
+        """Whether positions (Q, 3), metres, surface's frame, are inside: (Q,).
 
-        Decided by the parity of crossings of lines; on the surface itself either answer may come.
+        By the parity of crossings of lines; either result on the surface itself.
         """
         if self._ball is not None:
             return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)

@@ -1,10 +1,10 @@
-"""Largest balls inside a tool that touch its surface at given positions.
+"""Largest balls inside a tool, tangent to its surface at given positions (medial balls).
 
-A position on the surface can be drawn inward by r, along its inward normal, if the ball of radius r
-that touches the surface there has no surface in it: then the drawn point is r away from all of the
-surface. Balls start with the wanted radius and shrink until they are empty (Ma, Bae and Choi, "3D
-medial axis point approximation using nearest neighbors and the normal field", The Visual Computer
-28, 2012; here with the exact distances to triangles in place of those to sample points).
+A position on the surface can be drawn inward by r, along its inward normal, if its tangent ball of
+radius r contains no surface: the drawn point then has the distance r from all of the surface. Balls
+start with the requested radius and shrink until they are empty (Ma, Bae and Choi, "3D medial axis
+point approximation using nearest neighbors and the normal field", The Visual Computer 28, 2012;
+here with the exact distances to triangles in place of those to sample points).
 """
 
 from functools import cached_property
@@ -22,8 +22,8 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 SLACK = 0.01
-"""Share of its radius by which surface may reach into a ball that counts as empty. A larger value
-draws points in over flatter edges: at 0.01, over convex edges of more than 172 degrees."""
+"""Share of its radius by which surface may reach into an empty ball. A larger value draws points in
+over flatter edges: at 0.01, over convex edges of more than 172 degrees."""
 NEARLY = 0.05
 """Share of its radius by which surface may be off a ball and still count as touching it. A larger
 value finds the opposite wall of rounder meshes, and drops fewer points on edges of thin walls."""
@@ -31,37 +31,39 @@ ALIGNED = 0.96
 """Cosine between a plane's normal and the direction to its nearest point above which the ball
 touches the plane and not its border: 16 degrees. Larger: fewer opposite walls of round tools."""
 MOST_PIECES = 20_000
-"""Pieces into which long triangles are cut, about. Larger: slower cutting, faster searches."""
+"""Pieces of long triangles, about. Larger: slower bisection, faster searches."""
 MOST_PAIRS = 2_000_000
-"""Pairs of a ball and a triangle that are measured at a time, about: up to 0.5 kB each."""
+"""Ball-triangle pairs of a batch, about: up to 0.5 kB each."""
 SMALL = 0.1
-"""Size of a piece, in radii of a ball, up to which the nearest of the middles of pieces find what
-is in a ball. A larger value is faster and errs more, by the size of a piece at most."""
+"""Size of a piece, in radii of a ball, up to which a query of the nearest middles of pieces
+replaces the search in the ball. A larger value is faster and errs more, by the size of a piece at
+most."""
 NEIGHBOURS = 4
-"""Pieces with the nearest middles that are measured. Larger: fewer errors, and slower."""
+"""Nearest middles of a query, with exact distances to their pieces. Larger: fewer errors, and
+slower."""
 FEW = 100
-"""Pieces of a fine mesh around a ball that are enough for its facing, about. Larger: slower."""
+"""Pieces of a fine mesh around a ball for its facing, about. Larger: slower."""
 ROUNDS = 60
-"""Most steps of shrinking. A step shrinks a ball by `SLACK` at least; most take 2 to 4."""
+"""Most steps of shrinking. A step shrinks a ball by `SLACK` at least; most balls take 2 to 4."""
 SCALES = 4
-"""Sizes of smaller balls, each `2 SLACK` of the one before, that find walls too thin for larger
-ones: the last is 1.6e-7 of the wanted radius, and finds walls of a hundredth of that."""
+"""Sizes of smaller balls, each `2 SLACK` of the one before, for walls too thin for larger ones: the
+last is 1.6e-7 of the requested radius, and finds walls of a hundredth of that."""
 LINES = 12
-"""Lines that vote whether an open surface has matter at a position."""
+"""Lines of the vote on matter behind an open surface."""
 MATTER = 0.5
-"""Share of lines that must cross an open surface on both sides of a position for matter to be
-there: 2 w - 1 for a winding number w. Larger: fewer open surfaces count as solids with a hole."""
+"""Share of lines that must cross an open surface on both sides of a position for matter there: 2 w
+- 1 for a winding number w. Larger: fewer open surfaces count as solids with a hole."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
 class Balls(NamedTuple):
-    """Balls that touch the surface at given positions.
+    """Tangent balls at given positions.
 
     radius (Q,) metres; facing (Q,): cosine between the position's inward normal and that of the
-    touching surface that opposes it most: -1 between parallel walls, -cos(a) in a wedge of angle a,
-    1 where the ball touches nothing else.
+    most opposed touching surface: -1 between parallel walls, -cos(a) in a wedge of angle a, 1
+    without another contact.
     """
 
     radius: Floats
@@ -69,7 +71,7 @@ class Balls(NamedTuple):
 
 
 class _Octave(NamedTuple):
-    """Pieces of the surface of about one size."""
+    """Pieces of the surface of about one size, within a factor of two."""
 
     tree: "cKDTree"  # middles and numbers of solids, 4 axes
     triangles: Floats  # (P, 3, 3)
@@ -77,10 +79,10 @@ class _Octave(NamedTuple):
 
 
 class InscribedBalls:
-    """Finds balls inside the solids of a surface, of radii up to `greatest` metres; see the module.
+    """Inscribed balls of a surface's solids, of radii up to `greatest` metres; see the module.
 
     A solid is a closed body with its voids; all open surfaces together count as one. A solid's
-    balls stop at its own surface alone: what lies outside a solid is behind its surface.
+    balls stop at its own surface alone: anything outside a solid is behind its surface.
     """
 
     def __init__(self, surface: "Surface", greatest: float) -> None:
@@ -95,7 +97,7 @@ class InscribedBalls:
         self._octaves = self._cut(float(surface.areas.sum()))
 
     def _cut(self, area: float) -> list[_Octave]:
-        """Cut triangles into pieces no longer than a ball, if these are not too many."""
+        """Octaves of pieces no longer than a ball, if these are not too many."""
         from scipy.spatial import cKDTree  # noqa: PLC0415 - a third of a second, for insets alone
 
         longest = max(self._greatest, 3.0 * float(np.sqrt(area / MOST_PIECES)))
@@ -116,7 +118,7 @@ class InscribedBalls:
         ]
 
     def _cut_to(self, longest: float) -> tuple[Floats, Ints]:
-        """Pieces (P, 3, 3) of the triangles with sides up to `longest` metres, and their solids."""
+        """Pieces (P, 3, 3) of the triangles, sides up to `longest` metres; their solids (P,)."""
         pieces, solids = self._triangles, self._solids
         done: list[tuple[Floats, Ints]] = []
         n_done = 0
@@ -135,10 +137,10 @@ class InscribedBalls:
         )
 
     def touching(self, positions: Floats, face_of: NDArray[np.int32], radius: float) -> Balls:
-        """Find the largest balls, `radius` at most, that touch the surface at positions (Q, 3).
+        """Largest balls, `radius` at most, tangent to the surface at positions (Q, 3).
 
-        face_of (Q,) is the face on which each position lies. The radius is 0 at positions of an
-        open surface that has no matter behind it.
+        face_of (Q,) : face of each position. The radius is 0 on an open surface without matter
+        behind it.
         """
         local = positions - self._center
         radii, facing = self._shrunk(local, face_of, radius)
@@ -152,10 +154,10 @@ class InscribedBalls:
     def _see_thin_walls(
         self, local: Floats, face_of: NDArray[np.int32], radii: Floats, facing: Floats, most: float
     ) -> None:
-        """Shrink balls through walls thinner than their slack, which only smaller ones see.
+        """Shrink balls through walls thinner than their slack, visible to smaller ones only.
 
-        A ball that meets something other than its own plane and has its middle outside its solid is
-        tried smaller and smaller. Where none meets a wall, the body crosses itself: the ball stays.
+        A ball with a contact beside its own plane, and its middle outside its solid, is retried
+        smaller and smaller. If none meets a wall, the body crosses itself: the ball stays.
         """
         some = np.arange(len(local))
         for _ in range(SCALES):
@@ -187,7 +189,7 @@ class InscribedBalls:
     def _shrunk(
         self, local: Floats, face_of: NDArray[np.int32], radius: float
     ) -> tuple[Floats, Floats]:
-        """Radii and facings (Q,) of the largest balls, up to the slack of a ball of `radius`."""
+        """Radii and facings (Q,) of the largest balls, within the slack of a ball of `radius`."""
         radii = self._preshrunk(local, face_of, radius)
         facing = np.ones(len(local))
         order, at, step = np.argsort(radii, kind="stable"), 0, len(local)
@@ -207,9 +209,9 @@ class InscribedBalls:
         return radii, facing
 
     def _preshrunk(self, local: Floats, face_of: NDArray[np.int32], radius: float) -> Floats:
-        """Radii (Q,) at which balls no longer hold the pieces whose middles are nearest to theirs.
+        """Radii (Q,) of balls free of the pieces nearest to their centres.
 
-        An upper bound, and mostly near the result: it spares the search among all pieces in a ball.
+        An upper bound, mostly near the result: it saves the search among all pieces in a ball.
         """
         radii = np.full(len(local), radius)
         active = np.arange(len(local))
@@ -236,9 +238,9 @@ class InscribedBalls:
     ) -> tuple[Ints, Floats]:
         """Pairs of a ball and a piece that may meet it: ball (P,), (P, 3, 3).
 
-        radii (Q,), ascending, are results of `_preshrunk`, which is exact for pieces that are small
-        beside a ball. So whole balls need none of them, and the others a few, for their facings. A
-        ball lies on the inner side of the plane that touches the surface at its position.
+        radii (Q,), ascending, are results of `_preshrunk`, exact for pieces much smaller than a
+        ball. So unshrunk balls need none of these, and the others a few, for their facings. A ball
+        lies on the inner side of the tangent plane at its position.
         """
         from scipy.spatial import cKDTree  # noqa: PLC0415 - as above
 
@@ -266,14 +268,14 @@ class InscribedBalls:
         return np.concatenate(numbers), np.concatenate(pieces)
 
     def _has_matter(self, local: Floats) -> NDArray[np.bool_]:
-        """Whether open surfaces enclose positions (Q, 3) nearly: (Q,)."""
+        """Whether open surfaces nearly enclose positions (Q, 3): (Q,)."""
         is_open = self._bodies == 0
         tree = sides.triangle_tree(
             np.ascontiguousarray(self._triangles[is_open]), self._bodies[is_open]
         )
         directions = np.random.default_rng(60).normal(size=(LINES, 3))
         directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-        # Every line is a body of its own, so that the kernel answers for it alone.
+        # Every line is a body of its own, so the kernel counts its crossings separately.
         numbers = np.arange(len(local) * LINES)
         picks = np.full((len(numbers), LINES), -1, dtype=np.int64)
         picks[numbers, numbers % LINES] = numbers // LINES
@@ -285,9 +287,9 @@ class InscribedBalls:
 
 
 def _solids_of(surface: "Surface") -> Ints:
-    """Solid (F,) of each face: a closed body with the voids in it, or 0 for all open surfaces.
+    """Solid (F,) of each face: a closed body with its voids, or 0 for all open surfaces.
 
-    A void belongs to the body with the smallest box around it.
+    A void belongs to the body with the smallest AABB around it.
     """
     local = surface.triangles - surface.center
     n_bodies = int(surface.bodies.max()) + 1
@@ -313,10 +315,10 @@ def _solids_of(surface: "Surface") -> Ints:
 def _smaller(
     positions: Floats, normals: Floats, radii: Floats, touched: Floats, centers: Floats
 ) -> Floats:
-    """Radii (Q,) of balls that hold none of the touched points (Q, 3) of the surface.
+    """Radii (Q,) of balls free of the touched points (Q, 3) of the surface.
 
-    The ball through x and y that has its centre on the normal n at x has the radius
-    |y - x|^2 / (2 n . (y - x)).
+    The ball through x and y with its centre on the normal n at x has the radius |y - x|^2 / (2 n .
+    (y - x)).
     """
     is_inside = ((centers - touched) ** 2).sum(axis=1) < ((1.0 - SLACK) * radii) ** 2
     chord = touched - positions
@@ -330,7 +332,7 @@ def _shrink(
 ) -> tuple[Floats, Floats]:
     """Radii and facings (Q,) of the largest empty balls; ball (P,), pieces (P, 3, 3) pair them.
 
-    A smaller ball at a position lies within a larger one, so no other piece can come to meet it.
+    A smaller ball at a position lies within a larger one, so it meets no other piece.
     """
     radii, facing = radii.copy(), np.ones(len(positions))
     for _ in range(ROUNDS):
@@ -353,8 +355,8 @@ def _facings(
 ) -> Floats:
     """Cosines (P,) between the normals (P, 3) and those of the pieces that touch the balls.
 
-    Where the nearest points lie in tilted directions, the plane's own normal counts. At an edge the
-    direction counts, but only where the ball touches.
+    A plane's own normal counts within 16 degrees (`ALIGNED`) of the direction to its nearest point.
+    Otherwise, at an edge, this direction counts, and only in contact.
     """
     away = centers - touched
     distance = np.linalg.norm(away, axis=1)
@@ -368,7 +370,7 @@ def _facings(
 
 
 def _longest_of(vectors: Floats) -> Floats:
-    """Greatest length of three vectors each, (P, 3, 3): (P,)."""
+    """Greatest length (P,) of three vectors each, (P, 3, 3)."""
     squares = np.einsum("pck,pck->pc", vectors, vectors)
     a, b, c = squares[:, 0], squares[:, 1], squares[:, 2]
     return np.asarray(np.sqrt(np.maximum(np.maximum(a, b), c)))

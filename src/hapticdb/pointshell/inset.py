@@ -1,12 +1,12 @@
 """Points drawn inward from a tool's surface, for the distance law.
 
-Under the distance law contact begins a fixed distance before the surface. Points that lie as far
-inside the tool make it begin at the surface. The points are images of samples, moved along their
-inward normals, and an image is kept only if no part of the surface is nearer to it than its own
-sample. So points vanish along convex edges, which touch late, by d (1 / sin(a / 2) - 1) for an
-inset d and an edge of angle a. Walls thinner than two insets, and wedges below 60 degrees, keep all
-their points: as far in as these can go, which is half the thickness. So do details that would
-touch late by more than one inset.
+Under the distance law contact begins a fixed distance before the surface; points drawn inward by
+this distance make it begin at the surface. The points are images of samples, moved along their
+inward normals. An image is valid if no part of the surface is nearer to it than its own sample. So
+points vanish along convex edges, and these touch late by d (1 / sin(a / 2) - 1) for an inset d and
+an edge of angle a. Walls thinner than two insets, and wedges below 60 degrees, keep all their
+points at the greatest possible inset, half the thickness. So do details that would touch late by
+more than one inset.
 """
 
 from typing import TYPE_CHECKING, NamedTuple
@@ -22,17 +22,17 @@ if TYPE_CHECKING:
     from hapticdb.pointshell.orientation import Surface
 
 SAMPLES = 5
-"""Samples for each wanted point, at first."""
+"""Initial samples for each requested point."""
 ENOUGH = 3
-"""Images for each wanted point, below which more samples are drawn. Larger: more even, slower."""
+"""Images for each requested point below which more samples are drawn. Larger: more even, slower."""
 MOST_SAMPLES = 10
-"""Most samples for each wanted point. Larger: slower for tools that keep few of their images."""
+"""Most samples for each requested point. Larger: slower for tools with few valid images."""
 SHARP = -0.5
 """Cosine between the inward normals of two faces below which they form a thin wall or a sharp
 wedge, of less than 60 degrees. A larger value keeps points of wider wedges, which touch early."""
 LATEST = 2.0
-"""Distance from a sample to the nearest image, in insets, above which the sample's own image is
-kept: so no position touches late by more than one inset. Larger: more corners without points."""
+"""Distance from a sample to the nearest image, in insets, above which the sample's own image stays:
+no position touches late by more than one inset. Larger: more corners without points."""
 
 Floats = NDArray[np.float64]
 
@@ -48,9 +48,9 @@ class _Drawn(NamedTuple):
 def draw_inward(
     surface: "Surface", n_points: int, inset: float, rng: np.random.Generator
 ) -> _Drawn:
-    """Spread points evenly over the surface drawn inward by `inset` metres; see the module.
+    """Points spread evenly over the surface and drawn inward by `inset` metres; see the module.
 
-    Points of open surfaces without matter behind them stay where they are.
+    Points of open surfaces without matter behind them stay on the surface.
     """
     balls = InscribedBalls(surface, inset)
     per_point = SAMPLES
@@ -69,7 +69,7 @@ def draw_inward(
         if n_kept >= ENOUGH * n_points or per_point >= MOST_SAMPLES:
             break
         per_point = min(MOST_SAMPLES, 1 + per_point * ENOUGH * n_points // n_kept)
-    if n_kept < n_points:  # the deepest of the others
+    if n_kept < n_points:  # fill up with the deepest of the others
         others = np.flatnonzero(~is_kept)
         deepest = np.argsort(-radius[others], kind="stable")
         is_kept[others[deepest[: n_points - n_kept]]] = True
@@ -95,10 +95,10 @@ def _spread(
     n_points: int,
     share: float,
 ) -> NDArray[np.intp]:
-    """Choose `n_points` images (M, 3), as far from one another as elimination makes them.
+    """Choose `n_points` images (M, 3), as far apart as sample elimination makes them.
 
-    share : of all samples that the images are; it estimates the area that they lie on. Images of a
-    small ball or rod coincide, so each place is moved back a little towards its sample.
+    share : number of the images, as a share of all samples; an estimate of their area. Images of a
+    small ball or rod coincide, so each is moved back slightly towards its sample.
     """
     places = images + 1e-3 * (samples - images)
     spacing = spacing_of(share * float(surface.areas.sum()), n_points)

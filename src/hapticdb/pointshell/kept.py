@@ -1,9 +1,9 @@
-"""Shells of tools' files, kept in the user's cache from one process to the next.
+"""Cache of the shells of tool files, in the user's cache folder.
 
-Making the shell of the sample's wrench takes 0.9 s of processor time and a process that reads the
-file; reading a kept one takes 16 ms, most of them for the digests. Its entry is named by the file's
-bytes, the request and the versions of the libraries. It holds digests of the files beside the
-tool's own, and is ignored if one of them differs.
+Making the shell of the sample's wrench takes 0.9 s of processor time and a parser process; reading
+it from the cache 16 ms, most of them for the digests. The key of an entry is made of the file's
+bytes, the request and the versions of the libraries. An entry contains digests of the referenced
+files, and is ignored if one of them differs.
 """
 
 import contextlib
@@ -25,24 +25,24 @@ from hapticdb.user_cache import content_of, entry_of, keep
 NUMBERS = 7
 """Numbers of a point in an entry: position, normal, inset."""
 KEPT = ("is_closed", "seed", "defects", "chord", "has_unit")
-"""Fields of a shell that an entry holds as they are."""
+"""Fields of a shell stored unchanged in an entry."""
 
 
 class Tool(NamedTuple):
-    """A tool of a file: its shell, without triangles where it was kept, and its longest side, m."""
+    """A tool of a file: its shell, without triangles if cached, and its longest side, m."""
 
     shell: PointShell
     length: float
 
 
 def made_tool(path: str, points: int | None, *, unit: str | None, seed: int, inset: float) -> Tool:
-    """Tool of a file that is read now; arguments and errors are those of `PointShell.from_file`."""
+    """Tool of a file, without the cache; arguments and errors as for `PointShell.from_file`."""
     shell = PointShell.from_file(path, points, unit=unit, seed=seed, inset=inset)
     return Tool(shell, float(np.ptp(shell.outline, axis=0).max()))
 
 
 def kept_tool(path: str, points: int | None, *, unit: str | None, seed: int, inset: float) -> Tool:
-    """The same, bit for bit, but for its triangles; from the cache if it holds the tool."""
+    """Tool as by `made_tool`, from the cache if possible: bit for bit equal, without triangles."""
     began = time.time()
     n_points = DEFAULT_POINTS if points is None else points
     entry = _entry(Path(path), (n_points, unit, seed, inset))
@@ -55,7 +55,7 @@ def kept_tool(path: str, points: int | None, *, unit: str | None, seed: int, ins
 
 
 def _entry(path: Path, request: tuple[object, ...]) -> Path | None:
-    """File of the entry of a request; None for what is not kept, a saved shell or no file."""
+    """Cache file of a request; None for requests without an entry: a saved shell or no file."""
     suffix = path.suffix.lower()
     if suffix == ".npz" or not path.is_file():
         return None
@@ -68,7 +68,7 @@ def _entry(path: Path, request: tuple[object, ...]) -> Path | None:
 
 
 def _digest(file: Path | None) -> str | None:
-    """SHA-256 of a file's bytes; None where it cannot be read."""
+    """SHA-256 of a file's bytes; None if unreadable."""
     with contextlib.suppress(OSError):
         if file is not None:
             with file.open("rb") as stream:
@@ -77,7 +77,7 @@ def _digest(file: Path | None) -> str | None:
 
 
 def _read(entry: Path, file: Path) -> Tool | None:
-    """Tool that an entry holds; None if there is none, or a file beside the tool's has changed."""
+    """Tool of an entry; None without one, or if a referenced file has changed."""
     content = content_of(entry)
     if content is None:
         return None
@@ -94,7 +94,7 @@ def _read(entry: Path, file: Path) -> Tool | None:
 
 
 def _write(entry: Path, tool: Tool, began: float) -> None:
-    """Keep a tool, unless one of its files was written since `began`."""
+    """Store a tool, unless one of its files was written since `began`."""
     shell = tool.shell
     file = Path(shell.link)
     files = {name: beside(file.parent, name) for name in shell.named}

@@ -1,4 +1,4 @@
-"""The surface of a tool, to be measured from other surfaces."""
+"""The tool's surface, for proximity queries against other surfaces."""
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,13 +15,13 @@ from hapticdb.pointshell.shell import PointShell
 Floats = NDArray[np.float64]
 
 AT_ONCE = 32
-"""Boxes that are compared together. Larger: more memory."""
+"""Boxes of a batch. Larger: more memory."""
 
 
 class MovingSurface(CollisionShape):
     """A shell's surface, tool frame: triangles, or a ball about the origin.
 
-    corners (V, 3) : whose box holds it, metres.
+    corners (V, 3) : positions that span its AABB, metres.
 
     Raises `UsageError` if the shell has no surface.
     """
@@ -39,7 +39,7 @@ class MovingSurface(CollisionShape):
     def nearest(
         self, other: TriangleTree, poses: Floats, farthest: Floats, enough: float = 0.0
     ) -> Nearest:
-        """Measure from another surface at poses (N, 4, 4), as `kernels.triangles.nearest` does."""
+        """Distances from another surface at poses (N, 4, 4), as by `kernels.triangles.nearest`."""
         radius = self.radius
         near = nearest(other, self.tree, poses, farthest + radius, enough + radius)
         if radius == 0.0:
@@ -55,15 +55,15 @@ class MovingSurface(CollisionShape):
     def search(
         self, other: TriangleTree, motion: PathMotion, *, begin: float, best: float, fine: float
     ) -> Search:
-        """Search the least distance from another surface, as `kernels.triangles.sweeping` does."""
+        """Search for the least distance from another surface, by `kernels.triangles.sweeping`."""
         return Search(
             other, self.tree, motion, radius=self.radius, begin=begin, best=best, fine=fine
         )
 
     def box_gaps(self, bounds: Floats, poses: Floats, more: ArrayLike = 0.0) -> Floats:
-        """Distances (O, N) of boxes (O, 2, 3) from this one's at poses (N, 4, 4), never too large.
+        """Distances (O, N) of boxes (O, 2, 3) from this one's at poses (N, 4, 4), or lower bounds.
 
-        more (N,) : metres by which the surface's box is larger on each side.
+        more (N,) : enlargement of the surface's box on each side, metres.
         """
         low, high = self.corners.min(axis=0), self.corners.max(axis=0)
         middles = poses[:, :3, :3] @ (0.5 * (low + high)) + poses[:, :3, 3]

@@ -1,9 +1,8 @@
 """PointShell: the moving tool as points on its surface, each with a normal into the tool.
 
-A mesh becomes a shell in three steps: the inner side of each face is found (`orientation`), points
-are spread over the faces (`kernels.surfaces.sampling`), and the points are sorted along a Z-order
-curve. So successive points are close in space, and a frame looks up the same brick many times in a
-row if the brick has many points.
+A mesh becomes a shell in three steps: orientation of the faces (`orientation`), sampling of points
+on them (`kernels.surfaces.sampling`), and a sort along a Z-order curve. Successive points are close
+in space, so a frame looks up the same brick many times in a row if it contains many points.
 """
 
 import math
@@ -28,64 +27,62 @@ from hapticdb.poses import as_floats
 MAX_POINTS = 10_000_000
 """Greatest number of points of a shell."""
 DEFAULT_POINTS = 300
-"""Default number of points of a shell. More points feel finer details, and take longer."""
+"""Default number of points of a shell. More points resolve finer details, and take longer."""
 DENSE_POINTS = 200_000
-"""Default of the greatest number of points of a shell with a given spacing; these take a few
-seconds."""
+"""Default limit of the points of a shell with a given spacing; these take a few seconds."""
 ORDER_BITS = 10
-"""Bits of the curve that orders the points: 2^10 steps along the longest side of their bounding
-box. A larger value orders points of finer shells better, and changes every shell."""
+"""Bits of the ordering curve: 2^10 steps along the longest side of the points' AABB. A larger value
+orders points of finer shells better, and changes every shell."""
 
 FORMAT = "hapticdb.pointshell.shell 1"
 """Name of the file format, stored in a saved shell."""
 MOST_INFLATION, INFLATED_ANYWAY = 10, 1 << 20
 """A saved shell may unpack to at most this many times its size, plus this many bytes. Larger: a
-damaged file may use more memory. `save` does not compress; if another program compresses the file,
-a surface's numbers take two thirds of their size."""
+damaged file may use more memory. `save` does not compress; compressed by another program, a
+surface's numbers take two thirds of their size."""
 
 Floats = NDArray[np.float64]
 
 
 LEAST_COMPONENT = 1e-100
-"""Components of normals below this are set to 0: PostgreSQL treats a product that underflows as an
-error."""
+"""Least nonzero component of a normal; smaller ones become 0: PostgreSQL treats a product that
+underflows as an error."""
 
 
 @dataclass(frozen=True, eq=False)
 class PointShell:
-    """The tool: points on its surface and unit normals that point into it.
+    """The tool: points on its surface and unit normals into it.
 
     `from_mesh` and `from_file` sort the points along a Z-order curve, so neighbours by index are
     mostly close in space. Given arrays and saved shells keep their order.
 
-    Raises `UsageError` for arrays of another shape, not finite, or normals that are not of unit
-    length.
+    Raises `UsageError` for arrays of another shape, not finite, or normals not of unit length.
     """
 
     points: Floats
-    """(N, 3) metres, tool's frame, which is the file's own, not re-centred."""
+    """(N, 3) metres, tool's frame: the file's own, not re-centred."""
     normals: Floats
     """(N, 3) unit normals, into the tool."""
     center: Floats
     """(3,) centre of mass, metres: of a solid of uniform density for a closed surface (overlaps of
     bodies count twice), of the surface for an open one."""
     is_closed: bool = True
-    """False if the surface has open edges, so its inside is a guess."""
+    """False if the surface has open edges: its inside is then a guess."""
     link: str = ""
-    """Absolute path of the file that the shell was made from."""
+    """Absolute path of the source file."""
     seed: int = 0
     defects: str = ""
     """Defects of that file, in words; not saved."""
     surface: Surface | Ball | None = field(default=None, repr=False)
-    """On which the points lie, or from which they were drawn inward; not saved."""
+    """Surface of the points, before their inset; not saved."""
     inset: Floats = field(default_factory=lambda: np.zeros(0), repr=False)
-    """(N,) how far each point was drawn inward from the surface, metres; zeros unless given."""
+    """(N,) inward distance of each point from the surface, metres; zeros unless given."""
     chord: float = field(default=0.0, repr=False)
-    """Chord error of the surface, metres: of the tessellations of STEP and IFC files; not saved."""
+    """Chord error of the surface, metres, of STEP and IFC files; not saved."""
     has_unit: bool = field(default=False, repr=False)
-    """Whether a person or the file gave the unit of its lengths; a saved shell is in metres."""
+    """Whether the caller or the file gave the unit of length; a saved shell is in metres."""
     named: tuple[str, ...] = field(default=(), repr=False)
-    """Names of files that were looked for beside that file; not saved."""
+    """Names of files referenced by that file; not saved."""
 
     def __post_init__(self) -> None:
         for name, shape in (("points", (-1, 3)), ("normals", (-1, 3)), ("center", (3,))):
@@ -120,9 +117,9 @@ class PointShell:
 
     @property
     def outline(self) -> Floats:
-        """Positions (P, 3), metres, that span the tool's surface: its corners, if it is known.
+        """Positions (P, 3), metres, that span the tool's surface: its corners, if present.
 
-        Else the points, put back onto the surface that they were drawn inward from.
+        Else the points, moved back onto the surface by their insets.
         """
         if isinstance(self.surface, Surface):
             return self.surface.triangles.reshape(-1, 3)
@@ -139,32 +136,32 @@ class PointShell:
         seed: int = 0,
         inset: float = 0.0,
     ) -> "PointShell":
-        """Make the shell of all parts of a mesh file together, or load one that was saved.
+        """Make the shell of all parts of a mesh file together, or load a saved one.
 
         Parameters
         ----------
         path : path
-            A mesh file, or a shell saved as `.npz`, which is loaded unchanged.
+            A mesh file, or a shell saved as `.npz`, loaded unchanged.
         points : int, optional
             Number of points, 1 to 10^7; 300 unless given. With a spacing, the greatest number;
             200,000 unless given.
         spacing : float, optional
             Approximate distance of neighbours, metres; sets the number of points, at least 300.
         unit : str, optional
-            Unit of a file that names none; metres unless given.
+            Unit of a file without one; metres unless given.
         seed : int
             Random seed of the points: equal seeds give equal points.
         inset : float
-            How far the points are drawn inward, metres. Give the distance law's onset, 1.5 voxels,
-            for contact that begins at the surface; 0 for points on it, so that clearance is kept.
-            Thin walls, sharp edges and tips are drawn in as far as they can be.
+            Distance by which the points are drawn inward, metres. Give the distance law's onset,
+            1.5 voxels, for contact that begins at the surface; 0 for points on it, to preserve
+            clearance. Thin walls, sharp edges and tips are drawn in as far as possible.
 
         Raises
         ------
         UsageError
-            Numbers out of range, or a unit for a saved shell, which is in metres.
+            Numbers out of range, or a unit for a saved shell, whose unit is the metre.
         FileError
-            A file that cannot be read or holds no surface.
+            An unreadable file, or one without a surface.
         """
         path = Path(path)
         if path.suffix.lower() == ".npz":
@@ -201,7 +198,8 @@ class PointShell:
 
         vertices (V, 3), metres, define the shell's frame; faces (F, 3) are integers, in any order
         and winding; the others are as for `from_file`. Raises `UsageError` for numbers out of
-        range, vertices that are not finite, faces that name no vertex, and meshes without area.
+        range, vertices that are not finite, faces with indices out of range, and meshes without
+        area.
         """
         _check_request(DEFAULT_POINTS if points is None else points, spacing, seed, inset)
         corners = _as_floats(vertices, "vertices", finite=False)
@@ -277,7 +275,7 @@ class PointShell:
 
     @classmethod
     def load(cls, path: str | PathLike[str]) -> "PointShell":
-        """Read a shell that `save` wrote; `FileError` if the file is missing, damaged or other."""
+        """Read a shell written by `save`; `FileError` for a missing, damaged or other file."""
         try:
             with Path(path).open("rb") as file:
                 _check_members(file, path)
@@ -319,7 +317,7 @@ def _check_request(points: int, spacing: float | None, seed: int, inset: float =
 
 
 def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
-    """Check an archive's headers before any part of it is unpacked; refuse a bad one."""
+    """Check an archive's headers before any of it is unpacked; `FileError` for a bad one."""
     n_bytes = file.seek(0, SEEK_END)
     most = INFLATED_ANYWAY + MOST_INFLATION * n_bytes
     with zipfile.ZipFile(file) as archive:
@@ -343,7 +341,7 @@ def _check_members(file: BinaryIO, path: str | PathLike[str]) -> None:
 
 
 def _promised_bytes(stream: IO[bytes]) -> int:
-    """Bytes of the array that a .npy member's header describes."""
+    """Bytes of an array by the header of its .npy member."""
     version = np.lib.format.read_magic(stream)
     if version != (1, 0):
         raise ValueError(f"an array of version {version[0]}.{version[1]}")
@@ -352,7 +350,7 @@ def _promised_bytes(stream: IO[bytes]) -> int:
 
 
 def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
-    """Copy an array as C-contiguous float64."""
+    """Copy of an array as C-contiguous float64."""
     floats = as_floats(array, name).copy()
     if finite and not np.isfinite(floats).all():
         raise UsageError(f"{name} hold values that are not finite")
@@ -360,7 +358,7 @@ def _as_floats(array: ArrayLike, name: str, *, finite: bool = True) -> Floats:
 
 
 def _curve_order(points: Floats) -> NDArray[np.intp]:
-    """Indices (N,) that put points (N, 3) in order along a Z-order curve of cubic steps."""
+    """Indices (N,) that sort points (N, 3) along a Z-order curve of cubic steps."""
     low = points.min(axis=0)
     extent = float((points.max(axis=0) - low).max()) or 1.0
     # Half a step less than 2^ORDER_BITS. Planes of a tool often lie at its box's ends, middle and
@@ -370,7 +368,7 @@ def _curve_order(points: Floats) -> NDArray[np.intp]:
 
 
 def fibonacci_sphere(n_points: int) -> Floats:
-    """Points (N, 3) spread over the unit sphere along a spiral of the golden angle."""
+    """Points (N, 3) on the unit sphere along a spiral of the golden angle (Fibonacci lattice)."""
     heights = 1 - (2 * np.arange(n_points) + 1) / n_points
     angles = np.pi * (1 + 5**0.5) * np.arange(n_points)
     radii = np.sqrt(1 - heights**2)

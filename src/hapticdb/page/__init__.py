@@ -1,1 +1,1 @@
-"""The browser view: the scene, tools, and panels."""
+"""The browser view, on viser: scene, tools and panels."""

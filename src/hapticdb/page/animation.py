@@ -1,4 +1,4 @@
-"""A page in one file that plays how parts come out: the scene, the paths, viser's own player."""
+"""Animation of removal paths: a standalone HTML page with viser's player."""
 
 import importlib.util
 import os
@@ -30,24 +30,24 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 PLACES = 72
-"""Places that are shown of each path. More: smoother, and a larger file."""
+"""Poses per path. More: smoother motion, larger file."""
 PICTURES = 24.0
-"""Places shown a second."""
+"""Poses per second of playback."""
 PAUSE = 0.8
-"""Seconds of rest before and after each path."""
+"""Pause before and after each path, seconds."""
 AROUND = 0.6
-"""Surroundings that are shown on each side, in lengths of the box that the paths fill."""
+"""Margin of the surroundings, as a share of the longest edge of the paths' AABB."""
 MOST_TRIANGLES = 400_000
-"""Triangles of all that stands; of more, the largest objects are left out. More: a larger file."""
+"""Triangles of the surroundings; the largest objects are dropped first. More: larger file."""
 MOST_BLOCKS = 20_000
-"""Blocks for an object without triangles, at most."""
+"""Greatest number of blocks for an object without triangles."""
 STANDING: colours.Colour = (186, 193, 201)
 SEEN_THROUGH = 0.45
-"""Opacity of what stands: the parts are seen behind it. Larger: solid, and hides more."""
+"""Opacity of the surroundings, so that hidden parts show through."""
 
 
 class _Move(NamedTuple):
-    """Parts that come out: node, poses (n, 4, 4) of their displacements, and the words of it."""
+    """A step of the animation: node of its parts, poses (n, 4, 4), and label."""
 
     node: "SceneNodeHandle"
     poses: Floats
@@ -55,7 +55,7 @@ class _Move(NamedTuple):
 
 
 def check_view() -> None:
-    """Refuse in one line where what writes the page is not installed: MissingExtraError."""
+    """Check for the extra `view`; MissingExtraError without it."""
     if importlib.util.find_spec("viser") is None:
         raise MissingExtraError(f"an animation needs more packages: {pip_line('view')}")
 
@@ -68,14 +68,13 @@ def animate(
     exclude: Iterable[int] = (),
     up: str | None = None,
 ) -> None:
-    """Write a page that shows parts on their paths, one step after another, again and again.
+    """Write an HTML page that plays removal paths one after another, in a loop.
 
-    The page needs no server: any browser opens the file, which is replaced. Raises
-    `MissingExtraError` without the extra `view`, `FileError` if the file cannot be written.
+    The page needs no server. An existing file is replaced. Raises `MissingExtraError` without the
+    extra `view`, `FileError` if the file cannot be written.
 
-    steps : each with a path, in the order in which parts come out; exclude : ids of objects that
-    are not shown, unless they come out; up : axis 'x', 'y' or 'z' that points up, that of most of
-    the objects' files unless given.
+    steps : each with a path, in order of removal; exclude : ids of hidden objects, unless a step
+    removes them; up : vertical axis 'x', 'y' or 'z', by default that of most of the objects' files.
     """
     check_view()
     from hapticdb.page.process import new_server, stop  # noqa: PLC0415 - the extra `view`
@@ -95,7 +94,7 @@ def _recorded(
     server: "ViserServer", env: Environment, steps: Sequence[Extraction], exclude: set[int],
     up: str | None,
 ) -> str:  # fmt: skip
-    """Put the scene up, play all steps, and return the page."""
+    """HTML page of the scene with all steps."""
     axis = up_axis(env.objects()) if up is None else AXES.index(up)
     paths = [_shown_poses(found) for found in steps]
     box = _box_of(steps, paths)
@@ -120,7 +119,7 @@ def _recorded(
 def _move(
     server: "ViserServer", number: int, found: Extraction, poses: Floats, top: Floats
 ) -> _Move:
-    """Add the parts of a step in a colour of their own, and the words about it."""
+    """Add the parts of a step in a colour of their own, with a hidden label."""
     surface = found.shell.surface
     assert isinstance(surface, Surface)  # noqa: S101 - parts have a surface
     facets, middle = _sent([_of_triangles(surface.triangles)])
@@ -137,7 +136,7 @@ def _move(
 
 def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
     recording = server.get_scene_serializer()
-    for move in moves:  # the player begins again with these; viser sends only what changes
+    for move in moves:  # initial state of each loop; viser records changes only
         put_at(move.node, row_of_pose(move.poses[-1]))
         put_at(move.node, row_of_pose(move.poses[0]))
         move.node.visible = False
@@ -155,14 +154,14 @@ def _played(server: "ViserServer", moves: Sequence[_Move]) -> str:
 
 
 def _shown_poses(found: Extraction) -> Floats:
-    """Displacements (n, 4, 4) evenly along a path; the last one is its end."""
+    """Displacements (n, 4, 4), evenly spaced in the path parameter, both ends included."""
     assert found.way is not None  # noqa: S101 - each step has a path
     path = found.way.swept.path
     return path.at(np.linspace(0.0, path.length, PLACES))
 
 
 def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
-    """Box (2, 3) of all parts on all of their paths."""
+    """AABB (2, 3) of all parts along their paths."""
     corners = []
     for found, poses in zip(steps, paths, strict=True):
         low, high = found.shell.points.min(axis=0), found.shell.points.max(axis=0)
@@ -175,7 +174,7 @@ def _box_of(steps: Sequence[Extraction], paths: Sequence[Floats]) -> Floats:
 
 
 def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
-    """Triangles of what stands in the surroundings of a box (2, 3), the smallest objects first."""
+    """Facets of the objects near an AABB (2, 3), the smallest objects first."""
     reach = AROUND * float((box[1] - box[0]).max())
     near = [
         obj
@@ -200,7 +199,7 @@ def _standing(env: Environment, box: Floats, exclude: set[int]) -> list[Facets]:
 
 
 def _of_triangles(triangles: Floats) -> Facets:
-    """Triangles (F, 3, 3) with smooth and sharp edges."""
+    """Facets of triangles (F, 3, 3), split at sharp edges."""
     faces = np.arange(3 * len(triangles), dtype=np.int64).reshape(-1, 3)
     return sharpened([Facets(triangles.reshape(-1, 3), faces)])[0]
 
@@ -212,7 +211,7 @@ def _of_voxels(env: Environment, obj: Object) -> Facets:
 
 
 def _sent(several: Sequence[Facets]) -> tuple[Facets, Floats]:
-    """All triangles in one mesh, as it is sent: float32, about a middle (3,), and uint32."""
+    """One mesh, float32 about its centre (3,) for parts far from the origin, and that centre."""
     if not several:
         return Facets(
             np.empty((0, 3), dtype=np.float32), np.empty((0, 3), dtype=np.uint32)

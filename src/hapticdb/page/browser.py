@@ -1,4 +1,4 @@
-"""One browser: its session, its filter, and what its scene shows."""
+"""One browser: its session, object filter and scene."""
 
 import logging
 import threading
@@ -29,29 +29,30 @@ if TYPE_CHECKING:
 LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 Event = Any
-"""An event of viser: what a callback gets."""
+"""Event of a viser callback."""
 
 HAND_WIDTH = 1.0
-"""Width of the hand's own workspace in metres that the scene's diagonal stands for, at the start.
-Larger: the same depth on the screen gives more force."""
+"""Initial width of the hand's workspace, metres, that maps to the scene's diagonal. Larger: more
+force for the same penetration on the screen."""
 CAP = 7.0
-"""Greatest force of a hand in a browser, N: the longest arrow. As of scripted hands."""
+"""Force cap of a hand in a browser, N, as of scripted hands; length of the longest arrow."""
 LEAST_SEEN = 1e-4
-"""Least motion that is drawn, as a share of the scene's diagonal, and of a turn."""
+"""Least displacement drawn, as a share of the scene's diagonal, and of a quaternion's entries."""
 PLUMB_EVERY = 0.1
-"""Seconds from one line to what lies below the hand to the next. Larger: it follows more slowly."""
+"""Period of the plumb line, seconds."""
 LEAST_SHOWN = 0.01
-"""Least radius of what fills the view, as a share of the scene's diagonal."""
+"""Least radius of a view, as a share of the scene's diagonal."""
 HISTORY = 300
-"""Samples of the plot, ten seconds of them. Larger: a longer time is seen, and more is sent."""
+"""Samples of the force plot: ten seconds."""
 
 
 class Browser:
-    """What one browser shows and does.
+    """Session, object filter and scene of one browser.
 
-    Its callbacks run in viser's threads, `tick` in the page's clock, and the work of sessions in
-    threads of the site, in one of them at a time: `_beginning` is that one's. No thread waits for
-    the host with `_swapping`, under which the session is exchanged. `close` frees the number.
+    Callbacks run in viser's threads, `tick` in the page's clock, and sessions start and end in
+    worker threads of the site, one at a time (`_beginning`). `_swapping` guards the exchange of the
+    session; it is released before any call to the host, so no thread waits for the host under it.
+    `close` frees the browser's number.
     """
 
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
@@ -71,8 +72,8 @@ class Browser:
         """Whether the person has moved the hand."""
         self.history: deque[tuple[float, float]] = deque(maxlen=HISTORY)
         self._begun: float | None = None
-        self._keeps_tool: bool | None = None  # of the session to begin; None: none is wanted
-        self._over: list[HostedSession] = []  # to be ended
+        self._keeps_tool: bool | None = None  # of the requested session; None: no request
+        self._over: list[HostedSession] = []  # detached, to end
         self._beginning, self._swapping = threading.Lock(), threading.Lock()
         self._holding = threading.Lock()
         self._is_closed = False
@@ -84,19 +85,19 @@ class Browser:
         self.drawing.gizmo.on_update(self._moved)
 
     def hand_moved(self) -> None:
-        """Show where the hand is now."""
+        """Hook: the hand has moved."""
 
     def tool_changed(self) -> None:
-        """Show which tool is in the hand now."""
+        """Hook: the tool has changed."""
 
     def session_ended(self) -> None:
-        """Show that the session is over, and with it a recording."""
+        """Hook: the session is over, and so is its recording."""
 
     def frame_came(self, frame: np.void, wrench: Floats, touched: list[Object], now: float) -> None:
-        """Show a frame of the session, its wrench (6,), and what it touches."""
+        """Hook: a frame of the session, its wrench (6,), N and N m, and the touched objects."""
 
     def guarded(self, role: str, act: Callable[[Event], None]) -> Callable[[Event], None]:
-        """Return a callback that checks the role, and tells an error to the person alone."""
+        """Wrap a callback with a check of the role; errors are reported to this browser alone."""
 
         def call(event: Event) -> None:
             if self._is_closed:
@@ -111,7 +112,7 @@ class Browser:
             except HapticDBError as error:
                 self.failed(error)
             except Exception as error:
-                if self.has_gone:  # viser fails at what is shown to nobody
+                if self.has_gone:  # viser raises for a client without connection
                     LOG.info("a callback of a browser that has gone failed: %r", error)
                     return
                 LOG.exception("a callback of the page failed")
@@ -121,7 +122,7 @@ class Browser:
 
     @property
     def has_gone(self) -> bool:
-        """Whether the connection was lost, which viser may tell later."""
+        """Whether the connection is lost; viser's disconnect event may come later."""
         return self.client.client_id not in self.site.server.get_clients()
 
     def tell(self, title: str, text: str, *, is_good: bool = False) -> None:
@@ -132,11 +133,11 @@ class Browser:
             )
 
     def failed(self, error: Exception) -> None:
-        """Tell an error, in words that name nothing of the server's machine."""
+        """Show an error without the server's paths and addresses."""
         self.tell("Not done", self.site.error_text(error))
 
     async def _moved(self, event: "TransformControlsEvent") -> None:
-        """Move the hand; on the event loop, so that events keep their order."""
+        """Move the hand; async, on viser's event loop, so that events stay in order."""
 
         def act(event: Event) -> None:
             self.move_hand(checks.row_of(event.target.position, event.target.wxyz))
@@ -146,7 +147,7 @@ class Browser:
         self.guarded("toucher", act)(event)
 
     def move_hand(self, pose: Floats) -> None:
-        """Put the hand at a pose (7,), metres, for the person."""
+        """Move the hand to a pose (7,), metres."""
         self.hand, self.has_moved = pose, True
         self.drawing.words.visible = False
         session = self.session
@@ -154,8 +155,8 @@ class Browser:
             session.move(pose)
 
     def take_in_hand(self, tool: HeldTool, pose: Floats | None = None) -> None:
-        """Hold another tool, at a pose (7,) or at the start."""
-        with self._holding:  # a button that is pressed again calls this in another thread
+        """Use another tool, from a pose (7,), by default the start pose."""
+        with self._holding:  # a second click calls this in another thread
             self.tool = tool
             self.hand = self._start() if pose is None else pose
             self.drawing.hold(tool, self.colour, self.hand)
@@ -164,7 +165,7 @@ class Browser:
             self.hand_moved()
 
     def put_back(self) -> None:
-        """Put the part in hand back to its place, if there is one; take the first tool instead."""
+        """Put the dragged part back and use the first tool; without a dragged part, do nothing."""
         taken, self.taken = self.taken, None
         if taken is not None:
             self.scene.show((taken,))
@@ -172,29 +173,29 @@ class Browser:
 
     @property
     def unfelt(self) -> list[int]:
-        """Ids of objects that are neither seen nor felt here: hidden ones, and a part in hand."""
+        """Ids of the objects without collision here: hidden objects and the dragged part."""
         taken = () if self.taken is None else (self.taken,)
         return sorted({*self.scene.hidden, *taken} & self.site.objects.keys())
 
     def chosen_objects(self) -> list[Object]:
-        """Objects that are chosen, as far as they are there still."""
+        """Chosen objects that still exist."""
         objects = self.site.objects
         return [objects[i] for i in self.chosen if i in objects]
 
     def only_chosen(self) -> Object:
-        """Return the chosen object; UsageError if there is none, or more than one."""
+        """The chosen object; UsageError unless exactly one is chosen."""
         chosen = self.chosen_objects()
         if len(chosen) != 1:
             raise UsageError("choose one part first: click it, or take it from the list")
         return chosen[0]
 
     def filter_changed(self) -> None:
-        """Feel what is seen now: the session begins again if that is something else."""
+        """Restart the session if the set of colliding objects has changed."""
         if self.unfelt != self._unfelt:
             self.begin_anew()
 
     def begin_anew(self, *, keeps_tool: bool = True) -> None:
-        """Begin the session again, in a worker: its tool stays, or begins in the hand."""
+        """Request a new session from a worker; it starts at the tool's pose, or at the hand's."""
         if not self.visitor.may("toucher") or self._is_closed:
             return
         with self._swapping:
@@ -202,7 +203,7 @@ class Browser:
         self.site.workers.submit(self._begin_wanted)
 
     def _begin_wanted(self) -> None:
-        """Begin sessions while one is wanted; does nothing if another worker does so already."""
+        """Start sessions while one is requested, unless another worker is doing so."""
         while self._keeps_tool is not None and self._beginning.acquire(blocking=False):
             try:
                 self._begin()
@@ -215,7 +216,7 @@ class Browser:
                 self._beginning.release()
 
     def _begin(self) -> None:
-        """End the session, and begin another if one is wanted still."""
+        """End the session, and start the requested one."""
         with self._swapping:
             keeps_tool, self._keeps_tool = self._keeps_tool, None
         if keeps_tool is None or self._is_closed:
@@ -241,7 +242,7 @@ class Browser:
                 undo.pop_all()
 
     def _leave_session(self) -> Floats | None:
-        """Give up the session, if there is one; returns the pose (7,) of its tool."""
+        """Detach the session; pose (7,) of its tool, None without a frame."""
         session = self.session
         if session is None or not self._give_up(session):
             return None
@@ -253,7 +254,7 @@ class Browser:
         return None if frame is None else np.array(frame["tool"][0])
 
     def _give_up(self, session: HostedSession) -> bool:
-        """Have no session any more; False if it was given up already. `_end_sessions` ends it."""
+        """Detach the session for `_end_sessions`; False if it is detached already."""
         with self._swapping:
             if self.session is not session:
                 return False
@@ -262,13 +263,13 @@ class Browser:
             return True
 
     def _end_sessions(self) -> None:
-        """End the sessions that were given up, and tell what their recordings lack."""
+        """End the detached sessions, and report the lost frames of their recordings."""
         with self._swapping:
             over, self._over = self._over, []
         for session in over:
             try:
                 session.end()
-            except Exception:  # all of it that works has ended
+            except Exception:  # every other part of it has ended
                 LOG.exception("a session did not end well")
             self._tell_lost_frames(session)
 
@@ -284,14 +285,14 @@ class Browser:
         return pose_of_row(self.hand[:3], self.hand[3:])
 
     def matrix_of_tool(self) -> Floats:
-        """Pose (4, 4) of the tool, metres; that of the hand without a session."""
+        """Pose (4, 4) of the tool, metres; of the hand without a session."""
         session = self.session
         frame = None if session is None or session.is_over else session.latest()
         row = self.hand if frame is None else np.array(frame["tool"][0])
         return pose_of_row(row[:3], row[3:])
 
     def set_stiffness(self, stiffness: float) -> None:
-        """Set the spring between hand and tool, N/m."""
+        """Set the stiffness of the virtual coupling, N/m."""
         self.stiffness = stiffness
         session = self.session
         if session is not None and not session.is_over:
@@ -304,7 +305,7 @@ class Browser:
         return row_of_pose(self.site.facts.start(self.tool.radius, self.number))
 
     def _share(self) -> None:
-        """Show the tool to everyone, with the person's name to everyone else."""
+        """Show the tool in every browser, with the person's name in all others."""
         self._unshare()
         scene = self.site.server.scene
         name = f"/people/{self.number}"
@@ -357,7 +358,7 @@ class Browser:
         self.frame_came(one, wrench, touched, now)
 
     def _plumb(self, now: float) -> None:
-        """Draw a line from the hand to what lies below it, as a plumb hangs."""
+        """Draw the plumb line from the hand to the first surface below it."""
         if now - self._plumbed_at < PLUMB_EVERY:
             return
         self._plumbed_at = now
@@ -365,16 +366,16 @@ class Browser:
         self.drawing.plumb(self.hand[:3], None if met is None else met.point)
 
     def objects_changed(self) -> None:
-        """Objects were added, moved or removed by someone; called in the database's thread."""
+        """Drop removed objects from the selection; called in the follower's thread."""
         present = self.site.objects.keys()
         self.chosen = tuple(i for i in self.chosen if i in present)
         if self.taken is not None and self.taken not in present:
             self.taken = None
-        if not set(self.unfelt) <= set(self._unfelt):  # one that is not seen has come
+        if not set(self.unfelt) <= set(self._unfelt):  # a hidden object has come back
             self.begin_anew()
 
     def close(self) -> None:
-        """End the session and take the tool out of everyone's view."""
+        """End the session and remove the tool from every view."""
         self._is_closed = True
         self.site.view.contents.leave(self.client.client_id)
         if self.site.edits is not None:
@@ -388,6 +389,6 @@ class Browser:
 
 
 def has_moved(pose: Floats, before: Floats, diagonal: float) -> bool:
-    """Whether a pose (7,) looks other than before, in a scene of that diagonal, metres."""
+    """Whether two poses (7,) differ visibly in a scene of a diagonal, metres."""
     change = np.abs(pose - before)
     return bool((change[:3] > LEAST_SEEN * diagonal).any() or (change[3:] > LEAST_SEEN).any())

@@ -1,4 +1,4 @@
-"""Checks of values from a browser, which may send anything: UsageError for all others."""
+"""Validation of values from a browser: UsageError for any unexpected value."""
 
 import math
 from collections.abc import Collection
@@ -9,11 +9,11 @@ from numpy.typing import NDArray
 from hapticdb.errors import UsageError
 
 FARTHEST = 1e9
-"""Greatest coordinate that a browser may send, metres, as of poses in files."""
+"""Greatest coordinate, metres, as of poses in files."""
 
 
 def number_of(value: object, low: float, high: float, what: str) -> float:
-    """Return a finite number between two bounds."""
+    """A finite number in [low, high]."""
     if isinstance(value, bool) or not isinstance(value, int | float | np.number):
         raise UsageError(f"{what}: give a number")
     number = float(value)
@@ -23,28 +23,28 @@ def number_of(value: object, low: float, high: float, what: str) -> float:
 
 
 def text_of(value: object, longest: int, what: str) -> str:
-    """Return a text of at most `longest` letters, on one line."""
+    """A text of at most `longest` characters; characters that cannot be printed are dropped."""
     if not isinstance(value, str) or len(value) > longest:
         raise UsageError(f"{what}: give a text of at most {longest} letters")
     return "".join(letter for letter in value if letter.isprintable())
 
 
 def choice_of(value: object, choices: Collection[str], what: str) -> str:
-    """Return one of the choices that are there now."""
+    """One of the current choices."""
     if not isinstance(value, str) or value not in choices:
         raise UsageError(f"{what}: choose one of the list")
     return value
 
 
 def flag_of(value: object, what: str) -> bool:
-    """Return a box's state, ticked or not."""
+    """State of a check box."""
     if not isinstance(value, bool):
         raise UsageError(f"{what}: tick the box, or clear it")
     return value
 
 
 def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.float64]:
-    """Return `n` finite numbers (n,), none larger than `most` without its sign."""
+    """`n` finite numbers (n,) with an absolute value of at most `most`."""
     try:
         numbers = np.asarray(value, dtype=np.float64)
     except (TypeError, ValueError):
@@ -55,7 +55,7 @@ def numbers_of(value: object, n: int, most: float, what: str) -> NDArray[np.floa
 
 
 def row_of(position: object, wxyz: object) -> NDArray[np.float64]:
-    """Pose (7,) of a gizmo: position in metres, quaternion scalar first, made unit here."""
+    """Pose (7,) of a gizmo: metres, and a quaternion, scalar first, normalised here."""
     point = numbers_of(position, 3, FARTHEST, "a place")
     turn = numbers_of(wxyz, 4, FARTHEST, "a turn")
     length = math.hypot(*turn)

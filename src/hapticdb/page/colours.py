@@ -1,4 +1,4 @@
-"""Colours of the page: of tools, arrows, contacts and objects."""
+"""Colours of tools, arrows, contacts and objects."""
 
 import colorsys
 from typing import cast
@@ -10,20 +10,20 @@ from numpy.typing import NDArray
 from hapticdb.store.base import Object
 
 Colour = tuple[int, int, int]
-"""Red, green and blue as a screen shows them (sRGB), 0 to 255."""
+"""Red, green and blue, sRGB, 0 to 255."""
 Rgba = tuple[int, int, int, int]
-"""A colour and an opacity, 0 to 255."""
+"""sRGB colour and opacity, 0 to 255."""
 
 FORCE: Colour = (235, 104, 20)
-"""Force: its arrow and its plot."""
+"""Arrow and plot of the force."""
 TORQUE: Colour = (126, 87, 194)
-"""Torque: its arrow."""
+"""Arrow of the torque."""
 MARK: Colour = (214, 39, 60)
-"""What a sweep hits, and the ends of a measured distance."""
+"""Tool of a sweep at its first collision."""
 HELD: Colour = (250, 176, 5)
-"""A chosen part."""
+"""Default colour of the selected parts' colour control."""
 GOLDEN = 0.61803398875
-"""Part of the circle of hues from one number to the next: neighbours in number differ most."""
+"""Golden ratio: step in hue, as a share of the circle, so that neighbours in number differ most."""
 FAMILIES: tuple[Colour, ...] = (
     (158, 181, 207), (216, 181, 160), (174, 198, 164), (188, 178, 208), (221, 206, 168),
     (160, 194, 191), (211, 175, 187), (184, 190, 198), (200, 187, 165), (168, 181, 203),
@@ -31,19 +31,19 @@ FAMILIES: tuple[Colour, ...] = (
 )  # fmt: skip
 """Colours of sub-assemblies."""
 SHADES = (1.0, 0.86)
-"""Brightness of the objects of one sub-assembly, in turns by name. More shades: as `FAMILIES`."""
+"""Brightness of the objects of one sub-assembly, by a hash of the name."""
 MOST_COLOURS = 32
-"""Colours of one shape that are drawn. More: finer steps, and more nodes."""
+"""Colours of one shape. More: finer steps, and a node for each."""
 HEIGHTS: tuple[Colour, ...] = (
     (62, 84, 122), (74, 128, 140), (122, 162, 120), (206, 184, 126), (238, 226, 204),
 )  # fmt: skip
-"""Colours of a cloud without its own, from low to high."""
+"""Colour ramp of a cloud without colours, from low to high."""
 MARKED: Colour = (255, 170, 0)
-"""Colour of what is highlighted."""
+"""Highlighted objects."""
 FADED: Rgba = (128, 138, 150, 20)
-"""Colour and opacity of everything beside a pair that is shown."""
+"""All objects outside the selected pair."""
 PAIR: tuple[Colour, Colour] = ((235, 104, 20), (36, 99, 160))
-"""Colours of the two parts of a pair: orange and blue."""
+"""The two parts of a pair: orange and blue."""
 
 
 def _hue(number: int, lightness: float, saturation: float) -> Colour:
@@ -62,7 +62,7 @@ def of_tool(number: int) -> Colour:
 
 
 def of_contacts(points: NDArray[np.float64], touched: list[Object]) -> NDArray[np.uint8]:
-    """Colours (n, 3) of contacts (n, 3), metres: of the nearest, smallest touched box."""
+    """Colours (n, 3) of contacts (n, 3), metres: of the nearest AABB; in a tie, the smallest."""
     if not touched or not len(points):
         return np.full((len(points), 3), FORCE, dtype=np.uint8)
     ordered = sorted(touched, key=lambda obj: float(np.prod(obj.bounds[1] - obj.bounds[0])))
@@ -79,10 +79,11 @@ def of_contacts(points: NDArray[np.float64], touched: list[Object]) -> NDArray[n
 
 
 def colour_of(obj: Object) -> Colour:
-    """Colour of an object: the same in each session, whatever other objects there are.
+    """Colour of an object, the same in each session, independent of other objects.
 
-    The first element of its path gives the colour, or, for a name that is no path, its geometry, so
-    that equal parts look equal. The rest of the name gives the shade.
+    The first element of its path selects the family, so a sub-assembly has one; an object whose
+    name is no path has its family from its geometry, so equal parts look equal. A hash of the rest
+    of the name selects the shade.
     """
     assembly, _, rest = obj.name.partition("/")
     family = FAMILIES[_number(assembly if rest else obj.digest) % len(FAMILIES)]
@@ -92,10 +93,10 @@ def colour_of(obj: Object) -> Colour:
 
 
 def few(colours: NDArray[np.uint8] | None) -> tuple[list[Rgba], NDArray[np.int64]]:
-    """At most `MOST_COLOURS` colours, and the number in them of each of the given ones (n, 4)."""
+    """Palette of at most `MOST_COLOURS` colours, and the index in it of each colour (n, 4)."""
     if colours is None or not len(colours):
         return [], np.empty(0, dtype=np.int64)
-    # as numbers, which sort ten times faster than rows
+    # integers sort ten times faster than rows
     packed = np.ascontiguousarray(colours).view(">u4").reshape(-1).astype(np.uint32)
     shades, number = np.unique(packed, return_inverse=True)
     palette = shades.astype(">u4").view(np.uint8).reshape(-1, 4)
@@ -111,7 +112,7 @@ def few(colours: NDArray[np.uint8] | None) -> tuple[list[Rgba], NDArray[np.int64
 
 
 def by_height(heights: NDArray[np.float64]) -> NDArray[np.uint8]:
-    """Colours (n, 3) of heights (n,): from the lowest to the highest of 98 in 100 points."""
+    """Colours (n, 3) of heights (n,); the ramp spans percentiles 1 to 99."""
     low, high = np.percentile(heights, [1, 99])
     share = (heights - low) / max(float(high - low), 1e-12) * (len(HEIGHTS) - 1)
     steps, shades = np.arange(len(HEIGHTS)), np.array(HEIGHTS)
@@ -124,7 +125,7 @@ def _number(text: str) -> int:
 
 
 def sent(colours: NDArray[np.uint8]) -> NDArray[np.uint8]:
-    """Colours (..., 3) as the browser's batched meshes take them: linear light, not sRGB."""
+    """Colours (..., 3) in linear light, as viser's batched meshes take them."""
     light = colours / 255.0
     light = np.where(light <= 0.04045, light / 12.92, ((light + 0.055) / 1.055) ** 2.4)
     return np.round(255.0 * light).astype(np.uint8)

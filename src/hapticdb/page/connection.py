@@ -1,12 +1,10 @@
-"""What the server and its page process say to one another.
+"""Connection between the server and its page process.
 
-The page answers on a port of the loopback interface, which every user of this machine can reach. So
-the server makes a secret for each page process, and shows it in a header of each connection, beside
+The page listens on a port of the loopback interface, open to every user of the machine. So the
+server makes a secret for each page process and sends it in a header of each connection, along with
 the browser's name and role. The page closes every connection without it.
 
-The page also asks the server for what a hand calls (``prepare``), and is told how far that is.
-
-The messages are lines of JSON on a socket pair that the page process inherits.
+Messages are lines of JSON on an inherited socket pair: ``ping``, ``pong``, ``refused``.
 """
 
 import contextlib
@@ -27,27 +25,27 @@ LOG = logging.getLogger("hapticdb.page")
 SECRET, NAME, ROLE = "hapticdb-secret", "hapticdb-name", "hapticdb-role"
 """Headers of the server's connections to the page."""
 ROLES = ("viewer", "toucher", "editor")
-"""Roles, each with the rights of those before it: sees, feels, moves parts."""
+"""Roles; each includes the rights of those before it: to view, to touch, to move parts."""
 LONGEST_LINE = 4096
-"""Most bytes of one message. A longer line means that something else writes there."""
+"""Greatest length of a message, bytes."""
 LONGEST_WORDS = 200
-"""Letters of an error of viser in the log. Larger: more of what a client sent stands there."""
+"""Characters of a viser error in the log."""
 LATE = 1013
 """WebSocket close code "try again later", for a connection without the secret."""
 BREAKS_RULES = 1008
 """WebSocket close code "policy violation"."""
 MOST_FAILED = 20
-"""Messages of one connection that viser cannot take in, such as a text for a slider, before it is
-closed. Larger: such a client fills the log longer."""
+"""Messages that viser fails at, such as a text for a slider, before the connection is closed.
+Larger: a longer log from such a client."""
 
 
 class PageRequest(NamedTuple):
-    """What the page process is started with.
+    """Arguments of the page process.
 
-    urls : the environment's address for each role: the database decides what each may do; tools :
-    files, the first is chosen at the start; server, host : descriptors of the sockets to the server
+    urls : the environment's address for each role, whose rights the database enforces; tools :
+    files, the first is the initial tool; server, host : descriptors of the sockets to the server
     (this module) and to the `SessionHost`; secret : of the server's connections; recordings : a
-    folder, or None; is_direct : whether hands are coupled nowhere.
+    folder, or None; is_direct : direct rendering for all hands, without virtual coupling.
     """
 
     urls: Mapping[str, str]
@@ -61,7 +59,7 @@ class PageRequest(NamedTuple):
 
 
 class Visitor(NamedTuple):
-    """Who looks at the page through one browser: the name that others see, and the role."""
+    """Person at a browser: displayed name, and role."""
 
     name: str
     role: str
@@ -72,7 +70,7 @@ class Visitor(NamedTuple):
 
 
 class PageConnection:
-    """The page's end, on an inherited socket: lets in the server's connections, and nobody else."""
+    """The page's end of the inherited socket; admits connections of the server alone."""
 
     def __init__(self, descriptor: int, secret: str) -> None:
         self._socket = socket.socket(fileno=descriptor)
@@ -82,7 +80,7 @@ class PageConnection:
         self._thread.start()
 
     def guard(self, server: "viser.ViserServer") -> None:
-        """Close each connection to a viser server that is not our server's, or sends nonsense.
+        """Close connections without the secret, or with too many bad messages.
 
         A message that viser fails at is one line of the log, whatever viser raises.
         """
@@ -107,7 +105,7 @@ class PageConnection:
         inner.on_client_disconnect(leave)
 
     def visitor(self, client_id: int) -> Visitor:
-        """Return who a client is; KeyError if it is not connected, or not by our server."""
+        """Visitor of a client; KeyError without a connection or without the secret."""
         request = self._live[client_id].request
         assert request is not None  # noqa: S101 - the handshake is over
         shown = "".join(request.headers.get_all(SECRET)).encode(errors="replace")
@@ -116,7 +114,7 @@ class PageConnection:
         return Visitor(request.headers[NAME], request.headers[ROLE])
 
     def tell(self, word: str) -> None:
-        """Send a message to the server; does nothing if it has ended."""
+        """Send a message to the server; ignored if the server has ended."""
         with contextlib.suppress(OSError):
             self._socket.sendall(line(word))
 
@@ -130,14 +128,14 @@ class PageConnection:
 
 
 class _Nonsense:
-    """Messages that viser fails at: each is one line of the log, and too many end a connection."""
+    """Messages that viser fails at: one log line each; `MOST_FAILED` close a connection."""
 
     def __init__(self, connections: Mapping[Any, Any]) -> None:
         self._connections = connections
         self._failed: dict[int, int] = {}
 
     def contain(self, handler: Any) -> None:  # noqa: ANN401 - the server, or a connection
-        """Let nothing out that viser raises where it handles a message."""
+        """Wrap viser's message handler: no exception leaves it."""
         handle = handler._handle_incoming_message  # noqa: SLF001 - viser shows it nowhere else
 
         async def handled(client_id: int, message: "Message") -> None:
@@ -149,14 +147,14 @@ class _Nonsense:
         handler._handle_incoming_message = handled  # noqa: SLF001 - likewise
 
     def forget(self, client: int) -> None:
-        """Forget a client that has gone."""
+        """Drop a client's count after it has disconnected."""
         self._failed.pop(client, None)
 
     async def _fail(self, client: int, message: "Message", error: Exception) -> None:
         live = self._connections.get(client)
         failed = self._failed.get(client, 0) + 1
         if live is None or failed > MOST_FAILED:
-            return  # it has gone, or is being closed
+            return  # disconnected, or closing
         self._failed[client] = failed
         words = " ".join(f"{type(error).__name__}: {error}".split())[:LONGEST_WORDS]
         LOG.warning("a browser's %s cannot be taken in: %s", type(message).__name__, words)
@@ -165,5 +163,5 @@ class _Nonsense:
 
 
 def line(word: str, text: str = "") -> bytes:
-    """Bytes of a message."""
+    """Encoded message: JSON and a newline."""
     return json.dumps({"word": word, "text": text}).encode() + b"\n"

@@ -1,4 +1,4 @@
-"""The database behind the page: one thread has it open, and no thread of the page waits for it."""
+"""Database thread of the page, so that no other thread waits for the database."""
 
 import logging
 import queue
@@ -12,15 +12,15 @@ from hapticdb.errors import HapticDBError
 
 LOG = logging.getLogger("hapticdb.page")
 MOST_WAITING = 64
-"""Jobs that wait."""
+"""Capacity of the queue."""
 ENDS_WITHIN = 0.2
-"""Seconds in which a thread without a job ends. Larger: it wakes less often."""
+"""Poll period of an idle thread, seconds; bounds the time to end it."""
 
 Answer = TypeVar("Answer")
 
 
 class DatabaseThread:
-    """An environment in a thread of its own, opened for the first of all browsers' jobs."""
+    """Thread with an environment, opened at the first job of any browser."""
 
     def __init__(self, url: str, *, read_only: bool = True) -> None:
         self._url, self._read_only = url, read_only
@@ -36,7 +36,7 @@ class DatabaseThread:
         then: Callable[[Answer], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do a job later, in the database's thread; then call `then` or `failed` there, shortly."""
+        """Queue a job; then `then` or `failed` is called in this thread, and must be short."""
 
         def work() -> None:
             try:
@@ -52,7 +52,7 @@ class DatabaseThread:
             failed(HapticDBError("the database is busy with other people's wishes: try again"))
 
     def close(self) -> None:
-        """End the thread after the job that runs now."""
+        """End the thread after its current job."""
         self._is_ending.set()
         self._thread.join(10.0)
 
@@ -68,7 +68,7 @@ class DatabaseThread:
             self._env.close()
 
     def _opened(self) -> Environment:
-        """The environment, which is opened if it is not yet open."""
+        """The environment, opened on first use."""
         if self._env is None:
             self._env = open_environment(self._url, read_only=self._read_only)
         return self._env

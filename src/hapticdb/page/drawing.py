@@ -1,4 +1,4 @@
-"""What a person's own view shows beside the objects: hand, tool, arrows, contacts, marks."""
+"""Nodes of one person's view, apart from the objects: hand, tool, arrows, contacts, marks."""
 
 from typing import TYPE_CHECKING
 
@@ -21,23 +21,23 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 LONGEST_ARROW = 0.22
-"""Length of the longest arrow, as a share of the scene's diagonal: that of a force at the cap."""
+"""Length of an arrow at the force cap, as a share of the scene's diagonal."""
 ARROW_BEGINS = 1e-3
-"""Share of its longest length below which an arrow is not drawn. Larger: fewer arrows."""
+"""Least length of an arrow, as a share of the longest."""
 LEAST_DRAWN = 2e-4
-"""Least change that is drawn: of places as a share of the diagonal, of forces as one of the cap."""
+"""Least change drawn: of positions as a share of the diagonal, of forces as a share of the cap."""
 HAND_GIZMO = 110.0
-"""Size of the hand's gizmo in every view, pixels. Larger: easier to grab, and more is behind it."""
+"""Size of the hand's gizmo, pixels. Larger: easier to grab, and hides more."""
 PLUMB: colours.Colour = (70, 80, 95)
-"""Colour of the line from the hand to what lies below it."""
+"""Colour of the plumb line."""
 CONTACT_SHARE = 0.004
-"""Size of a contact's mark, as a share of the scene's diagonal. Larger: seen from farther away."""
+"""Size of a contact mark, as a share of the scene's diagonal."""
 
 
 def add_tool(
     scene: "SceneApi", name: str, tool: HeldTool, colour: colours.Colour, opacity: float | None
 ) -> "MeshHandle":
-    """Add a tool's surface to a scene; returns its handle, whose pose is the tool's."""
+    """Add a tool's surface to a scene; the pose of its handle is the tool's."""
     return scene.add_mesh_simple(
         name,
         tool.vertices,
@@ -54,7 +54,7 @@ def add_tool(
 def add_marks(
     scene: "SceneApi", name: str, places: Floats, words: str, size: float
 ) -> "list[SceneNodeHandle]":
-    """Mark places (N, 3), metres, with words beside the first; returns the nodes."""
+    """Mark points (N, 3), metres, with a label at the first; returns the nodes."""
     return [
         scene.add_point_cloud(
             name, places - places[0], (255, 214, 0), point_size=size, point_shape="circle",
@@ -65,24 +65,23 @@ def add_marks(
 
 
 def put_at(node: "SceneNodeHandle", pose: NDArray[np.floating]) -> None:
-    """Put a node at a pose (7,): metres, unit quaternion, scalar first."""
+    """Set a node's pose (7,): metres, unit quaternion, scalar first."""
     node.position = pose[:3]
     node.wxyz = pose[3:]
 
 
 class HandDrawing:
-    """Hand and tool of the person who looks, in their view alone.
+    """Hand and tool of one person, in their view alone.
 
-    diagonal : of the scene's box, metres, which sizes of arrows and marks follow; middle (3,) : of
-    that box, from which points are sent, since a browser has them in float32; cap : greatest force
-    that is sent, N.
+    diagonal : of the scene's AABB, metres; unit of arrow and mark sizes; middle (3,) : centre of
+    that AABB, origin of the points, since viser sends float32; cap : greatest force sent, N.
     """
 
     def __init__(self, client: "ClientHandle", diagonal: float, middle: Floats, cap: float) -> None:
         self._client = client
         self._diagonal = diagonal
         self.middle = middle
-        """Position of the nodes whose points are sent from it."""
+        """Position of the nodes with points relative to it."""
         self.cap = cap
         self._ghost: MeshHandle | None = None
         self._seen = np.full(12, 1e300)
@@ -92,7 +91,7 @@ class HandDrawing:
             "/hand", scale=HAND_GIZMO, fixed=True, line_width=3.0, disable_sliders=True,
             opacity=0.9, depth_test=False, visible=False, translation_limits=((-1e9, 1e9),) * 3,
         )  # fmt: skip
-        # Until the hand moves. A browser places letters in float32, which scatters them far away.
+        # Visible until the hand moves. Browsers place letters in float32: far away they scatter.
         step = float(np.spacing(np.abs(middle).max().astype(np.float32)))
         self.words = scene.add_label(
             "/hand/words", "", anchor="top-right", visible=step < LEAST_DRAWN * diagonal
@@ -126,7 +125,7 @@ class HandDrawing:
         )  # fmt: skip
 
     def hold(self, tool: HeldTool, colour: colours.Colour, pose: Floats) -> None:
-        """Show a tool's ghost at the gizmo, which goes to a pose (7,)."""
+        """Show a tool's ghost at the gizmo, both at a pose (7,)."""
         if self._ghost is not None:
             self._ghost.remove()
         self.gizmo.visible = True
@@ -135,7 +134,7 @@ class HandDrawing:
         self._ghost = add_tool(self._client.scene, "/hand/ghost", tool, colour, 0.28)
 
     def show(self, tool: Floats, hand: Floats, wrench: Floats) -> None:
-        """Show the force and torque (6,) at the tool's place, and the line from hand to tool."""
+        """Show the wrench (6,), N and N m, at the tool (7,), and a line from the hand (7,)."""
         seen = np.concatenate([tool[:3], hand[:3], wrench / self.cap * self._diagonal])
         if np.abs(seen - self._seen).max() < LEAST_DRAWN * self._diagonal:
             return
@@ -150,11 +149,11 @@ class HandDrawing:
                 self._tether.points = self._sent([[place, hand[:3]]])
 
     def _sent(self, points: ArrayLike) -> NDArray[np.float32]:
-        """Points as their nodes have them."""
+        """Points relative to `middle`."""
         return np.asarray(np.asarray(points) - self.middle, np.float32)
 
     def point(self, arrow: "ArrowsHandle", start: Floats, force: Floats) -> None:
-        """Let an arrow, whose node is at `middle`, show a force (3,), N, at a place."""
+        """Show a force (3,), N, at a position by an arrow with its node at `middle`."""
         longest = LONGEST_ARROW * self._diagonal
         way = force * (longest / self.cap)
         length = float(np.linalg.norm(way))
@@ -165,7 +164,7 @@ class HandDrawing:
         arrow.visible = is_seen
 
     def show_contacts(self, points: Floats, palette: NDArray[np.uint8]) -> None:
-        """Mark contacts (n, 3), each in its colour (n, 3)."""
+        """Mark contacts (n, 3), metres, in colours (n, 3)."""
         is_touching = bool(len(points))
         is_other = len(points) != len(self._marked) or bool(
             (np.abs(points - self._marked) > LEAST_DRAWN * self._diagonal).any()
@@ -178,7 +177,7 @@ class HandDrawing:
         self._contacts.visible = is_touching
 
     def plumb(self, hand: Floats, below: Floats | None) -> None:
-        """Draw a line from the hand to a place below it; none without a place."""
+        """Draw a line from the hand to a point below it; none without a point."""
         if below is None:
             self._plumb.visible = self._spot.visible = False
             return
@@ -189,7 +188,7 @@ class HandDrawing:
             self._plumb.visible = self._spot.visible = True
 
     def rest(self) -> None:
-        """Show no force, no contact and no line."""
+        """Hide the wrench, the contacts and the line to the tool."""
         self._seen = np.full(12, 1e300)
         for node in (self._force, self._torque, self._tether, self._contacts):
             node.visible = False

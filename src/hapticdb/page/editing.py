@@ -1,4 +1,4 @@
-"""Edits that people make on the page: one thread, one writable connection, undo for each person."""
+"""Edits of the page's editors: one thread, one writable connection, undo per person."""
 
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
@@ -30,15 +30,15 @@ Floats = NDArray[np.float64]
 
 
 MOST_STEPS = 1000
-"""Steps of a person that can be undone. Larger: more records in memory."""
+"""Greatest length of a person's undo history."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Step:
-    """One edit of one object, which was one transaction.
+    """One edit of one object, one transaction.
 
-    before : the object before it; for "put back", as it was when it was taken out;
-    place (4, 4) : world_from_part after it, metres; for "take out", where the object was.
+    before : the object before it; for "put back", before its removal; place (4, 4) :
+    world_from_part after it, metres; for "take out", before the removal.
     """
 
     kind: Literal["move", "take out", "put back"]
@@ -46,7 +46,7 @@ class _Step:
     place: Floats
 
     def describe(self) -> str:
-        """One line for people: what was done, to which object."""
+        """One line for people: the edit and its object."""
         whom = f"{self.before.id} ({self.before.name})"
         if self.kind != "move":
             return f"{'took out' if self.kind == 'take out' else self.kind} {whom}"
@@ -58,35 +58,35 @@ class _Step:
 
 
 class PersonsEdits:
-    """Edits of one person in an environment, each one transaction, and their undo.
+    """Edits of one person, each one transaction, and their undo.
 
-    A step is based on an object as the person saw it, and an undo on the person's last write of it.
-    If somebody else has written the object since, nothing is written, and ConflictError says so.
-    Steps from before another's write cannot be undone: they would take that back, too.
+    An edit is based on the revision of the object as shown to the person, an undo on the revision
+    of the person's last write of it. A newer write by another person raises ConflictError, and
+    nothing is written. It also ends the undo of earlier edits of the object, which would revert it.
     """
 
     def __init__(self, env: Environment) -> None:
         self._env = env
         self._done: list[_Step] = []
         self._revisions: dict[int, int] = {}
-        """Of the person's last write of each object, by its id."""
+        """Revision of the person's last write of each object, by id."""
         self._out: dict[int, Object] = {}
 
     def move(self, obj: Object, way: Floats) -> Object:
-        """Displace an object by (4, 4); ConflictError if another has written it since."""
+        """Displace an object by (4, 4), world frame; ConflictError after another person's write."""
         place = way @ obj.transform
         moved = self._move(obj, place, obj.revision)
         self._note(_Step("move", obj, place))
         return moved
 
     def take_out(self, obj: Object) -> str:
-        """Take an object, as the person saw it, out of the scene; errors as for `move`."""
+        """Remove an object at the revision shown to the person; errors as for `move`."""
         before = self._take_out(obj, obj.revision)
         self._note(_Step("take out", before, before.transform))
         return f"{short_name(obj.name)} is out"
 
     def put_back(self) -> str:
-        """Put back the object taken out last; UsageError if none, or ConflictError."""
+        """Restore the object removed last; UsageError without one, or ConflictError."""
         if not self._out:
             raise UsageError("you have taken no part out")
         before = [*self._out.values()][-1]
@@ -95,7 +95,7 @@ class PersonsEdits:
         return f"{short_name(before.name)} is back"
 
     def undo(self) -> str:
-        """Undo the person's last step; ConflictError if somebody has written its object since."""
+        """Undo the person's last edit; ConflictError after another person's write of its object."""
         if not self._done:
             raise UsageError("there is nothing to undo")
         step = self._done[-1]
@@ -114,12 +114,12 @@ class PersonsEdits:
         return f"undid: {step.describe()}"
 
     def accept(self, group: Group, known: Known, because: str | None) -> str:
-        """Accept the pairs of a group, or no longer without a reason."""
+        """Accept the pairs of a group for a reason; None withdraws the acceptance."""
         accept_pairs(self._env.store, [(one.a, one.b) for one in group.pairs], known, because)
         return "the pairs are " + ("no longer accepted" if because is None else "accepted")
 
     def add_rule(self, text: str, within: float) -> str:
-        """Add a rule about pairs within a distance, metres, after the others."""
+        """Append a rule for pairs within a distance, metres."""
         add_rules(self._env.store, [text], within)
         return "the rule is kept: look again"
 
@@ -146,9 +146,9 @@ class PersonsEdits:
         self._wrote(now, removed.transform, self._revisions[removed.id])
 
     def _wrote(self, obj: Object, place: Floats, base: int) -> None:
-        """Note a write, which was based on a revision: of another, it ends what can be undone.
+        """Record the revision of a write; another person's base revision ends the undo before it.
 
-        `obj` was read after the write. It may be as another has written it since.
+        `obj` was read after the write, so it may include a later write by another person.
         """
         if base != self._revisions.get(obj.id, base):
             self._drop(obj.id)
@@ -163,7 +163,7 @@ class PersonsEdits:
 
 @contextmanager
 def _conflicts_named(obj: Object) -> Iterator[None]:
-    """Say in a person's words that somebody else has written an object meanwhile."""
+    """Replace conflicts by messages for people."""
     try:
         yield
     except (ConflictError, ObjectNotFoundError) as error:
@@ -174,7 +174,7 @@ def _conflicts_named(obj: Object) -> Iterator[None]:
 
 
 class Edits:
-    """Edits of all people of a page, at the environment's address for one who may write."""
+    """Edits of all people, at the address of the role editor."""
 
     def __init__(self, url: str) -> None:
         self._database = DatabaseThread(url, read_only=False)
@@ -187,7 +187,7 @@ class Edits:
         then: Callable[[Answer], Any],
         failed: Callable[[HapticDBError], Any],
     ) -> None:
-        """Do an edit of a person, a unique number, later; then call `then` or `failed`."""
+        """Queue an edit of a person, a unique number; then `then` or `failed` is called."""
 
         def refused(error: HapticDBError) -> None:
             if isinstance(error, AccessError):
@@ -203,7 +203,7 @@ class Edits:
         self._database.ask(work, then, refused)
 
     def forget(self, person: int) -> None:
-        """Forget a person's moves."""
+        """Drop a person's undo history."""
         self._of.pop(person, None)
 
     def close(self) -> None:

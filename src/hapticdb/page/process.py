@@ -1,4 +1,4 @@
-"""The page's process: viser on the loopback interface, behind the server's relay."""
+"""Page process: viser on the loopback interface, behind the server's relay."""
 
 import contextlib
 import io
@@ -19,7 +19,7 @@ if TYPE_CHECKING:
     from viser import ClientHandle, ViserServer
 
 LOOKED_EVERY = 0.2
-"""Seconds from one look for the parent's end to the next. Larger: the process lives longer."""
+"""Period of the check for the parent's end, seconds."""
 PANEL = 340
 """Width of the panels, pixels. Larger: longer names, and less of the scene."""
 
@@ -44,7 +44,7 @@ def work(request: PageRequest, sender: MessageSender) -> None:
 
 
 def stop(server: "ViserServer") -> None:
-    """Stop viser, which would print that it has stopped."""
+    """Stop viser without its message on stdout."""
     with contextlib.redirect_stdout(io.StringIO()):
         server.stop()
 
@@ -53,14 +53,14 @@ def new_server() -> "ViserServer":
     """Start viser on a free port of the loopback interface."""
     import viser  # noqa: PLC0415 - the extra `view`
 
-    # a browser may go at any moment: what is sent to it then needs no words
+    # a browser may disconnect at any time: no warning for messages in its queue
     warnings.filterwarnings("ignore", "Queued a .* on a closed connection", UserWarning)
-    with contextlib.redirect_stdout(io.StringIO()):  # it prints a box with its own address
+    with contextlib.redirect_stdout(io.StringIO()):  # viser prints a box with its own address
         return viser.ViserServer("127.0.0.1", 0, verbose=False)
 
 
 def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
-    """Show the scene, and panels for each browser; `visitor_of`: KeyError if it has gone."""
+    """Show scene and panels; `visitor_of` raises KeyError after a client's disconnect."""
     server = site.server
     server.gui.set_panel_label(site.title)
     server.gui.configure_theme(
@@ -73,7 +73,7 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
     def connect(client: "ClientHandle") -> None:
         try:
             visitor = visitor_of(client.client_id)
-        except KeyError:  # it has gone again
+        except KeyError:  # disconnected already
             return
         number = site.take_number()
         try:
@@ -83,7 +83,7 @@ def open_page(site: Site, visitor_of: "Callable[[int], Visitor]") -> None:
             site.free_number(number)
             raise
         site.browsers[client.client_id] = browser
-        if client.client_id not in server.get_clients():  # it has gone while that was made
+        if client.client_id not in server.get_clients():  # disconnected meanwhile
             disconnect(client)
 
     def disconnect(client: "ClientHandle") -> None:

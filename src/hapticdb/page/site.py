@@ -1,4 +1,4 @@
-"""What all browsers of one page share: the environment's objects, tools, sessions, and a clock."""
+"""State shared by all browsers of a page: objects, tools, session host and clock."""
 
 import logging
 import threading
@@ -29,30 +29,29 @@ LOG = logging.getLogger("hapticdb.page")
 Floats = NDArray[np.float64]
 
 TICKS = 30.0
-"""Updates of tools and arrows, a second. Larger: smoother to look at, and more of a core for each
-browser."""
+"""Frequency of the clock, Hz. Larger: smoother motion, and more CPU for each browser."""
 WORKERS = 4
-"""Threads that begin sessions, so that a slow one delays no other browser much."""
+"""Threads for sessions: a slow start delays no other browser much."""
 
 
 class _Updated(Protocol):
-    """What a site asks of each browser, which imports this module."""
+    """Interface of a browser to the site; `Browser` itself imports this module."""
 
     def tick(self, now: float) -> None:
-        """Show what is new; called `TICKS` times a second, with seconds of a clock."""
+        """Show new frames; called `TICKS` times a second, with a monotonic time in seconds."""
 
     def objects_changed(self) -> None:
-        """Show the objects as they are now."""
+        """Show the objects' current state."""
 
     def close(self) -> None:
-        """End what the browser shows and does."""
+        """End the browser's session and nodes."""
 
 
 @dataclass(frozen=True, eq=False)
 class SceneFacts:
-    """Where everything happens: the box of all objects (2, 3), metres, and which way is up.
+    """AABB of all objects, (2, 3), metres, and orientation of the scene.
 
-    up, toward : unit vectors, the second level and towards the first eye; has_distances : whether
+    up, toward : unit vectors, upward, and horizontal towards the first eye; has_distances : whether
     forces come from distances to surfaces.
     """
 
@@ -64,7 +63,7 @@ class SceneFacts:
 
     @classmethod
     def of(cls, view: SceneView) -> "SceneFacts":
-        """SceneFacts of a view's objects; an empty environment has the box of its grid."""
+        """Facts of a view; an empty environment has the AABB of its grid."""
         box, objects = view.contents.box(), view.objects.values()
         bounds = view.grid.bounds if box is None else box
         toward = np.eye(3)[(view.up + 2) % 3]
@@ -73,23 +72,23 @@ class SceneFacts:
 
     @property
     def diagonal(self) -> float:
-        """Diagonal of the box, metres."""
+        """Diagonal of the AABB, metres."""
         return float(np.linalg.norm(self.bounds[1] - self.bounds[0])) or 1.0
 
     def start(self, radius: float, number: int) -> Floats:
-        """Pose of `tools.start_pose`, free in coarse voxels, too."""
+        """Pose (4, 4) of `tools.start_pose`, with clearance for coarse voxels."""
         radius = max(radius, tools.LEAST_VOXELS * self.voxel_size)
         return tools.start_pose(self.bounds, self.up, self.toward, radius, number)
 
     def reach(self, radius: float) -> float:
-        """Distance from the box's middle within which the first tool starts, metres."""
+        """Radius about the AABB's centre that contains the first tool at its start, metres."""
         away = self.start(radius, 0)[:3, 3] - self.bounds.mean(axis=0)
         return float(np.linalg.norm(away)) + radius
 
 
 @dataclass(eq=False)
 class Site:
-    """What all browsers share: viser's server, the host of sessions, and what the page is of."""
+    """State shared by all browsers; viser's server, session host, arguments of the process."""
 
     server: "ViserServer"
     host: AttachedHost
@@ -126,11 +125,11 @@ class Site:
         self.view.on_edit = self._learn
 
     def begin(self) -> None:
-        """Start the clock that updates all browsers."""
+        """Start the clock."""
         self._clock.start()
 
     def close(self) -> None:
-        """End all sessions, the clock, and the database's thread."""
+        """End all sessions, the clock and all threads."""
         self._is_ending.set()
         if self._clock.is_alive():
             self._clock.join(5.0)
@@ -144,19 +143,19 @@ class Site:
             self.edits.close()
 
     def take_number(self) -> int:
-        """Return the smallest number that no browser has: it decides a tool's colour and place."""
+        """Assign the smallest free number; it decides the tool's colour and start."""
         with self._lock:
             number = next(n for n in range(len(self._numbers) + 1) if n not in self._numbers)
             self._numbers.add(number)
             return number
 
     def free_number(self, number: int) -> None:
-        """Let another browser have a number."""
+        """Release a number."""
         with self._lock:
             self._numbers.discard(number)
 
     def leave(self, client: int) -> None:
-        """End what a client of viser shows and does; again it does nothing."""
+        """Close the browser of a client, once."""
         browser = self.browsers.pop(client, None)
         if browser is not None:
             try:
@@ -165,7 +164,7 @@ class Site:
                 LOG.exception("a browser did not end well")
 
     def everyone(self, act: Callable[[_Updated], None]) -> None:
-        """Do something for each browser; one that fails does not stop the others."""
+        """Call a function for each browser; a failure is logged and does not affect the others."""
         for browser in list(self.browsers.values()):
             try:
                 act(browser)
@@ -173,7 +172,7 @@ class Site:
                 LOG.exception("a browser's update failed")
 
     def error_text(self, error: BaseException) -> str:
-        """Words of an error as any browser may read them; see `wording.error_text`."""
+        """Text of an error for browsers; see `wording.error_text`."""
         request = self.request
         files = [obj.link for obj in self.objects.values()] + list(request.tools)
         folders = {file.rpartition("/")[0] for file in files}
@@ -182,12 +181,12 @@ class Site:
         return error_text(error, request.urls.values(), folders)
 
     def _learn(self) -> None:
-        """Objects have changed: somebody has edited the environment."""
+        """Update all browsers after a commit."""
         self.objects = self.view.objects
         self.everyone(lambda browser: browser.objects_changed())
 
     def _tick(self) -> None:
-        """Update all browsers `TICKS` times a second; a late tick is not made up for."""
+        """Update all browsers `TICKS` times a second; late ticks are skipped."""
         while not self._is_ending.is_set():
             begun = time.monotonic()
             self.everyone(lambda browser: browser.tick(begun))  # noqa: B023 - called at once
@@ -196,7 +195,7 @@ class Site:
 
 
 def checked_file(folder: Path | None, name: str) -> Path:
-    """Path in the operator's folder; UsageError without one, or if the name leads out."""
+    """Path in the operator's folder; UsageError without a folder, or for a path outside it."""
     if folder is None:
         raise UsageError("nothing is recorded here: the operator gave no folder (--recordings)")
     if not name or name != Path(name).name or name.startswith("."):

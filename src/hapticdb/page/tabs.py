@@ -1,4 +1,4 @@
-"""A browser with its tabs: the panels through which a person uses the page."""
+"""Browser with the tabs of the panel."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -21,12 +21,12 @@ if TYPE_CHECKING:
 
 
 class TabbedBrowser(Browser):
-    """A browser with all tabs; parameters as for `Browser`."""
+    """Browser with all tabs; parameters as for `Browser`."""
 
     def __init__(self, site: Site, client: "ClientHandle", visitor: Visitor, number: int) -> None:
         super().__init__(site, client, visitor, number)
         gui = client.gui
-        self._n_waiting = -1  # parts whose shape is still read; not known yet
+        self._n_waiting = -1  # parts without a shape yet; -1: never counted
         tabs = gui.add_tab_group()
         with tabs.add_tab("Touch"):
             self.touch = TouchPanel(self, gui)
@@ -43,26 +43,26 @@ class TabbedBrowser(Browser):
             self.take_in_hand(self.tool)
 
     def hand_moved(self) -> None:
-        """Show where the hand is now."""
+        """Show the hand's position."""
         self.touch.show_hand()
 
     def tool_changed(self) -> None:
-        """Show which tool is in the hand now."""
+        """Show the current tool."""
         self.touch.show_tool()
         self.parts.show_tool()
 
     def session_ended(self) -> None:
-        """Show that the session is over, and with it a recording."""
+        """End the recording in its tab."""
         self.record.session_ended()
 
     def frame_came(
         self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
     ) -> None:
-        """Show a frame of the session, its wrench (6,), and what it touches."""
+        """Show a frame's wrench (6,), N and N m, and the touched objects."""
         self.touch.show(frame, wrench, touched, now)
 
     def tick(self, now: float) -> None:
-        """Show the newest frame, of a replay, too."""
+        """Show the newest frame, of the session and of a replay."""
         self.record.tick(now)
         contents = self.site.view.contents
         waiting = contents.waiting() if self._n_waiting else 0
@@ -72,14 +72,14 @@ class TabbedBrowser(Browser):
         super().tick(now)
 
     def objects_changed(self) -> None:
-        """Objects were added, moved or removed by someone; called in the database's thread."""
+        """Update all tabs after a commit; called in the follower's thread."""
         super().objects_changed()
         self.parts.show_objects()
         self.clashes.objects_changed()
         self.parts.moving.renew()
 
     def close(self) -> None:
-        """End the session and take the tool out of everyone's view."""
+        """End the session and remove the tool from every view."""
         self._is_closed = True
         self.parts.moving.leave()
         super().close()

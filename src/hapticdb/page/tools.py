@@ -1,6 +1,6 @@
-"""Tools that a person can take in hand: built-in probes, the operator's files, parts of the scene.
+"""Tools of the page: built-in probes, the operator's files, parts of the scene.
 
-Each has its origin in its middle, so that its gizmo is where the tool is.
+The origin of each is the centre of its AABB, also of its gizmo.
 """
 
 import math
@@ -23,22 +23,21 @@ Floats = NDArray[np.float64]
 PROBE_SHARE = 0.028
 """Radius of the ball, as a share of the scene's diagonal."""
 LEAST_VOXELS = 3.0
-"""Least radius of a probe, voxels. Larger: probes feel smooth in coarser environments, and are
-larger there."""
+"""Least radius of a probe, voxels. Larger: smoother forces in coarse grids, and larger probes."""
 POINTS = 400
-"""Points of a probe's shell. Larger: smaller features are felt, and a frame takes longer."""
+"""Points of a probe's shell. More: forces from smaller features, and longer frames."""
 PART_POINTS = 1500
-"""Points of a part that is taken in hand; parts have more and finer edges than probes."""
+"""Points of a part's shell: parts have more and finer edges than probes."""
 AROUND = 40
-"""Corners around a probe. Larger: it looks rounder, and is more to send."""
+"""Segments of a probe's circumference. More: rounder, and more to send."""
 
 
 @dataclass(frozen=True, eq=False)
 class HeldTool:
-    """A tool as the page uses it.
+    """A tool of the page.
 
-    sample : makes the tool's shell, which calls kernels; vertices (V, 3) : corners of its surface,
-    about the tool's middle, metres; faces (F, 3); is_round : whether it is shaded smoothly.
+    sample : samples the point shell, by kernels; vertices (V, 3) : of its surface, metres, about
+    the tool's centre; faces (F, 3) : vertex indices; is_round : smooth shading.
     """
 
     name: str
@@ -49,20 +48,20 @@ class HeldTool:
 
     @cached_property
     def shell(self) -> PointShell:
-        """Points for the force, about the tool's middle, metres; made when it is first used."""
+        """Point shell about the tool's centre, metres; sampled at first use."""
         return self.sample()
 
     @property
     def radius(self) -> float:
-        """Distance of its farthest corner from its middle, metres."""
+        """Radius of the bounding sphere about the tool's centre, metres."""
         return float(np.linalg.norm(self.vertices, axis=1).max())
 
 
 def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
-    """Probes that fit a scene: a ball and a peg.
+    """Probes in proportion to a scene: a ball and a peg.
 
-    diagonal : of the scene's box, metres; has_distances : whether forces come from distances, so
-    that points are drawn inward by the law's onset.
+    diagonal : of the scene's AABB, metres; has_distances : whether forces come from distances, so
+    that the shell is inset by the law's onset.
     """
     radius = max(PROBE_SHARE * diagonal, LEAST_VOXELS * voxel_size)
     inset = inset_of(voxel_size, "distance" if has_distances else "plane")
@@ -83,7 +82,7 @@ def built_in(diagonal: float, voxel_size: float, *, has_distances: bool) -> list
 
 
 def from_files(paths: Sequence[str], voxel_size: float, *, has_distances: bool) -> list[HeldTool]:
-    """Tools of the operator's files, named by them; FileError if one holds no readable surface."""
+    """Tools of the operator's files, by the files' names; FileError without a surface."""
     inset = inset_of(voxel_size, "distance" if has_distances else "plane")
     found = []
     for path in map(Path, paths):
@@ -110,7 +109,7 @@ def _centred_shell(
 
 
 def from_shell(name: str, shell: PointShell) -> HeldTool:
-    """Tool of a shell in any frame: its origin becomes the middle of its box."""
+    """Tool of a shell in any frame, moved so that the centre of its AABB is the origin."""
     middle = middle_of(shell)
     surface = shell.surface
     if isinstance(surface, Surface):
@@ -129,13 +128,13 @@ def from_shell(name: str, shell: PointShell) -> HeldTool:
 
 
 def middle_of(shell: PointShell) -> Floats:
-    """Middle (3,) of the box of a shell's surface, metres, the shell's frame."""
+    """Centre (3,) of the AABB of a shell's surface, metres, the shell's frame."""
     outline = shell.outline
     return np.asarray(0.5 * (outline.min(axis=0) + outline.max(axis=0)))
 
 
 def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Surface of a profile (P, 2), radius and height, turned about the z axis: vertices, faces."""
+    """Surface of revolution about the z axis of a profile (P, 2), radius and height."""
     angles = np.arange(AROUND) * (2.0 * math.pi / AROUND)
     rings = np.stack(
         [
@@ -158,7 +157,7 @@ def _turned(profile: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def _hull(points: Floats) -> tuple[Floats, NDArray[np.int64]]:
-    """Convex hull of points (P, 3), wound outward: vertices and faces."""
+    """Convex hull of points (P, 3), metres: vertices, and faces wound outward."""
     from scipy.spatial import ConvexHull, QhullError  # noqa: PLC0415 - a third of a second
 
     try:
@@ -176,10 +175,10 @@ def _hull(points: Floats) -> tuple[Floats, NDArray[np.int64]]:
 
 
 def start_pose(bounds: Floats, up: Floats, toward: Floats, radius: float, number: int) -> Floats:
-    """Pose (4, 4) above the scene's box, where every tool is free and is seen at once.
+    """Pose (4, 4) above the scene's AABB, without contact and in view.
 
-    bounds : (2, 3) of the scene, metres; up, toward : unit vectors, the second level and towards
-    the eye; radius : of the tool, metres; number : of the person, so that tools stand side by side.
+    bounds : AABB (2, 3) of the scene, metres; up, toward : unit vectors, upward, and horizontal
+    towards the eye; radius : of the tool, metres; number : of the person, for a row of tools.
     """
     middle, half = 0.5 * (bounds[0] + bounds[1]), 0.5 * (bounds[1] - bounds[0])
     side = np.cross(up, toward)

@@ -1,8 +1,8 @@
-"""Widgets of viser, where its types need a word."""
+"""Setter for viser's widgets, missing in viser's types."""
 
 from typing import Any
 
 
 def put(widget: Any, value: object) -> None:  # noqa: ANN401 - viser's types hide the setter
-    """Set what a widget shows; its callbacks run with an event whose client is None."""
+    """Set a widget's value; its callbacks receive an event with client None."""
     widget.value = value

@@ -1,6 +1,6 @@
-"""Texts of the page: numbers with few decimals, names that fit, and everything escaped in HTML.
+"""Texts of the page: rounded numbers, shortened names, and HTML with everything escaped.
 
-Errors name files and addresses of the server's machine; `error_text` takes them out.
+`error_text` removes the server's paths and addresses from errors.
 """
 
 import html
@@ -13,25 +13,24 @@ from hapticdb.store.urls import redact
 from hapticdb.units import length_text
 
 LONGEST_NAME = 34
-"""Letters of a name on a button or in a line. Larger: more of a name is seen, and buttons wrap."""
+"""Characters of a name on a button or in a line. Larger: longer names, and buttons wrap."""
 MOST_SAID = 6
-"""Names in one list of what is touched. Larger: the panel grows and jumps while a tool slides."""
+"""Names in the list of touched objects. Larger: the panel's height varies more during a slide."""
 
 FAULT = "the page failed at this; the operator's log says why"
-"""All that a browser gets of an error that nobody has foreseen."""
+"""Text of an unexpected error."""
 ENVIRONMENT = "the environment"
-"""What stands for its address."""
+"""Replacement of the environment's address."""
 ADDRESS = re.compile(r"\b[a-zA-Z][\w+.-]*://[^\s'\"]*")
 """A URL, to its end."""
 FOLDERS = re.compile(r"""(?<![^\s'"`(\[<=:,;])/(?=[^\s/])(?:[^/\n:'",;]+/)*""")
-"""All of an absolute path but its last name. Names may have spaces."""
+"""The folders of an absolute path. Names may contain spaces."""
 
 
 def error_text(error: BaseException, addresses: Iterable[str], folders: Iterable[str] = ()) -> str:
-    """Words of an error as any browser may read them: without addresses and folders.
+    """Text of an error without addresses and folders; files stay, by name.
 
-    An absolute path in another folder than the known ones is found by its form. Files keep their
-    names.
+    Other absolute paths than those of `folders` are recognised by their form.
     """
     if not isinstance(error, HapticDBError):
         return FAULT
@@ -45,12 +44,12 @@ def error_text(error: BaseException, addresses: Iterable[str], folders: Iterable
 
 
 def plain_name(name: str) -> str:
-    """Return a name on one line: letters that cannot be printed become a question mark."""
+    """A name on one line, with question marks for characters that cannot be printed."""
     return "".join(letter if letter.isprintable() else "?" for letter in name) or "(no name)"
 
 
 def short_name(name: str, longest: int = LONGEST_NAME) -> str:
-    """Shorten a name to `longest` letters: its path's last part, then the middle is left out."""
+    """A name of at most `longest` characters: the path's last element, with its middle elided."""
     shown = plain_name(name)
     if len(shown) > longest:
         shown = shown.rsplit("/", 1)[-1] or shown
@@ -61,7 +60,7 @@ def short_name(name: str, longest: int = LONGEST_NAME) -> str:
 
 
 def escaped(text: str) -> str:
-    """Text as HTML shows it; nothing in it is read as a tag or an entity."""
+    """Text escaped for HTML."""
     return html.escape(plain_name(text), quote=True)
 
 
@@ -76,12 +75,12 @@ def torque_text(newton_metres: float) -> str:
 
 
 def size_text(obj: Object) -> str:
-    """Sides of an object's box, in metres or millimetres: ``1.2 m x 40 mm x 3 mm``."""
+    """Edges of an object's AABB, in metres or millimetres: ``1.2 m x 40 mm x 3 mm``."""
     return " × ".join(length_text(float(side)) for side in obj.bounds[1] - obj.bounds[0])  # noqa: RUF001 - the sign of sizes
 
 
 def swatch(colour: tuple[int, int, int]) -> str:
-    """Return a small square of a colour, as HTML."""
+    """A small square of a colour, as HTML."""
     red, green, blue = (int(channel) for channel in colour)
     return (
         '<span style="display:inline-block;width:0.7em;height:0.7em;border-radius:2px;'
@@ -90,7 +89,7 @@ def swatch(colour: tuple[int, int, int]) -> str:
 
 
 def rows_html(rows: Iterable[tuple[str, str]]) -> str:
-    """Return a table of two columns, both escaped."""
+    """A table of two columns, both escaped."""
     cells = "".join(
         '<tr><td style="opacity:0.6;padding:1px 10px 1px 0;vertical-align:top;white-space:nowrap">'
         f'{escaped(word)}</td><td style="word-break:break-word">{escaped(text)}</td></tr>'
@@ -100,5 +99,5 @@ def rows_html(rows: Iterable[tuple[str, str]]) -> str:
 
 
 def note_html(text: str) -> str:
-    """Return a small grey line, escaped."""
+    """A small grey line, escaped."""
     return f'<div style="font-size:0.8em;opacity:0.7;margin:2px 12px">{escaped(text)}</div>'

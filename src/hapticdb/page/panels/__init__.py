@@ -1,1 +1,1 @@
-"""The panels of a browser, one module a tab."""
+"""The tabs of the panel."""

@@ -1,4 +1,4 @@
-"""The tab Clashes: groups of pairs, shown one pair at a time; editors accept them and add rules."""
+"""Tab Clashes: groups of pairs, their display, acceptances and rules."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -25,18 +25,18 @@ if TYPE_CHECKING:
 
 ALL, OPEN = "all", "all but accepted, meant and gone"
 STATUSES = (OPEN, ALL, "new", "changed", "same", "gone", "accepted", "meant", "not looked at")
-"""Statuses by which the list is filtered."""
+"""Filter of the list by status."""
 NOTHING = "choose from the list"
 SEE = ("Show", "Next", "End")
-"""Steps: the chosen pair, the next one of its group, and everything."""
+"""Actions: show the chosen pair, show the next one of its group, show everything."""
 MOST_LISTED = 500
-"""Lines of the list; the filters find the others. Larger: a browser opens it more slowly."""
+"""Greatest number of groups in the list. Larger: slower to open in a browser."""
 LONGEST_TEXT = 400
-"""Letters of a reason, and of words that are looked for."""
+"""Greatest length of a reason, a rule, and the filter's words, characters."""
 
 
 class ClashPanel:
-    """Looks for clashes, lists and shows them; editors decide about them."""
+    """Search for clashes, list of groups, and, for editors, acceptances and rules."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -44,7 +44,7 @@ class ClashPanel:
         self._groups: list[Group] = []
         self._lines: dict[str, Group] = {}
         self._group: Group | None = None  # the chosen one
-        self._number = 0  # of its pair that is chosen
+        self._number = 0  # of its chosen pair
         self._drawn: list[Any] = []
         guard = browser.guarded
         self._within, self._contact = (
@@ -75,7 +75,7 @@ class ClashPanel:
         self._rules = gui.add_html("")
 
     def _lengths(self) -> list[float]:
-        """Greatest distance of a pair and contact tolerance, metres."""
+        """Greatest distance of a pair, and contact tolerance, metres."""
         return [
             1e-3 * checks.number_of(entry.value, 1e-6, 1e6, "a length")
             for entry in (self._within, self._contact)
@@ -107,7 +107,7 @@ class ClashPanel:
         self._fill()
 
     def objects_changed(self) -> None:
-        """Say that the list may be out of date."""
+        """Report that the list may be out of date."""
         if self._found is not None:
             self._work.said.content = note_html("Parts have changed since: look again.")
 
@@ -116,7 +116,7 @@ class ClashPanel:
             self._fill()
 
     def _fill(self) -> None:
-        """List the groups that the filters let pass."""
+        """List the groups that pass the filters."""
         kind = checks.choice_of(self._kind.value, (ALL, *REPORTED), "a kind")
         status = checks.choice_of(self._status.value, STATUSES, "a status")
         words = checks.text_of(self._words.value, LONGEST_TEXT, "words").casefold().split()
@@ -152,7 +152,7 @@ class ClashPanel:
         return self._group
 
     def _choose(self, group: Group, number: int) -> None:
-        """Choose a pair of a group, and write what it is."""
+        """Select a pair of a group, and show its properties."""
         self._group, self._number = group, number % len(group.pairs)
         one = group.pairs[self._number]
         names = [short_name(name or "(gone)", 80) for name in one[2:4]]
@@ -176,7 +176,7 @@ class ClashPanel:
         self._show(group.pairs[self._number])
 
     def _show(self, one: Clash) -> None:
-        """Bring the eye to a pair, and see through everything else."""
+        """Move the camera to a pair, and fade all other objects."""
         browser = self._browser
         there = [browser.site.objects.get(i) for i in (one.a, one.b)]
         boxes = [obj.bounds for obj in there if obj is not None]
@@ -195,7 +195,7 @@ class ClashPanel:
         browser.scene.fly_to(places.mean(axis=0), radius)
 
     def _end(self) -> None:
-        """See everything as before."""
+        """Remove the marks, and end the fading."""
         drawn, self._drawn = self._drawn, []
         for node in drawn:
             node.remove()

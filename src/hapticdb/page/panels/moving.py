@@ -1,4 +1,4 @@
-"""Moving a part by its gizmo, in the tab Parts: one transaction when it is let go of, and undo."""
+"""Edits of a part's placement by a gizmo: one transaction at the end of a drag, and undo."""
 
 import threading
 from collections.abc import Callable
@@ -21,19 +21,18 @@ if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, TransformControlsEvent
 
 MOVING_GIZMO = 0.13
-"""Size of a part's gizmo, as a share of the scene's diagonal. Larger: easier to grab."""
+"""Size of the gizmo, as a share of the scene's diagonal. Larger: easier to grab."""
 LEAST_WAY = 1e-9
-"""Least change of a part's placement, metres or radians, that is written. At 0 a click on the gizmo
-would be an edit."""
+"""Least change of a placement that is written: the largest entry of the change's matrix, metres or
+radians. At 0, a click on the gizmo would be an edit."""
 
 
 @dataclass(eq=False)
 class _HeldPart:
     """A part on its gizmo.
 
-    object : as this browser's moves are based on it; start : pose (4, 4) of the gizmo at which the
-    part is where `object` has it; left : pose at which the gizmo was let go of last; n_waiting :
-    moves that are not yet written.
+    object : base of this browser's next move; start : pose (4, 4) of the gizmo at the placement of
+    `object`; left : pose at the end of the last drag; n_waiting : moves in the queue.
     """
 
     object: Object
@@ -42,15 +41,15 @@ class _HeldPart:
     n_waiting: int = 0
 
     def way_to(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Displacement (4, 4) of the part when the gizmo is at a pose."""
+        """Displacement (4, 4), world frame, of the part at a pose of the gizmo."""
         return np.asarray(pose @ np.linalg.inv(self.start))
 
 
 class MovingControls:
-    """Moves the chosen part, for editors.
+    """Controls of the chosen part's placement, for editors.
 
-    Drags come on viser's event loop, answers in the thread of the edits, others' edits in the
-    follower's, and choices in viser's pool: one lock is held around what changes the gizmo.
+    Drags arrive on viser's event loop, results in the thread of the edits, other people's edits in
+    the follower's, and selections in viser's pool; one lock guards the gizmo.
     """
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
@@ -75,7 +74,7 @@ class MovingControls:
             self._undo.on_click(browser.guarded("editor", self._undo_last))
 
     def follow(self) -> None:
-        """Put the gizmo on the chosen part, if the box is ticked; a drag that runs is dropped."""
+        """Put the gizmo on the chosen part, if the box is ticked; a drag under way is dropped."""
         browser = self._browser
         with self._lock:
             self.leave()
@@ -97,7 +96,7 @@ class MovingControls:
             self._gizmo.on_update(partial(self._dragged, self._held))
 
     def renew(self) -> None:
-        """Put the gizmo where another has moved the part; not during own moves."""
+        """Follow other people's moves of the part; not during a drag or a write."""
         with self._lock:
             held = self._held
             if held is None or self._is_dragged or held.n_waiting:
@@ -107,7 +106,7 @@ class MovingControls:
                 self.follow()
 
     def leave(self) -> None:
-        """Take back a move that is not finished, as when the browser goes."""
+        """Revert an unfinished drag."""
         with self._lock:
             if self._is_dragged and self._held is not None:
                 self._browser.site.view.put_back(self._held.object.id)
@@ -120,21 +119,21 @@ class MovingControls:
         self.follow()
 
     async def _dragged(self, held: _HeldPart, event: "TransformControlsEvent") -> None:
-        """Write the part's new placement when it is let go of, by a person who is still there."""
+        """Preview a drag, and write the placement at its end, if the browser is still connected."""
 
         def act(event: "TransformControlsEvent") -> None:
             row = checks.row_of(event.target.position, event.target.wxyz)
             pose = pose_of_row(row[:3], row[3:])
             with self._lock:
-                if held is not self._held:  # the gizmo was put elsewhere: this drag is over
+                if held is not self._held:  # the gizmo was replaced: this drag is over
                     if event.phase == "end":
                         self.leave()
                     return
                 self._is_dragged = True
-                if event.phase != "end":  # everyone sees where it goes
+                if event.phase != "end":  # a preview for everyone
                     placement = held.way_to(pose) @ held.object.transform
                     self._browser.site.view.move(held.object.id, placement)
-                elif self._browser.has_gone:  # viser ends the drags of a lost browser, too
+                elif self._browser.has_gone:  # viser ends a lost browser's drags, too
                     self.leave()
                 else:
                     self._is_dragged = False
@@ -143,7 +142,7 @@ class MovingControls:
         self._browser.guarded("editor", act)(event)
 
     def _let_go(self, held: _HeldPart, pose: NDArray[np.float64]) -> None:
-        """Write a move that ends at a pose; one that follows another is based on its result."""
+        """Write the placement at the end of a drag, based on the result of the previous write."""
         browser = self._browser
         if float(np.abs(pose @ np.linalg.inv(held.left) - np.eye(4)).max()) < LEAST_WAY:
             self.renew()
@@ -155,7 +154,7 @@ class MovingControls:
             with self._lock:
                 obj, way = held.object, held.way_to(pose)
             moved = edits.move(obj, way)
-            if np.array_equal(moved.transform, way @ obj.transform):  # nobody wrote after it
+            if np.array_equal(moved.transform, way @ obj.transform):  # no later write by others
                 with self._lock:
                     held.object, held.start = moved, pose
             return moved
@@ -189,7 +188,7 @@ class MovingControls:
         self._ask(lambda own: own.undo())
 
     def _ask(self, job: Callable[[PersonsEdits], str]) -> None:
-        """Do an edit of this person, and tell what was done."""
+        """Queue an edit of this person, and notify of its result."""
         browser = self._browser
         if browser.site.edits is not None:
             browser.site.edits.ask(browser.client.client_id, job, self._written, browser.failed)

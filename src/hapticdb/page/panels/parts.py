@@ -1,4 +1,4 @@
-"""The tab Parts: a list with search, what a part is, what is shown, distances, moving a part."""
+"""Tab Parts: search, properties, visibility, distances, and moves of parts."""
 
 from collections.abc import Sequence
 from typing import TYPE_CHECKING, Any
@@ -25,15 +25,15 @@ Floats = NDArray[np.float64]
 NOTHING = "choose from the list"
 """First line of the list."""
 MOST_LISTED = 1_000
-"""Lines of the list; a search finds the others. Larger: a browser opens the list more slowly."""
+"""Greatest length of the list. Larger: slower to open in a browser."""
 LONGEST_SEARCH = 200
-"""Letters of a search. Larger: longer texts of a client are compared with every name."""
+"""Greatest length of a search, characters."""
 MOST_VOXELS = 60_000
-"""Voxels that are shown of a chosen part; of a larger part, every n-th. Larger: more is sent."""
+"""Greatest number of voxels drawn of a part; of a larger part, every n-th. Larger: more is sent."""
 
 
 class PartsPanel:
-    """Finds parts, says what they are, and sets what this browser shows and feels."""
+    """Search and selection of parts; visibility and collision of parts in this browser."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -72,7 +72,7 @@ class PartsPanel:
         self.show_objects()
 
     def show_objects(self) -> None:
-        """Show the list as the objects are now."""
+        """Update the list and the selection."""
         self._list()
         self._say_chosen()
 
@@ -111,7 +111,7 @@ class PartsPanel:
             self.choose(self._lines[label])
 
     def clicked(self, origin: Floats, way: Floats) -> None:
-        """Choose what a ray meets; or take it as an end of a distance."""
+        """Select the first part along a ray, or use the point as an end of a distance."""
         browser = self._browser
         met = browser.scene.pick(origin, way)
         if met is None:
@@ -124,7 +124,7 @@ class PartsPanel:
             self.choose((met.id,))
 
     def choose(self, ids: Sequence[int]) -> None:
-        """Mark objects, and say what they are."""
+        """Highlight objects, and show their properties."""
         browser = self._browser
         browser.chosen = tuple(i for i in ids if i in browser.site.objects)
         browser.scene.highlight(browser.chosen)
@@ -204,7 +204,7 @@ class PartsPanel:
             return bool(self._voxel_box.value) and self._browser.chosen == (obj.id,)
 
         def draw(places: Floats) -> None:
-            if not is_wanted():  # the box was cleared, or another part chosen, meanwhile
+            if not is_wanted():  # cleared, or another part chosen, meanwhile
                 return
             middle = self._browser.drawing.middle
             self._voxels = self._client.scene.add_point_cloud(
@@ -237,7 +237,7 @@ class PartsPanel:
         browser.site.database.ask(shell, hold, browser.failed)
 
     def show_tool(self) -> None:
-        """Show whether a part is in hand."""
+        """Show the button "Put it back" if a part is dragged."""
         self._back.visible = self._browser.taken is not None
 
     def _start_measuring(self, event: "GuiEvent[Any]") -> None:

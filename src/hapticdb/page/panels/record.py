@@ -1,4 +1,4 @@
-"""The tab Record: record what is felt, replay it on a slider of time."""
+"""Tab Record: recording of the session, and replay on a time slider."""
 
 import time
 from datetime import UTC, datetime
@@ -25,14 +25,14 @@ Floats = NDArray[np.float64]
 
 SUFFIX = ".hdbrec"
 MOST_LISTED = 200
-"""Recordings in the list, the newest. Larger: a longer list to search in."""
+"""Greatest number of listed recordings, the newest."""
 LONGEST_REPLAY = 1_000_000
-"""Frames of a recording that is replayed: a quarter of an hour at 1 kHz. Larger: more memory."""
+"""Greatest length of a replay, frames: 17 minutes at 1 kHz. Larger: more memory."""
 NOTHING = "(none)"
 
 
 class Replay(NamedTuple):
-    """Frames that a replay shows: times (M,), s; tools (M, 7); wrenches (M, 6), N and N m."""
+    """Frames of a replay: times (M,), s; tools (M, 7); wrenches (M, 6), N and N m."""
 
     times: Floats
     tools: Floats
@@ -40,7 +40,7 @@ class Replay(NamedTuple):
 
 
 class RecordPanel:
-    """Records this browser's session into the operator's folder, and replays what is there."""
+    """Recording of this browser's session into the operator's folder, and replay from it."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -92,7 +92,7 @@ class RecordPanel:
         self._state.content = note_html(f"Records {path.name}")
 
     def session_ended(self) -> None:
-        """Tell that a recording ended with its session."""
+        """Report the end of a recording by the end of its session."""
         if self._is_recording:
             self._stopped("The recording ended: the session began anew.")
 
@@ -168,7 +168,7 @@ class RecordPanel:
         self._play.label = "Pause"
 
     def tick(self, now: float) -> None:
-        """Go on playing; called by the page's clock."""
+        """Advance the replay; called by the page's clock."""
         if self._played_from is None or self._replay is None:
             return
         begun, at = self._played_from

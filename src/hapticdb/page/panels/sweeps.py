@@ -1,4 +1,4 @@
-"""The tab Sweep: whether a tool, or a part, is free along a way, and what it hits or nears."""
+"""Tab Sweep: verdict, hits and least distance of a tool or a part along a path."""
 
 import math
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -25,30 +25,30 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 
 MOST_NAMED = 8
-"""Objects that the answer names, with where each is hit."""
+"""Greatest number of listed hits."""
 COLOURS = {0: "#1f8a4c", 1: "#c62838", 3: "#a8730f", 4: "#a8730f"}
-"""Colours of verdicts, by their exit statuses."""
+"""Colours of verdicts, by exit status."""
 WAYS = {
     "to the hand": None, "+x": (0, 1.0), "-x": (0, -1.0), "+y": (1, 1.0), "-y": (1, -1.0),
     "+z": (2, 1.0), "-z": (2, -1.0),
 }  # fmt: skip
-"""Ways of a sweep: the axis of the scene and its sign; None: from where it is to the hand."""
+"""Directions of a sweep: axis of the world frame and sign; None: towards the hand."""
 
 
 class _SweepAnswer(NamedTuple):
-    """A sweep's answer, to be drawn; shell : what was swept."""
+    """Result of a sweep, and the swept shell."""
 
     shell: PointShell
     swept: Swept
 
     @property
     def place(self) -> PathPlace | None:
-        """Where something is hit first, or else where the tool comes nearest to anything."""
+        """Place of the first hit, or of the least distance without a hit."""
         return self.swept.hits[0] if self.swept.hits else self.swept.gap.place
 
 
 class SweepPanel:
-    """Runs sweeps of this browser's tool or chosen part, and shows what they hit."""
+    """Sweeps of this browser's tool or chosen part, and display of their results."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -105,7 +105,7 @@ class SweepPanel:
         self._clear.visible = True
 
     def _draw(self, found: _SweepAnswer, place: PathPlace, name: str) -> None:
-        """Show the tool where it hits first or comes nearest, and the two places there."""
+        """Draw the tool at the first hit or the least distance, and the nearest points there."""
         scene, swept = self._browser.client.scene, found.swept
         ghost = tools.from_shell(name, found.shell)
         pose = place.pose.copy()
@@ -134,7 +134,7 @@ class SweepPanel:
 
 
 class _SweepJob:
-    """A sweep as asked for; part : its id, None: the tool; way : one of `WAYS`; length : metres."""
+    """Request of a sweep; part : id, None for the tool; way : key of `WAYS`; length : metres."""
 
     def __init__(self, browser: Browser, part: int | None, way: str, length: float) -> None:
         self._site = browser.site
@@ -148,7 +148,7 @@ class _SweepJob:
         self.name = self._tool.name if obj is None else short_name(obj.name)
 
     def run(self, progress: Progress) -> _SweepAnswer:
-        """Sweep on a connection of its own."""
+        """Sweep on a separate connection."""
         with open_environment(self._site.url, read_only=True) as env:
             shell = self._tool.shell if self._part is None else env.shell(self._part, inset=0.0)
             present = [i for i in self._exclude if i in self._site.objects]
@@ -159,7 +159,7 @@ class _SweepJob:
         return _SweepAnswer(shell, swept)
 
     def _path(self, shell: PointShell) -> Floats:
-        """Poses of the sweep: of the tool, or displacements of the part from its place."""
+        """Poses (2, 4, 4) of the tool, or displacements of the part from its placement."""
         first = self._from if self._part is None else np.eye(4)
         last = first.copy()
         if self._way is not None:

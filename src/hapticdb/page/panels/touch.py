@@ -1,4 +1,4 @@
-"""The tab Touch: what is felt, as numbers, names and plots; the tool and how it feels."""
+"""Tab Touch: wrench, touched objects and force plot; tool, stiffness and scale."""
 
 from typing import TYPE_CHECKING, Any
 
@@ -25,21 +25,21 @@ if TYPE_CHECKING:
     from viser import GuiApi, GuiEvent, GuiUplotHandle
 
 SHOWN_EVERY = 0.2
-"""Seconds from one update of numbers and plots to the next."""
+"""Period of numbers and plot, seconds."""
 SECONDS = 10.0
-"""Seconds that the plot shows."""
+"""Time span of the plot, seconds."""
 HIGHEST = 8.0
-"""Top of the plot, N: above the greatest force of a hand in a browser."""
+"""Top of the plot, N: above the force cap of 7 N."""
 SOFTEST, STIFFEST = 50.0, 3000.0
-"""Range of the stiffness, N/m. Larger: harder surfaces, and forces that reach the cap sooner."""
+"""Range of the coupling's stiffness, N/m. Larger: harder surfaces, at the force cap sooner."""
 PART = "(a part)"
-"""The tool in the list while a part of the scene is held."""
+"""Entry of the list for a dragged part."""
 SCALES = (0.05, 20.0)
-"""Range of the scale, times the one at the start. Larger: smaller or larger hands."""
+"""Range of the scale, as multiples of the initial one."""
 
 
 class TouchPanel:
-    """Shows the session's newest frame, and sets the tool, its spring and its scale."""
+    """Readings of the session's newest frame, and controls of tool, stiffness and scale."""
 
     def __init__(self, browser: Browser, gui: "GuiApi") -> None:
         self._browser = browser
@@ -86,7 +86,7 @@ class TouchPanel:
     def _choose_tool(self, event: "GuiEvent[Any]") -> None:
         browser = self._browser
         is_held = event.target.value == PART and not self._is_of_the_list
-        if event.client is None or is_held:  # set by the page, or as it is
+        if event.client is None or is_held:  # set by the page, or unchanged
             return
         name = checks.choice_of(event.target.value, self._names, "a tool")
         browser.put_back()
@@ -128,11 +128,11 @@ class TouchPanel:
 
     @property
     def _is_of_the_list(self) -> bool:
-        """Whether the tool is one of the site's, and no part."""
+        """Whether the tool is one of the site's tools, not a part."""
         return self._browser.tool in self._browser.site.tools
 
     def show_tool(self) -> None:
-        """Show which tool is in the hand, so that each other one can be chosen."""
+        """Select the current tool in the list."""
         if not hasattr(self, "_tool"):
             return
         browser = self._browser
@@ -141,13 +141,13 @@ class TouchPanel:
         put(self._tool, browser.tool.name if self._is_of_the_list else PART)
 
     def show_hand(self) -> None:
-        """Show where the hand is."""
+        """Show the hand's position."""
         if hasattr(self, "_place"):
             for field, value in zip(self._place, self._browser.hand[:3].tolist(), strict=True):
                 put(field, round(value, field.precision))
 
     def show_parts(self, n_waiting: int, n_parts: int) -> None:
-        """Show how many parts have come, until all have."""
+        """Show the progress of reading shapes, until all are read."""
         self._waiting.visible = n_waiting > 0
         if n_waiting:
             self._waiting.content = note_html(f"{n_parts - n_waiting:,} of {n_parts:,} parts shown")
@@ -155,7 +155,7 @@ class TouchPanel:
     def show(
         self, frame: np.void, wrench: NDArray[np.float64], touched: list[Object], now: float
     ) -> None:
-        """Show a frame's force and torque (6,), what it touches, and the plot."""
+        """Show a frame's wrench (6,), N and N m, the touched objects, and the plot."""
         if now - self._shown_at < SHOWN_EVERY:
             return
         self._shown_at = now
@@ -211,7 +211,7 @@ class TouchPanel:
 
 
 def last_seconds(history: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Rows (n, 2) of the last `SECONDS`, times from now; zeros before, for a fixed range."""
+    """Rows (n, 2) of the last `SECONDS`: time before now, force; 0 N before the first sample."""
     rows = history.copy()
     rows[:, 0] -= history[-1, 0]
     rows = rows[rows[:, 0] >= -SECONDS]
@@ -223,7 +223,7 @@ def _css(colour: colours.Colour) -> str:
 
 
 def _plot(gui: "GuiApi", *, is_seen: bool) -> "GuiUplotHandle":
-    """Add the plot of the force in the last seconds."""
+    """Add the plot of the force."""
     from viser.uplot import Axis, Legend, Scale, Series  # noqa: PLC0415 - the extra `view`
 
     return gui.add_uplot(

@@ -1,4 +1,4 @@
-"""Work of a panel that takes long: in the site's thread for it, with a bar."""
+"""Long jobs of a panel: a thread of the site, and a progress bar."""
 
 import logging
 from collections.abc import Callable
@@ -14,13 +14,13 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("hapticdb.page")
 Progress = Callable[[int, int], None]
-"""Called with what is done and what there is to do; HapticDBError once the browser has gone."""
+"""Callback with the numbers of finished and of all steps; HapticDBError after a disconnect."""
 
 Answer = TypeVar("Answer")
 
 
 class Work:
-    """One job of a browser's panel at a time, named `what`: how far it is, and what came of it."""
+    """At most one job of a panel at a time, named `what`, with its progress and result."""
 
     def __init__(self, browser: Browser, gui: "GuiApi", what: str) -> None:
         self._browser, self._what = browser, what
@@ -29,7 +29,7 @@ class Work:
         self.said = gui.add_html("")
 
     def begin(self, job: Callable[[Progress], Answer], show: Callable[[Answer], None]) -> None:
-        """Do a job later, then show its answer, both in the site's thread for long work."""
+        """Queue a job; it and then `show` run in the site's thread for long jobs."""
         if self._is_running:
             raise UsageError(f"{self._what} is running: wait for it")
         self._is_running = True

@@ -1,1 +1,1 @@
-"""The scene of the browser view: objects as meshes, picked, hidden, coloured and moved."""
+"""The scene of the page: nodes, level of detail, picking, and updates from the database."""

@@ -1,4 +1,4 @@
-"""What one browser sees: hidden, isolated, highlighted and coloured objects, clicks, distances."""
+"""View of one browser: visibility, highlights, colours, picking, distances."""
 
 import time
 from collections.abc import Iterable, Mapping
@@ -21,14 +21,14 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 FLIGHT_S, FLIGHT_STEPS = 0.6, 18
-"""Seconds in which the eye comes to a place, and the steps of its way."""
+"""Duration of a camera motion, seconds, and its steps."""
 INK: Colour = (24, 32, 44)
-"""Colour of lines and labels of distances."""
+"""Colour of distance lines and labels."""
 
 
 @dataclass
 class _Look:
-    """State of one browser; ids of objects that are gone may stay in it."""
+    """State of one browser's view; ids of removed objects may stay in it."""
 
     hidden: set[int] = field(default_factory=set)
     isolated: frozenset[int] | None = None
@@ -53,10 +53,10 @@ class _Look:
 
 
 class BrowserScene:
-    """The scene as one browser sees it, until `Contents.leave`.
+    """The scene as seen by one browser, until `Contents.leave`.
 
-    What others do is seen here, too, as long as it is not hidden here. All methods may be called
-    from any thread, and take ids of objects that are there no longer.
+    Changes by others show here too, unless hidden here. All methods are thread-safe, and accept ids
+    of removed objects.
     """
 
     def __init__(self, client: "ClientHandle", contents: Contents) -> None:
@@ -68,11 +68,11 @@ class BrowserScene:
 
     @property
     def hidden(self) -> set[int]:
-        """Ids of the objects that this browser does not see."""
+        """Ids of the objects hidden in this browser."""
         return {i for i in list(self._contents.records) if not self._look.sees(i)}
 
     def show(self, ids: Iterable[int] | None = None) -> None:
-        """See objects again; all of them, and the end of `isolate`, without ids."""
+        """Show objects; without ids show all, and end `isolate`."""
         with self._contents.lock:
             before = self.hidden
             if ids is None:
@@ -85,14 +85,14 @@ class BrowserScene:
             self._draw(before ^ self.hidden)
 
     def hide(self, ids: Iterable[int]) -> None:
-        """Hide objects from this browser; they are not picked then."""
+        """Hide objects in this browser, also from picking."""
         with self._contents.lock:
             hidden = set(ids)
             self._look.hidden |= hidden
             self._draw(hidden)
 
     def isolate(self, ids: Iterable[int]) -> None:
-        """Hide all objects but these; `show` without ids ends it."""
+        """Hide all other objects; `show` without ids ends it."""
         with self._contents.lock:
             before = self.hidden
             self._look.isolated = frozenset(ids)
@@ -100,27 +100,27 @@ class BrowserScene:
             self._draw(before ^ self.hidden)
 
     def highlight(self, ids: Iterable[int]) -> None:
-        """Highlight these objects and no others; none without ids."""
+        """Highlight these objects alone."""
         with self._contents.lock:
             before, self._look.marked = self._look.marked, set(ids)
             self._draw(before ^ self._look.marked)
 
     def colour(self, ids: Iterable[int], colour: Colour) -> None:
-        """See objects in a colour, sRGB 0 to 255."""
+        """Colour objects, sRGB 0 to 255."""
         with self._contents.lock:
             wanted = set(ids)
             self._look.colours.update(dict.fromkeys(wanted, colour))
             self._draw(wanted)
 
     def spotlight(self, colours: Mapping[int, Colour]) -> None:
-        """See objects, hidden ones too, in these colours, and through all others."""
+        """Show objects, hidden ones too, in these colours, and fade all others; {} ends it."""
         with self._contents.lock:
             before, self._look.spotlit = self._look.spotlit, dict(colours)
             is_whole = bool(before) != bool(colours)
             self._draw(list(self._contents.records) if is_whole else before | self._look.spotlit)
 
     def fly_to(self, middle: Floats, radius: float) -> None:
-        """Bring the eye, in short steps, to where a ball (3,), metres, fills its view."""
+        """Move the camera, in short steps, until a sphere fills its view: centre (3,), metres."""
         camera = self._client.camera
         start = np.stack([camera.position, camera.look_at])
         way = start[0] - start[1]
@@ -137,11 +137,11 @@ class BrowserScene:
             self._contents.see(self._key, ids)
 
     def pick(self, origin: ArrayLike, direction: ArrayLike) -> Struck | None:
-        """The part that a ray, world frame, meets first, of those that this browser sees."""
+        """First visible object along a ray, world frame."""
         return self._contents.pick(origin, direction, self._look.sees)
 
     def measure(self, start: ArrayLike, end: ArrayLike) -> float:
-        """Draw the distance between two points (3,), metres, as a line and a label; returns it."""
+        """Draw the distance of two points (3,), metres, with a label; returns it."""
         ends = np.array([start, end], dtype=np.float64)
         distance = float(np.linalg.norm(ends[1] - ends[0]))
         scene = self._client.scene

@@ -1,4 +1,4 @@
-"""All objects of the scene, the nodes that draw them, and the audiences that see them."""
+"""Objects of the scene, their nodes, and the audiences of the nodes."""
 
 from collections.abc import Callable, Hashable, Iterable, Mapping, Sequence
 from itertools import count
@@ -18,11 +18,11 @@ from hapticdb.store.base import Object
 ALL = "all"
 """Key of the audience of all browsers."""
 MOST_LOOSE = 128
-"""Moved objects that get a node of their own, instead of being merged with others again."""
+"""Greatest number of moved objects with a node of their own; further ones are merged anew."""
 
 
 class Contents:
-    """Objects, their nodes and targets; what each audience sees. Safe to use from several threads.
+    """Objects, nodes, ray targets and audiences; thread-safe.
 
     audience : nodes of all browsers together.
     """
@@ -30,7 +30,7 @@ class Contents:
     def __init__(self, audience: Audience) -> None:
         self.lock = RLock()
         self.records: dict[int, Object] = {}
-        """Objects by id, as the database had them when they were read last."""
+        """Objects by id, as last read from the database."""
         self._members: dict[int, Member] = {}
         self._home: dict[int, Node] = {}
         self._targets = Targets(self._members)
@@ -44,7 +44,7 @@ class Contents:
         self._preview: dict[int, NDArray[np.float64]] = {}
 
     def add(self, objects: Sequence[Object]) -> None:
-        """Show objects as boxes, until `shape` gives them their shapes."""
+        """Show objects as their AABBs, until `shape` replaces these."""
         with self.lock:
             members = []
             for obj in objects:
@@ -57,7 +57,7 @@ class Contents:
             self.refresh()
 
     def remove(self, ids: Iterable[int]) -> None:
-        """Objects that are gone; ids that the scene does not have are passed over."""
+        """Remove objects; unknown ids are ignored."""
         with self.lock:
             for object_id in ids:
                 if self.records.pop(object_id, None) is not None:
@@ -68,10 +68,9 @@ class Contents:
                     self._preview.pop(object_id, None)
 
     def shape(self, found: Sequence[tuple[Object, PartShape, NDArray[np.float64]]]) -> None:
-        """Give objects their shapes, each at its pose (4, 4); passes over those that changed since.
+        """Set objects' shapes and poses (4, 4); objects changed meanwhile are skipped.
 
-        Where the object was moved meanwhile, the shape is shown at its newer place, if it is only a
-        rigid motion away.
+        An object in rigid motion meanwhile has its shape at its newer placement.
         """
         with self.lock:
             members = []
@@ -91,10 +90,10 @@ class Contents:
             self.refresh()
 
     def move(self, object_id: int, transform: ArrayLike, record: Object | None = None) -> bool:
-        """Show an object at a new placement, world_from_part (4, 4); False if there is none.
+        """Show an object at a placement (4, 4), world_from_part; False for an unknown id.
 
-        `record` is the object after a committed move. Without one the move is a preview, which the
-        next committed one of this object replaces.
+        record : the object after a committed move. Without it the move is a preview, until the next
+        commit of the object.
         """
         placed = np.asarray(transform, dtype=np.float64)
         with self.lock:
@@ -127,14 +126,14 @@ class Contents:
             self._stale[home.name] = home
 
     def _leave(self, object_id: int) -> None:
-        """Take an object out of its node."""
+        """Remove an object from its node."""
         home = self._home.pop(object_id, None)
         if home is not None:
             del home.members[object_id]
             self._stale[home.name] = home
 
     def _settle(self, nodes: Iterable[Node]) -> None:
-        """Draw the members of new nodes by them."""
+        """Make new nodes the homes of their members."""
         for node in nodes:
             for member in node.members.values():
                 self._members[member.id] = member
@@ -146,19 +145,19 @@ class Contents:
         return f"/parts/{next(self._numbers)}"
 
     def watch(self, key: Hashable, audience: Audience, sight: Sight) -> None:
-        """Let one browser see objects in its own way, from now on."""
+        """Add the audience of one browser."""
         with self.lock:
             self._audiences[key] = (audience, sight)
             for node in self._nodes():
                 self._sync(node, audience, sight)
 
     def leave(self, key: Hashable) -> None:
-        """Forget a browser."""
+        """Remove a browser's audience."""
         with self.lock:
             self._audiences.pop(key, None)
 
     def see(self, key: Hashable, ids: Iterable[int]) -> None:
-        """Draw anew what one browser sees of objects, after its sight of them changed."""
+        """Redraw objects for one browser, after a change of its view."""
         with self.lock:
             if key not in self._audiences:
                 return
@@ -168,7 +167,7 @@ class Contents:
                 self._sync(node, audience, sight)
 
     def refresh(self) -> None:
-        """Draw anew what has changed, for all audiences."""
+        """Redraw changed nodes for all audiences."""
         with self.lock:
             stale, self._stale = self._stale, {}
             for node in stale.values():
@@ -179,7 +178,7 @@ class Contents:
         return list({node.name: node for node in self._home.values()}.values())
 
     def _sync(self, node: Node, audience: Audience, sight: Sight) -> None:
-        """Bring the nodes of one audience up to date with what it sees of a node's objects."""
+        """Update an audience's scene nodes to its view of a node's objects."""
         wanted: Mapping[str, Drawing | Sprinkle] = node.drawings(sight) if node.members else {}
         if audience is self._audiences[ALL][0]:
             before = self._shown.pop(node.name, {})
@@ -203,12 +202,12 @@ class Contents:
     def pick(
         self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]
     ) -> Struck | None:
-        """The nearest object that a ray meets, of those that `sees` lets pass."""
+        """Nearest object along a ray, world frame, among those of `sees`; None without a hit."""
         with self.lock:
             return self._targets.first(origin, direction, sees)
 
     def box(self) -> NDArray[np.float64] | None:
-        """Lower and upper corner (2, 3) of all objects as they are shown now; None without any."""
+        """AABB (2, 3) of all objects as shown now, metres; None without objects."""
         with self.lock:
             boxes = [member.box for member in self._members.values()]
         if not boxes:
@@ -217,7 +216,7 @@ class Contents:
         return np.stack([stacked[:, 0].min(axis=0), stacked[:, 1].max(axis=0)])
 
     def waiting(self) -> int:
-        """Number of objects that are still boxes."""
+        """Number of objects without a shape yet."""
         with self.lock:
             return sum(member.shape is None for member in self._members.values())
 
@@ -232,7 +231,7 @@ def is_same_shape(one: Object, other: Object) -> bool:
 
 
 def motion(before: NDArray[np.float64], after: NDArray[np.float64]) -> NDArray[np.float64]:
-    """The rigid motion (4, 4) from one placement to another of equal stretch, world frame."""
+    """Rigid motion (4, 4), world frame, between two placements of equal stretch."""
     if np.array_equal(before, after):
         return np.eye(4)
     start, end = taken_apart(before).pose, taken_apart(after).pose

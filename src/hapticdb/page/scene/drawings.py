@@ -1,8 +1,8 @@
-"""What a node of the browser's scene shows, and the nodes of one audience kept in step with it.
+"""Scene nodes in viser, and their updates for one audience.
 
-Triangles are batches: one geometry at one or more places, each with a colour and a size. An
-audience is all browsers together or one of them; a node of one browser hides the shared node of its
-name there.
+Triangles are instanced: one geometry at N poses, each with a colour and a size. An audience is all
+browsers together or one browser; in a browser its own node replaces the shared node of the same
+name.
 """
 
 from collections.abc import Callable, Hashable
@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from viser import BatchedMeshHandle, PointCloudHandle, SceneApi, SceneNodeHandle
 
 LEAST_SIMPLIFIED = 64
-"""Vertices from which the browser makes coarser copies of a shape for a distant eye."""
+"""Least number of vertices of a shape with levels of detail."""
 COARSER = ((14.0, 0.4), (45.0, 0.1))
-"""Distances, in radii of a shape, from which the browser draws a share of its triangles. At 14
+"""Levels of detail: distance of the eye, in radii of the shape, and share of the triangles. At 14
 radii a shape fills a fifth of the picture's height."""
 
 
@@ -30,8 +30,8 @@ radii a shape fills a fifth of the picture's height."""
 class Geometry:
     """Triangles of a node, made when they are sent.
 
-    key : equal for equal triangles; make : gives vertices (V, 3) float32 and faces (F, 3) uint32;
-    radius : of its bounding box, metres; opacity : below 1 for what one sees through.
+    key : equal for equal triangles; make : vertices (V, 3) float32 and faces (F, 3) uint32; radius
+    : of the bounding sphere, metres; opacity : below 1 if transparent.
     """
 
     key: Hashable
@@ -40,7 +40,7 @@ class Geometry:
     opacity: float | None = None
 
     def coarser(self, n_vertices: int) -> tuple[tuple[float, float], ...] | str:
-        """Distances and shares of triangles of the browser's coarser copies."""
+        """Levels of detail for viser: distances, metres, and shares of triangles."""
         if n_vertices < LEAST_SIMPLIFIED:
             return "off"
         return tuple((ratio * self.radius, share) for ratio, share in COARSER)
@@ -48,10 +48,10 @@ class Geometry:
 
 @dataclass(frozen=True, eq=False)
 class Drawing:
-    """A node: a geometry at N places.
+    """A node of N instances of a geometry.
 
-    wxyzs (N, 4), positions (N, 3) metres, sizes (N,) or (N, 3): factors, 0 for what is hidden;
-    colours (N, 3) uint8, sRGB.
+    wxyzs (N, 4) : unit quaternions; positions (N, 3) : metres; sizes (N,) or (N, 3) : factors, 0 if
+    hidden; colours (N, 3) : uint8, sRGB.
     """
 
     geometry: Geometry
@@ -62,11 +62,11 @@ class Drawing:
 
     @property
     def key(self) -> Hashable:
-        """Equal for equal triangles."""
+        """Key of the geometry."""
         return self.geometry.key
 
     def equals(self, other: "Drawing | Sprinkle") -> bool:
-        """Whether both show the same."""
+        """Whether both are equal in the scene."""
         return (
             isinstance(other, Drawing)
             and self.key == other.key
@@ -84,7 +84,7 @@ class Drawing:
 
 @dataclass(frozen=True, eq=False)
 class Sprinkle:
-    """A node of points: wxyz (4,), position (3,) metres; colour : of all, None for their own."""
+    """A node of points: wxyz (4,), position (3,), metres; colour : None for the points' own."""
 
     key: Hashable
     dots: Dots
@@ -93,7 +93,7 @@ class Sprinkle:
     colour: Colour | None
 
     def equals(self, other: "Drawing | Sprinkle") -> bool:
-        """Whether both show the same."""
+        """Whether both are equal in the scene."""
         return (
             isinstance(other, Sprinkle)
             and (self.key, self.colour) == (other.key, other.colour)
@@ -103,7 +103,7 @@ class Sprinkle:
 
 
 class Audience:
-    """Nodes of all browsers (`server.scene`) or of one (`client.scene`)."""
+    """Scene nodes of all browsers (`server.scene`) or of one (`client.scene`)."""
 
     def __init__(self, scene: "SceneApi") -> None:
         self._scene = scene
@@ -112,11 +112,11 @@ class Audience:
 
     @property
     def names(self) -> set[str]:
-        """Names of its nodes."""
+        """Names of the nodes."""
         return self._meshes.keys() | self._blanks.keys()
 
     def put(self, name: str, drawing: Drawing | Sprinkle) -> None:
-        """Make a node show a drawing; triangles or points are sent only if they are others."""
+        """Set a node's drawing; geometry is sent only if its key changes."""
         blank = self._blanks.pop(name, None)
         if blank is not None:
             blank.remove()
@@ -146,7 +146,7 @@ class Audience:
         if isinstance(drawing, Sprinkle):
             return self._sprinkled(name, drawing)
         vertices, faces = drawing.geometry.make()
-        middle = drawing.positions.mean(axis=0)  # a browser has places in float32
+        middle = drawing.positions.mean(axis=0)  # viser sends float32
         return self._scene.add_batched_meshes_simple(
             name,
             vertices,
@@ -178,7 +178,7 @@ class Audience:
         )
 
     def blank(self, name: str) -> None:
-        """Make a node show nothing, also where the shared node of this name shows something."""
+        """Make a node empty, so that it hides the shared node of this name."""
         if name in self._blanks:
             return
         there = self._meshes.pop(name, None)
@@ -187,7 +187,7 @@ class Audience:
         self._blanks[name] = self._scene.add_frame(name, show_axes=False, visible=False)
 
     def drop(self, name: str) -> None:
-        """Remove a node, if there is one; a browser then shows the shared node again."""
+        """Remove a node, if present; the shared node of this name shows again."""
         there = self._meshes.pop(name, None)
         if there is not None:
             there[1].remove()

@@ -1,4 +1,4 @@
-"""Geometry as it is shown: triangles with smooth and sharp edges, voxels as blocks, boxes."""
+"""Triangles for display: sharp edges, blocks of voxels, boxes."""
 
 from collections.abc import Sequence
 from typing import NamedTuple
@@ -9,35 +9,35 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 SHARP = np.cos(np.radians(30.0))
-"""Cosine of the angle between two faces above which their common edge is drawn sharp."""
+"""Cosine of the least angle between the faces of a sharp edge."""
 _MIX = np.array(
     [0x9E3779B97F4A7C15, 0xC2B2AE3D27D4EB4F, 0x165667B19E3779F9, 0xD6E8FEB86659FD93],
     dtype=np.uint64,
 )
-"""Odd numbers that mix three coordinates and a shape into one number, to find equal positions."""
+"""Odd factors of a hash of a position and its shape's number, to weld equal positions."""
 _CUBE = np.array(
     [[x, y, z] for x in (-0.5, 0.5) for y in (-0.5, 0.5) for z in (-0.5, 0.5)]
 )  # fmt: skip
 _SIDES = np.array([
     [0, 1, 3, 2], [4, 6, 7, 5], [0, 4, 5, 1], [2, 3, 7, 6], [0, 2, 6, 4], [1, 5, 7, 3],
 ])  # fmt: skip
-"""Corners of a cube's sides, seen from outside in anticlockwise order: -x, +x, -y, +y, -z, +z."""
+"""Corners of a cube's sides, anticlockwise from outside: -x, +x, -y, +y, -z, +z."""
 
 
 class Facets(NamedTuple):
-    """Vertices (V, 3), metres, and faces (F, 3): float64 and int64; as sent, float32 and uint32."""
+    """Vertices (V, 3), metres, float64 or float32; faces (F, 3), int64 or uint32."""
 
     vertices: NDArray[np.floating]
     faces: NDArray[np.integer]
 
 
 def sharpened(several: Sequence[Facets]) -> list[Facets]:
-    """The same triangles in the same order, with vertices split where edges are sharp.
+    """The same triangles in the same order, with vertices split at sharp edges.
 
-    A browser shades a vertex with the mean normal of its faces. So faces share a vertex here only
-    if a path of smooth edges around that point joins them. Equal positions of one shape count as
-    one point, because many files repeat them for every triangle. Many small shapes together are ten
-    times faster than one after another.
+    A browser shades a vertex with the mean normal of its faces. So faces share a vertex only if
+    smooth edges at that point connect them. Equal positions of one shape count as one point, since
+    many files repeat them for every triangle. One call for many small shapes is ten times faster
+    than a call for each.
     """
     n_vertices = [len(facets.vertices) for facets in several]
     first = np.cumsum([0, *n_vertices])
@@ -48,9 +48,9 @@ def sharpened(several: Sequence[Facets]) -> list[Facets]:
     corners = _smooth_pairs(vertices[faces], points)
     graph = coo_array((np.ones(len(corners), dtype=np.int8), corners.T), shape=(faces.size,) * 2)
     n_found, found = connected_components(graph, directed=False)
-    # numbers in the order of the corners, so that those of each shape are neighbours
+    # numbered in the order of corners: the vertices of each shape are contiguous
     seen_first = np.empty(n_found, dtype=np.int64)
-    seen_first[found[::-1]] = np.arange(len(found))[::-1]  # the last one that is written stays
+    seen_first[found[::-1]] = np.arange(len(found))[::-1]  # the last write wins
     order = np.empty(n_found, dtype=np.int64)
     order[np.argsort(seen_first)] = np.arange(n_found)
     label = order[found].reshape(-1, 3)
@@ -65,7 +65,7 @@ def sharpened(several: Sequence[Facets]) -> list[Facets]:
 
 
 def _welded(vertices: NDArray[np.floating], shape: NDArray[np.int64]) -> NDArray[np.int64]:
-    """A number (V,) for each vertex, equal for equal positions in the same shape (V,)."""
+    """Indices (V,) of vertices, equal for equal positions in the same shape (V,)."""
     keys = np.empty((len(vertices), 4))
     keys[:, :3], keys[:, 3] = vertices + 0.0, shape  # -0.0 equals 0.0, but its bits differ
     mixed = (keys.view(np.uint64) * _MIX).sum(axis=1, dtype=np.uint64)
@@ -77,7 +77,7 @@ def _welded(vertices: NDArray[np.floating], shape: NDArray[np.int64]) -> NDArray
 
 
 def _smooth_pairs(triangles: NDArray[np.float64], points: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Pairs (P, 2) of corners that share a vertex: corner 3 f + k is corner k of face f."""
+    """Pairs (P, 2) of corners with a common vertex: corner 3 f + k is corner k of face f."""
     normals = np.cross(triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0])
     length = np.linalg.norm(normals, axis=1, keepdims=True)
     normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
@@ -97,12 +97,12 @@ def _smooth_pairs(triangles: NDArray[np.float64], points: NDArray[np.int64]) -> 
 
 
 def _next_corner(corner: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The corner that follows in the same face."""
+    """Next corner of the same face."""
     return np.where(corner % 3 == 2, corner - 2, corner + 1)
 
 
 def cube() -> Facets:
-    """A cube of edge 1 about the origin."""
+    """Cube of edge 1 about the origin."""
     return _quads(_CUBE[_SIDES])
 
 
@@ -114,17 +114,17 @@ def _quads(corners: NDArray[np.float64]) -> Facets:
 
 
 class Blocks(NamedTuple):
-    """Cubes of equal size: whole numbers (n, 3) of their places, in cubes; edge in voxels."""
+    """Cubes of equal size: integer positions (n, 3), in cubes, and edge, in voxels."""
 
     places: NDArray[np.int64]
     edge: int
 
 
 def coarsened(voxels: NDArray[np.int64], most: int) -> Blocks:
-    """Voxels (n, 3) as at most `most` cubes that hold them, whose edge is a power of two.
+    """At most `most` cubes that cover voxels (n, 3); their edge is a power of two.
 
-    The places of the cubes are counted from the grid's origin, and differ by less than 2^20 on each
-    axis, so that three of them fit into one integer.
+    Positions are relative to the grid's origin and span less than 2^20 on each axis, so that three
+    fit in one integer.
     """
     places, edge = voxels, 1
     while len(places) > most or np.ptp(places, axis=0).max(initial=0) >= 1 << 20:
@@ -133,7 +133,7 @@ def coarsened(voxels: NDArray[np.int64], most: int) -> Blocks:
 
 
 def block_facets(blocks: Blocks) -> Facets:
-    """The sides of cubes that no neighbour covers, in voxels from the grid's origin."""
+    """Exposed sides of cubes, in voxels from the grid's origin."""
     places = blocks.places
     low = places.min(axis=0) - 1
     shape = places.max(axis=0) - low + 2

@@ -1,4 +1,4 @@
-"""The thread that follows what is committed to the environment."""
+"""Follower of the environment's commits."""
 
 from collections.abc import Callable
 from concurrent.futures import Future
@@ -12,13 +12,13 @@ from hapticdb.resident.changes import writes_since
 from hapticdb.store.base import Object
 
 LOOK_EVERY_S = 0.02
-"""Seconds between two looks for commits of others."""
+"""Poll period, seconds."""
 TRY_AGAIN_S = 1.0
-"""Seconds after a failed statement until the next look."""
+"""Seconds from a failed statement to the next poll."""
 
 
 class Follower:
-    """Thread that calls `tell`: with all objects, then written, gone and revision."""
+    """Thread that calls `tell` with written objects, removed ids and revision; first with all."""
 
     grid: Grid
     """The environment's grid, from `start` on."""
@@ -33,12 +33,12 @@ class Follower:
         self._thread = Thread(target=self._run, name="follower", daemon=True)
 
     def start(self) -> None:
-        """Open the environment, tell all of its objects, and follow it; a HapticDBError if not."""
+        """Open the environment, report all objects, and start polling; HapticDBError on failure."""
         self._thread.start()
         self._opened.result()
 
     def close(self, timeout: float) -> None:
-        """Close the connection, and wait until the thread has ended, at most so many seconds."""
+        """Close the connection, and join the thread with a timeout, seconds."""
         self._ended.set()
         self._thread.join(timeout)
 
@@ -63,11 +63,11 @@ class Follower:
                     self._catch_up(env)
                 pause = LOOK_EVERY_S
             except HapticDBError:
-                pause = TRY_AGAIN_S  # a server that is away: what it missed is read later
+                pause = TRY_AGAIN_S  # server unreachable: all objects are read again later
                 self._revision = -1
 
     def _catch_up(self, env: Environment) -> None:
-        """Tell what was committed since the known revision."""
+        """Report the commits since the last reported revision."""
         with env.store.snapshot():
             revision = env.store.revision()
             if revision == self._revision:

@@ -1,4 +1,4 @@
-"""Names of objects: the sub-assemblies in them, and a search."""
+"""Object names: sub-assemblies and search."""
 
 from collections.abc import Mapping
 
@@ -15,10 +15,10 @@ def assemblies_of(names: Mapping[int, str]) -> dict[str, list[int]]:
 
 
 def found_ids(names: Mapping[int, str], text: str) -> list[int]:
-    """Ids of the names that hold each word of a text, in any order and whatever the case.
+    """Ids of the names with each word of a text, in any order and case.
 
-    First those whose last element begins with the text, then those whose last element has a word of
-    it, then the rest; by name within each.
+    First those with the text at the start of their last element, then those with a word of it in
+    their last element, then the rest; by name within each.
     """
     words = text.casefold().split()
     whole = " ".join(words)

@@ -1,4 +1,4 @@
-"""Objects gathered into few nodes: batches of one shape, and merged shapes of one colour."""
+"""Few nodes for many objects: instances of one shape, and merged shapes of one colour."""
 
 from collections.abc import Callable, Hashable, Sequence
 from dataclasses import dataclass, replace
@@ -14,21 +14,21 @@ from hapticdb.page.scene.shapes import Dots, PartShape, Piece
 from hapticdb.poses import quaternion_of
 
 LEAST_SAVED = 2_000
-"""Triangles that a batch must save, compared with merging its objects, to be a node of its own."""
+"""Least number of triangles saved by an instanced node over merging."""
 MOST_MERGED = 24_000
-"""Triangles of a merged node, unless one object alone has more."""
+"""Greatest number of triangles of a merged node with more than one object."""
 BOX_OPACITY = 0.3
-"""Opacity of the boxes of objects whose shape is being read."""
+"""Opacity of the AABBs of objects without a shape yet."""
 _OPAQUE = 255
 _UNTURNED = np.array([1.0, 0.0, 0.0, 0.0])
 
 
 @dataclass
 class Member:
-    """An object as nodes draw it.
+    """An object in its node.
 
-    pose (4, 4): rigid world_from_shape, metres; box (2, 3): it holds the object, world frame;
-    colour: its own; shape: None while it is a box.
+    pose (4, 4) : rigid, world_from_shape, metres; box (2, 3) : AABB, world frame; colour : its own;
+    shape : None while it is shown as its AABB.
     """
 
     id: int
@@ -39,18 +39,17 @@ class Member:
 
 
 Sight = Callable[[Member], Colour | Rgba | None]
-"""Colour in which an audience sees an object, with an opacity if it sees through it; None if it
-does not see it."""
+"""Colour of an object for an audience, with an opacity if transparent; None if hidden."""
 
 
 class BatchNode:
-    """One shape at one or more places; without a shape, the boxes of objects as cubes."""
+    """Instances of one shape; without a shape, AABBs of objects as scaled cubes."""
 
     def __init__(self, name: str, members: Sequence[Member], shape: PartShape | None) -> None:
         self.name = name
         self.members = {member.id: member for member in members}
         self._slots = list(members)
-        """Its members; one that has left is not seen, and keeps its place."""
+        """Instances in order; a removed member is invisible, and its slot stays."""
         self._is_boxes = shape is None
         self._geometries: list[tuple[Rgba | None, Geometry]] = [
             (None, Geometry("box", _cube32, 0.87, BOX_OPACITY))
@@ -65,11 +64,11 @@ class BatchNode:
 
     @property
     def is_cheap_to_move(self) -> bool:
-        """Whether a moved object sends few bytes: its node's places, 28 bytes each."""
+        """Whether a move sends few bytes: all poses of the node, 28 bytes each."""
         return self._is_boxes or len(self._slots) <= 256
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
-        """A node for each colour of the shape, and for each opacity; hidden objects have size 0."""
+        """A drawing for each piece of the shape and each opacity; hidden objects have size 0."""
         colours = [sight(one) if one.id in self.members else None for one in self._slots]
         opacities = np.array([(*colour, _OPAQUE)[3] if colour else -1 for colour in colours])
         for slot, member in enumerate(self._slots):
@@ -100,7 +99,7 @@ class BatchNode:
 
 
 class _CloudNode:
-    """A cloud at its place, as points."""
+    """Points of one cloud."""
 
     is_cheap_to_move = True
 
@@ -110,7 +109,7 @@ class _CloudNode:
         self._serial, self._dots = shape.serial, dots
 
     def drawings(self, sight: Sight) -> dict[str, Sprinkle]:
-        """Its only node."""
+        """The only drawing."""
         (member,) = self.members.values()
         colour = sight(member)
         if colour is None:
@@ -121,7 +120,7 @@ class _CloudNode:
 
 
 def _geometry_of(key: Hashable, piece: Piece, radius: float) -> Geometry:
-    """A piece of a shape, see-through as its colour is."""
+    """Geometry of a piece of a shape, with the opacity of its colour."""
     return Geometry(key, lambda: piece.facets, radius, _opacity(piece.colour))
 
 
@@ -135,13 +134,13 @@ def _cube32() -> Facets:
 
 
 class _MergedNode:
-    """Different shapes, mostly of one colour, at their places, as one geometry.
+    """Different shapes, mostly of one colour, merged into one geometry.
 
-    Pieces that an audience sees in another colour are drawn by nodes beside it, one a colour. If
-    one is hidden, marked or moved, the rest is merged anew.
+    Pieces in another colour for an audience have separate nodes, one a colour. If one is hidden,
+    highlighted or moved, the rest is merged anew.
     """
 
-    is_cheap_to_move = False  # all triangles of the node are sent
+    is_cheap_to_move = False  # sends all triangles of the node
 
     def __init__(self, name: str, members: Sequence[Member]) -> None:
         self.name = name
@@ -151,7 +150,7 @@ class _MergedNode:
         self._center = (self._low + self._high) / 2
 
     def drawings(self, sight: Sight) -> dict[str, Drawing]:
-        """Its node, and one for each other colour."""
+        """A drawing for the node's own colour, and one for each other colour."""
         of_colour: dict[tuple[str, Rgba], list[tuple[Member, int]]] = {}
         for member in self.members.values():
             colour = sight(member)
@@ -185,12 +184,12 @@ class _MergedNode:
 
 
 Node = BatchNode | _CloudNode | _MergedNode
-"""Objects that are drawn together: some may leave `members`, none may join. `drawings`: what an
-audience sees, by paths in the scene."""
+"""Group of objects in one node; `members` may shrink, never grow. `drawings` : its scene nodes for
+an audience, by name."""
 
 
 def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) -> Facets:
-    """Pieces of members' shapes, by their numbers, at their places, metres from a centre (3,)."""
+    """Pieces (member, index) merged in metres, relative to a centre (3,), world frame."""
     vertices, faces, n_vertices = [], [], 0
     for member, n in pieces:
         if member.shape is None:
@@ -204,7 +203,7 @@ def merged(pieces: Sequence[tuple[Member, int]], center: NDArray[np.float64]) ->
 
 
 def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
-    """Nodes of new names for members with shapes: batches of repeated shapes, the rest merged."""
+    """Nodes with new names for members with shapes: repeated shapes instanced, others merged."""
     of_shape: dict[int, list[Member]] = {}
     for member in members:
         of_shape.setdefault(id(member.shape), []).append(member)
@@ -229,7 +228,7 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
 
 
 def _runs(members: list[Member]) -> list[list[Member]]:
-    """Members cut into runs of at most `MOST_MERGED` triangles that lie near one another."""
+    """Runs of at most `MOST_MERGED` triangles, along the Morton order of their centres."""
     centers = np.array([member.box.mean(axis=0) for member in members])
     low = centers.min(axis=0)
     size = max(float((centers - low).max()), 1e-12)
@@ -249,7 +248,7 @@ def _runs(members: list[Member]) -> list[list[Member]]:
 
 
 def _interleaved(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Z-order (n,) of steps (n, 3) below 1024."""
+    """Morton codes (n,) of steps (n, 3) below 1024."""
     order = np.zeros(len(steps), dtype=np.int64)
     for bit in range(10):
         for axis in range(3):

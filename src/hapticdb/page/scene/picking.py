@@ -1,4 +1,4 @@
-"""Which object a ray meets first, and where."""
+"""Picking: first object along a ray."""
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
@@ -11,7 +11,7 @@ from hapticdb.page.scene.nodes import Member
 
 @dataclass(frozen=True)
 class Struck:
-    """An object that a ray meets first: where (3,), and how far from the ray's origin; metres."""
+    """Hit of a ray: point (3,), world frame, and distance from the ray's origin; metres."""
 
     id: int
     point: NDArray[np.float64]
@@ -19,23 +19,23 @@ class Struck:
 
 
 class Targets:
-    """What rays can meet: members by id, each by its shape, or by its box until it has one."""
+    """Ray targets: members by id, each by its shape, or by its AABB without one."""
 
     def __init__(self, members: Mapping[int, Member]) -> None:
         self._members = members
-        self._boxes: NDArray[np.float64] | None = None  # of all members; None: they have changed
+        self._boxes: NDArray[np.float64] | None = None  # of all members; None after a change
 
     def changed(self) -> None:
-        """Note that members have come, gone or moved."""
+        """Invalidate the AABBs after a change of members."""
         self._boxes = None
 
     def first(
         self, origin: ArrayLike, direction: ArrayLike, sees: Callable[[int], bool]
     ) -> Struck | None:
-        """The nearest of the objects that `sees` lets pass; None if the ray meets none.
+        """Nearest object along a ray among those of `sees`; None without a hit.
 
-        Objects are tried in the order in which the ray enters their boxes, until the next box lies
-        behind the nearest hit.
+        Broad phase: AABBs in the order of the ray's entry, up to the nearest hit of the narrow
+        phase.
         """
         start = np.asarray(origin, dtype=np.float64)
         way = np.asarray(direction, dtype=np.float64)
@@ -64,7 +64,7 @@ class Targets:
 def _slabs(
     boxes: NDArray[np.float64], start: NDArray[np.float64], way: NDArray[np.float64]
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Distances at which a ray enters and leaves each box (n, 2, 3), which is a little enlarged."""
+    """Slab test: entry and exit distances (n,) of AABBs (n, 2, 3), enlarged by rounding errors."""
     room = 1e-9 * (np.abs(boxes).max(axis=(1, 2)) + np.abs(start).max())
     with np.errstate(divide="ignore", invalid="ignore"):
         one = (boxes[:, 0] - room[:, None] - start) / way
@@ -77,7 +77,7 @@ def _slabs(
 def _met(
     target: Member, start: NDArray[np.float64], way: NDArray[np.float64], enters: float
 ) -> float | None:
-    """Distance to an object; None if the ray misses it."""
+    """Distance to an object, metres; None without a hit."""
     if target.shape is None:
         return enters
     turn = target.pose[:3, :3]

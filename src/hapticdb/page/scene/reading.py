@@ -1,4 +1,4 @@
-"""Reads the shapes of objects from the database, off the page's thread."""
+"""Reader of the objects' shapes, in a thread of its own."""
 
 from collections.abc import Callable, Sequence
 from contextlib import closing
@@ -21,24 +21,24 @@ from hapticdb.store.base import Object
 from hapticdb.store.connect import open_store
 
 ShapedObject = tuple[Object, PartShape, NDArray[np.float64]]
-"""An object, its shape, and the shape's pose (4, 4), world_from_shape."""
+"""Object, its shape, and the shape's pose (4, 4), world_from_shape."""
 SHOW_EVERY_S = 0.5
-"""Seconds after which the shapes read so far are shown."""
+"""Greatest time between two updates of the scene, seconds."""
 SHOW_TRIANGLES = 1_000_000
-"""Triangles after which the shapes read so far are shown."""
+"""Triangles of an update, at which it is sent."""
 
 
 MOST_DOTS = 600_000
-"""Points of a cloud that are drawn. A larger value shows more detail, and sends 15 bytes each."""
+"""Greatest number of drawn points of a cloud. Larger: more detail, 15 bytes each."""
 CUBES = 1024
-"""Cubes along a cloud's longest edge that tell rays where its points are, before `MOST_BLOCKS`."""
+"""Cubes along a cloud's longest edge as its ray target, before `MOST_BLOCKS`."""
 MOST_BLOCKS = 6_000
-"""Cubes that stand for voxels of an object without a surface, or, for rays, for a cloud's points.
-A larger value shows more detail, and sends about 100 bytes more for each cube."""
+"""Greatest number of cubes of an object without a surface, and of a cloud's ray target. Larger:
+more detail, about 100 bytes each."""
 
 
 class ShapeReader:
-    """Thread that reads shapes: `show` gets them, `lost` objects without triangles."""
+    """Thread that reads shapes: `show` receives them, `lost` the objects without triangles."""
 
     def __init__(
         self,
@@ -56,16 +56,16 @@ class ShapeReader:
         self._thread.start()
 
     def read(self, objects: Sequence[Object]) -> None:
-        """Read the shapes of objects after those that wait already."""
+        """Queue objects."""
         self._wanted.put(objects)
 
     def close(self) -> None:
-        """End the thread; it ends after the surface that it reads."""
+        """End the thread after its current surface."""
         self._ended.set()
         self._wanted.put(None)
 
     def join(self, timeout: float) -> None:
-        """Wait until the thread has ended."""
+        """Join the thread, with a timeout in seconds."""
         self._thread.join(timeout)
 
     def _run(self) -> None:
@@ -73,7 +73,7 @@ class ShapeReader:
             self._read(objects)
 
     def _read(self, objects: Sequence[Object]) -> None:
-        # by digest: a batch of equal parts is complete when it is shown
+        # by digest: equal parts are shown together, instanced
         ordered = sorted(objects, key=lambda obj: obj.digest)
         left = {obj.id: obj for obj in objects}
         ready: list[ShapedObject] = []
@@ -92,7 +92,7 @@ class ShapeReader:
                     ready.append(self._shaped(obj, part))
                     n_triangles += ready[-1][1].n_triangles
                     del left[obj.id]
-        except HapticDBError:  # the database is away or damaged: the others are shown by voxels
+        except HapticDBError:  # database unreachable or damaged: voxels for the others
             pass
         self._show_drawn(ready)
         self._lost(list(left.values()))
@@ -102,7 +102,7 @@ class ShapeReader:
         self._show(ready)
 
     def _shaped(self, obj: Object, part: Part) -> ShapedObject:
-        """The object's shape, which equal parts of equal stretch share, and its pose."""
+        """Object, shape and pose; equal parts of equal stretch share a shape."""
         placed = taken_apart(obj.transform)
         if part.faces is None:
             cloud = _cloud(obj, part)
@@ -119,7 +119,7 @@ class ShapeReader:
 
 
 def _cloud(obj: Object, part: Part) -> PartShape:
-    """Points of a cloud at its place, at most `MOST_DOTS` of them, in its colours or by height."""
+    """At most `MOST_DOTS` points of a cloud, world frame, in its colours or coloured by height."""
     points, colours = part.world_points(), part.colours
     if len(points) > MOST_DOTS:
         some = np.random.default_rng(0).permutation(len(points))[:MOST_DOTS]
@@ -138,7 +138,7 @@ def _cloud(obj: Object, part: Part) -> PartShape:
 
 
 def centred(pose: NDArray[np.float64], shape: PartShape) -> NDArray[np.float64]:
-    """World_from_shape (4, 4) from world_from_part: the shape's frame is about its centre."""
+    """World_from_shape (4, 4) from world_from_part: a shape's origin is its centre."""
     moved = pose.copy()
     moved[:3, 3] += pose[:3, :3] @ shape.center
     return moved

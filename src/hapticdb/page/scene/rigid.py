@@ -1,4 +1,4 @@
-"""Placements taken apart: what a shape is stretched by, and the rigid rest."""
+"""Polar decomposition of placements into a stretch and a rigid pose."""
 
 import math
 from functools import lru_cache
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 SAME = 1e-7
-"""Greatest difference of two stretches that count as one, relative."""
+"""Relative tolerance of equal stretches."""
 REMEMBERED = 1 << 14
-"""Placements whose parts are kept, 1 kB each. A larger value saves time in larger scenes."""
+"""Placements in the cache, 1 kB each. Larger: faster in larger scenes."""
 
 
 class Placed(NamedTuple):
     """A placement (4, 4) as pose @ stretch.
 
-    pose : (4, 4) float64, rigid, proper; metres.
-    stretch : (3, 3) float64; a symmetric matrix, with its first row negated for a mirrored part.
+    pose : (4, 4) float64, rigid, proper; metres. stretch : (3, 3) float64, symmetric, with its
+    first row negated for a mirrored part.
     """
 
     pose: NDArray[np.float64]
@@ -25,7 +25,7 @@ class Placed(NamedTuple):
 
     @property
     def key(self) -> bytes:
-        """Bytes that are equal for stretches that differ by rounding alone."""
+        """Bytes of the rounded stretch, equal for stretches equal up to rounding errors."""
         size = max(float(np.abs(self.stretch).max()), 1e-300)
         exponent = round(math.log2(size))
         steps = np.round(self.stretch / (SAME * 2.0**exponent))
@@ -33,7 +33,7 @@ class Placed(NamedTuple):
 
 
 def taken_apart(transform: NDArray[np.float64]) -> Placed:
-    """Polar decomposition of an affine placement (4, 4), also a flat one; read-only."""
+    """Polar decomposition of an affine placement (4, 4), also a singular one; read-only."""
     return _taken_apart(np.asarray(transform, dtype=np.float64).tobytes())
 
 

@@ -1,4 +1,4 @@
-"""A distinct shape of one or more objects: what is sent to the browser, and what rays meet."""
+"""Distinct shapes of the scene: display geometry and ray target."""
 
 from collections.abc import Iterable
 from functools import cache, cached_property
@@ -12,14 +12,14 @@ from hapticdb.page.colours import Rgba, few
 from hapticdb.page.scene.facets import Facets, sharpened
 
 _EMBREE_SIZE = 100.0
-"""Size to which a shape is scaled before Embree sees it: Embree has absolute tolerances, and parts
-are millimetres or kilometres."""
+"""Size to which a shape is scaled for Embree, whose tolerances are absolute, while parts are
+millimetres or kilometres."""
 
 _SERIALS = count()
 
 
 class Piece(NamedTuple):
-    """Triangles of one colour, as they are drawn; without a colour they take the object's."""
+    """Triangles of one colour; None for the object's colour."""
 
     colour: Rgba | None
     facets: Facets
@@ -34,53 +34,53 @@ class Dots(NamedTuple):
 
 
 class PartShape:
-    """Triangles of one or more objects, metres, in a frame about their own centre.
+    """Triangles of one or more objects, metres, about their own centre.
 
-    colours (F, 4) uint8 : the file's, of each triangle. A cloud is drawn as `dots`; its triangles
-    are cubes that hold its points, for rays.
+    colours (F, 4) uint8 : of the triangles, from the file. A cloud is drawn as `dots`; its
+    triangles are cubes around its points, as ray target.
     """
 
     def __init__(self, facets: Facets, colours: NDArray[np.uint8] | None = None) -> None:
         self.serial = next(_SERIALS)
-        """A number that no other shape of this process has."""
+        """Unique number in this process."""
         low, high = facets.vertices.min(axis=0), facets.vertices.max(axis=0)
         self.center: NDArray[np.float64] = (low + high) / 2
         """The frame's origin in the part frame, metres."""
         self.half: NDArray[np.float64] = (high - low) / 2
-        """Half the edges of its bounding box (3,), metres."""
+        """Half the edges of its AABB (3,), metres."""
         self.facets = Facets(facets.vertices - self.center, facets.faces)
         self.split: Facets | None = None
-        """`drawn`, once it is made."""
+        """Cache of `drawn`."""
         self.dots: Dots | None = None
         self._palette, self._number = few(colours)
 
     @property
     def n_triangles(self) -> int:
-        """Number of its triangles."""
+        """Number of triangles."""
         return len(self.facets.faces)
 
     @property
     def radius(self) -> float:
-        """Radius of its bounding box, metres."""
+        """Radius of the bounding sphere, metres."""
         return float(np.linalg.norm(self.half))
 
     @property
     def drawn(self) -> Facets:
-        """Its triangles in their order, with vertices split at sharp edges; float32 and uint32."""
+        """Triangles in their order, with vertices split at sharp edges; float32 and uint32."""
         if self.split is None:
             draw_each([self])
         return cast("Facets", self.split)
 
     @property
     def colour(self) -> Rgba | None:
-        """The file's colour of most of its triangles; None without one."""
+        """Colour of most triangles in the file; None without colours."""
         if not self._palette:
             return None
         return self._palette[int(np.bincount(self._number).argmax())]
 
     @cached_property
     def pieces(self) -> list[Piece]:
-        """Its triangles as they are drawn, by colour."""
+        """Display triangles by colour."""
         if len(self._palette) <= 1:
             return [Piece(self.colour, self.drawn)]
         vertices, faces = self.drawn
@@ -92,13 +92,13 @@ class PartShape:
         return found
 
     def bounds(self, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Lower and upper corner (2, 3) of a box that holds it at a pose, metres, world frame."""
+        """AABB (2, 3) of the turned bounding box at a pose (4, 4), metres, world frame."""
         reach = np.abs(pose[:3, :3]) @ self.half
         return np.stack([pose[:3, 3] - reach, pose[:3, 3] + reach])
 
     @cached_property
     def _embree(self) -> tuple[object, float]:
-        """Embree's scene of the triangles, and the factor that scales metres to it."""
+        """Embree's scene of the triangles, and its scale, 1/m."""
         from embreex.mesh_construction import TriangleMesh  # noqa: PLC0415 - extra `view`
         from embreex.rtcore_scene import EmbreeScene  # noqa: PLC0415 - likewise
 
@@ -111,13 +111,13 @@ class PartShape:
     def first_hit(
         self, origin: NDArray[np.float64], direction: NDArray[np.float64]
     ) -> float | None:
-        """Distance to the nearest triangle that a ray meets, from either side; None if it misses.
+        """Distance along a ray to the nearest triangle, metres, two-sided; None without a hit.
 
-        origin (3,) and direction (3,), a unit vector, are in the shape's frame. Embree finds the
+        origin (3,), direction (3,), a unit vector : in the shape's frame. Embree selects the
         triangle; the distance is computed in 64 bits from the triangle's plane.
         """
         scene, scale = self._embree
-        # a start near the shape: 32 bits resolve its triangles however far away the eye is
+        # start near the shape: float32 resolves its triangles for any distance of the eye
         skipped = max(float(-(origin @ direction)) - 2 * self.radius, 0.0)
         start = (origin + skipped * direction) * scale
         found = scene.run(  # type: ignore[attr-defined]
@@ -140,7 +140,7 @@ class PartShape:
 
 
 def draw_each(shapes: Iterable[PartShape]) -> None:
-    """Make `PartShape.drawn` of several shapes together, which is faster than one by one."""
+    """Make `PartShape.drawn` of several shapes in one call of `sharpened`, which is faster."""
     missing = [shape for shape in shapes if shape.split is None]
     if not missing:
         return
@@ -151,7 +151,7 @@ def draw_each(shapes: Iterable[PartShape]) -> None:
 
 @cache
 def _device() -> object:
-    """Embree's device, one for all scenes: Embree crashes when thousands of them are made."""
+    """Embree's only device: it crashes after thousands of them."""
     from embreex.rtcore import EmbreeDevice  # noqa: PLC0415 - extra `view`
 
     return EmbreeDevice()

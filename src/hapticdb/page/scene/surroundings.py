@@ -1,4 +1,4 @@
-"""What surrounds the objects: which way is up, the ground, light, background, the first view."""
+"""Surroundings of the objects: vertical axis, ground, light, background, first view."""
 
 from typing import TYPE_CHECKING, Literal, NamedTuple, get_args
 
@@ -13,23 +13,23 @@ if TYPE_CHECKING:
 
 Plane = Literal["yz", "zx", "xy"]
 PLANES: tuple[Plane, ...] = get_args(Plane)
-"""Plane of the ground, by the number of the axis that points up."""
+"""Plane of the ground, by the number of the vertical axis."""
 FIELD_OF_VIEW = 0.7
-"""Height of the first view, radians. A larger value distorts more."""
+"""Vertical field of view, radians. Larger: more perspective distortion."""
 TOWARDS = (0.62, 0.50, 0.42)
 """Direction from the objects to the first eye: along the two axes of the ground, and up."""
 ABOVE = (226, 231, 237)
 BELOW = (250, 251, 252)
 """Colours of the background, at the top and at the bottom of the picture."""
 AMBIENT = 0.5
-"""Light from everywhere, beside viser's default lights. Larger: brighter and flatter shadows."""
+"""Ambient light, in addition to viser's default lights. Larger: brighter, flatter shadows."""
 LINE = (196, 202, 210)
 SECTION = (168, 176, 187)
 """Colours of the ground's lines: all, and each tenth."""
 SHADOW = 0.45
 """Opacity of the shadow under the middle of the objects."""
 SHADOW_EDGE, SHADOW_BLUR = 3.0, 0.05
-"""Edge of the image of the shadow, and how soft it is, in radii of the scene."""
+"""Edge of the shadow's image, and its blur (sigma), in radii of the scene."""
 SHADOW_PIXELS = 192
 """Pixels along that edge. More: a finer shadow, and more bytes."""
 GROUND_EDGE = 4.0
@@ -37,14 +37,14 @@ GROUND_EDGE = 4.0
 
 
 class View(NamedTuple):
-    """Where an eye is, and what it looks at: positions (3,), metres, world frame."""
+    """Eye and target of a camera: positions (3,), metres, world frame."""
 
     position: NDArray[np.float64]
     look_at: NDArray[np.float64]
 
 
 def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
-    """A view from which all of a box (2, 3) is seen, and what is within `reach` of its middle."""
+    """View of an AABB (2, 3) and of a sphere of radius `reach` about its centre, metres."""
     center = box.mean(axis=0)
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, reach, 1e-9)
     way = np.zeros(3)
@@ -54,12 +54,12 @@ def framing(box: NDArray[np.float64], up: int, reach: float = 0.0) -> View:
 
 
 def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -> None:
-    """Light, background, ground and first view for objects in a box (2, 3), metres."""
+    """Add light, background, ground and first view for objects in an AABB (2, 3), metres."""
     scene = server.scene
     scene.set_up_direction(tuple(np.eye(3)[up]))
     scene.configure_default_lights(enabled=True, cast_shadow=False)
     scene.add_light_ambient("/light", intensity=AMBIENT)
-    scene.configure_environment_map(None)  # one takes twenty times as long without a graphics card
+    scene.configure_environment_map(None)  # with one, 20 times slower without a GPU
     steps = np.linspace(0.0, 1.0, 64)[:, None, None]
     shades = (1 - steps) * np.array(ABOVE) + steps * np.array(BELOW)
     scene.set_background_image(np.tile(shades.astype(np.uint8), (1, 8, 1)), format="png")
@@ -68,7 +68,7 @@ def add_surroundings(server: "ViserServer", box: NDArray[np.float64], up: int) -
 
 
 def set_first_view(server: "ViserServer", box: NDArray[np.float64], up: int, reach: float) -> None:
-    """Let browsers begin with the view of `framing`."""
+    """Set the initial camera of browsers to the view of `framing`."""
     view, camera = framing(box, up, reach), server.initial_camera
     radius = float(np.linalg.norm(view.position - view.look_at)) * np.sin(FIELD_OF_VIEW / 2)
     camera.fov = FIELD_OF_VIEW
@@ -79,7 +79,7 @@ def set_first_view(server: "ViserServer", box: NDArray[np.float64], up: int, rea
 
 
 def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
-    """Lines below the objects, a power of ten of metres apart."""
+    """Lines below the objects, a power of ten metres apart."""
     radius = max(float(np.linalg.norm(box[1] - box[0])) / 2, 1e-9)
     spacing = 10.0 ** np.floor(np.log10(radius / 2))
     center = box.mean(axis=0)
@@ -104,7 +104,7 @@ def _set_ground(scene: "SceneApi", box: NDArray[np.float64], up: int) -> None:
 
 
 def add_shadow(scene: "SceneApi", boxes: NDArray[np.float64], up: int) -> None:
-    """A soft shadow of boxes (n, 2, 3) on the ground: an image, which costs a browser nothing."""
+    """Add a soft shadow of AABBs (n, 2, 3), metres, on the ground: an image, free to render."""
     axes = [(up + 1) % 3, (up + 2) % 3]
     low, high = boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2, 1e-9)

@@ -1,4 +1,4 @@
-"""The scene that all browsers see: objects of an environment, followed as others edit them."""
+"""The scene shared by all browsers, updated after each commit to the environment."""
 
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
@@ -25,32 +25,31 @@ if TYPE_CHECKING:
     from viser import ViserServer
 
 ENDS_WITHIN_S = 10.0
-"""Seconds that `SceneView.close` waits for each of its threads."""
+"""Timeout for the end of each thread, seconds."""
 
 
 class SceneView:
-    """Shows the objects of an environment in all browsers of a viser server, and follows edits.
+    """Display of an environment's objects in all browsers of a viser server.
 
-    Boxes are shown at once, then the objects' surfaces and points as they are read, then, as
-    blocks, the voxels of objects without a surface in the database. All methods may be called from
-    any thread.
+    AABBs show at once, then surfaces and points as they are read, then blocks of voxels for objects
+    without a surface in the database. All methods are thread-safe.
 
-    The server's scene below ``/parts``, its ground, light, background and first view are this
-    view's. HapticDBError if the environment cannot be opened or read.
+    The view owns the server's scene below ``/parts``, its ground, light, background and first view.
+    HapticDBError if the environment cannot be opened or read.
     """
 
     def __init__(self, server: "ViserServer", url: str) -> None:
         self._server, self._url = server, url
         self.contents = Contents(Audience(server.scene))
-        """The objects, their nodes, and what each browser sees of them."""
+        """Objects, nodes, and the view of each browser."""
         self.on_edit: Callable[[], None] | None = None
-        """Called from a thread after each commit, the view's own or another's, is shown."""
+        """Called in a thread of the view after each commit shown, its own or another's."""
         self._is_closed = Event()
         self._is_surrounded = False
         self.up = 2
-        """Number of the axis that points up: 0 for x, 1 for y, 2 for z."""
+        """Vertical axis: 0 for x, 1 for y, 2 for z."""
         self.revision = -1
-        """Revision of the environment that is shown."""
+        """Revision of the environment on display."""
         self._reader = ShapeReader(url, self._show_shapes, self._show_voxels)
         self._follower = Follower(url, self._follow)
         try:
@@ -60,7 +59,7 @@ class SceneView:
             raise
 
     def close(self) -> None:
-        """End the view's threads and its connection. The browsers keep what they show."""
+        """End the threads and close the connection; the browsers' scenes stay."""
         self._is_closed.set()
         self._reader.close()
         self._follower.close(ENDS_WITHIN_S)
@@ -73,15 +72,15 @@ class SceneView:
 
     @property
     def objects(self) -> Mapping[int, Object]:
-        """All objects by id, as of `revision`: a copy."""
+        """Copy of all objects by id, as of `revision`."""
         with self.contents.lock:
             return dict(self.contents.records)
 
     def move(self, object_id: int, transform: ArrayLike) -> bool:
-        """Show an object at a new placement at once, in all browsers, before it is committed.
+        """Preview an object at a placement in all browsers, before the commit; False if unknown.
 
-        transform (4, 4): world_from_part, metres, of the present one's scale. The next commit that
-        writes the object replaces the preview; `put_back` takes it back. False without the object.
+        transform (4, 4) : world_from_part, metres, with the present scale. The next commit of the
+        object replaces the preview; `put_back` reverts it.
         """
         with self._server.atomic():
             moved = self.contents.move(object_id, transform)
@@ -89,14 +88,14 @@ class SceneView:
         return moved
 
     def put_back(self, object_id: int) -> None:
-        """Show an object where the database has it."""
+        """Revert a preview to the committed placement."""
         with self.contents.lock:
             obj = self.contents.records.get(object_id)
             if obj is not None:
                 self.move(object_id, obj.transform)
 
     def _follow(self, written: list[Object], removed: list[int], revision: int) -> None:
-        """Show what was committed: the first time, all objects."""
+        """Show a commit, at first all objects."""
         with self.contents.lock, self._server.atomic():
             self.contents.remove(removed)
             anew = []
@@ -127,21 +126,21 @@ class SceneView:
             self.contents.shape(found)
 
     def _show_voxels(self, objects: Sequence[Object]) -> None:
-        """Show objects without triangles as blocks of their voxels."""
+        """Show objects without triangles as blocks of voxels."""
         if not objects:
             return
         with suppress(HapticDBError), open_environment(self._url, read_only=True) as env:
             for obj in objects:
                 if self._is_closed.is_set():
                     return
-                with suppress(HapticDBError):  # removed, or the database is away
+                with suppress(HapticDBError):  # removed, or database unreachable
                     voxels = env.voxels(obj.id)
                     if len(voxels):
                         self._show_shapes([_blocks(obj, voxels, self.grid)])
 
 
 def _blocks(obj: Object, voxels: NDArray[np.int64], grid: Grid) -> ShapedObject:
-    """Blocks of an object's voxels, in the world frame, as its shape."""
+    """Shape of an object's voxels, as blocks in the world frame."""
     vertices, faces = block_facets(coarsened(voxels, MOST_BLOCKS))
     shape = PartShape(Facets(vertices * grid.voxel_size + np.array(grid.origin), faces))
     return obj, shape, centred(np.eye(4), shape)

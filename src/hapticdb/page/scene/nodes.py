@@ -228,7 +228,7 @@ def gathered(members: Sequence[Member], names: Callable[[], str]) -> list[Node]:
 
 
 def _runs(members: list[Member]) -> list[list[Member]]:
-    """Runs of at most `MOST_MERGED` triangles, along the Morton order of their centres."""
+    """Runs of at most `MOST_MERGED` triangles, along the Z-order of their centres."""
     centers = np.array([member.box.mean(axis=0) for member in members])
     low = centers.min(axis=0)
     size = max(float((centers - low).max()), 1e-12)
@@ -248,7 +248,7 @@ def _runs(members: list[Member]) -> list[list[Member]]:
 
 
 def _interleaved(steps: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Morton codes (n,) of steps (n, 3) below 1024."""
+    """Z-order (n,) of steps (n, 3) below 1024."""
     order = np.zeros(len(steps), dtype=np.int64)
     for bit in range(10):
         for axis in range(3):

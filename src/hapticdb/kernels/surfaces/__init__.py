@@ -1,4 +1,4 @@
-"""Kernels of surfaces: triangles to voxels and bricks, points on a surface, its inside."""
+"""Kernels of surfaces: voxelization, distance bands, sampling, orientation, distances."""
 
 from hapticdb.kernels._later import later_modules
 

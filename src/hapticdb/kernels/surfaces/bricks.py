@@ -1,15 +1,15 @@
-"""Bricks under construction: a hash table from a brick's packed key to its 512 bits.
+"""Bricks under construction: hash table from packed brick key to 512 bits of occupancy.
 
-A brick is a cube of 8 x 8 x 8 voxels, and bit number n of its occupancy is the Z-order of (i, j, k)
-modulo 8. So each of its eight 64-bit words is a cube of 4 x 4 x 4 voxels, and a run of voxels along
-any axis sets its bits in a word by one OR with a shifted mask.
+A brick is a cube of 8 x 8 x 8 voxels; bit n of its occupancy is the voxel with Z-order n of (i, j,
+k) modulo 8. So each of its eight 64-bit words is a cube of 4 x 4 x 4 voxels, and a run of voxels
+along any axis sets its bits in a word by one OR with a shifted mask.
 
 The number of an axis here is that of its bit in each group of three: 2 for i, 1 for j, 0 for k.
-While bricks are being filled, their key is *packed*: (i >> 3, j >> 3, k >> 3) in 18 bits each. That
-is cheaper to compute than the Z-order key, which each brick needs once, at the end.
+While bricks are being filled, their key is *packed*: (i >> 3, j >> 3, k >> 3) in 18 bits each,
+cheaper to compute than the Z-order key, which each brick needs once, at the end.
 
-The table grows by doubling, so its memory is in proportion to the bricks that exist and never to
-the grid. Its arrays are those of one `_BrickTable`; the caller counts the bricks in use.
+The table grows by doubling, so its memory is in proportion to the existing bricks, not to the grid.
+Its arrays are the fields of a `_BrickTable`; the caller counts the bricks in use.
 """
 
 from typing import NamedTuple
@@ -21,23 +21,23 @@ from hapticdb.kernels._jit import INTS, INTS2, entry, leaf, maker
 from hapticdb.kernels.curves import Z_ORDER, compact, encode
 
 FIRST_CAPACITY = np.int64(256)
-"""Bricks for which a new table has room. A larger value costs each small part time to clear it."""
+"""Capacity of a new table, bricks. Larger: slower for small parts, by the time to clear it."""
 RUNS_AT_ONCE = 1024
-"""Runs that are collected before they are marked: 40 kB. Fewer would pass arrays between kernels
-more often, more would leave the processor's first cache."""
+"""Runs in the buffer: 40 kB. Fewer: arrays pass between kernels more often. More: the buffer leaves
+the first-level cache."""
 RUN_AXIS, RUN_LAST = 3, 4
-"""Columns of a run behind its first voxel (i, j, k): the axis along which it goes on, and its last
-coordinate on that axis."""
+"""Columns of a run after its first voxel (i, j, k): its axis, and its last coordinate on it."""
 PACKED_BITS = 18
-"""Bits of each coordinate in a packed key: a grid has at most 2^21 voxels an axis, 2^18 bricks."""
+"""Bits of a coordinate in a packed key: a grid has at most 2^21 voxels an axis, 2^18 bricks."""
 PACKED_MASK = (1 << PACKED_BITS) - 1
 
 
 class _BrickTable(NamedTuple):
-    """A hash table of bricks of capacity C. It has 2 C slots, so that probes stay short.
+    """Hash table of bricks of capacity C, with 2 C slots for short probes.
 
-    keys (C,) int64, packed; words (C, 8) int64, zero where unused; slots (2 C,) int32, the index of
-    the brick whose hash leads here, or -1; recent (256, 2) int64, a key and its brick's index.
+    keys (C,) int64, packed; words (C, 8) int64, zero where unused; slots (2 C,) int32, open
+    addressing with linear probing: index of a brick, or -1; recent (256, 2) int64, cache of keys
+    and brick indices.
     """
 
     keys: NDArray[np.int64]
@@ -62,14 +62,14 @@ RUN_MASKS = _run_masks()
 
 @leaf
 def _first_slot(key, mask):
-    """Slot where the search for a packed key begins. No product has more than 63 bits."""
+    """First slot of a packed key's probe sequence. No product has more than 63 bits."""
     mixed = (key & 0x7FFFFFF) * 0x5BD1E995 + (key >> 27) * 0x2545F491
     return (mixed >> 20 ^ mixed) & mask
 
 
 @maker
 def new_table(capacity):
-    """Return an empty table for that many bricks, a power of two."""
+    """Empty table; capacity : bricks, a power of two."""
     keys = np.empty(capacity, np.int64)
     words = np.zeros((capacity, 8), np.int64)
     slots = np.empty(2 * capacity, np.int32)
@@ -84,7 +84,7 @@ def new_table(capacity):
 
 @maker
 def grown(table, n_bricks, wanted):
-    """Copy the first `n_bricks` bricks into a larger table, with room for `wanted`."""
+    """Copy of the first `n_bricks` bricks in a larger table, with room for `wanted`."""
     capacity = 2 * table.keys.shape[0]
     while capacity < wanted:
         capacity *= 2
@@ -105,8 +105,8 @@ def grown(table, n_bricks, wanted):
 def mark_while_room(table, n_bricks, runs, done, n_runs):
     """Mark runs done..n_runs until the table is full; return the runs done and the bricks in use.
 
-    No array is replaced or passed on in this function, since numba would count references to it
-    atomically: that took half of the time of voxelizing when each run was one call.
+    This function replaces and passes on no array, since numba would count references to it
+    atomically: half of the time of voxelizing, with one call a run.
     """
     keys, words, slots, recent = table
     mask = slots.shape[0] - 1
@@ -148,7 +148,7 @@ def mark_while_room(table, n_bricks, runs, done, n_runs):
 
 @leaf
 def bricks_of_run(first, last):
-    """Return how many bricks a run crosses at most."""
+    """Upper bound of the bricks crossed by a run."""
     return ((last - first) >> 3) + 2
 
 
@@ -204,10 +204,10 @@ def sorted_bricks(
 def mark_points(
     points: NDArray[np.float64], bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Bricks of the voxels that hold points (N, 3), as `voxelize.voxelize` returns them.
+    """Bricks of the voxels of points (N, 3), as from `voxelize.voxelize`.
 
-    In voxels from the grid's origin; points outside the grid, or not finite, are left out. Boxes
-    are half-open here: voxel (i, j, k) holds the points of [i, i + 1) x ...
+    Points are in voxels from the grid's origin; those outside the grid, or not finite, are ignored.
+    Boxes are half-open here: voxel (i, j, k) contains the points of [i, i + 1) x ...
     """
     points = points.reshape(-1, 3)
     in_grid = ((points >= 0.0) & (points < float(1 << bits))).all(axis=1)

@@ -1,22 +1,22 @@
-"""Triangles, or points, -> the band of distances around them, as packed rows.
+"""Band of unsigned distances around triangles or points, as packed rows.
 
-Space is cut into blocks of 8^3 bricks. A block holds the least squared distance of its 66^3
-centres: its 64^3 voxels, and one centre more on each side, which the rows of its outer bricks need.
-Each triangle is entered into the blocks that it comes near to, one line of centres along k after
-the other. Then the block is quantised, and each brick that has a distance becomes a row.
+Space is divided into blocks of 8^3 bricks. A block contains the least squared distance of its 66^3
+centres: its 64^3 voxels, and one more centre on each side for the rows of its outer bricks. Each
+triangle is entered into the blocks near it, one line of centres along k after the other. Then the
+block is quantised, and each brick with a distance becomes a row.
 
-Which centres a triangle comes near to follows from directions: no centre within h of a triangle
-lies farther than h outside the triangle's extent in any direction. The directions are the normal,
-the normals of the edges in the plane, those of the edges' shadows on the plane (i, j), and the
-axes. For a triangle that is a line, two directions square to it and its own replace the first ones.
+Separating directions bound the centres near a triangle: every centre within h of a triangle lies at
+most h outside its extent in any direction. The directions are the normal, the normals of the edges
+in the plane, those of the edges' projections on the plane (i, j), and the axes. For a triangle
+degenerate to a line, its own direction and two perpendicular ones replace the first ones.
 
-A distance depends on the triangle and on the centre's place in the grid alone, not on the block or
-on other triangles, and the least is taken before it is quantised. So neither the order of the
-triangles nor a split of them changes a bit, and rows that share a centre have the same value there.
+A distance depends on the triangle and on the centre's position in the grid alone, not on the block
+or on other triangles, and the minimum precedes the quantisation. So neither the order of the
+triangles nor a split of them changes a bit, and rows with a common centre have the same value
+there.
 
-Where the distance to the plane, or to the bounding box, already exceeds what the centre has, the
-exact one is not computed. To make this exact to the last bit, the exact distance is never taken
-below those two.
+The exact distance is not computed if the distance to the plane, or to the AABB, already exceeds the
+centre's value. For bit-exact results, the exact distance is never below those two.
 """
 
 from collections.abc import Iterator
@@ -47,49 +47,48 @@ from hapticdb.kernels.surfaces.voxelize import normal_of
 BRICK = 8
 """Voxels of a brick on each axis."""
 BLOCK_BITS = 3
-"""Bits of a brick's place in its block, on each axis."""
+"""Bits of a brick's coordinate in its block."""
 BLOCK_BRICKS = 1 << (3 * BLOCK_BITS)
-"""Bricks of a block, and most rows that it makes."""
+"""Bricks of a block, and upper bound of its rows."""
 BLOCK = BRICK << BLOCK_BITS
 """Voxels of a block on each axis. Larger: fewer triangles enter several blocks; a block of 64 takes
-2.3 MB for each thread."""
+2.3 MB in each thread."""
 SIDE = BLOCK + 2
 """Centres of a block on each axis."""
 REACH = 0.5 * (SIDE - 1)
-"""From the middle of a block to its outermost centres along an axis, voxels."""
+"""Distance of a block's middle to its outermost centres along an axis, voxels."""
 SLACK = 1e-6
-"""Voxels by which directions reach farther than h, because of rounding."""
+"""Margin of the directions' reach h for rounding, voxels."""
 NEAR_ZERO = 1e-12
-"""Slopes below it count as it: what a line along k changes then is below `SLACK`."""
+"""Least slope; a smaller one changes a line along k by less than `SLACK`."""
 FAR = 2.0**40
-"""Coordinates beyond it, in voxels, are set to it, so that no product overflows. Triangles with
-such corners, far outside any grid, are less exact."""
+"""Coordinates are clamped to this, in voxels, against overflow of products. Triangles with such
+corners, far outside any grid, are less exact."""
 NOTHING = HALF_WIDTH * HALF_WIDTH * (1.0 + 1e-9)
-"""Squared distance of a centre to which no triangle comes near: just above h^2."""
+"""Squared distance of a centre without a triangle near it: just above h^2."""
 POINT, LINE, FACE = 0, 1, 2
-"""Prepared of a triangle: all corners coincide, all lie on a line, or neither."""
+"""Kinds of triangles: all corners coincide, all lie on a line, or neither."""
 N_SIDES = 7
 """Directions of a triangle: 0 to 3 bound k, 4 to 6 bound j. The first is the normal of a face."""
 AT_X, AT_Y, AT_Z, INVERSE, LOW, HIGH, NEAR_LOW, NEAR_HIGH = 0, 1, 2, 3, 4, 5, 6, 7
-"""Fields of a direction: unit vector, 1 / slope, least and greatest value in the triangle, and
-where it is near."""
+"""Fields of a direction: unit vector, 1 / slope, least and greatest value in the triangle, and the
+same bounds of the centres near it."""
 EDGE_X, EDGE_Y, EDGE_Z, INVERSE_SQUARE = 3, 4, 5, 6
-"""Fields of an edge behind its first corner: its vector, 1 / its squared length or 0."""
+"""Fields of an edge after its first corner: its vector, and 1 / its squared length, or 0."""
 ROWS_OF_PIECE = 8 * BLOCK_BRICKS
-"""Rows that one call makes at most: 4 MB. A larger value takes more memory and reports progress
-less often."""
+"""Greatest number of rows of one call: 4 MB. Larger: more memory, fewer progress reports."""
 PAIRS_OF_PIECE = 1 << 12
-"""Triangles that one call enters into blocks at most: a second or two where each covers a block. A
-larger value reports progress less often."""
+"""Greatest number of (block, triangle) pairs of one call: a second or two if each triangle covers
+its block. Larger: fewer progress reports."""
 TRIANGLES_AT_ONCE = 1 << 20
-"""Triangles, or points, whose blocks one call finds. A larger value reports progress less often."""
+"""Triangles, or points, of one call of `find_blocks`. Larger: fewer progress reports."""
 
 
 class _Prepared(NamedTuple):
-    """One triangle, prepared. All relative to its first corner where a direction is meant.
+    """One triangle, prepared; directions are relative to its first corner.
 
-    sides (7, 8), edges (3, 7), box (2, 3) float64: its directions, edges and bounding box; corners
-    (3, 3) float64.
+    sides (7, 8), edges (3, 7), box (2, 3) float64: its directions, edges and AABB; corners (3, 3)
+    float64.
     """
 
     sides: NDArray[np.float64]
@@ -116,10 +115,9 @@ BLOCK_FIELDS = fields_of(_Block, FLOATS, INTS2, BYTES)
 
 @leaf
 def _set_side(shape, n, x, y, z, slope, reach):
-    """Set direction n to the unit vector along (x, y, z), or to no bound where that is null.
+    """Set direction n to the unit vector along (x, y, z), or to no bound for a null vector.
 
-    slope : AT_Y or AT_Z, the axis that the direction is solved for; reach : half the edge of the
-    boxes that are to come near, 0 for points.
+    slope : AT_Y or AT_Z, axis of the solution; reach : half the edge of boxes, 0 for points.
     """
     sides, corners = shape.sides, shape.corners
     length = np.sqrt(x * x + y * y + z * z)
@@ -146,9 +144,9 @@ def _set_side(shape, n, x, y, z, slope, reach):
 
 @leaf
 def _set_edges(triangles, t, shape):
-    """Set corners, bounding box and edges of triangle t; return the number of its longest edge.
+    """Set corners, AABB and edges of triangle t; return the number of its longest edge.
 
-    Returns -1 when all its corners coincide.
+    Returns -1 if all corners coincide.
     """
     corners, edges, box = shape.corners, shape.edges, shape.box
     for axis in range(3):
@@ -177,7 +175,7 @@ def _set_shape(triangles, t, shape, reach):
     """Prepare triangle t of triangles (T, 3, 3), or point t of (T, 1, 3); return its kind."""
     longest = _set_edges(triangles, t, shape)
     edges = shape.edges
-    for m in range(3):  # square to each edge's shadow
+    for m in range(3):  # perpendicular to each edge's projection on (i, j)
         _set_side(shape, 4 + m, -edges[m, EDGE_Y], edges[m, EDGE_X], 0.0, AT_Y, reach)
     if longest < 0:
         for n in range(4):
@@ -193,7 +191,7 @@ def _set_shape(triangles, t, shape, reach):
             _set_side(shape, 1 + m, y * w - z * v, z * u - x * w, x * v - y * u, AT_Z, reach)
         return FACE
     u, v, w = edges[longest, EDGE_X], edges[longest, EDGE_Y], edges[longest, EDGE_Z]
-    if abs(u) <= min(abs(v), abs(w)):  # square to the edge and to the axis that it is farthest from
+    if abs(u) <= min(abs(v), abs(w)):  # perpendicular to the edge and to x, y or z
         x, y, z = 0.0, w, -v
     elif abs(v) <= abs(w):
         x, y, z = -w, 0.0, u
@@ -208,7 +206,7 @@ def _set_shape(triangles, t, shape, reach):
 
 @inlined
 def _y_interval(sides, x, least, greatest):
-    """Narrow an interval of y to where the line at x comes near the shadow."""
+    """Narrow an interval of y to the part of the line at x near the triangle's projection."""
     for n in range(4, N_SIDES):
         value = sides[n, AT_X] * x
         least = max(least, (sides[n, NEAR_LOW] - value) * sides[n, INVERSE])
@@ -218,7 +216,7 @@ def _y_interval(sides, x, least, greatest):
 
 @inlined
 def _z_interval(sides, x, y, least, greatest):
-    """Narrow an interval of z to where the line at (x, y) comes near."""
+    """Narrow an interval of z to the part of the line at (x, y) near the triangle."""
     for n in range(4):
         value = sides[n, AT_X] * x + sides[n, AT_Y] * y
         least = max(least, (sides[n, NEAR_LOW] - value) * sides[n, INVERSE])
@@ -228,7 +226,7 @@ def _z_interval(sides, x, y, least, greatest):
 
 @leaf
 def whole(low, high, first, last):
-    """Numbers from low to high that lie in first..last: the least, and one past the greatest."""
+    """Integers from low to high in first..last: the least, and one past the greatest."""
     low, high = max(np.ceil(low), float(first)), min(np.floor(high), float(last))
     if low > high:
         return first, first
@@ -237,10 +235,10 @@ def whole(low, high, first, last):
 
 @entry(FLOATS3, INT, INTS2)
 def find_blocks(triangles, bits, pairs):
-    """Blocks near each triangle; returns how many pairs of a block and a triangle there are.
+    """Blocks near each triangle; returns the number of (block, triangle) pairs.
 
     triangles (T, 3, 3), or (T, 1, 3) for points. pairs (P, 2) int64: the block's Z-order key and
-    the triangle; those beyond P are counted only.
+    the triangle; pairs beyond P are counted only.
     """
     shape = _Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     last, half = (np.int64(1) << max(bits - BLOCK_BITS - 3, 0)) - 1, 0.5 * BLOCK
@@ -274,7 +272,7 @@ def find_blocks(triangles, bits, pairs):
 
 @leaf
 def _segment_square(x, y, z, u, v, w, inverse):
-    """Squared distance of (x, y, z) to the segment from 0 to (u, v, w); 1 / its squared length."""
+    """Squared distance of (x, y, z) to the segment from 0 to (u, v, w); inverse : of its square."""
     t = min(max((x * u + y * v + z * w) * inverse, 0.0), 1.0)
     x, y, z = x - t * u, y - t * v, z - t * w
     return x * x + y * y + z * z
@@ -282,7 +280,7 @@ def _segment_square(x, y, z, u, v, w, inverse):
 
 @inlined
 def cover(squares, spans, line, first, end):
-    """Let a line's span hold the centres first..end; all of a new line begin at `NOTHING`."""
+    """Extend a line's span by the centres first..end; a new line begins at `NOTHING`."""
     low, high = spans[line, 0], spans[line, 1]
     if low >= high:
         for k in range(np.uint64(line * SIDE), np.uint64((line + 1) * SIDE)):
@@ -294,9 +292,9 @@ def cover(squares, spans, line, first, end):
 
 @inlined
 def _edge_square(sides, edges, is_line, x, y, z, u, v, w):
-    """Least squared distance of the centre (x, y, z) to the edges that it lies outside of, or 0.
+    """Least squared distance of a centre to the edges with it on their outer side, or 0.
 
-    (u, v, w) is the same centre from the first corner. For a line, to all edges.
+    (x, y, z) : the centre; (u, v, w) : relative to the first corner. For a line, to all edges.
     """
     near = np.inf
     for m in range(3):
@@ -312,10 +310,10 @@ def _edge_square(sides, edges, is_line, x, y, z, u, v, w):
 
 @inlined
 def _enter_line(shape, kind, squares, at, x, y, base_z, first, end):
-    """Enter a triangle into the centres first..end of a line along k.
+    """Update the centres first..end of a line along k by a triangle.
 
-    at : the place of the line's first centre in squares; x, y : the line's place in the grid;
-    base_z : that of its first centre.
+    at : index of the line's first centre in squares; x, y : the line's position in the grid; base_z
+    : position of its first centre.
     """
     sides, edges, box, corners = shape
     u, v = x - corners[0, 0], y - corners[0, 1]
@@ -341,7 +339,7 @@ def _enter_line(shape, kind, squares, at, x, y, base_z, first, end):
 
 @leaf
 def enter(shape, kind, block, i, j, k):
-    """Enter a triangle into the block whose first centre is that of voxel (i, j, k)."""
+    """Enter a triangle into a block; voxel (i, j, k) has the block's first centre."""
     sides, _, box, corners = shape
     squares, spans, _ = block
     x0, y0, z0 = i + 0.5, j + 0.5, k + 0.5
@@ -366,13 +364,13 @@ def enter(shape, kind, block, i, j, k):
 
 @inlined
 def _brick_at(centre):
-    """Place in its block, on an axis, of the last brick whose row has begun at a centre."""
+    """Coordinate in its block of the last brick with a row begun at a centre, on one axis."""
     return min(max(centre, 0) // BRICK, BLOCK // BRICK - 1)
 
 
 @leaf
 def _quantise(block, reached):
-    """Set the steps of a block from its squared distances, and which bricks' rows meet a span.
+    """Quantise a block's squared distances, and mark the bricks with rows that meet a span.
 
     reached (8, 8) int64: bit k of item (i, j) for the brick at (i, j, k).
     """
@@ -391,7 +389,7 @@ def _quantise(block, reached):
             for here in range(np.uint64(line * SIDE + low), np.uint64(line * SIDE + high)):
                 if squares[here] < NOTHING:
                     steps[here] = step_of(np.sqrt(squares[here]))
-            # a row goes on for two centres beyond the first one of the next
+            # rows overlap by two centres
             bits = (2 << _brick_at(high - 1)) - (1 << _brick_at(low - 2))
             for i in range(_brick_at(x - 2), _brick_at(x) + 1):
                 for j in range(_brick_at(y - 2), _brick_at(y) + 1):
@@ -400,9 +398,9 @@ def _quantise(block, reached):
 
 @leaf
 def _copy_row(steps, i, j, k, out, n):
-    """Copy the row that begins at centre (i, j, k) of a block to row n of out (R, 1000).
+    """Copy the row from centre (i, j, k) of a block on to row n of out (R, 1000).
 
-    Returns whether it has a distance.
+    Returns whether the row has a distance.
     """
     least = np.int64(BEYOND)
     for x in range(ROW_SIDE):
@@ -418,11 +416,11 @@ def _copy_row(steps, i, j, k, out, n):
 
 @entry(FLOATS3, INTS2, BLOCK_FIELDS, INTS, INT, INTS, BYTES2)
 def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
-    """Rows of the blocks from pair at[0] on; returns how many rows were made.
+    """Rows of the blocks from pair at[0] on; returns their number.
 
-    pairs (P, 2) int64, as `find_blocks` gives them, ascending; block : the one under construction,
-    kept between calls; at (1,) int64, where the next call goes on. Stops before a block for which
-    keys (R,) and out (R, 1000) may have no room, and after `PAIRS_OF_PIECE`, also within a block.
+    pairs (P, 2) int64, ascending, as from `find_blocks`; block : under construction, state between
+    calls; at (1,) int64, first pair of the next call. Stops before a block with possibly more rows
+    than room in keys (R,) and out (R, 1000), and after `PAIRS_OF_PIECE`, also within a block.
     """
     shape = _Prepared(np.empty((N_SIDES, 8)), np.empty((3, 7)), np.empty((2, 3)), np.empty((3, 3)))
     bricks = np.int64(1) << max(bits - 3, 0)
@@ -458,15 +456,15 @@ def rows_of_blocks(triangles, pairs, block, at, bits, keys, out):
 def band_pieces(
     triangles: NDArray[np.float64], bits: int, rows: int = ROWS_OF_PIECE
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8], NDArray[np.int64]]]:
-    """Band of triangles (T, 3, 3), or points (P, 1, 3), a bounded time and number of rows at once.
+    """Band of triangles (T, 3, 3), or points (P, 1, 3), in pieces of bounded time and rows.
 
-    Corners in voxels from the grid's origin, finite; a triangle may be a line or a point. What lies
-    outside the grid of `bits` bits an axis, 1 to 21, counts where it is near. rows: most of a
-    piece, at least `BLOCK_BRICKS`.
+    Corners in voxels from the grid's origin, finite; a triangle may be a line or a point. Triangles
+    outside the grid of `bits` bits an axis, 1 to 21, count if near it. rows : of a piece, at most;
+    at least `BLOCK_BRICKS`.
 
-    Yields the share that is done, 0 to 1; the Z-order keys (R,) of all bricks whose row has a
-    distance of up to h, ascending through all pieces, each once; and their packed rows, data and
-    ends, as `packing.pack` gives them. A piece may have none.
+    Yields the share done, 0 to 1; the Z-order keys (R,) of all bricks with a distance of up to h in
+    their row, ascending through all pieces, each once; and their packed rows, data and ends, as
+    from `packing.pack`. A piece may be empty.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64)
     keys = np.empty(rows, dtype=np.int64)

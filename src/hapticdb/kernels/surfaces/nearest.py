@@ -1,8 +1,8 @@
-"""Distances from places to the nearest of many triangles, through a tree of boxes.
+"""Distance from a point to the nearest triangle, by a BVH of AABBs.
 
-The tree is that of `sides`. A node whose box is farther than the nearest triangle so far is not
-entered, so the distance is that of testing every triangle. Lengths are in metres, in one frame of
-the caller's choice.
+The BVH is `sides.TriangleTree`. Branch and bound: nodes beyond the nearest triangle so far are
+pruned, so the distance equals the minimum over all triangles. Lengths are in metres, in one frame
+of the caller's choice.
 """
 
 import numpy as np
@@ -12,12 +12,12 @@ from hapticdb.kernels.rigid import gap, moment
 from hapticdb.kernels.surfaces.sides import LEAF_SIZE
 
 ROUNDED = 1.0 + 1e-9
-"""Factor of a squared distance from which on a box is farther, whatever the rounding."""
+"""Margin of pruning by a triangle's AABB, on squared distances, for rounding."""
 
 
 @leaf
 def _square_to_box(boxes, node, x, y, z):
-    """Squared distance from (x, y, z) to the node's box; infinite if it holds no triangle."""
+    """Squared distance from (x, y, z) to the node's AABB; infinite if the node is empty."""
     dx = gap(x, boxes[node, 0, 0], boxes[node, 1, 0])
     dy = gap(y, boxes[node, 0, 1], boxes[node, 1, 1])
     dz = gap(z, boxes[node, 0, 2], boxes[node, 1, 2])
@@ -26,7 +26,7 @@ def _square_to_box(boxes, node, x, y, z):
 
 @leaf
 def _square_to_own_box(corners, n, x, y, z):
-    """Squared distance from (x, y, z) to the box of triangle n."""
+    """Squared distance from (x, y, z) to the AABB of triangle n."""
     a, b, c = corners[n, 0, 0], corners[n, 1, 0], corners[n, 2, 0]
     dx = gap(x, min(a, b, c), max(a, b, c))
     a, b, c = corners[n, 0, 1], corners[n, 1, 1], corners[n, 2, 1]
@@ -49,7 +49,7 @@ def _square_to_edge(px, py, pz, ux, uy, uz):
 
 @inlined
 def sides_of(corners, n):
-    """Corner a of triangle n, its sides u and v from there, and u x v: twelve numbers."""
+    """Corner a of triangle n, its edge vectors u and v from there, and u x v: twelve numbers."""
     ax, ay, az = corners[n, 0, 0], corners[n, 0, 1], corners[n, 0, 2]
     ux, uy, uz = corners[n, 1, 0] - ax, corners[n, 1, 1] - ay, corners[n, 1, 2] - az
     vx, vy, vz = corners[n, 2, 0] - ax, corners[n, 2, 1] - ay, corners[n, 2, 2] - az
@@ -59,10 +59,11 @@ def sides_of(corners, n):
 
 @inlined
 def shares_of(sides, x, y, z):
-    """Area of a triangle of `sides_of`, and shares of u and v at a place's image in its plane.
+    """Barycentric coordinates of a point's projection on a triangle, without a division.
 
-    (x, y, z): from corner a. All three times twice the area and in its square, so that nothing is
-    divided; the image is inside where both shares are 0 or more and together at most the area.
+    sides : as from `sides_of`; (x, y, z) : the point relative to corner a. Returns |u x v|^2, and
+    the coordinates along u and v times that; the projection is inside if both are at least 0 and
+    add up to at most the first.
     """
     _, _, _, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
     along = (y * vz - z * vy) * nx + (z * vx - x * vz) * ny + (x * vy - y * vx) * nz
@@ -72,7 +73,7 @@ def shares_of(sides, x, y, z):
 
 @leaf
 def square_to_triangle(corners, n, x, y, z):
-    """Squared distance from (x, y, z) to triangle n: to an edge, or to the plane above it."""
+    """Squared distance from (x, y, z) to triangle n: to an edge, or to its interior."""
     sides = sides_of(corners, n)
     ax, ay, az, ux, uy, uz, vx, vy, vz, nx, ny, nz = sides
     px, py, pz = x - ax, y - ay, z - az
@@ -90,10 +91,10 @@ def square_to_triangle(corners, n, x, y, z):
 
 @leaf
 def distance_at(tree, x, y, z, enough, farthest, hint, waiting, squares):
-    """Distance of a place, up to `farthest`, and the number of its triangle, or -1.
+    """Distance of a point to the nearest triangle, up to `farthest`, and its number, or -1.
 
-    A distance of `enough` or less ends the search: it is then that of some triangle. hint : number
-    of a triangle that may be near, or -1; waiting, squares (STACK,) are scratch.
+    A distance of `enough` or less ends the search, with the distance of some triangle. hint :
+    number of a triangle probably near, or -1; waiting, squares (STACK,) : scratch.
     """
     boxes = tree.boxes
     first_leaf = boxes.shape[0] // 2

@@ -1,9 +1,9 @@
-"""Points spread evenly over a surface.
+"""Blue-noise sampling of a surface.
 
 Weighted sample elimination (Yuksel, "Sample Elimination for Generating Poisson Disk Sample Sets",
-Computer Graphics Forum 34(2), 2015): several times as many candidates as wanted are drawn, and
-the most crowded one is dropped, again and again. All lengths are in metres, in one frame of the
-caller's choice.
+Computer Graphics Forum 34(2), 2015): from several times as many candidates as points, the most
+crowded one is eliminated repeatedly. All lengths are in metres, in one frame of the caller's
+choice.
 """
 
 from typing import NamedTuple
@@ -16,22 +16,21 @@ from hapticdb.kernels._jit import FLOAT, FLOATS2, INT, INTS32, INTS32_3, entry, 
 Floats = NDArray[np.float64]
 
 CHUNK = 1 << 18
-"""Candidates that are drawn at a time. Another value draws the random numbers in another order, so
-that every shell changes; a larger one takes more memory."""
+"""Candidates of one draw. Another value changes the order of the random numbers, and so every
+shell. Larger: more memory."""
 CROWD = 500
-"""Candidates that a candidate may be compared with, on average; above it the reach is shortened.
-Several sheets at one place have half as many. A larger value makes folded surfaces slower to
-sample."""
+"""Greatest mean number of neighbours of a candidate; above it the reach is shortened. Several
+coincident sheets have half as many. Larger: slower for folded surfaces."""
 OPPOSITE = 0.35
-"""Reach across a sheet, as a part of the spacing. Larger: thin walls get fewer points an area."""
+"""Reach across a sheet, as a share of the spacing. Larger: fewer points per area of thin walls."""
 
 
 @leaf
 def _pair_weight(points, face_of, normals, a, b, reach, nearest):
-    """Weigh a and b on each other: (1 - d / reach)^8, d the distance, at least `nearest`.
+    """Mutual weight of a and b: (1 - d / reach)^8, d the distance, at least `nearest`.
 
-    Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet have a weight only
-    within `OPPOSITE` times the reach.
+    Yuksel 2015, equations 2 and 5. Points on opposite sides of a sheet have a weight only within
+    `OPPOSITE` times the reach.
     """
     x = points[a, 0] - points[b, 0]
     y = points[a, 1] - points[b, 1]
@@ -56,9 +55,9 @@ def _pair_weight(points, face_of, normals, a, b, reach, nearest):
 
 @leaf
 def _sift_down(heap, rank, weights, at, size):
-    """Restore the heap, heaviest first, below `at`, whose weight may have fallen.
+    """Restore the max-heap below `at` after a decrease of its weight.
 
-    rank (M,) int32 is the position of each candidate in the heap, -1 of one that was dropped.
+    rank (M,) int32 : position of each candidate in the heap, -1 after its elimination.
     """
     item = heap[at]
     weight = weights[item]
@@ -79,11 +78,11 @@ def _sift_down(heap, rank, weights, at, size):
 
 @entry(FLOATS2, INTS32, FLOATS2, INTS32, INTS32_3, INT, FLOAT, FLOAT)
 def eliminate_kernel(points, face_of, normals, cell_of, ranges, n_keep, reach, nearest):
-    """Drop the most crowded candidate, again and again, until `n_keep` are left.
+    """Eliminate the most crowded candidate repeatedly, down to `n_keep`.
 
     points (M, 3), sorted by cell; face_of (M,) int32; normals (F, 3); cell_of (M,) int32; ranges
-    (C, 9, 2) int32, the candidates in the cells around each.
-    Returns (M,) int32, -1 for the candidates that were dropped.
+    (C, 9, 2) int32, candidates in the cells around each. Returns (M,) int32, -1 for eliminated
+    candidates.
     """
     n_points = points.shape[0]
     weights = np.empty(n_points, dtype=np.float64)
@@ -130,13 +129,13 @@ class _Cells(NamedTuple):
 
 
 def _sort_into_cells(points: Floats, edge: float) -> _Cells:
-    """Candidates (M, 3) in cubes of that edge, and for each cube the 27 around it as 9 runs."""
+    """Grid of cubes of an edge over candidates (M, 3), with the 27 cubes around each as 9 runs."""
     low = points.min(axis=0)
     extent = points.max(axis=0) - low
     edge = max(edge, float(extent.max()) / 2**20)  # three axes of a key fit 63 bits
     _, ny, nz = (extent / edge).astype(np.int64) + 3
     keys = np.zeros(len(points), dtype=np.int64)
-    for axis, n in enumerate((1, ny, nz)):  # a border of one empty cell: neighbours never wrap
+    for axis, n in enumerate((1, ny, nz)):  # a border of one empty cell: neighbours do not wrap
         keys *= n
         keys += ((points[:, axis] - low[axis]) / edge).astype(np.int64) + 1
     order = np.argsort(keys, kind="stable")
@@ -159,10 +158,10 @@ def spread_points(
     n_keep: int,
     spacing: float,
 ) -> NDArray[np.intp]:
-    """Choose `n_keep` of M candidates, as far apart as elimination makes them: ascending indices.
+    """Indices of `n_keep` of M candidates, by weighted sample elimination, ascending.
 
     points (M, 3), uniform over the surface; face_of (M,); normals (F, 3) of the faces, unit, all to
-    the same side; spacing: distance of neighbours if the points kept were a hexagonal lattice.
+    the same side; spacing : of a hexagonal lattice with the same density.
     """
     cells = _sort_into_cells(points, spacing)
     while cells.crowd > CROWD:  # sheets folded upon one another
@@ -190,12 +189,12 @@ def sample_surface(
     n_points: int,
     rng: np.random.Generator,
 ) -> tuple[Floats, NDArray[np.int32]]:
-    """Choose points (N, 3) spread evenly over triangles -> points, and the face (N,) of each.
+    """Points (N, 3) evenly spaced on triangles, and the face (N,) of each.
 
-    triangles (F, 3, 3); areas (F,), all positive; normals (F, 3). Several times as many candidates
-    are drawn in strata of equal area, and the most crowded are dropped. Measured on a
-    sphere, the nearest neighbours are 0.74 of the hexagonal lattice's spacing apart with 10
-    candidates a point, 0.69 with 5, 0.66 with 4.
+    triangles (F, 3, 3); areas (F,), all positive; normals (F, 3). Candidates are drawn in strata of
+    equal area, then the most crowded are eliminated. Measured on a sphere, the nearest neighbours
+    are 0.74 of the hexagonal lattice's spacing apart with 10 candidates a point, 0.69 with 5, 0.66
+    with 4.
     """
     n_candidates = n_points * (10 if n_points <= 20_000 else 5 if n_points <= 200_000 else 4)
     filled = np.cumsum(areas)

@@ -1,10 +1,9 @@
-"""Which side of a surface is inside, and which body encloses which: by votes of lines.
+"""Orientation of surfaces and nesting of bodies, by parity votes of lines through a BVH.
 
-A ray that begins inside a closed surface crosses it an odd number of times, one that begins outside
-an even number (Jordan's theorem). So a line through a face shows which side of the face is inside,
-by the parity of its crossings ahead of the face and behind it, for any winding of the triangles. A
-line may meet an edge, a hole or a rounding error, so several lines vote. A tree of boxes spares a
-line from testing every triangle. Lengths are in metres, in one frame of the caller's choice.
+A ray from a point inside a closed surface crosses it an odd number of times, from a point outside
+an even number (Jordan's theorem). So the parities of a line's crossings ahead of a face and behind
+it give the face's inner side, for any winding of the triangles. A line may hit an edge, a hole or a
+rounding error, so several lines vote. Lengths are in metres, in one frame of the caller's choice.
 docs/decisions/0015 gives the reasons.
 """
 
@@ -31,26 +30,25 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 LEAF_SIZE = 4
-"""Triangles in a leaf of the tree. A larger value: a lower tree, and more triangles are tested."""
+"""Triangles of a leaf of the BVH. Larger: a lower tree, and more triangle tests."""
 STACK = 64
-"""Nodes that wait to be visited: more than the height of a tree over 2^31 leaves."""
+"""Size of a traversal stack: more than the height of a tree over 2^31 leaves."""
 TOUCH = 2
-"""Code of a crossing at the line's own start: such a line has no vote."""
+"""Code of a crossing at the line's own start, which invalidates its vote."""
 PATIENCE = 32
-"""Most lines that vote on one patch or body. A larger value decides more doubtful ones, slower."""
+"""Greatest number of lines for one patch or body. Larger: slower, fewer undecided."""
 ENOUGH = 5
-"""Votes by which one side has to lead for the voting to end early. A larger value is slower and
-errs less often."""
+"""Lead of one side at which the votes end early. Larger: slower, fewer errors."""
 LABOUR = 2e8
-"""Nodes of the tree that all votes together may visit: a few seconds. Beyond it patches get fewer
-votes, or none. A larger value lets dense, tangled surfaces take longer."""
+"""Limit of node visits by all votes together: a few seconds. Beyond it patches get fewer votes, or
+none. Larger: more time for dense, tangled surfaces."""
 
 
 class TriangleTree(NamedTuple):
-    """Boxes over triangles: a complete binary tree, node n above nodes 2 n + 1 and 2 n + 2.
+    """BVH of AABBs over triangles: complete binary tree, children of node n at 2 n + 1 and 2 n + 2.
 
-    Triangles are sorted by body, then by Z-order of their centroids, so that a line that asks about
-    one body enters only the nodes that hold some of it.
+    Triangles are sorted by body, then in Z-order of their centroids, so a query of one body visits
+    its own nodes only.
     """
 
     corners: Floats  # (T, 3, 3), sorted
@@ -65,7 +63,7 @@ TREE = fields_of(TriangleTree, FLOATS3, INTS, INTS, FLOATS3, INTS2, FLOAT)
 
 
 def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
-    """Build the tree over triangles (T, 3, 3), T > 0, of the bodies (T,)."""
+    """BVH over triangles (T, 3, 3), T > 0, of the bodies (T,)."""
     centroids = (triangles[:, 0] + triangles[:, 1] + triangles[:, 2]) / 3.0
     least = centroids.min(axis=0)
     extent = float((centroids.max(axis=0) - least).max()) or 1.0
@@ -87,9 +85,9 @@ def triangle_tree(triangles: Floats, bodies: Ints) -> TriangleTree:
 
 
 def refitted(tree: TriangleTree, corners: Floats) -> TriangleTree:
-    """Tree over the same triangles with other corners (T, 3, 3), in the tree's order.
+    """BVH over the same triangles with other corners (T, 3, 3), in the tree's order.
 
-    Its boxes are as tight as those of a new tree, but the order is that of the old corners.
+    Its AABBs are as tight as those of a new tree, but in the order of the old corners.
     """
     boxes, slack = _boxes_of(corners)
     return tree._replace(corners=corners, boxes=boxes, slack=slack)
@@ -97,10 +95,10 @@ def refitted(tree: TriangleTree, corners: Floats) -> TriangleTree:
 
 @entry(FLOATS3, FLOATS3)
 def boxes_kernel(corners, boxes):
-    """Write boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), and return their slack.
+    """Write AABBs (nodes, 2, 3) over sorted triangles (T, 3, 3), and return their slack.
 
-    A rounding error could make a line in the plane of a flat box miss it, so boxes are larger on
-    all sides.
+    AABBs are enlarged by the slack: a rounding error could make a line in the plane of a flat one
+    miss it.
     """
     slack = 0.0
     for n in range(corners.shape[0]):
@@ -125,7 +123,7 @@ def boxes_kernel(corners, boxes):
 
 
 def _boxes_of(corners: Floats) -> tuple[Floats, float]:
-    """Boxes (nodes, 2, 3) over sorted triangles (T, 3, 3), and the tree's slack."""
+    """AABBs (nodes, 2, 3) over sorted triangles (T, 3, 3), and the tree's slack."""
     n_leaves = 1
     while n_leaves * LEAF_SIZE < len(corners):
         n_leaves *= 2
@@ -135,7 +133,7 @@ def _boxes_of(corners: Floats) -> tuple[Floats, float]:
 
 @leaf
 def _line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
-    """Whether the line through o, of inverse direction i, meets the node's box."""
+    """Slab test: whether the line through o, of inverse direction i, meets the node's AABB."""
     a = (boxes[node, 0, 0] - ox) * ix
     b = (boxes[node, 1, 0] - ox) * ix
     near = min(a, b)
@@ -153,7 +151,7 @@ def _line_meets_box(ox, oy, oz, ix, iy, iz, boxes, node):
 
 @leaf
 def _crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
-    """Where the line through o along d crosses triangle n: 1 ahead, -1 behind, TOUCH at o, or 0.
+    """Crossing of the line through o along d with triangle n: 1 ahead, -1 behind, TOUCH at o, or 0.
 
     Moeller and Trumbore, Journal of Graphics Tools 2(1), 1997.
     """
@@ -182,8 +180,8 @@ def _crossing_side(ox, oy, oz, dx, dy, dz, corners, n, slack):
 def crossings(origin, direction, body, skip, tree, stack):
     """Crossings of a line with one body, ahead of the origin and behind it, and nodes visited.
 
-    Face `skip`, on which the line starts, is not tested. So the start needs no offset from it, and
-    walls may be of any thinness. Both counts are -1 where the start lies on another triangle.
+    Face `skip`, the line's own face, is not tested. So the start needs no offset from it, and walls
+    may be arbitrarily thin. Both counts are -1 if the start lies on another triangle.
     """
     ox, oy, oz = origin[0], origin[1], origin[2]
     dx, dy, dz = direction[0], direction[1], direction[2]
@@ -224,13 +222,13 @@ def crossings(origin, direction, body, skip, tree, stack):
 
 @entry(TREE, INTS2, FLOATS2, FLOATS2, FLOATS2, INTS, INTS)
 def side_votes_kernel(tree, picks, directions, centroids, normals, body_of, out):
-    """For each patch, votes that its normals point inside, minus votes that they do not.
+    """For each patch, votes for inward normals minus votes for outward ones.
 
     picks (P, L) int64 faces, -1 for none; directions (L, 3); centroids, normals (F, 3); body_of
-    (F,) int64; out (P,) int64. A line that starts on a closed surface crosses the rest of it an odd
-    number of times on the side of its start that is inside, and an even number on the other side.
-    Any other count comes of a hole or a rounding error and has no vote. `LABOUR` is shared evenly:
-    where each line crosses thousands of triangles, some patches get fewer lines, or none.
+    (F,) int64; out (P,) int64. A line from a face of a closed surface crosses the rest of it an odd
+    number of times on the inner side of the face, and an even number on the other side. Other
+    parities come from a hole or a rounding error and have no vote. `LABOUR` is shared evenly: if
+    each line crosses thousands of triangles, some patches get fewer lines, or none.
     """
     stack = np.empty(STACK, dtype=np.int64)
     spent = 0
@@ -262,7 +260,7 @@ def nesting_kernel(tree, pairs, picks, directions, centroids, out):
     """For each pair (inner, outer) of bodies, whether the outer one encloses all of the inner one.
 
     pairs (Q, 2) int64; picks (B, L) int64 faces of each body, -1 for none; out (Q,) uint8. One line
-    that starts outside decides against it.
+    with its start outside decides against it.
     """
     stack = np.empty(STACK, dtype=np.int64)
     for q in range(pairs.shape[0]):
@@ -286,7 +284,7 @@ def nesting_kernel(tree, pairs, picks, directions, centroids, out):
 
 
 def normals_of(triangles: Floats) -> tuple[Floats, Floats]:
-    """Find unit normals (F, 3) by the winding, and areas (F,); zero for needles and points."""
+    """Unit normals (F, 3) by the winding, and areas (F,); zero for degenerate triangles."""
     along = triangles[:, 1] - triangles[:, 0]
     across = triangles[:, 2] - triangles[:, 0]
     cross = np.cross(along, across)
@@ -300,10 +298,9 @@ def normals_of(triangles: Floats) -> tuple[Floats, Floats]:
 
 
 def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
-    """Pick `PATIENCE` faces of each group in proportion to their area, (n_groups, PATIENCE).
+    """`PATIENCE` faces of each group in proportion to their area, (n_groups, PATIENCE).
 
-    group (F,) is the group of each face. Small groups repeat their faces; a group without area has
-    none: -1.
+    group (F,) : of each face. Small groups repeat their faces; a group without area has none: -1.
     """
     totals = np.bincount(group, areas, n_groups)
     order = np.argsort(group, kind="stable")
@@ -319,7 +316,7 @@ def _pick_faces(group: Ints, areas: Floats, n_groups: int) -> Ints:
 
 @cache
 def directions_of(n: int) -> Floats:
-    """Return `n` fixed directions, spread over the sphere, none along an axis."""
+    """`n` fixed unit vectors, uniform over the sphere, none along an axis."""
     directions = np.random.default_rng(2015).normal(size=(n, 3))
     directions[np.abs(directions) < 1e-3] = 1e-3
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
@@ -334,7 +331,7 @@ def side_votes(
     centroids: Floats,
     normals: Floats,
 ) -> Ints:
-    """Let lines vote on each patch: positive (P,) where its normals point inside.
+    """Votes (P,) on each patch: positive for inward normals.
 
     patch, body, areas (F,); centroids, normals (F, 3). In a patch all normals are on one side.
     """

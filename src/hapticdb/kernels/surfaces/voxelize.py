@@ -1,33 +1,34 @@
-"""Triangles -> the voxels that they meet, exactly, at a cost in proportion to those voxels.
+"""Exact voxelization of triangles, at a cost in proportion to the voxels.
 
-A voxel belongs when the triangle meets its closed box by the separating axis test (Akenine-Moeller,
-"Fast 3D Triangle-Box Overlap Testing", 2001): no separation above 1e-9 voxel along the 3 box
-normals, the 9 cross products of an edge and a box normal, and the triangle's normal, each axis of
-unit length and both shadows taken whole (all three corners, not one face of them).
+A voxel belongs to a triangle if the triangle meets its closed box by the separating axis test
+(Akenine-Moeller, "Fast 3D Triangle-Box Overlap Testing", 2001): no separation above 1e-9 voxel
+along the 3 box normals, the 9 cross products of an edge and a box normal, and the triangle's
+normal, each axis of unit length and both projections complete (all three corners, not one face of
+them).
 
 Here the test is not made voxel by voxel. Each axis bounds a linear function of the voxel's corner
 from below and from above. A cross product with box normal w has no w in it, so the nine are three
 each on the planes (u, v), (u, w) and (v, w), as in the conservative rasterisation of Schwarz and
-Seidel ("Fast parallel surface and solid voxelization on GPUs", 2010). Hence, with w the axis along
-which the fewest columns meet the triangle:
+Seidel ("Fast parallel surface and solid voxelization on GPUs", 2010). Hence, with w the axis with
+the fewest columns through the triangle:
 
 - each row u has one interval of columns v, and one of w;
 - each v has one interval of w;
 - each column (u, v) has one interval of w from the normal,
 
-and what is left of w is one run of voxels, set by one OR for each half brick that it crosses.
+and their intersection is one run of voxels along w, set by one OR for each half brick on it.
 
 Precision
 ---------
-Each triangle is first moved by whole voxels to the corner of its own bounding box, without
-rounding. Axes are kept unscaled and the tolerance is scaled instead, so that on coordinates with
-few bits every bound is exact. Otherwise a bound errs by a few 2^-53 of the triangle's length: far
-below the tolerance up to 2^16 voxels, near it at 2^21. The normal of a thin triangle is computed in
-twice the precision, since what cancels in it would turn the axis.
+Each triangle is first moved by whole voxels to the corner of its own AABB, without rounding. Axes
+are kept unscaled and the tolerance is scaled instead, so that on coordinates with few bits every
+bound is exact. Otherwise a bound errs by a few 2^-53 of the triangle's length: far below the
+tolerance up to 2^16 voxels, near it at 2^21. The normal of a thin triangle is computed in twice the
+precision, since cancellation would turn the axis.
 
 Null axes are skipped: a cross product shorter than 1e-30 voxel (an edge parallel to the box normal,
-or none), and a normal whose length is at most 2^-50 of the longest edge's square, that is, of a
-triangle that is a line to within 1e-9 voxel in the largest grid. The others decide a line exactly.
+or none), and a normal shorter than 2^-50 of the longest edge's square, of a triangle degenerate to
+a line to within 1e-9 voxel in the largest grid. The others decide a line exactly.
 """
 
 from collections.abc import Iterator
@@ -59,35 +60,34 @@ NULL_EDGE = 1e-30
 NULL_NORMAL = 2.0**-50
 """Normals up to this length, in squares of the longest edge, are skipped as null."""
 THIN = 2.0**14
-"""Above this edge^3 / |normal| the normal is computed in twice the precision: its rounding would
-move the result by 1e-11 voxel. A larger value is faster and less exact."""
+"""Greatest edge^3 / |normal| for a normal in double precision; beyond it, its rounding would move
+the result by 1e-11 voxel, and the normal is computed in twice the precision. Larger: faster, less
+exact."""
 FAR = 2.0**60
-"""Coordinates beyond it, in voxels, are set to it, so that no product of three overflows."""
+"""Coordinates are clamped to this, in voxels, against overflow of a product of three."""
 AXIS_X, AXIS_Y, AXIS_Z = np.int64(0), np.int64(1), np.int64(2)
 """Numbers of the axes as int64: numba would give a bare 0 a type of its own."""
 OUTSIDE, CUT, WHOLE = 0, 1, 2
-"""Part of a triangle's bounding box that lies in the grid: nothing, a part, all."""
+"""Parts of a triangle's AABB in the grid: none, some, all."""
 AT_TRIANGLE, AT_ROW, AT_COLUMN, ROWS_DONE = 0, 1, 2, 3
-"""Fields of `resume`, where voxelizing goes on: the triangle; the row in it, counted from the first
-row of its bounding box, or -1 where the triangle is new; the column; thousandths of its rows that
-are done."""
+"""Fields of `resume`, the state between calls: triangle; row in it, from the first row of its AABB,
+or -1 for a new triangle; column; thousandths of its rows done."""
 MOST_BRICKS = 1 << 17
-"""Bricks of a piece: 10 MB, and as much again while they are sorted. A larger value takes more
-memory and reports progress less often; a smaller one sorts and merges more pieces."""
+"""Bricks of a piece: 10 MB, and as much again for sorting. Larger: more memory, fewer progress
+reports; smaller: more pieces to sort and merge."""
 VISITS_A_BRICK = 128
-"""Bricks that runs of voxels may cross before a piece ends, for each brick that it may have. So a
-piece ends, and progress is reported, also where many triangles meet the same bricks. A larger value
-reports less often."""
+"""Limit of a piece's brick crossings by runs, for each brick of its limit, so that a piece ends
+also if many triangles meet the same bricks. Larger: fewer progress reports."""
 VOXELS_AT_ONCE = 1 << 23
-"""Voxels that the runs collected before they are marked may have: a fraction of a second. A smaller
-value marks fewer runs at once where triangles are very long."""
+"""Limit of the voxels of buffered runs: a fraction of a second. Smaller: fewer runs at once for
+very long triangles."""
 STEEP = 1e40
-"""Stands for 1 / 0 in the slope of an axis that is square to the direction solved for."""
+"""Replaces 1 / 0 in the slope of an axis perpendicular to the direction solved for."""
 
 
 @leaf
 def _exact_difference(a, b):
-    """Return (d, e) with d + e = a - b exactly (Knuth, TwoDiff)."""
+    """(d, e) with d + e = a - b exactly (Knuth, TwoDiff)."""
     d = a - b
     t = d - a
     return d, (a - (d - t)) - (b + t)
@@ -95,7 +95,7 @@ def _exact_difference(a, b):
 
 @leaf
 def _exact_product(a, b):
-    """Return (p, e) with p + e = a b exactly (Dekker 1971)."""
+    """(p, e) with p + e = a b exactly (Dekker 1971)."""
     p = a * b
     t = 134217729.0 * a
     a_high = t - (t - a)
@@ -108,7 +108,7 @@ def _exact_product(a, b):
 
 @leaf
 def _exact_minor(corners, p, q):
-    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, exact to the last bits."""
+    """Minor (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p, exact to the last bits."""
     a, a_low = _exact_difference(corners[1, p], corners[0, p])
     b, b_low = _exact_difference(corners[2, q], corners[0, q])
     c, c_low = _exact_difference(corners[1, q], corners[0, q])
@@ -122,7 +122,7 @@ def _exact_minor(corners, p, q):
 
 @leaf
 def minor(corners, p, q):
-    """Return (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p."""
+    """Minor (c1 - c0)_p (c2 - c0)_q - (c1 - c0)_q (c2 - c0)_p."""
     return (corners[1, p] - corners[0, p]) * (corners[2, q] - corners[0, q]) - (
         corners[1, q] - corners[0, q]
     ) * (corners[2, p] - corners[0, p])
@@ -130,7 +130,7 @@ def minor(corners, p, q):
 
 @leaf
 def normal_of(corners):
-    """Return the normal (x, y, z) of a triangle (3, 3), zeros where it is null."""
+    """Normal (x, y, z) of a triangle (3, 3), not of unit length; zeros if null."""
     x, y, z = (
         minor(corners, AXIS_Y, AXIS_Z),
         minor(corners, AXIS_Z, AXIS_X),
@@ -160,10 +160,10 @@ def slope(along, length):
 
 @leaf
 def _set_edge_axis(axes, row, corners, n, p, q):
-    """Axis square to edge n of a triangle in the plane of two axes p and q, to be solved for q.
+    """Axis perpendicular to edge n in the plane of axes p and q, solved for q.
 
     Sets the coefficient of p, the least and the greatest value of ``coefficient * p + rest * q``
-    over the corners of voxels that touch, and 1 / rest.
+    over the corners of touching voxels, and 1 / rest.
     """
     m, o = (n + 1) % 3, (n + 2) % 3
     from_p, from_q, to_p, to_q = corners[n, p], corners[n, q], corners[m, p], corners[m, q]
@@ -185,7 +185,7 @@ def _set_edge_axis(axes, row, corners, n, p, q):
 
 @leaf
 def _set_normal_axis(plane, corners, normal, u, v, w):
-    """Like `_set_edge_axis` for the normal: coefficients of u and v, bounds, 1 / that of w."""
+    """As `_set_edge_axis`, for the normal: coefficients of u, v, bounds, 1 / coefficient of w."""
     at_u, at_v, at_w = normal[u], normal[v], normal[w]
     if at_w < 0.0:
         at_u, at_v, at_w = -at_u, -at_v, -at_w
@@ -210,11 +210,10 @@ def _set_normal_axis(plane, corners, normal, u, v, w):
 
 @leaf
 def _place_in_grid(triangles, t, edge, corners, box):
-    """Move a triangle to its own corner and find the voxels of its bounding box.
+    """Move a triangle to the corner of its AABB, and compute the voxels of the AABB.
 
-    Writes corners (3, 3), and to box (3, 3) int64 the first and last voxel on each axis, counted
-    from the move, and the move. Returns OUTSIDE when the grid has none of them, CUT when it has not
-    all, WHOLE otherwise.
+    Writes corners (3, 3), and to box (3, 3) int64 the first and last voxel on each axis, relative
+    to the move, and the move. Returns `OUTSIDE`, `CUT` or `WHOLE`.
     """
     placed = WHOLE
     for axis in range(3):
@@ -245,7 +244,7 @@ def _place_in_grid(triangles, t, edge, corners, box):
 
 @leaf
 def _order_axes(box, normal):
-    """Axes (u, v, w): w crosses the fewest columns, and u has fewer rows than v."""
+    """Axes (u, v, w): w with the fewest columns, u with fewer rows than v."""
     x = box[1, 0] - box[0, 0]
     y = box[1, 1] - box[0, 1]
     z = box[1, 2] - box[0, 2]
@@ -261,7 +260,7 @@ def _order_axes(box, normal):
 
 @leaf
 def _longest_box(triangles, edge):
-    """Return the most voxels that a triangle's bounding box has along an axis, in the grid."""
+    """Upper bound of the voxels of any triangle's AABB along an axis, in the grid."""
     longest = 0.0
     for t in range(triangles.shape[0]):
         for axis in range(3):
@@ -282,7 +281,7 @@ def _set_axes(axes, plane, corners, normal, u, v, w):
 
 @leaf
 def _set_spans(axes, spans, box, v, w):
-    """Set the interval of w for each v of a triangle's bounding box."""
+    """Set the interval of w for each v of a triangle's AABB."""
     for at_v in range(box[0, v], box[1, v] + 1):
         y = float(at_v)
         low, high = float(box[0, w]), float(box[1, w])
@@ -296,7 +295,7 @@ def _set_spans(axes, spans, box, v, w):
 
 @inlined
 def _row_intervals(axes, x, box_intervals):
-    """Narrow a bounding box's intervals of v and of w, both lowest first, to those of the row x."""
+    """Intersect an AABB's intervals of v and of w, both lowest first, with those of the row x."""
     low, high, low_row, high_row = box_intervals
     for n in range(3):
         value = axes[n, 0] * x
@@ -310,7 +309,7 @@ def _row_intervals(axes, x, box_intervals):
 
 @inlined
 def _write_run(runs, n, axes, voxel, last):
-    """Write run n: it begins at a voxel, given on the axes (u, v, w), and ends at `last` on w."""
+    """Write run n: first voxel on the axes (u, v, w), and last coordinate on w."""
     u, v, w = axes
     runs[n, u], runs[n, v], runs[n, w] = voxel
     runs[n, RUN_AXIS] = 2 - w
@@ -319,9 +318,9 @@ def _write_run(runs, n, axes, voxel, last):
 
 @leaf
 def _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
-    """Write the runs of voxels of triangles from resume on until `runs` is full; return how many.
+    """Write the runs of triangles from `resume` on until `runs` is full; return their number.
 
-    resume (4,) int64 is where it stopped. The other arrays keep what was computed for the triangle.
+    resume (4,) int64 : state between calls. The other arrays are state of the current triangle.
     """
     n_runs = 0
     for t in range(resume[AT_TRIANGLE], triangles.shape[0]):
@@ -337,7 +336,7 @@ def _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
         first_u, first_v = box[0, u], box[0, v]
         move_u, move_v, move_w = box[2, u], box[2, v], box[2, w]
         if placed == WHOLE and first_u == box[1, u] and first_v == box[1, v]:
-            # a triangle in one column meets every voxel of it that its bounding box meets
+            # a triangle in one column meets every voxel of its AABB
             start = (first_u + move_u, first_v + move_v, box[0, w] + move_w)
             _write_run(runs, n_runs, uvw, start, box[1, w] + move_w)
             n_runs += 1
@@ -381,11 +380,11 @@ def _fill_runs(triangles, edge, resume, corners, box, axes, plane, spans, runs):
 
 @entry(FLOATS3, INT, INTS, INT)
 def voxelize_kernel(triangles, bits, resume, most):
-    """Bricks of the voxels that triangles (T, 3, 3) meet: packed keys, words (C, 8), count.
+    """Bricks of the voxels of triangles (T, 3, 3): packed keys, words (C, 8), count.
 
-    Stops after about `most` bricks, or when runs of voxels have crossed many times as many.
-    resume (4,) int64 is where it begins and then where it has stopped: `AT_TRIANGLE`, `AT_ROW`,
-    `AT_COLUMN` and `ROWS_DONE`. All is done when the triangle is T.
+    Stops after about `most` bricks, or when runs have crossed `VISITS_A_BRICK` times as many.
+    resume (4,) int64 : state between calls, `AT_TRIANGLE`, `AT_ROW`, `AT_COLUMN`, `ROWS_DONE`; at
+    the end the triangle is T.
     """
     edge = float(1 << bits)
     table, n_bricks = new_table(FIRST_CAPACITY), np.int64(0)
@@ -397,7 +396,7 @@ def voxelize_kernel(triangles, bits, resume, most):
     plane = np.empty(5)
     spans = np.empty((longest, 2))
     n_visits = np.int64(0)
-    if resume[AT_ROW] >= 0:  # in the middle of a triangle: compute its axes again
+    if resume[AT_ROW] >= 0:  # within a triangle: recompute its axes
         _place_in_grid(triangles, resume[AT_TRIANGLE], edge, corners, box)
         normal = normal_of(corners)
         u, v, w = _order_axes(box, normal)
@@ -423,10 +422,10 @@ def voxelize_kernel(triangles, bits, resume, most):
 def voxelize_pieces(
     triangles: NDArray[np.float64], bits: int, most: int = MOST_BRICKS
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
-    """What `voxelize` returns, a bounded number of bricks at a time, after the share that is done.
+    """Result of `voxelize` in pieces of a bounded number of bricks, each after the share done.
 
-    The share is 0 to 1, within a triangle by its rows. Pieces may have bricks in common, whose bits
-    add.
+    The share is 0 to 1, within a triangle by its rows. Pieces may have bricks in common; their bits
+    are to be ORed.
     """
     corners = np.ascontiguousarray(triangles, dtype=np.float64).reshape(-1, 3, 3)
     resume = np.array([0, -1, 0, 0], dtype=np.int64)
@@ -441,12 +440,12 @@ def voxelize_pieces(
 def voxelize(
     triangles: NDArray[np.float64], bits: int
 ) -> tuple[NDArray[np.int64], NDArray[np.uint8]]:
-    """Bricks of the voxels that triangles (T, 3, 3) meet -> Z-order keys (B,), occupancy (B, 64).
+    """Z-order keys (B,) and occupancy (B, 64) of the voxels of triangles (T, 3, 3).
 
-    Corners in voxels from the grid's origin, finite; what lies outside the grid of `bits` bits an
-    axis, 1 to 21, is cut off. Keys are ascending, each once; bit number n of an occupancy is the
-    voxel of Z-order n modulo 8, least significant first. Boxes are closed: a triangle in the plane
-    between two layers of voxels marks both. Threads may voxelize different parts at once.
+    Corners in voxels from the grid's origin, finite; parts outside the grid of `bits` bits an axis,
+    1 to 21, are clipped. Keys are ascending, each once; bit n of an occupancy is the voxel of
+    Z-order n modulo 8, least significant first. Boxes are closed: a triangle in the plane between
+    two layers of voxels marks both. Threads may voxelize different parts at once.
     """
     _, keys, occupancy = next(voxelize_pieces(triangles, bits, 1 << 40))
     return keys, occupancy

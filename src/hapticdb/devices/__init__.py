@@ -1,1 +1,1 @@
-"""Devices that a hand holds: the protocol, scripted, simulated and vendors' devices."""
+"""Haptic devices: the protocol, scripted, simulated and vendors' devices."""

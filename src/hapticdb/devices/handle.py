@@ -1,4 +1,4 @@
-"""Handle: where the hand is in the scene, after scale and clutch, and its path if it is known."""
+"""Handle: pose and velocity of the hand in the scene, after scale and clutch."""
 
 import math
 
@@ -19,16 +19,15 @@ Hand = NDArray[np.void]
 MOST_SCALE = 1e6
 """Greatest scale: a millimetre of the hand is a kilometre of the scene."""
 NO_POSE = (0.0, 0.0, 0.0, 1.0, 0.0, 0.0, 0.0)
-"""Position and unit quaternion of no move and no turn."""
+"""Position and unit quaternion of the identity."""
 
 
 class Handle:
-    """The handle: the hand's pose in the scene, to which the tool is pulled.
+    """The handle: the hand's pose in the scene, to which the tool is coupled.
 
-    While the clutch is open the hand moves and the handle stays; when the clutch closes the handle
-    moves on from its place. After a reading that is not finite, or beyond 1e9 m, m/s or rad/s, the
-    handle has no place (its x is NaN) until the next valid reading. A handle has the state of one
-    session.
+    While the clutch is open the hand moves and the handle stays; once it is closed the handle moves
+    on from its pose. After a reading that is not finite, or beyond 1e9 m, m/s or rad/s, the handle
+    has no pose (its x is NaN) until the next valid reading. A handle has the state of one session.
 
     Parameters
     ----------
@@ -39,7 +38,7 @@ class Handle:
         Pose (4, 4) or point (3,) of the handle at the start, scene metres. None: the hand's pose,
         its position scaled.
     clutch : int or None
-        Number of the button that opens the clutch while it is held down; None: no clutch.
+        Number of the button that opens the clutch while pressed; None: no clutch.
 
     Raises
     ------
@@ -56,7 +55,7 @@ class Handle:
             raise UsageError(f"button {clutch} for the clutch: give 0 to 30")
         self.scale = float(scale)
         self.record = np.zeros((), HANDLE)
-        """Record of `HANDLE`, in the form that kernels read."""
+        """Record of `HANDLE`, for the kernels."""
         self.record["scale"], self.record["clutch"] = scale, 0 if clutch is None else 1 << clutch
         if start is not None:
             pose = pose_at(start)
@@ -68,7 +67,7 @@ class Handle:
     def start(self, reading: Reading, hand: Hand) -> None:
         """Place the handle for a reading, at rest; writes `hand`, except its `is_stale`.
 
-        If the reading has no valid place, `follow` places the handle at the next one that has.
+        Without a valid pose in the reading, `follow` places the handle at the next valid one.
         """
         self.record["is_placed"] = hand["is_open"] = False
         pose_numbers(hand)[:] = (math.nan, *NO_POSE[1:])
@@ -76,5 +75,5 @@ class Handle:
         hand["velocity"] = 0.0
 
     def follow(self, reading: Reading, hand: Hand) -> None:
-        """Move the handle as far as the reading says; writes `hand`."""
+        """Move the handle by the hand's motion up to a reading; writes `hand`."""
         follow(self.record, reading.pose, reading.velocity, reading.buttons, hand)

@@ -1,8 +1,8 @@
-"""Device profiles: what a device can render, and how heavy it is; by its name.
+"""Device profiles by name: rendering limits and mass of a device.
 
-A profile states the force that a device can hold, the stiffest spring and the strongest damper that
-it renders cleanly, and its mass, as far as they are known. `hapticdb.devices.stability` computes
-from it how stiff a session may be.
+A profile states the greatest force, the stiffest spring and the strongest damper that a device
+renders cleanly, and its mass, as far as published. `hapticdb.devices.stability` computes the stable
+stiffness of a session from it.
 """
 
 import math
@@ -12,48 +12,47 @@ from typing import Protocol, runtime_checkable
 from hapticdb.errors import UsageError
 
 LIGHTEST = 0.045
-"""Mass, kg, that is assumed where a device's mass is not known: that of the lightest device of the
-table. Larger: stiffer springs are allowed on devices whose mass nobody told, with more risk."""
+"""Mass, kg, assumed for a device of unknown mass: that of the lightest device of the table. Larger:
+stiffer springs are allowed on such devices, with more risk."""
 HAND_CAP = 7.0
-"""Cap, N, of hands that are not real (scripted and simulated ones): that of a desktop device.
-Larger: their sessions reach deeper, with forces that no desktop device can hold."""
+"""Cap, N, of scripted and simulated hands: that of a desktop device. Larger: their sessions reach
+deeper, with forces beyond any desktop device."""
 HAND_STIFFNESS = 1000.0
-"""Stiffness, N/m, of a session with a hand that is not real, unless another is asked for."""
+"""Default stiffness, N/m, of a session with a scripted or simulated hand."""
 STIFFEST = 1e6
-"""Greatest stiffness, N/m, that any profile has: stiffer than a device can render."""
+"""Greatest stiffness, N/m, of any profile: stiffer than a device can render."""
 
 
 @dataclass(frozen=True)
 class DeviceProfile:
-    """What a device renders, in its own metres and newtons.
+    """Rendering limits of a device, in its own metres and newtons.
 
     Attributes
     ----------
     name : str
         The device's name, for messages.
     cap : float
-        Greatest force that its motors hold, N.
+        Greatest force of its motors, N.
     stiffness : float
-        Stiffest spring that it renders, N/m.
+        Stiffest rendered spring, N/m.
     damping : float
-        Strongest damper that it renders, N s/m: a damper that the loop commands, not friction of
-        the device's own.
+        Strongest rendered damper, N s/m: commanded by the loop, without the device's own friction.
     mass : float or None
-        Mass that a hand feels at its tip, kg. None: not known.
+        Apparent mass at its tip, kg. None: not known.
     own_damping : float
         Damping of the device's own mechanics, N s/m. 0: not known.
     hand_damping : float or None
-        Damping of the hand that holds the device, N s/m. None: a person's, who holds it lightly.
+        Damping of the hand that holds the device, N s/m. None: a person's, in a light grip.
         Infinite: no force moves this hand, so any spring is stable.
     usual_stiffness : float or None
-        Stiffness of a session unless another is asked for, N/m. None: `stiffness`.
+        Default stiffness of a session, N/m. None: `stiffness`.
     torque_cap : float or None
         Greatest torque of its motors, N m. None: not known; see `hapticdb.session.coupling`.
     turn_stiffness : float or None
-        Stiffest spring of turns, N m/rad. None: not known.
+        Stiffest rotational spring, N m/rad. None: not known.
     delay : float or None
-        Seconds from reading a place until the force that answers it acts, without the period of
-        the loop. None: not known.
+        Seconds from reading a pose until the corresponding force acts, without the period of the
+        loop. None: not known.
 
     Raises
     ------
@@ -90,7 +89,7 @@ class DeviceProfile:
 
     @property
     def first_stiffness(self) -> float:
-        """Stiffness of a session unless another is asked for, N/m."""
+        """Default stiffness of a session, N/m."""
         return self.stiffness if self.usual_stiffness is None else self.usual_stiffness
 
 
@@ -109,9 +108,9 @@ PROFILES = {
         DeviceProfile("sigma.7", 12.0, 4000.0, 30.0),
     )
 }
-"""Profiles of devices that can be bought, by their names."""
+"""Profiles of commercial devices, by name."""
 UNKNOWN = DeviceProfile("unknown", HAND_CAP, 1000.0, 5.0)
-"""Profile of a device that states none: what most desktop devices render."""
+"""Profile of a device without one: common limits of desktop devices."""
 SCRIPTED = DeviceProfile(
     "scripted",
     HAND_CAP,
@@ -121,20 +120,20 @@ SCRIPTED = DeviceProfile(
     usual_stiffness=HAND_STIFFNESS,
     delay=0.0,
 )
-"""Profile of a hand that follows a script: no force moves it."""
+"""Profile of a scripted hand: no force moves it."""
 
 
 @runtime_checkable
 class _SupportsProfile(Protocol):
-    """A device that knows its profile, before it is opened."""
+    """A device with a profile, available before it is opened."""
 
     @property
     def profile(self) -> DeviceProfile:
-        """What the device can render."""
+        """Rendering limits of the device."""
 
 
 def profile_of(device: object) -> DeviceProfile:
-    """Profile of a device; `UNKNOWN` where the device states none.
+    """Profile of a device; `UNKNOWN` for a device without one.
 
     Raises
     ------
@@ -153,7 +152,7 @@ def profile_of(device: object) -> DeviceProfile:
 
 
 def profile_named(name: str) -> DeviceProfile:
-    """Profile of a device by its name; capitals and spaces do not matter.
+    """Profile of a device by its name; case and spaces do not matter.
 
     Raises
     ------

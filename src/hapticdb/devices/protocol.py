@@ -1,13 +1,13 @@
-"""The protocol of a device, its reading, and the check of each reading, once a frame.
+"""Device protocol, readings, and their check in every frame.
 
-A device has two methods, `read` and `apply`. Each ability that only some devices have is a small
-Protocol of its own. A device is pickled into the process of the loop and opened there.
+A device has two methods, `read` and `apply`. Each optional ability is a small Protocol of its own.
+A device is pickled into the process of the loop and opened there.
 
 `Reader` checks in every frame whatever may change between two frames. A reading of the wrong kind
 (shape or type of its arrays) is a fault of the device's program: it raises an error, and the
-session ends without force. Numbers that are no valid pose (not finite, no rotation) may last a
-moment only: the hand's place is unknown until the next valid reading, and the force falls as it
-does in cells that are not resident.
+session ends without force. Numbers without a valid pose (not finite, no rotation) are a transient:
+the hand's pose is unknown until the next valid reading, and the force decays as in cells that are
+not resident.
 """
 
 import operator
@@ -21,16 +21,16 @@ from hapticdb.errors import DeviceError, UsageError
 from hapticdb.kernels.hand.handle import FARTHEST, is_somewhere
 
 SKEW = 1e-3
-"""Greatest error of the dot products of a rotation's columns, which are 0 or 1 when exact. Rounding
-to single precision and drift stay below it, a scaled rotation does not. Larger: less exact poses
-are accepted."""
+"""Greatest error of the dot products of a rotation's columns, 0 or 1 when exact. Rounding to single
+precision and drift stay below it, a scaled rotation does not. Larger: less exact poses are
+accepted."""
 MOST_BUTTONS = (1 << 31) - 1
 """Greatest mask of buttons: 31 bits, as a recording stores them."""
 DOUBLE = np.dtype(np.float64)
 
 
 class Reading(NamedTuple):
-    """Where the hand is, how fast it moves and which buttons it holds down."""
+    """Pose and velocity of the hand, and its pressed buttons."""
 
     pose: NDArray[np.float64]
     """(4, 4) rigid transform `world_from_hand`, metres, in the device's frame."""
@@ -39,28 +39,28 @@ class Reading(NamedTuple):
     """(6,) linear velocity of the hand's origin in m/s, then angular in rad/s; device's frame."""
 
     buttons: int
-    """One bit for each button, 1 while it is held down; the first button is the lowest bit."""
+    """Mask of the buttons, 1 for a pressed one; the first button is the lowest bit."""
 
 
 class Device(Protocol):
-    """A haptic device: it reports where the hand is, and pushes the hand.
+    """A haptic device: it measures the hand's motion, and applies a wrench to the hand.
 
     Both methods raise `DeviceError` if the device does not answer or was unplugged.
     """
 
     def read(self) -> Reading:
-        """Return where the hand is now; a pose of NaN while the device does not know."""
+        """Return the hand's present pose and velocity; a pose of NaN while it is unknown."""
 
     def apply(self, wrench: NDArray[np.float64]) -> None:
         """Push the hand with a wrench (6,), N and N m in the device's frame, until the next call.
 
-        The device reduces the wrench to what its motors can do.
+        The device limits the wrench to the caps of its motors.
         """
 
 
 @runtime_checkable
 class SupportsOpen(Protocol):
-    """A device that is opened once, in the process that uses it."""
+    """A device with a connection, opened once in the process that uses it."""
 
     def open(self) -> None:
         """Connect to the hardware; raises `DeviceError` or `MissingExtraError`."""
@@ -68,7 +68,7 @@ class SupportsOpen(Protocol):
 
 @runtime_checkable
 class SupportsClose(Protocol):
-    """A device that is closed when the session ends."""
+    """A device with resources, released at the end of the session."""
 
     def close(self) -> None:
         """Set the force to zero and release the hardware; a second call does nothing."""
@@ -76,11 +76,11 @@ class SupportsClose(Protocol):
 
 @runtime_checkable
 class SupportsEnd(Protocol):
-    """A device whose script ends, such as a path."""
+    """A device with a finite script, such as a path."""
 
     @property
     def is_over(self) -> bool:
-        """Whether the last reading was at the end of the script; the hand rests there."""
+        """Whether the last reading was at the end of the script, the hand's resting pose."""
 
 
 @runtime_checkable
@@ -88,17 +88,17 @@ class SupportsRewind(Protocol):
     """A device with a script that can start again."""
 
     def rewind(self) -> None:
-        """Start the script again at the next read."""
+        """Restart the script at the next read."""
 
 
 class Reader:
-    """Reads a device and returns only readings that kernels can take without a check of their own.
+    """Readings of a device in the form of the kernels, without need of a further check.
 
     A pose (4, 4) and a velocity (6,) are arrays of float64. Arrays of other real numbers (float32,
     integers), of another memory order or read-only are copied; lists, masked arrays, objects and
     complex numbers are refused.
 
-    The check adds 2 to 4 us to a frame, and 11 us where arrays are copied (a shared Xeon).
+    The check adds 2 to 4 us to a frame, and 11 us if arrays are copied (a shared Xeon).
     """
 
     def __init__(self, device: Device) -> None:
@@ -108,7 +108,7 @@ class Reader:
         self._last: Reading | None = None
 
     def read(self) -> Reading:
-        """Return where the hand is now; the pose is NaN if the device's is no rigid transform.
+        """Return the device's reading; its pose is NaN if it was no rigid transform.
 
         Raises
         ------
@@ -140,7 +140,7 @@ class Reader:
         return reading if _is_rigid_enough(pose) else reading._replace(pose=self._nowhere)
 
     def complaint(self) -> str:
-        """One line: what is wrong with the last reading's numbers; empty if nothing is wrong."""
+        """Fault of the last reading's numbers, in one line; empty without one."""
         last = self._last
         if last is None:
             return ""
@@ -156,7 +156,7 @@ class Reader:
         return ""
 
     def _converted(self, reading: Reading) -> Reading:
-        """Copy a reading whose arrays have another type or memory order into our own arrays."""
+        """Copy a reading with arrays of another type or memory order into own arrays."""
         self._take("pose", reading.pose, self._pose)
         self._take("velocity", reading.velocity, self._velocity)
         try:
@@ -195,7 +195,7 @@ class Reader:
 
 def _is_rigid_enough(pose: NDArray[np.float64]) -> bool:
     """Whether a pose (4, 4) has a rotation, exact to `SKEW`, and the last row 0 0 0 1."""
-    # plain floats, products written out: a quarter of the time that array operations take
+    # plain floats, products written out: a quarter of the time of array operations
     (a, b, c, _), (d, e, f, _), (g, h, i, _), last = pose.tolist()
     return bool(
         abs(a * a + d * d + g * g - 1.0) <= SKEW
@@ -210,7 +210,7 @@ def _is_rigid_enough(pose: NDArray[np.float64]) -> bool:
 
 
 def check_device(device: object) -> None:
-    """Refuse an object that is no device; the message says what to pass instead.
+    """Refuse an object that is no device, with a hint at the class to pass instead.
 
     Raises
     ------

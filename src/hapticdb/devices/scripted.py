@@ -1,7 +1,7 @@
-"""Devices that follow a script; `hapticdb.devices.protocol` defines what a device is.
+"""Scripted devices, without hardware; `hapticdb.devices.protocol` defines a device.
 
-Scripted devices need no hardware. They read the time from a clock and start at their first read.
-Every read writes into the same arrays, so a reading is valid only until the next read.
+They read the time from a clock and start at their first read. Every read writes into the same
+arrays, so a reading is valid only until the next read.
 """
 
 import math
@@ -19,26 +19,27 @@ from hapticdb.kernels.motion import play, survey, sway
 from hapticdb.poses import quaternion_of, read_timed_poses
 
 Clock = Callable[[], float]
-"""Returns seconds since some fixed instant; the time never goes back."""
+"""Seconds since some fixed instant, monotonic."""
 
 LEVER = 0.1
-"""Metres. Along a path with a speed, a turn counts as the distance that a point this far from the
-origin moves. Larger: turns take longer."""
+"""Lever arm, metres. Along a path with a speed, a turn counts as the arc length of a point at this
+distance from the origin. Larger: turns take longer."""
 
 PATH_SPEED = 0.1
-"""Metres a second along a path without times, unless another speed is given."""
+"""Default speed along a path without times, m/s."""
 
 CYCLE = 20.0
-"""Seconds after which `RandomHand` repeats itself; its frequencies are multiples of 1 / CYCLE."""
+"""Period of `RandomHand`, s; its frequencies are multiples of 1 / CYCLE."""
 
 SLOWEST, FASTEST = 0.3, 8.0
-"""Lowest and highest frequency (Hz) of a `RandomHand`'s motion."""
+"""Lowest and highest frequency, Hz, of the motion of a `RandomHand`."""
 
 
 def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[np.float64]:
     """Copy of a wrench (6,) with force and torque shortened to the caps (N, N m).
 
-    Directions are kept. A force or torque that is not finite becomes zero, so no motor receives it.
+    Directions are preserved. A force or torque that is not finite becomes zero, so no motor
+    receives it.
     """
     fx, fy, fz, tx, ty, tz = wrench.tolist()
     f, t = math.hypot(fx, fy, fz), math.hypot(tx, ty, tz)
@@ -51,7 +52,7 @@ def capped(wrench: NDArray[np.float64], force: float, torque: float) -> NDArray[
 
 
 def pose_at(place: ArrayLike) -> NDArray[np.float64]:
-    """Pose (4, 4) of a place: a pose as it is, a point (3,) with the hand upright."""
+    """Pose (4, 4): a pose unchanged, or the hand upright at a point (3,)."""
     given = np.array(place, dtype=np.float64)
     if given.shape not in {(3,), (4, 4)} or not np.isfinite(given).all():
         raise UsageError(
@@ -84,7 +85,7 @@ class _Scripted:
         self._reading = Reading(self._pose, self._velocity, 0)
 
     def rewind(self) -> None:
-        """Start the script again at the next read."""
+        """Restart the script at the next read."""
         self._start = None
 
     def _elapsed(self) -> float:
@@ -99,7 +100,7 @@ class _Scripted:
 
 
 class Player(_Scripted):
-    """A hand that follows timed poses; between two poses it moves straight and turns evenly.
+    """A hand on timed poses, interpolated linearly, rotations by slerp.
 
     Parameters
     ----------
@@ -108,10 +109,10 @@ class Player(_Scripted):
     poses : array_like
         (M, 4, 4) rigid transforms, metres. Their differences give the velocity.
     loops : bool
-        Start again at the end; for a smooth return, the path must end where it starts. Otherwise
-        the hand rests at the last pose.
+        Start again at the end; for a smooth return, the path must end at its start. Otherwise the
+        hand rests at the last pose.
     clock : callable
-        Returns seconds; it must be picklable.
+        Time in seconds; must be picklable.
     """
 
     def __init__(
@@ -151,15 +152,15 @@ class Player(_Scripted):
 
 
 class Path(Player):
-    """A hand that follows a file of poses (`hapticdb.read_poses`).
+    """A hand on the poses of a file (`hapticdb.read_poses`).
 
     Parameters
     ----------
     path : path
         The file. Its column ``t``, if it has one, gives the times (s) unless `speed` is given.
     speed : float, optional
-        Metres a second; 0.1 if the file gives no time. A turn counts as the distance that a point
-        0.1 m from the origin moves; poses that repeat the one before are left out.
+        Metres a second; 0.1 if the file gives no time. A turn counts as the arc length of a point
+        0.1 m from the origin; successive equal poses count once.
     loops, clock
         As for `Player`.
 
@@ -179,7 +180,7 @@ class Path(Player):
     ) -> None:
         times, poses = read_timed_poses(path)
         self.assumed_speed = PATH_SPEED if times is None and speed is None else None
-        """Metres a second that were assumed because neither file nor `speed` told it."""
+        """Assumed speed, m/s, without times in the file and without `speed`; else None."""
         if times is None or speed is not None:
             times, poses = _times_at(poses, _positive("speed", self.assumed_speed or speed or 0.0))
         super().__init__(times, poses, loops=loops, clock=clock)
@@ -188,7 +189,7 @@ class Path(Player):
 def _times_at(
     poses: NDArray[np.float64], speed: float
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Times of the poses at a given speed, and the poses without repeated ones."""
+    """Times of the poses at a given speed, and the poses without repetitions."""
     q = quaternion_of(poses[:, :3, :3])
     # chord to q or -q, whichever is nearer; exact for small turns, where acos is not
     chord = np.minimum(
@@ -202,11 +203,11 @@ def _times_at(
 
 
 class RandomHand(_Scripted):
-    """Smooth random motion about a place, like a hand's; the same seed gives the same motion.
+    """Smooth random motion about a center, like a hand's; equal seeds give equal motions.
 
     Each axis is a sum of sines between 0.3 and 8 Hz with amplitudes proportional to 1 / f^2. All
     frequencies are multiples of one, and the motion repeats after 20 s. It starts at the center.
-    Slow waves that would carry the hand beyond its reach are left out.
+    Slow waves that would carry the hand beyond its reach are omitted.
 
     Parameters
     ----------
@@ -255,13 +256,13 @@ class RandomHand(_Scripted):
 N_WAVES = 8
 """Sines on each axis of a `RandomHand`. Larger: a more irregular motion, slower reads."""
 N_SAMPLES = 16384
-"""Instants of a cycle at which speed and reach are measured. Larger: more exact, slower to make."""
+"""Samples of a cycle for its speed and reach. Larger: more exact, slower to make."""
 
 
 def _random_waves(
     seed: int, speed: float, angular_speed: float, reach: float
 ) -> NDArray[np.float64]:
-    """Waves (6, 8, 4) in the form that the kernel `sway` takes."""
+    """Waves (6, 8, 4) for the kernel `sway`."""
     slowest = SLOWEST
     while slowest < FASTEST:
         waves = _waves_above(slowest, seed)
@@ -283,7 +284,10 @@ def _random_waves(
 
 
 def _waves_above(slowest: float, seed: int) -> NDArray[np.float64]:
-    """Waves (6, 8, 4): random phases, `slowest` to `FASTEST` Hz, amplitudes 1 / f^2."""
+    """Waves (6, 8, 4): amplitude 1 / f^2, angular frequency, random phase, and its sine.
+
+    Frequencies f from `slowest` to `FASTEST` Hz.
+    """
     random = np.random.default_rng(seed)
     steps = np.linspace(0.0, 1.0, N_WAVES)
     spread = np.clip(steps + random.uniform(-0.5, 0.5, (6, N_WAVES)) / N_WAVES, 0.0, 1.0)

@@ -1,4 +1,4 @@
-"""A simulated device: a mass that a hand holds; forces are capped and act after a latency."""
+"""Simulated device: a mass on the spring of a hand, with capped forces and a latency."""
 
 import math
 import time
@@ -23,37 +23,39 @@ from hapticdb.kernels.motion import pull
 from hapticdb.poses import quaternion_of
 
 STEP = 1e-4
-"""Seconds of one step of the integration. Larger: less work a read, but only softer grips."""
+"""Time step of the integration, s. Larger: less work a read, but only softer grips."""
 
 INERTIA, TURN_GRIP, MAX_TORQUE = 1e-4, 1e-3, 0.2
-"""Moment of inertia, kg m^2; stiffness of a grip for rotations, N m/rad for each N/m; N m."""
+"""Moment of inertia, kg m^2; rotational stiffness of a grip, N m/rad for each N/m; torque cap, N
+m."""
 LEAST_CAP = 1e-6
-"""Cap (N) that the profile of a device without motors has. Smaller: contacts become softer."""
+"""Cap, N, in the profile of a device without motors. Smaller: contacts become softer."""
 LONGEST = 0.05
-"""Greatest time (s) that one read integrates; after a longer pause the time before is skipped."""
+"""Longest time, s, that one read integrates; after a longer pause the time before is skipped."""
 
 
 class SimulatedDevice:
-    """A device with a mass; the hand pulls it by a spring, the applied wrench pushes it.
+    """A device with a mass: the hand pulls it by a spring, the applied wrench pushes it.
 
-    The spring is critically damped: m x'' = k (h - x) + 2 sqrt(k m) (h' - x') + F, where h is the
-    hand and x the device. Rotations follow the same law. The integration has fixed steps of 0.1 ms;
-    the pose is extrapolated from the last step to the instant of the read.
+    The spring is critically damped: m x'' = k (h - x) + 2 sqrt(k m) (h' - x') + F, with the hand h
+    and the device x. Rotations follow the same law. The integration has fixed steps of 0.1 ms; the
+    pose is extrapolated from the last step to the instant of the read.
 
     Parameters
     ----------
     hand : Device
-        Gives the pose that the person wants the device to have.
+        Intended motion of the device, as readings.
     mass : float
         Mass of the device, kg. Its moment of inertia is 1e-4 kg m^2 about every axis.
     grip : float
         Stiffness of the hand, N/m; for rotations a thousandth of it, N m/rad.
     max_force : float
-        Greatest force of the motors, N, beside a torque of 0.2 N m; longer wrenches are shortened.
+        Greatest force of the motors, N; their greatest torque is 0.2 N m. Longer wrenches are
+        shortened.
     latency : float
         Seconds from `apply` until the motors push.
     clock : callable
-        Returns seconds; it must be picklable, and should be the hand's clock.
+        Time in seconds; must be picklable, and should be the hand's clock.
 
     Raises
     ------
@@ -92,7 +94,7 @@ class SimulatedDevice:
 
     @property
     def profile(self) -> DeviceProfile:
-        """Caps, mass and delay of the device; its hand's damping is that of the grip."""
+        """Caps, mass and delay of the device; the damping of its hand is that of the grip."""
         mass, grip = self._inertias[0], self._grips[0]
         return DeviceProfile(
             "simulated",
@@ -112,7 +114,7 @@ class SimulatedDevice:
         return isinstance(self.hand, SupportsEnd) and self.hand.is_over
 
     def rewind(self) -> None:
-        """Start again at the next read, in the hand's pose; the hand rewinds too if it can."""
+        """Restart at the next read, in the hand's pose; the hand rewinds too if it can."""
         if isinstance(self.hand, SupportsRewind):
             self.hand.rewind()
         self._time = None
@@ -125,9 +127,9 @@ class SimulatedDevice:
         self._pending.append((self.clock() + self.latency, push))
 
     def read(self) -> Reading:
-        """Return pose and velocity of the device now; the next read overwrites its arrays.
+        """Pose and velocity of the device now; the next read overwrites the arrays.
 
-        While the hand's place is unknown, the device's place is unknown too, and it does not move.
+        Without a valid pose of the hand the device has none either, and does not move.
         """
         hand = self._reader.read()
         now = self.clock()

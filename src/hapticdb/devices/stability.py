@@ -1,8 +1,8 @@
-"""How stiff a spring a device holds without trembling.
+"""Stable stiffness of a virtual spring on a device.
 
-A sampled spring gives back more energy than was put in: the force of a place comes late, by half a
-period on average and by the delay of device and transfer. Only damping of the device and of the
-hand that holds it takes this energy away (Gil, Sanchez, Hulin, Preusche and Hirzinger 2009).
+A sampled spring returns more energy than was put in: its force is late, by half a period on average
+and by the delay of device and transfer. Only the damping of the device and of the hand dissipates
+this energy (Gil, Sanchez, Hulin, Preusche and Hirzinger 2009).
 """
 
 import math
@@ -12,29 +12,29 @@ from hapticdb.devices.profiles import LIGHTEST, DeviceProfile
 from hapticdb.errors import UsageError
 
 SHARE = 0.4
-"""Share of the bound of Gil and others that is used. Measured limits were 0.42 to 0.60 of the bound
-for a light grip and 0.88 to 1.02 for a firm one. Larger: stiffer surfaces, which tremble in a light
+"""Used share of the bound of Gil and others. Measured limits were 0.42 to 0.60 of the bound for a
+light grip and 0.88 to 1.02 for a firm one. Larger: stiffer surfaces, which tremble in a light
 grip."""
 GRIP_STIFFNESS = 100.0
-"""Stiffness of a hand that holds a device lightly, N/m. Larger: more damping is expected of it."""
+"""Stiffness of a light grip, N/m. Larger: more damping is expected of the hand."""
 GRIP_DAMPING = 0.6
-"""Damping of that hand, in sqrt(stiffness times mass): 0.3 of critical. Larger: likewise."""
+"""Damping of a light grip, in sqrt(stiffness times mass): 0.3 of critical. Larger: likewise."""
 SMALLEST = 1.0
-"""Smallest stiffness that a session may have, N/m: a softer one cannot be felt."""
+"""Least stiffness of a session, N/m: a softer one is imperceptible."""
 
 
 @dataclass(frozen=True)
 class _Allowance:
-    """Stiffness that a session gets, and why it is not the one that was asked for.
+    """Stiffness granted to a session, and the reason if it was lowered.
 
     Attributes
     ----------
     asked, stiffness : float
-        What was asked for, and what is given, N/m.
+        Requested and granted stiffness, N/m.
     delay : float
-        Seconds that the rule counted.
+        Delay in the stability rule, s.
     lowered : str or None
-        One line: by what the stiffness was lowered; None if it was not.
+        One line: the limit that lowered the stiffness; None if none did.
     """
 
     asked: float
@@ -44,10 +44,10 @@ class _Allowance:
 
 
 def hand_damping(profile: DeviceProfile) -> float:
-    """Damping of the hand that holds the device, N s/m.
+    """Damping of the hand on the device, N s/m.
 
-    That of a light grip, b = 0.6 sqrt(100 m), unless the profile states it. Where the mass m is not
-    known, the lightest device's is taken.
+    That of a light grip, b = 0.6 sqrt(100 m), unless the profile states it. For an unknown mass m,
+    the lightest device's is assumed.
     """
     if profile.hand_damping is not None:
         return profile.hand_damping
@@ -63,7 +63,7 @@ def delay_of(profile: DeviceProfile, rate: float, delay: float | None = None) ->
 
 
 def stable_stiffness(profile: DeviceProfile, rate: float, delay: float) -> float:
-    """Stiffest spring, N/m, that stays stable in a light grip; infinite for a hand without motors.
+    """Greatest stiffness, N/m, stable in a light grip; infinite for a scripted hand.
 
     K = 0.4 (b + b_hand) / (T / 2 + t_d), with the period T = 1 / rate and the delay t_d, seconds.
     """
@@ -73,7 +73,7 @@ def stable_stiffness(profile: DeviceProfile, rate: float, delay: float) -> float
 def allow(
     profile: DeviceProfile, rate: float, asked: float | None = None, delay: float | None = None
 ) -> _Allowance:
-    """Lower a stiffness to what the device renders and what stays stable.
+    """Limit a stiffness to the device's greatest and to the stable one.
 
     Parameters
     ----------
@@ -89,7 +89,7 @@ def allow(
     Raises
     ------
     UsageError
-        If the stiffness is not a number above `SMALLEST`.
+        If the stiffness is not a number of `SMALLEST` or more.
     """
     wanted = profile.first_stiffness if asked is None else asked
     if not (math.isfinite(wanted) and wanted >= SMALLEST):
@@ -109,7 +109,7 @@ def allow(
 
 
 def _stable_text(profile: DeviceProfile, rate: float, delay: float) -> str:
-    """Clause for people: at what conditions the stable stiffness is that small."""
+    """Clause of a message: conditions of the stable stiffness."""
     grip, mass = "", ""
     if profile.hand_damping is None:
         grip = " in a light grip"

@@ -1,7 +1,6 @@
-"""Devices of vendors, each driven through a package or service.
+"""Vendors' devices, each driven through a package or service.
 
-Before `open` nothing is imported and no hardware is used, so a device can be pickled into the
-process that uses it.
+Import and use of hardware wait for `open`, so a device can be pickled into its process.
 """
 
 import importlib
@@ -15,18 +14,18 @@ from numpy.typing import NDArray
 from hapticdb.errors import DeviceError, MissingExtraError, pip_line
 
 WINDOW = 0.02
-"""Seconds over which a velocity is measured if the device gives none. Larger: smoother, later."""
+"""Window, s, of the velocity of a device that reports none. Larger: smoother, later."""
 
 
 def load(module: str, extra: str) -> ModuleType:
-    """Import a module that drives a device.
+    """Import the driver module of a device.
 
     Raises
     ------
     MissingExtraError
         If its package is not installed.
     DeviceError
-        If the package is installed, but the vendor's own library that it calls is not.
+        If the package is installed, but the vendor's own library below it is not.
     """
     try:
         return importlib.import_module(module)
@@ -40,13 +39,13 @@ def load(module: str, extra: str) -> ModuleType:
 
 
 class VelocityWindow:
-    """Velocity of a hand: the difference between its poses over 20 ms, divided by the time."""
+    """Velocity of a hand: finite difference of its poses over a window of 20 ms."""
 
     def __init__(self) -> None:
         self._seen: deque[tuple[float, NDArray[np.float64]]] = deque()
 
     def measure(self, now: float, pose: NDArray[np.float64]) -> NDArray[np.float64]:
-        """Velocity (6,), m/s and rad/s, from the poses (4, 4) seen so far and this one."""
+        """Velocity (6,), m/s and rad/s, from the earlier poses (4, 4) and this one at `now`, s."""
         seen = self._seen
         while len(seen) > 1 and seen[1][0] <= now - WINDOW:
             seen.popleft()

@@ -22,19 +22,18 @@ TIMEOUT = 7
 TORQUE_CAP = 0.2
 """Cap, N m, of a device whose profile gives none."""
 PROFILE = DeviceProfile("force-dimension", cap=7.0, stiffness=3000.0, damping=20.0)
-"""Profile of a device whose model is not told: no more than every model renders."""
+"""Profile of an unspecified model: limits within those of every model."""
 
 
 class ForceDimensionDevice:
     """A device of Force Dimension; its frame is that of its manual.
 
-    A device without a wrist reports the hand upright; one without motors in its wrist ignores the
-    torque.
+    Without a wrist its rotation is the identity; without motors in the wrist the torque is ignored.
 
     Parameters
     ----------
     serial : int, optional
-        Serial number; without one, the first free device is taken.
+        Serial number; the first free device unless given.
     profile : DeviceProfile
         The model's profile, as of `hapticdb.devices.profiles.PROFILES`.
     """

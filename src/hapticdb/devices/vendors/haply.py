@@ -2,10 +2,10 @@
 
 Written from the documentation of the Inverse SDK 3.5 (docs.haply.co: "WebSocket Protocol", "Control
 Commands", tutorials 01, 02 and 06). On connection the service sends the list of devices; after
-that, exactly one state for each message that it receives. Positions are in metres, velocities in
-m/s, forces in N; x is right, y forward, z up. A VerseGrip, if there is one, gives the orientation
-and the buttons. The Inverse3 has no motors for torque, so the torque is ignored. The angular
-velocity is measured over 20 ms.
+that, exactly one state for each received message. Positions are in metres, velocities in m/s,
+forces in N; x is right, y forward, z up. An optional VerseGrip gives the orientation and the
+buttons. The Inverse3 has no motors for torque, so the torque is ignored. The angular velocity is
+measured over 20 ms.
 """
 
 import contextlib
@@ -29,7 +29,7 @@ URL = "ws://localhost:10001"
 LOOPBACK = {"localhost", "127.0.0.1", "::1"}
 
 SILENCE = 0.1
-"""Seconds without an answer after which the device counts as lost."""
+"""Longest time to an answer, s; then the device counts as lost."""
 
 HANDSHAKE = {"configure": {"profile": {"name": "hapticdb"}}}
 """Session part of the first message: the name of the profile."""
@@ -38,7 +38,7 @@ AXES = ("x", "y", "z")
 
 
 PROFILE = DeviceProfile("inverse3", cap=7.0, stiffness=1000.0, damping=5.0)
-"""Profile of an Inverse3. Its maker gives no stiffness: what most desktop devices render."""
+"""Profile of an Inverse3. Its maker gives no stiffness: common limits of desktop devices."""
 
 
 class HaplyDevice:
@@ -47,11 +47,11 @@ class HaplyDevice:
     Parameters
     ----------
     device_id : str, optional
-        The service's name of the device ("049D"); without one, the first device is taken.
+        The service's name of the device ("049D"); the first device unless given.
     url : str
         The service's address, on this machine.
     profile : DeviceProfile
-        What the device renders; an Inverse3's unless given.
+        Limits of the device; an Inverse3's unless given.
 
     Raises
     ------
@@ -106,7 +106,7 @@ class HaplyDevice:
             raise
 
     def _find(self) -> str:
-        """Name of the wanted device, from the list that the service sends first."""
+        """Name of the device, from the service's first message, a list."""
         found = [each.get("device_id") for each in self._receive().get("inverse3", [])]
         if not found or self.device_id not in {None, *found}:
             which = "no Inverse3" if self.device_id is None else f"no Inverse3 {self.device_id}"

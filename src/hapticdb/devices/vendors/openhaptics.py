@@ -1,10 +1,10 @@
 """Devices of 3D Systems (Touch, Touch X, Phantom) through OpenHaptics.
 
 Written from the README and the sources of `pyopenhaptics` 1.0.1, which calls OpenHaptics 3.4. The
-device's state can be read only in a callback of the OpenHaptics scheduler, which runs 1000 times a
-second in a thread of its own. So the callback stores the reading for `read`, and sends the force
-that `apply` stored. The package gives neither velocity nor torque: velocities are measured over
-20 ms, torque is ignored. The library itself comes from the vendor.
+device's state is readable only in a callback of the OpenHaptics scheduler, at 1000 Hz in a thread
+of its own. So the callback stores the reading for `read`, and sends the force stored by `apply`.
+The package gives neither velocity nor torque: velocities are measured over 20 ms, torque is
+ignored. The library itself comes from the vendor.
 """
 
 import contextlib
@@ -22,14 +22,14 @@ from hapticdb.devices.vendors import VelocityWindow, load
 from hapticdb.errors import DeviceError
 
 INVALID_HANDLE = 0xFFFFFFFF
-"""HD_INVALID_HANDLE, which hdInitDevice returns if there is no device."""
+"""HD_INVALID_HANDLE, returned by hdInitDevice if there is no device."""
 
 SILENCE = 0.1
-"""Seconds without a callback after which the device counts as lost."""
+"""Longest time between callbacks, s; then the device counts as lost."""
 
 STALE = 0.05
-"""Seconds after which a force that no other replaced becomes zero: the scheduler would repeat the
-last force for ever if the loop stopped."""
+"""Age, s, at which a force without successor becomes zero: the scheduler would repeat the last
+force for ever if the loop stopped."""
 
 
 class OpenHapticsDevice:

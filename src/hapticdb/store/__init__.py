@@ -1,1 +1,1 @@
-"""Stores: one class an engine, behind the protocols of `hapticdb.store.base`."""
+"""Storage engines behind the protocols of `hapticdb.store.base`, one class each."""

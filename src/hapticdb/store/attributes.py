@@ -1,4 +1,4 @@
-"""What objects say: the words ``attribute=value``; a scene's box, and which axis points up."""
+"""Attributes of objects: selection by ``attribute=value``, a scene's AABB and up axis."""
 
 import json
 import math
@@ -14,17 +14,17 @@ from hapticdb.store.base import Object
 
 AXES = ("x", "y", "z")
 MOST_TOLD = 5
-"""Most values or names of attributes that an error lists. Larger: longer lines."""
+"""Values or names of attributes in an error, at most."""
 
 
 def scene_bounds(objects: Iterable[Object]) -> NDArray[np.float64] | None:
-    """Lower and upper corner (2, 3) of all objects, metres, world frame; None without any."""
+    """AABB (2, 3) of all objects, lower and upper corner, metres, world frame; None without any."""
     boxes = np.array([obj.bounds for obj in objects])
     return np.stack([boxes[:, 0].min(axis=0), boxes[:, 1].max(axis=0)]) if len(boxes) else None
 
 
 def up_axis(objects: Iterable[Object]) -> int:
-    """Axis that points up in a scene, 0 to 2: that of most voxels; z for files that name none."""
+    """Up axis of a scene, 0 to 2: the one of most voxels; z for files without an up axis."""
     votes = np.zeros(3)
     for obj in objects:
         said = obj.attributes.get("up")
@@ -33,12 +33,12 @@ def up_axis(objects: Iterable[Object]) -> int:
 
 
 def having_attribute(objects: Sequence[Object], word: str) -> list[Object]:
-    """Objects that ``attribute=value`` chooses, in their order; none if the word has no ``=``.
+    """Objects selected by ``attribute=value``, in their order; none if the word has no ``=``.
 
-    The attribute ends at the first ``=``; ``outer.inner`` enters an object of JSON, unless it is a
-    whole name. The value is compared with the attribute's text, then as a pattern of `fnmatch`. A
-    number equals every way to write it; true, false and null are written so; of a list any element
-    may fit; anything else is compared as JSON without spaces.
+    The attribute ends at the first ``=``; ``outer.inner`` enters a JSON object, unless it is a
+    whole name. The value is compared with the attribute's text, then as a pattern of `fnmatch`.
+    Numbers compare by value; true, false and null by these words; of a list any element may match;
+    anything else is compared as JSON without spaces.
     """
     attribute, equals, wanted = word.partition("=")
     if not equals or not attribute:
@@ -48,7 +48,7 @@ def having_attribute(objects: Sequence[Object], word: str) -> list[Object]:
 
 
 def attribute_hint(objects: Sequence[Object], word: str) -> str:
-    """What there is instead of ``attribute=value``, for an error; empty without a ``=``."""
+    """Hint at existing values or names for an error; empty for a word without a ``=``."""
     attribute, equals, _ = word.partition("=")
     if not equals or not attribute:
         return ""
@@ -66,7 +66,7 @@ def _some(texts: Sequence[str]) -> str:
 
 
 def _values_of(obj: Object, attribute: str) -> Iterator[object]:
-    """Values of an object's attribute: each element of a list, and nothing where it has none."""
+    """Values of an object's attribute: the elements of a list, too; none without the attribute."""
     value: object = obj.attributes
     if attribute in obj.attributes:
         value = obj.attributes[attribute]
@@ -81,7 +81,7 @@ def _values_of(obj: Object, attribute: str) -> Iterator[object]:
 
 
 def _text_of(value: object) -> str:
-    """Text that stands for a value of JSON."""
+    """Text of a JSON value."""
     if isinstance(value, str):
         return value
     if isinstance(value, float) and value.is_integer():
@@ -90,7 +90,7 @@ def _text_of(value: object) -> str:
 
 
 def _test_of(wanted: str) -> Callable[[object], bool]:
-    """Build the test of one value."""
+    """Predicate of one value."""
     pattern = re.compile(translate(wanted))
     number = _number_of(wanted)
 
@@ -104,7 +104,7 @@ def _test_of(wanted: str) -> Callable[[object], bool]:
 
 
 def _number_of(text: str) -> float | None:
-    """The number that a text writes, as JSON would; None if it writes none."""
+    """Number written as JSON in a text; None for anything else."""
     try:
         value = json.loads(text)
     except (ValueError, RecursionError):

@@ -1,4 +1,4 @@
-"""What an engine does for an opened environment: the protocol `Store`, and what crosses it."""
+"""Protocol `Store` of the engines, and its arguments and results: rows, objects, changes."""
 
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager
@@ -14,7 +14,7 @@ from hapticdb.units import length_text, notebook_html, place_text
 
 Layout = Literal["voxel", "brick"]
 Columns = Literal["voxel", "brick", "distances"]
-"""What a read returns: rows of a layout, or bricks with their distances."""
+"""Columns of a read: rows of a layout, or bricks with their distances."""
 LAYOUTS: tuple[Layout, ...] = get_args(Layout)
 BRICK_SHIFT = 3 * BRICK_BITS
 """Bits of a voxel's key below its brick's."""
@@ -23,18 +23,18 @@ CELL_SHIFT = 15
 BRICK_BYTES = 64
 """Bytes of a brick's occupancy: a bit for each of its 512 voxels."""
 LONGEST_BAND = 2048
-"""Most bytes of a row's packed distances, more than `kernels.field.packing` ever makes."""
+"""Upper bound of a row's packed distances, bytes; `kernels.field.packing` makes fewer."""
 
 Keys = NDArray[np.int64]
 Progress = Callable[[int, int], object]
-"""Called with how much of a work is done, and with the total. May raise an error, which ends it."""
+"""Called with the amount of work done and the total. Its error ends the work."""
 
 
 class Band(NamedTuple):
-    """Distances to surfaces of R rows, packed (`hapticdb.kernels.field`).
+    """Packed distances to surfaces, of R rows (`hapticdb.kernels.field`).
 
-    data : (n,) uint8, packed distances, row after row.
-    ends : (R,) int64, where the bytes of each row end in `data`.
+    data : (n,) uint8, row after row.
+    ends : (R,) int64, end of each row's bytes in `data`.
     """
 
     data: NDArray[np.uint8]
@@ -46,7 +46,7 @@ class Band(NamedTuple):
         return np.diff(self.ends, prepend=0)
 
     def picked(self, which: NDArray[np.int64]) -> "Band":
-        """Copies of the rows at the given places, in their order."""
+        """Copies of the rows of given indices, in their order."""
         lengths, bytes_of = self.lengths[which], self.data.tobytes()
         pairs = zip(self.ends[which].tolist(), lengths.tolist(), strict=True)
         joined = b"".join([bytes_of[end - length : end] for end, length in pairs])
@@ -64,10 +64,10 @@ class Rows(NamedTuple):
     """A batch of rows of the index table.
 
     keys : (R,) int64, ascending: voxel keys, or brick keys.
-    ids : (R,) int64, ids of objects.
-    occupancy : (64 R,) uint8, row after row; empty on the voxel layout.
-    distances : to surfaces, for each brick near one, even without a voxel; None if the object has
-        none, or they were not read.
+    ids : (R,) int64, object ids.
+    occupancy : (64 R,) uint8, 64 bytes a row; empty on the voxel layout.
+    distances : to surfaces, for each brick near one, also without a voxel; None if the object has
+        none, or unread.
     """
 
     keys: Keys
@@ -86,11 +86,11 @@ class Rows(NamedTuple):
         return Rows(self.keys[low:high], self.ids[low:high], bits, distances)
 
     def having(self, distances: Band | None) -> "Rows":
-        """These rows with other distances; `_replace` fails, since it asks for the length."""
+        """These rows with other distances. `_replace` fails: `len` is not the number of fields."""
         return Rows(self.keys, self.ids, self.occupancy, distances)
 
     def picked(self, which: NDArray[np.int64]) -> "Rows":
-        """Copies of the rows at the given places, in their order."""
+        """Copies of the rows of given indices, in their order."""
         bits = NO_OCCUPANCY
         if self.occupancy.size:
             some = self.occupancy.reshape(-1, BRICK_BYTES)[which]
@@ -99,33 +99,33 @@ class Rows(NamedTuple):
         return Rows(self.keys[which], self.ids[which], bits, distances)
 
     def occupied(self) -> "Rows":
-        """Rows whose brick holds a voxel, without distances."""
+        """Rows of bricks with a voxel, without distances."""
         rows = self.having(None)
         if self.distances is None:
             return rows
         return rows.picked(np.flatnonzero(self.occupancy.reshape(-1, BRICK_BYTES).any(axis=1)))
 
     def measured(self) -> "Rows":
-        """Rows with distances, of those that `Store.rows_after` returns."""
+        """Rows with distances, from a result of `Store.rows_after`."""
         if self.distances is None:
             return NO_DISTANCES
         return self.picked(np.flatnonzero(self.distances.lengths))
 
 
 NO_KEYS = np.empty(0, dtype=np.int64)
-# from bytes, hence read-only: kernels are compiled for the one type that every path gives them
+# from bytes, hence read-only: kernels are compiled for this one array type
 NO_OCCUPANCY = np.frombuffer(b"", dtype=np.uint8)
 NO_ROWS = Rows(NO_KEYS, NO_KEYS, NO_OCCUPANCY)
 NO_DISTANCES = NO_ROWS.having(Band(NO_OCCUPANCY, NO_KEYS))
 
 
 def no_rows(*, distances: bool) -> Rows:
-    """Build the answer of a read that finds nothing."""
+    """Empty result of a read."""
     return NO_DISTANCES if distances else NO_ROWS
 
 
 def joined(parts: Sequence[Rows], *, distances: bool) -> Rows:
-    """Batches of rows as one, in their order; all with distances or all without."""
+    """Concatenation of batches in their order; all with distances or all without."""
     if not parts:
         return no_rows(distances=distances)
     bits = np.frombuffer(b"".join([part.occupancy.tobytes() for part in parts]), np.uint8)
@@ -151,18 +151,18 @@ def row_shift(layout: Layout) -> int:
 
 @dataclass(frozen=True)
 class Object:
-    """One object, as the table `object` holds it.
+    """An object: a row of the table `object`.
 
-    id : assigned when the object is written, and never reused; 0 before that
+    id : assigned by its first write, never reused; 0 before
     name : path of the part inside its file
-    link : absolute path of the file that holds its surface
+    link : absolute path of the file of its surface
     digest : digest of its geometry in its own frame
     transform (4, 4) float64 : world_from_part, metres
-    voxels : how many voxels its surface touches
+    voxels : number of voxels touched by its surface
     bounds (2, 3) float64 : lower and upper corner, metres, world frame
-    attributes : JSON: ``unit`` of its file; ``up``, its axis x, y or z; what an IFC file says
-    revision : revision of the environment that last wrote the object
-    rows_crc, distances_crc : checksums of its rows and distances as they were written, or None
+    attributes : JSON: ``unit`` of its file; ``up``, its axis x, y or z; attributes of an IFC file
+    revision : revision of the environment made by its last write
+    rows_crc, distances_crc : checksums of its rows and distances at the write, or None
     surface : its packed surface, from `Environment.remove` alone, for `restore`
     """
 
@@ -191,15 +191,15 @@ class Object:
 
     @property
     def has_distances(self) -> bool:
-        """Whether distances to its surface are stored beside its voxels."""
+        """Whether distances to its surface are stored with its voxels."""
         return self.distances_crc is not None
 
 
 @dataclass(frozen=True)
 class Change:
-    """One committed write. A reader learns from it which keys to read again.
+    """One committed write, with the keys for a reader to read again.
 
-    ranges (C, 2) int64: lowest and highest voxel key of each range that was touched, ascending.
+    ranges (C, 2) int64 : lowest and highest voxel key of each touched range, ascending.
     """
 
     revision: int
@@ -209,7 +209,7 @@ class Change:
 
 
 Replacements = Callable[[], Iterable[tuple[Object, Rows]]]
-"""Gives objects to be replaced, each once, with their new rows."""
+"""Makes the objects to be replaced, each once, with their new rows."""
 
 
 class Histogram(NamedTuple):
@@ -225,10 +225,10 @@ class Histogram(NamedTuple):
 
 
 class Freshness(NamedTuple):
-    """How old the statistics of the keys are, which the strategy `cbgroup` uses.
+    """Age of the statistics of the keys, which the strategy `cbgroup` uses.
 
-    revision : revision of the environment when the statistics were made, None without statistics;
-    changes : writes committed since.
+    revision : of the environment at the time of the statistics, None without any; changes : writes
+    committed since.
     """
 
     revision: int | None
@@ -236,7 +236,7 @@ class Freshness(NamedTuple):
 
 
 class Size(NamedTuple):
-    """How large the tables are; bytes of the whole database with its log; of surfaces, packed."""
+    """Size of the tables; bytes : of the whole database with its log; surface_bytes : packed."""
 
     rows: int
     bytes: int
@@ -246,11 +246,13 @@ class Size(NamedTuple):
 
 
 class LocatedShell(NamedTuple):
-    """A shell at its pose, as `Store.statement` takes it: arrays in the order of the points.
+    """Point shell at a pose, argument of `Store.statement`; arrays in the order of the points.
 
-    placed (N + 1, 6) float64: points in metres and normals, world frame; the last row is the tool's
-    centre; addresses (N,) int64, -1 outside the grid; `kernels.query.contact` computes both;
-    stiffness in N/m; exclude (E,) int64: ids of objects that are not felt.
+    placed (N + 1, 6) float64 : points in metres and normals, world frame; last row: the tool's
+    centre.
+    addresses (N,) int64 : of the points' voxels, -1 outside the grid; from `kernels.query.contact`.
+    stiffness : N/m.
+    exclude (E,) int64 : ids of objects without force.
     """
 
     placed: NDArray[np.float64]
@@ -260,7 +262,7 @@ class LocatedShell(NamedTuple):
 
 
 def all_rows(store: "Store", limit: int) -> Iterator[Rows]:
-    """All rows in ascending order of key and id, at most `limit` at a time."""
+    """All rows in ascending order of key and id, in batches of at most `limit`."""
     key, object_id = -1, 0
     while len(rows := store.rows_after(key, object_id, limit)):
         key, object_id = int(rows.keys[-1]), int(rows.ids[-1])
@@ -270,17 +272,17 @@ def all_rows(store: "Store", limit: int) -> Iterator[Rows]:
 class Store(Protocol):
     """An opened environment. Methods take and return whole batches.
 
-    A store belongs to the thread that opened it. Reads outside `snapshot` see what is committed
-    when each begins. All reads inside see one revision.
+    Only the thread that opened a store may use it. A read outside `snapshot` sees all commits
+    before its start. All reads inside see one revision.
     """
 
     @property
     def url(self) -> str:
-        """URL of the environment, as messages name it: without a password."""
+        """URL of the environment for messages, without a password."""
 
     @property
     def name(self) -> str:
-        """Its name among the environments of one folder or database."""
+        """Name among the environments of one folder or database."""
 
     @property
     def engine(self) -> str:
@@ -288,15 +290,15 @@ class Store(Protocol):
 
     @property
     def grid(self) -> Grid:
-        """The environment's grid, fixed when it was made."""
+        """Grid of the environment, fixed at its creation."""
 
     @property
     def layout(self) -> Layout:
-        """Which index table it has, fixed when it was made."""
+        """Layout of its index table, fixed at its creation."""
 
     @property
     def wants_distances(self) -> bool:
-        """Whether parts get distances to their surfaces when they are imported; bricks only."""
+        """Whether an import computes distances to the surfaces of parts; bricks only."""
 
     @property
     def is_read_only(self) -> bool:
@@ -304,25 +306,25 @@ class Store(Protocol):
 
     @property
     def identity(self) -> object:
-        """A value that differs for another environment made later in the same place."""
+        """Device and inode, or a table's oid: different for a later environment of this URL."""
 
     def close(self) -> None:
         """Close the connection."""
 
     def discard(self) -> None:
-        """Close the environment, and delete it if nothing was ever written to it."""
+        """Close and delete a new environment without commits; only servers verify that again."""
 
     def snapshot(self) -> AbstractContextManager[None]:
         """All reads inside see one committed revision. May be nested."""
 
     # -- rows: arrays of keys and of bounds are ascending, distinct and contiguous -----------------
     #
-    # Rows come in ascending order of key and id, by one statement, but for `lookup_each`: those of
-    # bricks that hold a voxel. With `distances` all rows that have some, whose occupancy is zero
-    # where a brick holds no voxel; objects without distances have no rows then.
+    # Rows are in ascending order of key and id, by one statement (`lookup_each`: one a key), of
+    # bricks with a voxel. With `distances`: all rows with distances, of zero occupancy in a brick
+    # without a voxel; objects without distances have no rows then.
 
     def lookup(self, keys: Keys, *, distances: bool = False) -> Rows:
-        """Rows of distinct ascending keys (U,), in the form that this engine answers fastest."""
+        """Rows of distinct ascending keys (U,), by this engine's fastest statement."""
 
     def lookup_each(self, keys: Keys, *, distances: bool = False) -> Rows:
         """Rows as by `lookup`, one statement a key: the paper's point queries."""
@@ -331,7 +333,7 @@ class Store(Protocol):
         """Rows with a key in any closed range, ascending and disjoint."""
 
     def count(self, lows: Keys, highs: Keys) -> int:
-        """Number of rows in the ranges, of bricks without a voxel, too, counted in the engine."""
+        """Number of rows in the ranges, counted in the engine; bricks without a voxel count."""
 
     def rows_of(self, object_id: int, lows: Keys, highs: Keys, *, distances: bool = False) -> Rows:
         """Rows of one object with a key in any closed range, ascending and disjoint."""
@@ -339,7 +341,7 @@ class Store(Protocol):
     def rows_after(self, key: int, object_id: int, limit: int) -> Rows:
         """At most `limit` of all rows after (key, id); (-1, 0) starts at the first.
 
-        Bricks come with their distances, which have no bytes where the row has none.
+        Bricks have their distances, of 0 bytes in a row without any.
         """
 
     def statement(self, frame: LocatedShell) -> NDArray[np.float64]:
@@ -357,28 +359,29 @@ class Store(Protocol):
         """Counter that changes when the last read may have seen another revision."""
 
     def newest(self) -> int:
-        """As `version`, of what is committed now, without a round trip to a server.
+        """As `version`, for the newest commit, mostly without a round trip to a server.
 
-        A server's notification of a commit takes a moment. Inside a snapshot the server is asked.
+        A server's notification of a commit takes a moment. Inside a snapshot, PostgreSQL is
+        queried.
         """
 
     def watch(self, *, is_prompt: bool = False) -> None:
-        """Begin to notice commits from now on; may be called again.
+        """Begin to notice commits; may be called again.
 
-        is_prompt : whether reads report a lost or silent server within 0.4 s, and do not wait for
-        it to come back. The loss of a file is always reported at once.
+        is_prompt : whether reads report a lost or silent server within 0.4 s, without waiting for
+        its return. The loss of a file is always reported at once.
         """
 
     def has_changed(self) -> bool:
         """Whether something was committed since `watch` or the last call. Never waits.
 
         Cheap enough for hundreds of calls a second. It may be true without a commit, as at the
-        first call without a `watch`. It is not false when a commit came before the call, but on
-        a server the notification of a commit takes a moment. Raises UsageError inside a snapshot.
+        first call without a `watch`. After a commit it is false only until a server's notification
+        has arrived. Raises UsageError inside a snapshot.
         """
 
     def objects(self, ids: Collection[int] | None = None) -> list[Object]:
-        """All objects, or those of some ids that are there, ordered by id."""
+        """All objects, or the existing ones of some ids, ordered by id."""
 
     def object(self, object_id: int) -> Object:
         """One object; raises ObjectNotFoundError when there is none of that id."""
@@ -387,41 +390,40 @@ class Store(Protocol):
         """Summary rows of all objects, ordered by id, a twentieth of the time of `objects`."""
 
     def removed(self, link: str) -> set[str]:
-        """Names of a file's parts that were removed and are not there again."""
+        """Names of a file's removed parts, except those added again."""
 
     def changes(self, since: int = 0) -> Iterator[Change]:
         """Committed writes after that revision, oldest first."""
 
     def surfaces(self, digests: Sequence[str]) -> dict[str, bytes]:
-        """Packed surfaces of the digests that have one, in one statement."""
+        """Packed surfaces by digest, in one statement; unknown digests are left out."""
 
     def surface_digests(self) -> set[str]:
         """Digests of all surfaces."""
 
     # -- writes: an object's rows, its record and its `Change`, in one transaction -----------------
     #
-    # A given surface, packed, is stored under the record's digest, unless there is one already. The
-    # last object of a digest takes the surface along when it is removed or gets another digest.
-    # An object has distances if its rows have them. All raise ReadOnlyError where writes are
-    # refused.
+    # A packed surface is stored once, under the record's digest. It is deleted when the last object
+    # of its digest is removed or gets another digest. An object has distances if its rows have
+    # them. All raise ReadOnlyError on a read-only environment.
 
     def loading(self) -> AbstractContextManager[None]:
-        """A context in which many objects are written. May be nested.
+        """Context for the writes of many objects. May be nested.
 
-        Inside, an engine may postpone work that only readers need, such as an index. At the end it
-        does this work, after an error, too. Writes that were committed inside are safe.
+        Inside, an engine may postpone work for readers, such as an index, to the end; after an
+        error, it is done, too. Writes committed inside are safe.
         """
 
     def add(self, record: Object, rows: Rows, surface: bytes | None = None) -> int:
-        """Write an object and its rows (any ids in them); its id is its own if above 0 and free."""
+        """Write an object and its rows, of any ids; returns its id: its own if above 0 and free."""
 
     def replace(
         self, record: Object, rows: Rows, surface: bytes | None = None, *, everywhere: bool = False
     ) -> None:
         """Exchange an object's rows; `everywhere` deletes old ones outside its bounds, too.
 
-        A record with a revision above 0 was derived from the object of that revision. Raises
-        ConflictError when the object has been written since.
+        A record with a revision above 0 is derived from the object of this revision: ConflictError
+        if the object has been written since.
         """
 
     def replace_all(self, made: Replacements) -> None:
@@ -432,7 +434,7 @@ class Store(Protocol):
         """
 
     def remove(self, object_id: int, revision: int | None = None) -> Object:
-        """Remove an object and its rows; returns the object as it was, with its surface.
+        """Remove an object and its rows; returns the former object with its surface.
 
         Raises ConflictError when a revision is given and the object has been written since.
         """
@@ -447,19 +449,19 @@ class Store(Protocol):
     ) -> MaybeMark:
         """Delete rows and write others, in one transaction.
 
-        Rows of a later revision than a given one stay, and so does what `accept_pair` has written.
-        The mark becomes `now` if it is `was`, and else, or without `now`, one that is new. Returns
-        what it became if it was `was`: then nobody else has written since that was read.
+        Rows of a later revision than a given one stay, as do the entries of `accept_pair`. If the
+        mark is `was`, it becomes `now`, or a new one without `now`, and is returned: nobody has
+        written since it was read. Otherwise it becomes a new one, and None is returned.
         """
 
     def accept_pair(self, a: int, b: int, because: str | None, shapes: str | None) -> None:
-        """Note why a pair is accepted, and the shapes of both; nothing if it has no row."""
+        """Store why a pair is accepted, and both shapes; no effect without a row of the pair."""
 
     def rules(self) -> tuple[Rule, ...]:
-        """What is decided about pairs; the first rule that reaches a pair counts."""
+        """Rules for pairs, in order; the first one matching a pair applies."""
 
     def change_rules(self, change: Callable[[tuple[Rule, ...]], Sequence[Rule]]) -> None:
-        """Replace all rules by what is made of them, in one transaction."""
+        """Replace all rules by `change` of them, in one transaction."""
 
     # -- statistics, cost figures, checks ----------------------------------------------------------
 
@@ -470,19 +472,19 @@ class Store(Protocol):
         """Equi-count histogram of all row keys, of R buckets."""
 
     def freshness(self, resolution: int) -> Freshness:
-        """How old the statistics are that `quantiles` uses at that resolution."""
+        """Age of the statistics of `quantiles` at this resolution."""
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Renew the statistics that `quantiles` uses; fresh ones are renewed only if `anew`."""
+        """Renew the statistics of `quantiles`; fresh ones only with `anew`."""
 
     def costs(self, machine: str) -> Mapping[str, float] | None:
-        """Figures that `save_costs` kept for that machine."""
+        """Cost figures of this machine, from `save_costs`; None without any."""
 
     def save_costs(self, machine: str, figures: Mapping[str, float]) -> None:
-        """Keep the fitted cost figures of a machine."""
+        """Store the fitted cost figures of a machine."""
 
     def findings(self) -> Iterator[str]:
-        """What is wrong with pages, indexes and kept statistics, a line each."""
+        """Faults of pages, indexes and stored statistics, a line each."""
 
 
 @runtime_checkable

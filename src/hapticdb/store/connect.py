@@ -1,4 +1,4 @@
-"""Opens, makes and copies environments by their URLs, and grants rights on them."""
+"""Opening, creating and copying environments by URL; rights on them."""
 
 import os
 
@@ -27,7 +27,8 @@ def create_store(
 ) -> Store:
     """Make a new environment; bricks need a hierarchical curve.
 
-    distances : whether imported parts get distances to their surfaces; None for a layout's own.
+    distances : whether imports compute distances to the parts' surfaces; None for the layout's
+    default.
     """
     if layout not in LAYOUTS:
         raise UsageError(f"layout {layout!r}: choose one of {', '.join(LAYOUTS)}")
@@ -37,15 +38,15 @@ def create_store(
 
 
 def exists(url: Url) -> bool:
-    """Whether something is there already, an environment or not."""
+    """Whether the file or schema exists, an environment or not."""
     return engine_of(url).exists(os.fspath(url))
 
 
 def grant(url: Url, role: str, right: Right) -> None:
-    """Give a role of the server one right on an environment; see `hapticdb.store.postgres.rights`.
+    """Grant one right on an environment to a role of the server: `store.postgres.rights`.
 
-    Raises `AccessError` for another user than the owner; `UsageError` when there is no such role,
-    when the role may do everything anyway, or when the engine has no roles.
+    Raises `AccessError` for a user other than the owner; `UsageError` for an unknown role, a role
+    with all rights anyway, or an engine without roles.
     """
     engine = engine_of(url)
     if not isinstance(engine, SupportsGrant):
@@ -65,15 +66,15 @@ def backup_environment(
 ) -> BackupReport:
     """Copy a whole SQLite environment as of one moment, while others read and write it.
 
-    file : path of the copy, an environment, too, which appears whole or not at all
-    replace : replace an environment that is there, and its log, unless somebody has it open: after
-        the copy is whole beside it. So a copy is put back, too.
+    file : path of the copy, an environment, too; created whole or not at all
+    replace : replace an existing environment and its log, unless it is open in any process, once
+        the new copy is whole beside it; this also restores a copy
     progress : called after each 4 MiB with the bytes done and in all
 
-    Raises `EnvironmentExistsError` when `file` is there and `replace` is false; `BusyError` when it
-    is open, unless by a reader that cannot write the folder; `NotAnEnvironmentError` when it is no
-    environment; `DamagedError`, and replaces nothing, when the copy is damaged; `UsageError` when
-    either is on PostgreSQL, or both are one file.
+    Raises `EnvironmentExistsError` when `file` exists and `replace` is false; `BusyError` when it
+    is open, except by a reader without write access to the folder; `NotAnEnvironmentError` when it
+    is no environment; `DamagedError`, and replaces nothing, when the copy is damaged; `UsageError`
+    when either is on PostgreSQL, or both are one file.
     """
     engine, other = engine_of(url), engine_of(file)
     if not isinstance(engine, SupportsBackup):

@@ -1,4 +1,4 @@
-"""Ranges of row keys that cover an object or a box."""
+"""Key ranges covering an object or a box."""
 
 from typing import NamedTuple
 
@@ -10,10 +10,10 @@ from hapticdb.kernels.query import grouping
 from hapticdb.store.base import Keys, Layout, Object, row_shift
 
 BOX_CUBES = 16
-"""Cubes along a box's longest edge: more give more ranges with fewer keys outside the box."""
+"""Cubes along a box's longest edge. More: more ranges, with fewer keys outside the box."""
 BAND_MARGIN = 5
-"""Voxels around an object's bounds in which its rows of distances lie: the half width of the band,
-a voxel for the centres beside a brick, and rounding."""
+"""Margin around an object's bounds for its rows of distances, voxels: half width of the band, one
+for the centres beside a brick, and rounding."""
 
 
 class Ranges(NamedTuple):
@@ -28,7 +28,7 @@ EVERYWHERE = Ranges(np.zeros(1, np.int64), np.full(1, np.iinfo(np.int64).max))
 
 
 def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
-    """Ranges of row keys over an object's bounds, a voxel wider; `BAND_MARGIN` with distances."""
+    """Key ranges over an object's bounds, a voxel wider; `BAND_MARGIN` with distances."""
     low, high = grid.voxels_of(obj.bounds)
     margin = BAND_MARGIN if obj.has_distances else 1
     return box_ranges(grid, layout, low - margin, high + margin)
@@ -37,7 +37,7 @@ def object_ranges(grid: Grid, layout: Layout, obj: Object) -> Ranges:
 def box_ranges(
     grid: Grid, layout: Layout, low: NDArray[np.int64], high: NDArray[np.int64]
 ) -> Ranges:
-    """Ranges of row keys that cover the voxels low (3,) to high (3,), cut to the grid."""
+    """Key ranges covering the voxels low (3,) to high (3,), clipped to the grid."""
     low = np.clip(low, 0, grid.side - 1)
     high = np.clip(high, 0, grid.side - 1)
     longest = int((high - low).max()) + 1

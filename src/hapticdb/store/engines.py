@@ -1,4 +1,4 @@
-"""Engines by the schemes of URLs, imported when first named: a verb on a file loads no driver."""
+"""Engines by URL scheme, imported on first use: a verb on a file loads no driver."""
 
 import os
 from importlib import import_module
@@ -11,7 +11,7 @@ from hapticdb.store.urls import redact, scheme_of
 
 Url = str | os.PathLike[str]
 Right = Literal["viewer", "toucher", "editor", "nobody"]
-"""Rights of a role: read and touch; also keep cost figures; also edit; nothing."""
+"""Rights of a role: read and query; also store cost figures; also edit; none."""
 
 
 class BackupReport(NamedTuple):
@@ -25,11 +25,11 @@ class BackupReport(NamedTuple):
 
 
 class Engine(Protocol):
-    """What an engine does with URLs, before a store is open.
+    """Operations of an engine on URLs, before a store is open.
 
-    URLs come as the user wrote them. Only the methods that say so connect to anything.
+    URLs are unchanged user input. All methods may connect.
 
-    title : its name in messages: ``PostgreSQL``.
+    title : name of the engine in messages: ``PostgreSQL``.
     """
 
     title: str
@@ -41,28 +41,28 @@ class Engine(Protocol):
         """
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        """Make a new environment; raises EnvironmentExistsError when something is there.
+        """Make a new environment; raises EnvironmentExistsError when the file or schema exists.
 
         distances : its `Store.wants_distances`; false on the layout voxel.
         """
 
     def exists(self, url: str) -> bool:
-        """Whether something is there already, an environment or not. May connect."""
+        """Whether the file or schema exists, an environment or not. May connect."""
 
 
 @runtime_checkable
 class SupportsGrant(Protocol):
-    """An engine that has users, and stores the rights of each."""
+    """An engine that has users, and enforces the rights of each."""
 
     def grant(self, url: str, role: str, right: Right) -> None:
-        """Give a role one right on an environment; it replaces the role's former one."""
+        """Grant one right on an environment to a role, instead of its former one."""
 
 
 class Lag(NamedTuple):
-    """How far a standby is behind its primary, as the standby states it.
+    """Lag of a standby behind its primary, by the standby's own figures.
 
     replayed : position in the primary's log; seconds : since the last replayed commit, None before
-    the first. They grow where nothing is written, too.
+    the first. It grows without writes, too.
     """
 
     replayed: str
@@ -71,18 +71,18 @@ class Lag(NamedTuple):
 
 @runtime_checkable
 class MayLag(Protocol):
-    """An opened store whose answers may come from a standby."""
+    """An opened store possibly served by a standby."""
 
     def lag(self) -> Lag | None:
-        """How far the server that answers is behind; None if it is no standby."""
+        """Lag of the server; None for a primary."""
 
 
 @runtime_checkable
 class DropsRows(Protocol):
-    """An opened store in which a crash may leave rows of an object that is not there."""
+    """An opened store in which a crash can leave orphan rows: rows without an object."""
 
     def drop_rows(self, object_id: int) -> None:
-        """Delete such rows; nothing if there is an object of that id."""
+        """Delete the orphan rows of an id; no effect if the object exists."""
 
 
 @runtime_checkable
@@ -96,7 +96,7 @@ class SupportsBackup(Protocol):
 
 
 FOLDERS = {"": "sqlite", "sqlite": "sqlite", "postgresql": "postgres", "postgres": "postgres"}
-"""Folder of an engine's modules, by the scheme of a URL; a path has no scheme."""
+"""Subpackage of an engine, by URL scheme; a path has no scheme."""
 
 
 def engine_of(url: Url) -> Engine:
@@ -104,7 +104,7 @@ def engine_of(url: Url) -> Engine:
 
     Raises `UsageError` for an unknown scheme; `MissingExtraError` without the engine's driver.
     """
-    # a Path object is a path, whatever its name looks like
+    # a Path object is a path, whatever its name
     scheme = scheme_of(url) if isinstance(url, str) else ""
     if scheme not in FOLDERS:
         raise unknown_scheme(scheme)
@@ -112,7 +112,7 @@ def engine_of(url: Url) -> Engine:
     if folder == "postgres":
         try:
             import_module("psycopg")
-        except ImportError as error:  # the driver is missing, or does not find its own library
+        except ImportError as error:  # the driver, or a library that it loads, is missing
             raise MissingExtraError(
                 f"{redact(os.fspath(url))} needs psycopg: install it with {pip_line('postgres')}"
             ) from error
@@ -120,7 +120,7 @@ def engine_of(url: Url) -> Engine:
 
 
 def unknown_scheme(scheme: str) -> UsageError:
-    """Build the error for a URL that no engine opens."""
+    """Build the error for a URL of no engine."""
     return UsageError(
         f"scheme {scheme!r}: give a path, sqlite:///path or postgresql://host/database"
     )

@@ -1,4 +1,4 @@
-"""Which objects a tool feels: those that words choose, without those that other words leave out."""
+"""Filters: the objects of a query, selected by `where` and `exclude`."""
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
@@ -13,13 +13,13 @@ from hapticdb.store.finding import MOST_IDS, Listing, Words, checked_words
 Key = TypeVar("Key")
 Value = TypeVar("Value")
 MOST_KEPT = 16
-"""Filters whose objects are kept for the next frame."""
+"""Filters in a cache, at most."""
 
 
 class Unfelt(NamedTuple):
-    """Objects of one revision that are not felt.
+    """Objects of one revision excluded from a query.
 
-    ids (E,) int64, ascending and distinct; missing : errors of the words that choose nothing.
+    ids (E,) int64, ascending and distinct; missing : errors of the words without a match.
     """
 
     ids: Keys
@@ -27,14 +27,14 @@ class Unfelt(NamedTuple):
 
 
 class Filter:
-    """Which objects are felt: those that `where` chooses, or all, without those of `exclude`.
+    """Selection of objects: those of `where`, or all without it, less those of `exclude`.
 
-    It holds words and no objects, and so applies to later objects, names and attributes, too.
+    A filter stores words and no objects, and so applies to later objects, names and attributes.
 
-    where, exclude : words of `hapticdb.store.finding.find_objects`, texts of digits as ids; all
-    objects if `where` has none; is_empty : every object is felt; is_fixed : by excluded ids alone.
+    where, exclude : words of `hapticdb.store.finding.find_objects`, texts of digits as ids;
+    is_empty : all objects are selected; is_fixed : excludes by ids alone.
 
-    Raises `UsageError` when a word is neither an int nor a text.
+    Raises `UsageError` for a word other than an int or a text.
     """
 
     def __init__(self, where: Words = (), exclude: Words = ()) -> None:
@@ -59,12 +59,12 @@ class Filter:
 
     @cached_property
     def fixed_ids(self) -> Keys:
-        """Ids (E,) to exclude of a filter that `is_fixed`, ascending and distinct."""
+        """Excluded ids (E,) of a filter with `is_fixed`, ascending and distinct."""
         ids = {i for i in self.exclude if isinstance(i, int) and 0 < i < MOST_IDS}
         return np.array(sorted(ids), dtype=np.int64)
 
     def left_out(self, objects: Sequence[Object], url: str) -> Unfelt:
-        """Objects not felt, of all of one revision, ascending by id, and words without a match."""
+        """Objects excluded from `objects`, all of one revision by id, and words without a match."""
         missing: list[ObjectNotFoundError] = []
         listing = Listing(objects, url)
         out = {obj.id for obj in _chosen(listing, "exclude", self.exclude, missing)}
@@ -74,7 +74,7 @@ class Filter:
         return Unfelt(np.array(sorted(out), dtype=np.int64), tuple(missing))
 
     def felt(self, objects: Sequence[Object], url: str) -> list[Object]:
-        """Objects that are felt; ObjectNotFoundError if a word chooses nothing. As `left_out`."""
+        """Selected objects, as `left_out`; ObjectNotFoundError for a word without a match."""
         left_out = self.left_out(objects, url)
         for error in left_out.missing:
             raise error
@@ -88,7 +88,7 @@ def _chosen(
     words: Iterable[int | str],
     missing: list[ObjectNotFoundError],
 ) -> list[Object]:
-    """Objects that words choose; the errors name the option."""
+    """Objects selected by words; the errors name the option."""
     errors: list[ObjectNotFoundError] = []
     found = listing.chosen(words, errors)
     missing.extend(ObjectNotFoundError(f"{option}: {error}") for error in errors)
@@ -98,7 +98,7 @@ def _chosen(
 NOTHING: Words = ()
 """No words."""
 ALL = Filter()
-"""The filter under which every object is felt."""
+"""The filter of all objects."""
 
 
 class FiltersOfWords:
@@ -108,7 +108,7 @@ class FiltersOfWords:
         self._filters: dict[tuple[tuple[object, ...], tuple[object, ...]], Filter] = {}
 
     def of(self, where: Words, exclude: Words) -> Filter:
-        """Filter of the words; the same one for the same words; UsageError as for `Filter`."""
+        """The filter of these words, cached; UsageError as for `Filter`."""
         if not isinstance(where, (tuple, list)) or not isinstance(exclude, (tuple, list)):
             return Filter(where, exclude)
         if not where and not exclude:
@@ -124,7 +124,7 @@ class FiltersOfWords:
 
 
 def keep_last(kept: dict[Key, Value], key: Key, value: Value) -> None:
-    """Keep a value under a new key; the oldest of more than `MOST_KEPT` is dropped."""
+    """Store a value under a new key; the oldest of more than `MOST_KEPT` is dropped."""
     kept[key] = value
     if len(kept) > MOST_KEPT:
         del kept[next(iter(kept))]

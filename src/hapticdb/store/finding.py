@@ -1,4 +1,4 @@
-"""Finds objects by ids, names, patterns and attributes."""
+"""Search for objects by ids, names, patterns and attributes."""
 
 import re
 import unicodedata
@@ -14,43 +14,43 @@ from hapticdb.store.base import Object
 from hapticdb.store.refusals import no_object
 
 MOST_IDS = 1 << 63
-"""All ids lie below this value: they are signed 64-bit integers in the databases."""
+"""Upper bound of ids: signed 64-bit integers in the databases."""
 
 NAME = "name="
-"""Before a word that is a name though it could be an id or something else."""
+"""Prefix of a name that reads as an id or an attribute."""
 
 Words = Iterable[int | str]
-"""Ids, names, patterns and ``attribute=value``, as `find_objects` reads them."""
+"""Ids, names, patterns and ``attribute=value``, as of `find_objects`."""
 
 
 class HasObjects(Protocol):
-    """What `find_objects` asks: a store, or an environment, which lists again only what is new."""
+    """Source of objects: a store, or an environment with its cache of objects."""
 
     @property
     def url(self) -> str:
-        """For messages."""
+        """URL for messages."""
 
     def objects(self) -> list[Object]:
         """All objects, ordered by id."""
 
     def object(self, object_id: int, /) -> Object:
-        """One object; raises ObjectNotFoundError when there is none of that id."""
+        """One object; raises ObjectNotFoundError for an unknown id."""
 
 
 def find_objects(store: HasObjects, words: Words) -> list[Object]:
-    """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
+    """Objects selected by ids, names, patterns and attributes, each once, ordered by id.
 
-    The store lists all objects once, and only if a word is no id. An int, or a text of digits, is
-    an id; ``3,4`` is several. Any other text, such as ``007``, is a name or a pattern as of
-    `fnmatch`; case counts. Names are paths, such as ``body/door/handle``: a text without ``/`` is
-    compared with every element of the path, one with ``/`` with the path from its beginning. A
-    sub-assembly chooses everything below it. Names are compared in Unicode's normal form C. A text
-    that is exactly a name is no pattern. A text that fits no name, but has ``=``, is
+    The store lists all objects once, and only for a word other than an id. An int, or a text of
+    digits, is an id; ``3,4`` is several. Any other text, such as ``007``, is a name or a pattern as
+    of `fnmatch`; case counts. Names are paths, such as ``body/door/handle``: a text without ``/``
+    is compared with every element of the path, one with ``/`` with the path from its beginning. A
+    sub-assembly selects everything below it. Names are compared in Unicode's normal form C. A text
+    equal to a name is no pattern. A text with ``=`` and without a matching name is
     ``attribute=value``: see `hapticdb.store.attributes.having_attribute`. ``name=3`` is a name,
-    too. A text with commas is several words, unless it chooses something as a whole.
+    too. A text with commas is several words, unless it matches as a whole.
 
-    Raises `ObjectNotFoundError` when a word chooses nothing; `UsageError` when a word is neither an
-    int nor a text.
+    Raises `ObjectNotFoundError` for a word without a match; `UsageError` for a word other than an
+    int or a text.
     """
     checked = checked_words(words)
     if all(isinstance(word, int) for word in checked):
@@ -70,9 +70,9 @@ class Listing:
     def chosen(
         self, words: Words, missing: list[ObjectNotFoundError] | None = None
     ) -> list[Object]:
-        """Objects that words choose, each once.
+        """Objects selected by words, each once.
 
-        missing : takes the errors of words without a match; without it, the first one is raised.
+        missing : receives the errors of words without a match; without it, the first one is raised.
         """
         errors: list[ObjectNotFoundError] = []
         found: set[int] = set()
@@ -97,7 +97,7 @@ class Listing:
             if len(pieces) == 1:
                 errors.append(_nothing_like(word, self._objects, self._url))
                 return []
-        elif len(pieces) == 1:  # too long for a number that Python reads
+        elif len(pieces) == 1:  # more digits than any id
             errors.append(ObjectNotFoundError(f"no object {word[:40]}... in {self._url}"))
             return []
         return [
@@ -115,7 +115,7 @@ class Listing:
 
 
 def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
-    """Words as ids and texts, texts of digits as ids; refuses anything else, named `what`."""
+    """Words as ids and texts, texts of digits as ids; UsageError naming `what` otherwise."""
     if isinstance(words, (str, bytes, bytearray, memoryview)) or not isinstance(words, Iterable):
         raise UsageError(f"{what} {words!r}: give ids, names and patterns in a list")
     checked: list[int | str] = []
@@ -132,7 +132,7 @@ def checked_words(words: Words, what: str = "objects") -> tuple[int | str, ...]:
 
 
 def _read(text: str) -> list[int | str]:
-    """Ids where a text is nothing else, such as ``3,4``; otherwise the text."""
+    """Ids of a text of ids alone, such as ``3,4``; otherwise the text."""
     pieces = [piece.strip() for piece in text.split(",")]
     if all(is_id(piece) and len(piece) <= len(str(MOST_IDS)) for piece in pieces):
         return [int(piece) for piece in pieces]
@@ -140,7 +140,7 @@ def _read(text: str) -> list[int | str]:
 
 
 def is_id(piece: str) -> bool:
-    """Whether a text is the id of an object; no id begins with a 0 that it does not need."""
+    """Whether a text is an object id: digits without leading zeros."""
     return piece.isascii() and piece.isdecimal() and (piece[0] != "0" or piece == "0")
 
 
@@ -151,7 +151,7 @@ def _object_of(store: HasObjects, object_id: int) -> Object:
 
 
 def _named_like(objects: Sequence[Object], pattern: str) -> list[Object]:
-    """Objects that a name or pattern chooses, by the rules of `find_objects`, in their order."""
+    """Objects matching a name or pattern, by the rules of `find_objects`, in their order."""
     pattern = composed(pattern.rstrip("/") or pattern)
     branches = [_branches(composed(obj.name), is_path="/" in pattern) for obj in objects]
     as_it_stands = [obj for obj, some in zip(objects, branches, strict=True) if pattern in some]
@@ -167,7 +167,7 @@ def composed(text: str) -> str:
 
 
 def _branches(name: str, *, is_path: bool) -> list[str]:
-    """Texts to compare a pattern with: a path's elements, or each beginning of the path."""
+    """Texts to match with a pattern: a path's elements, or each beginning of the path."""
     elements = name.split("/")
     if not is_path:
         return elements
@@ -175,7 +175,7 @@ def _branches(name: str, *, is_path: bool) -> list[str]:
 
 
 def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFoundError:
-    """Build the error for a name or pattern that fits nothing."""
+    """Build the error for a name or pattern without a match."""
     folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
     names = {obj.id: obj.name for obj in objects}
     if alike := _named_like(folded, word.casefold()):

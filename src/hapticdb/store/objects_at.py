@@ -1,4 +1,4 @@
-"""Which objects are in given voxels, exactly, by queries of the store."""
+"""Exact object ids of given voxels, by queries of the store."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,10 +25,10 @@ def ids_of_voxels(store: Store, keys: Keys, exclude: Keys) -> NDArray[np.int64]:
 
 
 def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> NDArray[np.int64]:
-    """Ids of the objects whose surface is near the centres of voxels (n,), distinct and ascending.
+    """Ids of the objects with a surface near the centres of voxels (n,), distinct, ascending.
 
-    Near is at most `within` voxels and the half width of the band; an object in a voxel counts,
-    too. Every object must have distances. Otherwise as `ids_of_voxels`.
+    Near: within the lesser of `within` voxels and the half width of the band, or in a voxel itself.
+    Every object must have distances. Otherwise as `ids_of_voxels`.
     """
     bricks, inverse = np.unique(keys >> BRICK_SHIFT, return_inverse=True)
     rows = store.lookup(bricks, distances=True)
@@ -47,7 +47,7 @@ def ids_near_voxels(store: Store, keys: Keys, exclude: Keys, within: float) -> N
 
 
 def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """Every brick (n,) with every row of it, (P,): index in `bricks`, and index of the row."""
+    """Every brick (n,) with each of its rows, (P,): index in `bricks`, and index of the row."""
     first = np.searchsorted(rows.keys, bricks)
     last = np.searchsorted(rows.keys, bricks, side="right")
     brick = np.repeat(np.arange(len(bricks)), last - first)
@@ -56,7 +56,7 @@ def _rows_of_bricks(rows: Rows, bricks: Keys) -> tuple[NDArray[np.int64], NDArra
 
 
 def _is_in_voxel(store: Store, rows: Rows, row: NDArray[np.int64], keys: Keys) -> NDArray[np.bool_]:
-    """Whether the brick of rows (P,), given by their indices, holds the voxel of each key (P,)."""
+    """Whether the bricks of rows (P,), given by index, contain the voxels of keys (P,)."""
     if store.grid.curve == "z":
         bit = keys & ((1 << BRICK_SHIFT) - 1)
     else:

@@ -1,4 +1,4 @@
-"""Pairs of objects as the table `pair` keeps them, and what a store does with them."""
+"""Rows of the table `pair`, rules, and summary rows of objects."""
 
 import os
 from collections.abc import Callable, Container, Iterator, Sequence
@@ -15,12 +15,12 @@ STATUSES: tuple[Status, ...] = get_args(Status)
 SAYS: tuple[Says, ...] = get_args(Says)
 
 COLUMNS = "a, b, kind, at_least, at_most, a_x, a_y, a_z, b_x, b_y, b_z, status, revision, setting"
-"""Columns of the table `pair` that a measurement writes."""
+"""Columns of the table `pair` written by a measurement."""
 ALL = f"SELECT {COLUMNS}, because, shapes FROM pair ORDER BY a, b"
 A, B, KIND, SETTING, BECAUSE = map(
     [*COLUMNS.split(", "), "because"].index, ("a", "b", "kind", "setting", "because")
 )
-"""Places of columns in a row of `ALL` as the engine gives it."""
+"""Indices of columns in a row of `ALL`."""
 PUT = f"""
 INSERT INTO pair ({COLUMNS}) {{values}}
     ON CONFLICT (a, b) DO UPDATE
@@ -29,22 +29,22 @@ INSERT INTO pair ({COLUMNS}) {{values}}
        b_y = excluded.b_y, b_z = excluded.b_z, status = excluded.status,
        revision = excluded.revision, setting = excluded.setting
  WHERE excluded.revision >= pair.revision"""
-"""Writes rows, given as each engine gives values."""
+"""Writes rows; `values` in an engine's own form."""
 COUNT = "UPDATE pair SET at_least = (SELECT count(*) - 1 FROM pair) WHERE (a, b) = (%s, %s)"
-"""Notes in the mark's row how many other rows there are."""
+"""Stores the number of other rows in the mark's row."""
 HELD = "SELECT setting, revision FROM pair WHERE (a, b) = (%s, %s)"
 MARK = (0, 1)
-"""Key of the row that is no pair but the mark. No object has the id 0."""
+"""Key of the mark's row, which is no pair. No object has the id 0."""
 
 
 class PairRow(NamedTuple):
-    """What was found about two objects.
+    """Result of the narrow phase for two objects.
 
     a, b : ids, the lesser one first; kind : ``far`` beyond the distance of the search; at_least,
-    at_most : metres, of the gap, or of the depth of an overlap, at_most None without a bound;
-    place : x, y, z on a, then on b, metres, world frame; status : since the last complete search;
-    revision : of the environment that was read; setting : of the search; because, shapes : why the
-    pair is accepted, and both digests then, or None.
+    at_most : metres, of the gap, or of the penetration depth, at_most None without a bound; place :
+    x, y, z on a, then on b, metres, world frame; status : since the last complete search;
+    revision : of the environment read; setting : of the search; because, shapes : reason of an
+    accepted pair, and both digests then, or None.
     """
 
     a: int
@@ -66,10 +66,10 @@ class PairRow(NamedTuple):
 
 
 class Rule(NamedTuple):
-    """Decision about pairs, by the words of their objects (`store.finding`).
+    """Rule for pairs, by the words of their objects (`store.finding`).
 
-    one, other : words, a comma between several; kinds : that are meant; length : metres, the
-    greatest depth that is meant, None for any, or the clearance; because : why, may be empty.
+    one, other : words, a comma between several; kinds : the accepted ones; length : metres, the
+    greatest accepted depth, None for any, or the clearance; because : reason, may be empty.
     """
 
     one: str
@@ -81,10 +81,10 @@ class Rule(NamedTuple):
 
 
 class Mark(NamedTuple):
-    """State of the table, so that a search need not look at pairs of unchanged objects again.
+    """State of the table, so that a search can skip pairs of unchanged objects.
 
-    After a search of everything, alone from its reading to its end: the setting and the revision
-    of all pairs of near boxes. Otherwise a setting that nobody has given.
+    After a search of everything, without other writes from its reading to its end: the setting and
+    revision of all pairs of near boxes. Otherwise a random setting.
     """
 
     setting: str = ""
@@ -94,7 +94,7 @@ class Mark(NamedTuple):
     def after(
         cls, found: Sequence[tuple[str, int]], was: "MaybeMark", now: "MaybeMark"
     ) -> tuple["MaybeMark", PairRow]:
-        """What `put_pairs` returns, and the row that it writes; found : the mark's row, or none."""
+        """Result of `put_pairs`, and its row of the mark; found : the present row, or none."""
         held = cls(*found[0]) if found else cls()
         mark = now if now is not None and held == was else cls(f"written {os.urandom(8).hex()}")
         row = PairRow(*MARK, Kind.FAR, 0.0, None, (0.0,) * 6, "same", mark.revision, mark.setting)
@@ -107,10 +107,10 @@ Ids = Sequence[tuple[int, int]]
 
 
 class KeptPairs:
-    """Rows of the table, read together, and each checked when it is used.
+    """Rows of the table from one read, each checked on use.
 
-    rows : as the engine gave them, by a and b: `COLUMNS`, because and shapes; checked : makes a
-    `PairRow` of one, or raises `DamagedError`.
+    rows : from the engine, by a and b: `COLUMNS`, because and shapes; checked : converts one to a
+    `PairRow`, or raises `DamagedError`.
     """
 
     def __init__(
@@ -123,9 +123,9 @@ class KeptPairs:
         self._n_marked = 0 if row is None else row.at_least
 
     def fit(self, setting: str) -> bool:
-        """Whether rows are as the mark's writer left them: so many, of that setting or accepted.
+        """Whether the rows are unchanged since the mark: same number, same setting or accepted.
 
-        Programs that know of no mark, and people, write without changing it.
+        Programs without marks, and people, write without changing it.
         """
         return self._n_marked == len(self.rows) and all(
             row[SETTING] == setting or row[BECAUSE] is not None for row in self.rows
@@ -135,18 +135,18 @@ class KeptPairs:
         return map(self._checked, self.rows)
 
     def parted(self, ids: Container[int]) -> tuple["KeptPairs", "KeptPairs"]:
-        """Rows of pairs that one of these objects is in, and the other rows."""
+        """Rows of pairs with one of these objects, and the other rows."""
         some = [row for row in self.rows if row[A] in ids or row[B] in ids]
         others = [row for row in self.rows if row[A] not in ids and row[B] not in ids]
         return KeptPairs(some, self._checked), KeptPairs(others, self._checked)
 
     def none(self) -> "KeptPairs":
-        """No rows."""
+        """The same without rows."""
         return KeptPairs((), self._checked)
 
 
 class Outlines(NamedTuple):
-    """What is short of O objects: names, digests, ids and revisions (O,), bounds (O, 2, 3)."""
+    """Summary rows of O objects: ids and revisions (O,), bounds (O, 2, 3) in metres."""
 
     names: Sequence[str]
     digests: Sequence[str]

@@ -1,7 +1,7 @@
-"""Checks of everything that is read from an environment's tables, the same for every engine.
+"""Validation of all values from an environment's tables, common to all engines.
 
-An environment may be damaged, or made by somebody who means harm. Every value, apart from the rows
-of the index, gets the right type within its bounds here, or a DamagedError that names the place.
+An environment may be damaged or malicious. Every value, apart from the rows of the index, gets the
+right type within its bounds here, or a DamagedError with its location.
 """
 
 import contextlib
@@ -34,33 +34,33 @@ from hapticdb.store.refusals import made_before
 from hapticdb.verdicts import Kind
 
 KEY_END = 1 << 63
-"""One above the largest count or key that an int64 holds."""
+"""Upper bound of counts and keys: int64."""
 ROWS_CRC = "rows_crc"
-"""Name under which the checksum of an object's rows is stored among its attributes."""
+"""Attribute with the checksum of an object's rows."""
 DISTANCES_CRC = "distances_crc"
-"""Name under which the checksum of an object's distances is stored among its attributes."""
+"""Attribute with the checksum of an object's distances."""
 CHECKSUMS = (ROWS_CRC, DISTANCES_CRC)
 ACTIONS = ("add", "move", "remove")
-"""Actions that a row of `change` may have."""
+"""Actions in a row of `change`."""
 TABLES = (
     "brick", "change", "cost", "environment", "object", "pair", "quantile", "removed", "rule",
     "surface", "voxel",
 )  # fmt: skip
-"""Tables that every environment has."""
+"""Tables of every environment."""
 NO_VOXEL = bytes(8)
-"""Packed occupancy of a brick that holds no voxel of the object, which the tables leave out."""
+"""Packed occupancy of a brick without a voxel of the object, left out in the tables."""
 Floats = NDArray[np.float64]
 
 
 def damaged(url: str, cause: str) -> DamagedError:
-    """Build the error for an environment whose contents are broken."""
+    """Build the error for an environment with broken contents."""
     return DamagedError(f"{url} is damaged ({cause}): restore a copy or import the files again")
 
 
 class Checksum:
     """CRC-32 of an object's keys, and of its bricks or distances, over its rows in order of keys.
 
-    With distances, keys and lengths count as pairs, so that no byte can pass to the next row.
+    With distances, keys and lengths count as pairs, so no byte can move to the next row.
     """
 
     __slots__ = ("_contents", "_keys")
@@ -69,7 +69,7 @@ class Checksum:
         self._keys = self._contents = 0
 
     def add(self, rows: Rows) -> None:
-        """Add the next rows: their distances, or else their bricks."""
+        """Add the next rows: their distances, or without any their bricks."""
         keys, contents = rows.keys, rows.occupancy
         if rows.distances is not None:
             keys = np.stack([keys, rows.distances.lengths], axis=1)
@@ -79,7 +79,7 @@ class Checksum:
             self._contents = zlib.crc32(np.ascontiguousarray(contents).data, self._contents)
 
     def value(self) -> int:
-        """The checksum of all rows so far."""
+        """Checksum of all rows so far: CRC of the keys << 32 | CRC of the contents."""
         return self._keys << 32 | self._contents
 
 
@@ -96,7 +96,7 @@ def distances_crc(rows: Rows) -> int | None:
 
 
 def attributes_text(record: Object, rows: Rows) -> str:
-    """An object's attributes as JSON, with the checksums of its rows among them."""
+    """An object's attributes as JSON, with the checksums of its rows."""
     kept = {**record.attributes, ROWS_CRC: f"{rows_crc(rows.occupied()):016x}"}
     kept.pop(DISTANCES_CRC, None)
     crc = distances_crc(rows)
@@ -106,13 +106,13 @@ def attributes_text(record: Object, rows: Rows) -> str:
 
 
 def check_lengths(url: str, most: int) -> None:
-    """Refuse rows of distances if the most bytes of a row cannot be."""
+    """Refuse rows of distances of more bytes than `LONGEST_BAND`."""
     if most > LONGEST_BAND:
         raise damaged(url, "distances of the wrong length")
 
 
 def band_of(url: str, packed: bytes, lengths: NDArray[np.int64]) -> Band:
-    """Packed distances that were read, and the bytes of each row."""
+    """Packed distances from a read, with the bytes of each row; DamagedError if they differ."""
     check_lengths(url, lengths.max(initial=0))
     ends = np.cumsum(lengths)
     if len(packed) != (int(ends[-1]) if len(ends) else 0):
@@ -121,7 +121,7 @@ def band_of(url: str, packed: bytes, lengths: NDArray[np.int64]) -> Band:
 
 
 def bricks_of(url: str, packed: bytes, count: int) -> NDArray[np.uint8]:
-    """Occupancy of bricks that were read, packed one after the other."""
+    """Occupancy of bricks from their packed concatenation."""
     try:
         return occupancy.unpack(packed, count)
     except ValueError as error:
@@ -129,7 +129,7 @@ def bricks_of(url: str, packed: bytes, count: int) -> NDArray[np.uint8]:
 
 
 def fields_of(rows: Rows) -> Iterator[tuple[bytes | None, bytes | None]]:
-    """Occupancy and distances of bricks as tables hold them: packed, None where there are none."""
+    """Fields of bricks for the tables: packed occupancy and distances, None without any."""
     bricks = occupancy.pack(rows.occupancy)
     if rows.distances is None:
         return zip(_pieces(*bricks), repeat(None))
@@ -143,7 +143,7 @@ def _pieces(data: NDArray[np.uint8], ends: NDArray[np.int64]) -> Iterator[bytes 
 
 
 def wish_of(url: str, stored: object) -> bool:
-    """Whether an environment wants distances, from a number 0 or 1, or a boolean."""
+    """Whether imports compute distances, from a number 0 or 1, or a boolean."""
     if stored not in {0, 1}:
         raise damaged(url, "whether it wants distances is neither yes nor no")
     return bool(stored)
@@ -171,7 +171,7 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
 
     kinds : ``table``, or another kind of object, by name.
     """
-    if "band" in kinds:  # distances had a table of their own
+    if "band" in kinds:  # an older format: distances had a table
         raise made_before(url)
     for name in TABLES:
         kind = kinds.get(name)
@@ -182,7 +182,7 @@ def check_tables(url: str, kinds: Mapping[str, str]) -> None:
 
 
 def object_of(url: str, row: Sequence[Any]) -> Object:
-    """Read an object: id, name, link, digest, transform, voxels, bounds, attributes, revision.
+    """Parse an object: id, name, link, digest, transform, voxels, bounds, attributes, revision.
 
     Arrays of doubles are little-endian bytes or a list.
     """
@@ -222,11 +222,11 @@ def object_of(url: str, row: Sequence[Any]) -> Object:
 
 
 def outlines_of(url: str, rows: Sequence[Sequence[Any]]) -> Outlines:
-    """Read what is short of objects: name, digest, id, revision, bounds as bytes or as a list."""
+    """Parse summary rows: name, digest, id, revision, bounds as bytes or as a list."""
     names, digests, ids, revisions, bounds = zip(*rows, strict=True) if rows else ((),) * 5
     try:
         if set(map(type, (*ids, *revisions))) - {int} or set(map(type, (*names, *digests))) - {str}:
-            raise TypeError  # noqa: TRY301 - told below
+            raise TypeError  # noqa: TRY301 - caught below
         numbers = np.array((ids, revisions), dtype=np.int64)
         if set(map(type, bounds)) == {bytes} and set(map(len, bounds)) == {48}:
             boxes = np.frombuffer(b"".join(bounds), dtype="<f8")
@@ -234,14 +234,14 @@ def outlines_of(url: str, rows: Sequence[Sequence[Any]]) -> Outlines:
             boxes = np.array(bounds, dtype=np.float64)
         boxes = boxes.reshape(-1, 2, 3)
         if not (boxes[:, 0] <= boxes[:, 1]).all() or not np.isfinite(boxes).all():
-            raise ValueError  # noqa: TRY301 - told below
+            raise ValueError  # noqa: TRY301 - caught below
     except (TypeError, ValueError, OverflowError):
         raise damaged(url, "names, digests, ids, revisions or bounds of its objects") from None
     return Outlines(names, digests, numbers[0], numbers[1], boxes)
 
 
 def change_of(url: str, row: Sequence[Any]) -> Change:
-    """Read a committed write from (revision, action, id, ranges); ranges as bytes or as a list."""
+    """Parse a committed write (revision, action, id, ranges); ranges as bytes or as a list."""
     revision, action, object_id, ranges = row
     place = f"change {revision!s:.40}"
     if not _is_count(revision) or not _is_count(object_id) or action not in ACTIONS:
@@ -253,7 +253,7 @@ def change_of(url: str, row: Sequence[Any]) -> Change:
 
 
 def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
-    """Read packed surfaces (digest, geometry); `hapticdb.mesh.packing` judges what they hold."""
+    """Parse packed surfaces (digest, geometry); `hapticdb.mesh.packing` validates the bytes."""
     found = {}
     for digest, geometry in rows:
         if not (isinstance(digest, str) and isinstance(geometry, bytes)):
@@ -263,7 +263,7 @@ def surfaces_of(url: str, rows: Iterable[Sequence[Any]]) -> dict[str, bytes]:
 
 
 def pair_of(url: str, row: Sequence[Any]) -> PairRow:
-    """Read a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
+    """Parse a pair: a, b, kind, at_least, at_most, its place, status, revision, ..., shapes."""
     a, b, kind, at_least, at_most, *place, status, revision, setting, because, shapes = row
     try:
         is_sound = math.isfinite(at_least + (at_most or 0.0) + sum(place))
@@ -287,7 +287,7 @@ def pair_of(url: str, row: Sequence[Any]) -> PairRow:
 
 
 def rule_of(url: str, row: Sequence[Any]) -> Rule:
-    """Read a rule: one, other, says, kinds, length, because."""
+    """Parse a rule: one, other, says, kinds, length, because."""
     one, other, says, kinds, length, because = row
     try:
         named = tuple(Kind(kind) for kind in kinds.split(",") if kind)
@@ -306,7 +306,7 @@ def rule_of(url: str, row: Sequence[Any]) -> Rule:
 
 
 def digests_of(url: str, rows: Iterable[Sequence[Any]]) -> set[str]:
-    """Read the digests (digest,) of surfaces."""
+    """Parse the digests (digest,) of surfaces."""
     found = {row[0] for row in rows}
     if not all(isinstance(digest, str) for digest in found):
         raise damaged(url, "a surface whose digest is no text")
@@ -314,7 +314,7 @@ def digests_of(url: str, rows: Iterable[Sequence[Any]]) -> set[str]:
 
 
 def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
-    """Read a kept histogram; bounds as bytes or as a list."""
+    """Parse a stored histogram; bounds as bytes or as a list."""
     keys = _int64s(bounds)
     if keys is None or len(keys) < 2 or (np.diff(keys) < 0).any() or not _is_count(n_rows):
         raise damaged(
@@ -324,7 +324,7 @@ def histogram_of(url: str, bounds: object, n_rows: object) -> Histogram:
 
 
 def figures_of(url: str, text: object) -> Mapping[str, float]:
-    """Read the kept figures of a cost model: finite numbers by name."""
+    """Parse the stored figures of a cost model: finite numbers by name."""
     figures = _json_of(text)
     if figures is None or not all(_is_finite(value) for value in figures.values()):
         raise damaged(url, "kept costs that are no numbers; 'hapticdb info --calibrate' renews")
@@ -334,7 +334,7 @@ def figures_of(url: str, text: object) -> Mapping[str, float]:
 def findings_of_kept(
     url: str, histograms: Iterable[Sequence[Any]], costs: Iterable[Sequence[Any]]
 ) -> Iterator[str]:
-    """What is wrong with kept histograms (bounds, n_rows) and cost figures (text,)."""
+    """Faults of stored histograms (bounds, n_rows) and cost figures (text,), a line each."""
     for row in histograms:
         with contextlib.suppress(DamagedError):
             histogram_of(url, *row)
@@ -348,7 +348,7 @@ def findings_of_kept(
 
 
 def number_of(url: str, value: object, what: str) -> int:
-    """Read a count, such as a revision."""
+    """Parse a count, such as a revision."""
     if not _is_count(value):
         raise damaged(url, f"{what} is no count")
     return cast("int", value)
@@ -363,12 +363,12 @@ def _is_finite(value: object) -> bool:
 
 
 def _doubles(stored: object, count: int) -> Floats | None:
-    """That many finite float64, from bytes or a list of numbers; None for anything else."""
+    """Finite float64 of this count, from bytes or a list of numbers; None for anything else."""
     if isinstance(stored, bytes) and len(stored) == 8 * count:
         found = np.frombuffer(stored, dtype="<f8")
     elif isinstance(stored, list) and all(_is_finite(value) for value in stored):
         found = np.array(stored, dtype=np.float64)
-        found.flags.writeable = False  # of an object that many share
+        found.flags.writeable = False  # of a shared object
     else:
         return None
     return found if len(found) == count and np.isfinite(found).all() else None
@@ -384,7 +384,7 @@ def _int64s(stored: object) -> Keys | None:
 
 
 def _json_of(stored: object) -> dict[str, Any] | None:
-    """JSON object in a text, or None if the text holds none."""
+    """JSON object of a text; None for anything else."""
     if not isinstance(stored, str):
         return None
     try:

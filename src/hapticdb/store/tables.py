@@ -1,4 +1,7 @@
-"""An environment in tables of SQL: what the engines have in common. Parameters are ``%s``."""
+"""Statements and writes on an environment's SQL tables, common to the engines.
+
+Parameters are ``%s``.
+"""
 
 import json
 from abc import ABC, abstractmethod
@@ -45,7 +48,7 @@ from hapticdb.store.refusals import check_unwritten, no_object, present_already
 
 Result = TypeVar("Result")
 Form = Literal["lookup", "lookup_one", "scan", "rows_of", "after"]
-"""Ways to ask for rows: as the methods of `Tables`; `lookup_one`, a statement a key."""
+"""Queries for rows, named as the methods of `Tables`; `lookup_one`: a statement a key."""
 
 INSERT_OBJECT = """
 INSERT INTO object (id, name, link, digest, transform, voxels, bounds, attributes, revision)
@@ -54,7 +57,7 @@ UPDATE_OBJECT = """
 UPDATE object SET digest = %s, transform = %s, voxels = %s, bounds = %s, attributes = %s,
        revision = %s
  WHERE id = %s"""
-# asked before the bytes are sent
+# before the bytes are sent
 LACKS_SURFACE = "SELECT NOT EXISTS (SELECT 1 FROM surface WHERE digest = %s)"
 DROP_SURFACE = """
 DELETE FROM surface
@@ -70,7 +73,7 @@ INSERT INTO cost VALUES (%s, %s) ON CONFLICT (machine) DO UPDATE SET figures = e
 
 
 def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int64]:
-    """Ranges of voxel keys (C, 2) that a write of these rows touched, as `Change` holds them.
+    """Ranges of voxel keys (C, 2) touched by a write of these rows, for `Change`.
 
     Rounded outwards to cells; in lexicographic order to slabs, each of all voxels of one i.
     """
@@ -82,7 +85,7 @@ def touched_ranges(grid: Grid, layout: Layout, row_keys: Keys) -> NDArray[np.int
 
 
 class _Connection(Protocol):
-    """What the connection of any engine does."""
+    """Connection of any engine."""
 
     is_read_only: bool
 
@@ -91,19 +94,19 @@ class _Connection(Protocol):
 
 
 class Tables(ABC):
-    """The tables of one environment: objects, changes, surfaces, pairs, kept statistics, writes.
+    """The tables of one environment: objects, changes, surfaces, pairs, statistics, writes.
 
     A subclass runs statements, and reads and writes the tables of rows; attributes as of `Store`.
     """
 
     AMONG: ClassVar[str]
-    """Condition that an id is in a JSON list."""
+    """Condition: id in a JSON list."""
     LISTED: ClassVar[str]
-    """Query of the texts in a JSON list."""
+    """Query: texts of a JSON list."""
     AS_TEXT: ClassVar[str]
-    """What makes text of a column of JSON."""
+    """Suffix: column of JSON as text."""
     TAKEN: ClassVar[type[Exception]]
-    """The driver's error where an object has this link and name already."""
+    """Driver's error for a second object of this link and name."""
 
     url: str
     grid: Grid
@@ -120,15 +123,15 @@ class Tables(ABC):
     def _rows(
         self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
     ) -> list[Any]:
-        """Rows of a statement that reads; binary : whether as the engine holds them, if faster."""
+        """Rows of a reading statement; binary : in the engine's own format, if faster."""
 
     @abstractmethod
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
-        """Rows, as a form of question finds them: none for no keys, or without their table."""
+        """Rows of a query; none for no keys."""
 
     @abstractmethod
     def _do(self, text: str, parameters: Sequence[Any] = ()) -> list[Any]:
-        """One statement of a write; its rows, where it returns some."""
+        """Run one statement of a write; returns its rows, if any."""
 
     @abstractmethod
     def _save(self, text: str, parameters: Sequence[Any] = ()) -> None:
@@ -136,27 +139,27 @@ class Tables(ABC):
 
     @abstractmethod
     def _alone(self, work: Callable[[], Result]) -> Result:
-        """Do what makes no revision, in one transaction that holds the write lock."""
+        """Run `work`, without a new revision, in one transaction with the write lock."""
 
     @abstractmethod
     def _commit(self, work: Callable[[], Result]) -> Result:
-        """Do a write in one transaction; `work` begins with `_next_revision`."""
+        """Run a write in one transaction; `work` begins with `_next_revision`."""
 
     @abstractmethod
     def _next_revision(self) -> int:
-        """Number of the revision that this write makes."""
+        """Revision of this write."""
 
     @abstractmethod
     def _new_id(self, revision: int) -> int | None:
-        """Id of a new object; None where the table itself gives it."""
+        """Id of a new object; None if the table assigns it."""
 
     @abstractmethod
     def _packed(self, values: NDArray[Any]) -> object:
-        """Numbers of any shape as the engine's columns hold them."""
+        """Numbers of any shape in the format of the engine's columns."""
 
     @abstractmethod
     def _put(self, rows: Rows, object_id: int) -> None:
-        """Write the rows of an object that has none."""
+        """Write the rows of an object without rows."""
 
     @abstractmethod
     def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
@@ -168,7 +171,7 @@ class Tables(ABC):
 
     @abstractmethod
     def _exchange_pairs(self, gone: Ids, rows: Sequence[PairRow]) -> None:
-        """Delete rows of the table `pair`, and write others unless a later revision's are there."""
+        """Delete rows of the table `pair`, and write others, except over a later revision's."""
 
     @abstractmethod
     def _exact(self, resolution: int) -> tuple[Keys, int]:
@@ -208,7 +211,7 @@ class Tables(ABC):
     def objects(self, ids: Collection[int] | None = None) -> list[Object]:
         if ids is not None:
             return self._objects(self.AMONG, json.dumps(list(ids)))
-        self.revision()  # first: a write between the two statements is noticed by the next read
+        self.revision()  # first: the next read notices a write between the two statements
         return self._objects("TRUE")
 
     def object(self, object_id: int) -> Object:
@@ -282,7 +285,7 @@ class Tables(ABC):
 
     def replace_all(self, made: Replacements) -> None:
         def work() -> None:
-            revision = self._next_revision()  # locks, so that nobody writes what `made` reads
+            revision = self._next_revision()  # locks, so nobody writes what `made` reads
             for n, (record, rows) in enumerate(made()):
                 revision = self._next_revision() if n else revision
                 self._exchange(revision, record, rows)
@@ -364,23 +367,23 @@ class Tables(ABC):
         )
 
     def _put_surface(self, digest: str, surface: bytes | None) -> None:
-        """Write a surface, unless there is one of that digest."""
+        """Write a surface, unless its digest has one."""
         if surface is not None and self._do(LACKS_SURFACE, (digest,)) == [(True,)]:
             self._do("INSERT INTO surface VALUES (%s, %s)", (digest, surface))
 
     def _drop_surface(self, digest: str) -> None:
-        """Delete a surface that no object has any more."""
+        """Delete a surface without objects."""
         self._do(DROP_SURFACE, (digest, digest))
 
     def _log(self, revision: int, action: str, object_id: int, row_keys: Keys) -> None:
-        """Record which keys a write touched."""
+        """Record the keys touched by a write."""
         ranges = touched_ranges(self.grid, self.layout, row_keys)
         self._note((revision, action, object_id, self._packed(ranges)))
 
     # -- statistics ------------------------------------------------------------------------------
 
     def quantiles(self, resolution: int) -> Histogram:
-        """The kept one while no object was written since, else by a scan of the whole index."""
+        """The stored one while no object was written since, else from a scan of the whole index."""
         kept = self._rows(
             "SELECT bounds, n_rows FROM quantile WHERE resolution = %s AND bounds IS NOT NULL"
             f" AND revision = {LAST_REVISION}",
@@ -396,7 +399,7 @@ class Tables(ABC):
         return Freshness(made, int(revision) - int(made or 0))
 
     def analyze(self, resolution: int, *, anew: bool = False) -> None:
-        """Compute and keep a histogram, unless a fresh one is kept."""
+        """Compute and store a histogram, unless a fresh one is stored."""
         freshness = self.freshness(resolution)
         if anew or freshness.revision is None or freshness.changes:
             revision, n_rows, bounds = self._measured(resolution)
@@ -404,7 +407,7 @@ class Tables(ABC):
             self._save(KEEP_HISTOGRAM, (resolution, revision, n_rows, told))
 
     def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
-        """Revision, rows and bounds of a new histogram; None for statistics kept elsewhere."""
+        """Revision, rows and bounds of a new histogram; None for statistics of the server."""
         with self.snapshot():
             revision = self.revision()
             bounds, n_rows = self._exact(resolution)

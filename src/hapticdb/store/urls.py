@@ -1,4 +1,4 @@
-"""URLs of environments: their scheme, and secrets that are never shown."""
+"""URLs of environments: schemes, redaction of secrets."""
 
 import re
 from urllib.parse import quote, unquote
@@ -6,12 +6,12 @@ from urllib.parse import quote, unquote
 from hapticdb.errors import UsageError
 
 SECRET = re.compile(r"password|secret|passphrase|token|scram", re.IGNORECASE)
-"""Names of parameters whose values are not shown."""
+"""Parameters with secret values."""
 PARTITIONS = "partitions"
-"""Parameter that names the servers of the rows of an environment that is to be made."""
+"""Parameter with the servers for the rows of a new environment."""
 PASSWORD = re.compile(r"(?P<user>\w+://[^:/?@\[]*):(?P<password>.*)@", re.DOTALL)
 PORTS = re.compile(r"\d*(?:,[^@/?]*)?(?:/[^@?]*)?\?(?:.*&)?[a-z_]+=")
-"""Text that begins with a port and not with a password: host:5432/database?user=me@there."""
+"""A port and not a password after the colon: host:5432/database?user=me@there."""
 
 
 def scheme_of(url: str) -> str:
@@ -21,7 +21,7 @@ def scheme_of(url: str) -> str:
 
 
 def redact(url: str) -> str:
-    """Hide the passwords of a URL, up to the last @, and its partitions, which have some, too."""
+    """URL without its passwords, up to the last @, and its partitions, which have some, too."""
     if "://" not in url:
         return url
     secret = PASSWORD.match(url)
@@ -37,7 +37,7 @@ def redact(url: str) -> str:
 
 
 def with_partitions(url: str, servers: str) -> str:
-    """URL of a new environment whose rows get onto servers, hosts or URLs with commas between."""
+    """URL of a new environment with its rows on servers: hosts or URLs with commas between."""
     if scheme_of(url) not in {"postgresql", "postgres"}:
         raise UsageError(f"{redact(url)}: only environments on PostgreSQL have partitions")
     named = ",".join(quote(one.strip(), safe="") for one in servers.split(","))

@@ -1,1 +1,1 @@
-"""PostgreSQL through psycopg 3: the engine for many people at once. Needs the extra `postgres`."""
+"""PostgreSQL through psycopg 3: the engine for many clients. Needs the extra `postgres`."""

@@ -1,8 +1,8 @@
-"""URLs of environments on PostgreSQL: which server, which database, which environment in it.
+"""URLs of environments on PostgreSQL: server, database, environment.
 
 ``postgresql://user@host:port/database?environment=NAME``, with libpq's parameters, TLS among them.
-An environment is a schema, `hapticdb` unless named. ``?partitions=A,B`` names the servers of the
-rows of an environment that is to be made (`hapticdb.store.postgres.partitions`).
+An environment is a schema, `hapticdb` unless named. ``?partitions=A,B`` names the servers for the
+rows of a new environment (`hapticdb.store.postgres.partitions`).
 """
 
 from typing import NamedTuple
@@ -20,7 +20,7 @@ LONGEST_NAME = 63
 
 
 class Address(NamedTuple):
-    """A URL taken apart.
+    """A parsed URL.
 
     conninfo : for libpq; environment : the schema; shown : the redacted URL; partitions : servers
     of the rows.
@@ -33,11 +33,11 @@ class Address(NamedTuple):
 
 
 def parse(url: str) -> Address:
-    """Take a URL apart; UsageError for one that libpq or the server cannot use, or of two names."""
+    """Parse a URL; UsageError if libpq or the server cannot use it, or for two environments."""
     shown = redact(url)
     head, _, query = url.partition("?")
     authority, _, path = head.partition("://")[2].partition("/")
-    # libpq would take a part of a password with an @ for a host, and name it in its message
+    # libpq would read part of a password with an @ as a host, and print it in its message
     if authority.count("@") > 1 or "@" in path or "#" in url or "\0" in url:
         raise failures.unusable("", shown)
     pairs = [pair.partition("=") for pair in query.split("&") if pair]
@@ -48,7 +48,7 @@ def parse(url: str) -> Address:
     _check_environment(environment, shown)
     spread = [value.split(",") for key, _, value in pairs if key == PARTITIONS]
     others = [
-        # libpq takes no second = in a pair, and people write ?options=-cstatement_timeout=50
+        # libpq accepts no second = in a pair; ?options=-cstatement_timeout=50 is common
         f"{key}{equals}{value.replace('=', '%3D')}"
         for key, equals, value in pairs
         if key not in {"environment", PARTITIONS}
@@ -69,7 +69,7 @@ def parse(url: str) -> Address:
 
 
 def with_environment(url: str, name: str) -> str:
-    """Rewrite a URL so that it names another environment of the same database."""
+    """URL of another environment in the same database."""
     check_name(name, "an environment's name")
     head, _, query = url.partition("?")
     kept = [pair for pair in query.split("&") if pair and not pair.startswith("environment=")]
@@ -98,7 +98,7 @@ def partition_addresses(address: Address) -> list[Address]:
 
 
 def check_name(name: str, what: str) -> None:
-    """Refuse a name that is no text, empty, or longer than the server's 63 bytes."""
+    """Refuse a name other than a text of 1 to 63 bytes, the server's limit, without a byte 0."""
     if not isinstance(name, str):
         raise UsageError(f"{what} {name!r}: give a str, not {type(name).__name__}")
     try:
@@ -117,7 +117,7 @@ def check_name(name: str, what: str) -> None:
 def _check_environment(name: str, shown: str) -> None:
     if (
         not name
-        or not name.isprintable()  # nor half a surrogate pair, which no server accepts
+        or not name.isprintable()  # nor half a surrogate pair
         or "$$" in name  # would end the text of a function
         or len(name.encode()) > LONGEST_NAME
         or name.startswith("pg_")

@@ -1,12 +1,12 @@
-"""Rows on other servers: the tables of rows, partitioned by ranges of their keys.
+"""Partitions: the tables of rows on other servers, by ranges of their keys.
 
-The table of a layout's rows is declared partitioned; each partition is a foreign table of
-`postgres_fdw` in a schema of the environment's name on another server. Objects, surfaces and the
-log of changes stay where the environment is.
+The table of a layout's rows is partitioned; each partition is a foreign table of `postgres_fdw` in
+a schema of the environment's name on another server. Objects, surfaces and the log of changes stay
+on the environment's own server.
 
 A partition's ends lie between cells of 32 x 32 x 32 voxels. postgres_fdw commits on the partitions
-before the environment commits; after a crash in between they hold rows of no object, which no frame
-reads (`tables/statements`) and `check --repair` removes.
+before the environment commits; a crash in between leaves orphan rows, which no frame reads
+(`tables/statements`) and `check --repair` removes.
 """
 
 import re
@@ -22,9 +22,9 @@ from hapticdb.store.postgres.address import Address, partition_addresses
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 CELL_BITS = 15
-"""Bits of a key that name a voxel within its cell."""
+"""Bits of a voxel's key within its cell."""
 SCHEMA = Path(__file__).with_name("schema.sql").read_text(encoding="utf-8")
-"""Makes all tables and functions of an environment, in its schema."""
+"""Creates all tables and functions of an environment, in its schema."""
 SIZE = """
 CREATE VIEW size AS
 SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0)::bigint AS bytes,
@@ -32,7 +32,7 @@ SELECT coalesce(sum(pg_total_relation_size(oid)) FILTER (WHERE relkind = 'r'), 0
          / current_setting('block_size')::int AS pages
   FROM pg_class
  WHERE relnamespace = quote_ident({name})::regnamespace"""
-"""On a partition: bytes of tables and indexes, pages of the rows' index."""
+"""View on a partition: bytes of tables and indexes, pages of the rows' index."""
 SERVER = """
 CREATE SERVER {server} FOREIGN DATA WRAPPER postgres_fdw
 OPTIONS (host {host}, port {port}, dbname {database}, async_capable 'true', fetch_size '10000',
@@ -45,11 +45,11 @@ SELECT DISTINCT srvname::text
   FROM pg_foreign_table JOIN pg_class ON pg_class.oid = ftrelid
   JOIN pg_foreign_server ON pg_foreign_server.oid = ftserver
  WHERE relnamespace = quote_ident(%s)::regnamespace AND srvname LIKE %s"""
-"""Servers that `spread` made for an environment."""
+"""Foreign servers of an environment, from `spread`."""
 
 
 def ends(grid: Grid, layout: Layout, n: int) -> list[int]:
-    """Keys (n - 1,) at which all but the first of n partitions begin: cells if possible."""
+    """First keys (n - 1,) of all but the first of n partitions, on cells if possible."""
     shift = row_shift(layout)
     within = CELL_BITS if 3 * grid.bits >= CELL_BITS + n.bit_length() else shift
     cells = 1 << max(3 * grid.bits - within, 0)
@@ -74,7 +74,7 @@ def spread(
     grid: Grid,
     layout: Layout,
 ) -> "Callable[[ServerConnection], None]":
-    """Make the partitions of a new environment; returns what its own transaction does then."""
+    """Create the partitions of a new environment; returns the rest, for its own transaction."""
     partitions = partition_addresses(address)
     if not partitions:
         return lambda _: None
@@ -101,7 +101,7 @@ def spread(
 
 
 def drop(connection: ServerConnection, connect: Callable[[Address], ServerConnection]) -> None:
-    """Delete an environment's servers, and its partitions where the address names them."""
+    """Delete an environment's foreign servers, and the partitions in its address."""
     name = connection.address.environment
     for (server,) in connection.rows(SERVERS, (name, _server_name(name, "%"))):
         drop_server = sql.SQL("DROP SERVER {} CASCADE").format(sql.Identifier(server))
@@ -122,7 +122,7 @@ def _undo(made: Sequence[ServerConnection]) -> None:
 
 
 def _make_partition(connection: ServerConnection, layout: Layout) -> None:
-    """Make a partition's schema and tables, inside a transaction."""
+    """Create a partition's schema and tables, inside a transaction."""
     name = connection.address.environment
     try:
         connection.execute(sql.SQL("CREATE SCHEMA {}").format(sql.Identifier(name)))
@@ -140,7 +140,7 @@ def _make_partition(connection: ServerConnection, layout: Layout) -> None:
 def _join(
     connection: ServerConnection, made: Sequence[ServerConnection], grid: Grid, layout: Layout
 ) -> None:
-    """Exchange the table of rows for a partitioned one, inside the environment's transaction."""
+    """Replace the table of rows by a partitioned one, inside the environment's transaction."""
     schema = connection.address.environment
     try:
         if not connection.execute(
@@ -180,13 +180,13 @@ def _join(
                 name=sql.Literal(layout),
             )
         )
-    connection.execute(f"SELECT count(*) FROM {layout}")  # reaches each of them, or fails now
+    connection.execute(f"SELECT count(*) FROM {layout}")  # reaches each partition, or fails now
 
 
 def _make_server(
     connection: ServerConnection, partition: ServerConnection, number: int
 ) -> sql.Identifier:
-    """Make a foreign server with one login for everybody; only this owner may use it in tables."""
+    """Create a foreign server, one login for all roles; only this owner may use it in tables."""
     info = partition.driver.info
     server = sql.Identifier(_server_name(connection.address.environment, number))
     place = {"host": info.host, "port": str(info.port), "database": info.dbname}

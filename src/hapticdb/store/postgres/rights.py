@@ -1,7 +1,7 @@
 """Rights of roles on an environment, enforced by the server.
 
-A viewer reads and touches. A toucher also keeps cost figures. An editor also adds, moves and
-removes objects. Only the owner, who made the environment, may change its tables and grant rights.
+A viewer reads and queries. A toucher also stores cost figures. An editor also adds, moves and
+removes objects. Only the owner, the environment's creator, may change its tables and grant rights.
 """
 
 from psycopg import sql
@@ -21,7 +21,7 @@ WITHDRAWN = (
 VIEWER = (
     "GRANT USAGE ON SCHEMA {schema} TO {role}",
     "GRANT SELECT ON ALL TABLES IN SCHEMA {schema} TO {role}",
-    # everybody has it by default, but the owner may have revoked it
+    # a default, but the owner may have revoked it
     "GRANT USAGE ON TYPE {schema}.hit TO {role}",
     (
         "GRANT EXECUTE ON FUNCTION {schema}.has_voxel(bytea, bigint),"
@@ -40,7 +40,7 @@ EDITOR = (
     "GRANT INSERT, DELETE ON {schema}.removed TO {role}",
     "GRANT INSERT, UPDATE ON {schema}.quantile TO {role}",
     "GRANT UPDATE (revision) ON {schema}.environment TO {role}",
-    # UPDATE: a copy keeps its ids, so the sequence must be set after them
+    # UPDATE: a copy preserves ids, so the sequence must be set after them
     "GRANT USAGE, SELECT, UPDATE ON SEQUENCE {schema}.object_id_seq TO {role}",
     "GRANT EXECUTE ON FUNCTION {schema}.refresh_statistics() TO {role}",
 )
@@ -59,13 +59,13 @@ SELECT pg_has_role(role.oid, kept.relowner, 'MEMBER')
 
 
 def grant(connection: ServerConnection, role: str, right: Right) -> None:
-    """Give a role that right on an environment instead of its former one; one transaction.
+    """Grant a role one right on an environment instead of its former one; one transaction.
 
-    connection : of the environment's owner; role : a person's or a group's, as it is written.
-    Rights that the role has through a group stay.
+    connection : of the environment's owner; role : a person's or a group's, unquoted. Rights
+    through a group stay.
 
-    Raises `AccessError` for another user than the owner; `UsageError` when there is no such role,
-    when it may do everything anyway, or when the server would cut its name off at 63 bytes.
+    Raises `AccessError` for a user other than the owner; `UsageError` for an unknown role, a role
+    with all rights anyway, or a name above the server's 63 bytes.
     """
     check_name(role, "a role's name")
     if right not in GRANTED:

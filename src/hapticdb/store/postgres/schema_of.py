@@ -1,4 +1,4 @@
-"""The schema of an environment: made, opened, checked, dropped."""
+"""Schema of an environment: creation, opening, checks, deletion."""
 
 from typing import NamedTuple
 
@@ -27,7 +27,7 @@ def connected(url: str, *, read_only: bool = False) -> ServerConnection:
 
 
 def connect(address: Address, *, read_only: bool = False) -> ServerConnection:
-    """Connect to a database; refuses a standby that is to be written."""
+    """Connect to a database; refuses to write to a standby."""
     found = ServerConnection(address, read_only=read_only)
     if found.is_standby and not read_only:
         found.close()
@@ -36,7 +36,7 @@ def connect(address: Address, *, read_only: bool = False) -> ServerConnection:
 
 
 def exists(url: str) -> bool:
-    """Whether a schema of that name is there, an environment or not."""
+    """Whether a schema of this name exists, an environment or not."""
     with connected(url, read_only=True) as connection:
         return _has_schema(connection)
 
@@ -63,7 +63,7 @@ def opened(url: str, *, read_only: bool) -> ServerConnection:
 
 
 def check(connection: ServerConnection) -> None:
-    """Refuse a schema that is no environment, is of another format, or may not be read."""
+    """Refuse a schema without an environment, of a newer format, or without the right to read."""
     shown, name = connection.shown, connection.address.environment
     if not _has_schema(connection):
         raise EnvironmentNotFoundError(
@@ -91,7 +91,7 @@ def check(connection: ServerConnection) -> None:
 
 
 def _check_writable(connection: ServerConnection) -> None:
-    """Refuse a user without a right to write, before minutes of work; a toucher has one."""
+    """Refuse a user without any right to write, before minutes of work; a toucher has one."""
     if connection.rows("SELECT has_table_privilege('cost', 'INSERT')") != [(True,)]:
         raise ReadOnlyError(
             f"{connection.shown} can only be read by this user; its owner can allow more with "
@@ -107,7 +107,7 @@ SELECT relname::text, CASE relkind WHEN 'r' THEN 'table' WHEN 'p' THEN 'table' W
 
 
 class Made(NamedTuple):
-    """The row `environment`; identity : an oid, new if remade; is_spread : onto partitions."""
+    """The row `environment`; identity : its table's oid; is_spread : rows on partitions."""
 
     grid: Grid
     layout: Layout
@@ -117,7 +117,7 @@ class Made(NamedTuple):
 
 
 def read_environment(connection: ServerConnection) -> Made:
-    """Read the one row of the table `environment`."""
+    """Read and check the one row of the table `environment`."""
     kinds = dict(connection.rows(TABLE_KINDS, (connection.address.environment,)))
     rows = connection.rows(
         "SELECT voxel_size, origin_x, origin_y, origin_z, bits, curve, layout,"
@@ -131,7 +131,7 @@ def read_environment(connection: ServerConnection) -> Made:
 
 
 def created(url: str, grid: Grid, layout: Layout, *, distances: bool) -> None:
-    """Make its partitions, then the schema with all tables and the grid, in one transaction."""
+    """Create the partitions, then the schema with all tables and the grid, in one transaction."""
     with connected(url) as connection:
         name = connection.address.environment
         if connection.address.partitions and _has_schema(connection):
@@ -168,7 +168,7 @@ def _there_already(connection: ServerConnection) -> EnvironmentExistsError:
 
 
 def drop(connection: ServerConnection) -> None:
-    """Delete an environment, whatever is in it."""
+    """Delete an environment with its contents."""
     partitions.drop(connection, connect)
     schema = sql.Identifier(connection.address.environment)
     connection.write(

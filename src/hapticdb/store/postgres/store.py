@@ -33,9 +33,9 @@ from hapticdb.store.postgres.watching import Watch
 from hapticdb.store.tables import Form
 
 GROUPS_KEYS_ITSELF = 170_000
-"""Server version, as libpq numbers it, from which `= ANY` reads each leaf page once."""
+"""Least server version, in libpq's form, whose `= ANY` reads each leaf page once."""
 GROUPING_THRESHOLD = 256
-"""Least number of distinct keys that `auto` groups on older servers: docs/decisions/0014."""
+"""Least number of distinct keys grouped by `auto` on older servers: docs/decisions/0014."""
 
 
 REPLAYED = """
@@ -43,12 +43,12 @@ SELECT pg_last_wal_replay_lsn()::text,
        extract(epoch FROM clock_timestamp() - pg_last_xact_replay_timestamp())::float8
  WHERE pg_is_in_recovery()"""
 MOST_BITS = 1 << 20
-"""Range of excluded ids up to which a bit for each is sent, 128 KiB; else each row is compared with
-each id."""
+"""Range of excluded ids up to which a bitmap is sent, 128 KiB; else each row is compared with each
+id."""
 
 
 class PostgresStore(ServerTables):
-    """An environment on a PostgreSQL server. Open with `open`, make with `create`."""
+    """An environment on a PostgreSQL server: `open` or `create`."""
 
     def __init__(self, connection: ServerConnection) -> None:
         super().__init__(connection)
@@ -79,7 +79,7 @@ class PostgresStore(ServerTables):
     def create(
         cls, url: str, grid: Grid, layout: Layout = "brick", *, distances: bool = False
     ) -> "PostgresStore":
-        """Make a new environment with its grid: a schema that appears whole or not at all."""
+        """Make a new environment with its grid: a schema, created whole or not at all."""
         schema_of.created(url, grid, layout, distances=distances)
         return cls.open(url)
 
@@ -88,12 +88,12 @@ class PostgresStore(ServerTables):
         self.close()
 
     def loading(self) -> contextlib.AbstractContextManager[None]:
-        """Inside, an empty table may have no index; the index is made at the end."""
+        """Inside, an empty table may lack its index, which is built at the end."""
         return self._loading
 
     @contextlib.contextmanager
     def snapshot(self) -> Iterator[None]:
-        """As of the base; those of partitions are taken one after the other when it begins."""
+        """As of the base; those of partitions begin one after the other on entry."""
         with self._connection.snapshot():
             if self._is_spread:
                 self._connection.rows(SIZE_OF_PARTITIONS)
@@ -115,7 +115,7 @@ class PostgresStore(ServerTables):
     # -- reads -----------------------------------------------------------------------------------
 
     def _unpacked(self, found: list[bytes | None], *, distances: bool = False) -> Rows:
-        """Rows from a statement's one packed row; its last value is the revision that was read."""
+        """Rows of a statement's one packed row; its last value is the revision."""
         seen = found[-1]
         self._seen = wire.read_int8(seen) if seen is not None else -1
         if found[0] is None:
@@ -128,7 +128,7 @@ class PostgresStore(ServerTables):
         if distances:
             lengths = wire.read_int8s(found[4])
             rows = rows.having(parsing.band_of(self.url, found[3] or b"", lengths))
-        # not in order while a first import has no index
+        # out of order while a first import has no index
         return rows if is_ascending(keys, ids) else rows.picked(np.lexsort((ids, keys)))
 
     def _read(self, form: Form, *asked: Any, distances: bool) -> Rows:  # noqa: ANN401 - keys or numbers
@@ -168,7 +168,7 @@ class PostgresStore(ServerTables):
     def _without_excluded(
         self, text: str, parameters: list[wire.Parameter], exclude: Keys
     ) -> tuple[str, list[wire.Parameter]]:
-        """A statement and its parameters with a condition that leaves objects out."""
+        """A statement and its parameters with the condition on excluded objects."""
         if not exclude.size:
             return text, parameters
         if exclude is not self._excluded:
@@ -181,7 +181,7 @@ class PostgresStore(ServerTables):
 
 
 def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
-    """Parameters that stand for ids (E,), ascending; a single one where they are far apart."""
+    """Parameters of excluded ids (E,), ascending: a bitmap with its ends, or an array if sparse."""
     low, high = int(exclude[0]), int(exclude[-1])
     if high - low >= MOST_BITS:
         return [wire.int8s(exclude)]
@@ -192,7 +192,7 @@ def _excluded_parameters(exclude: Keys) -> list[wire.Parameter]:
 
 
 class _PostgresEngine:
-    """Environments on servers."""
+    """Operations on URLs of servers."""
 
     title = "PostgreSQL"
 
@@ -200,7 +200,7 @@ class _PostgresEngine:
         return PostgresStore.open(url, read_only=read_only)
 
     def create(self, url: str, grid: Grid, layout: Layout, *, distances: bool = False) -> Store:
-        """Make a schema, which appears whole or not at all."""
+        """Create a schema, whole or not at all."""
         return PostgresStore.create(url, grid, layout, distances=distances)
 
     def exists(self, url: str) -> bool:

@@ -1,12 +1,12 @@
-"""How a reader learns that others have committed: by LISTEN, and by asking for the revision.
+"""Detection of other clients' commits, by LISTEN and by polling of the revision.
 
 Each write notifies the environment's channel in its own transaction (PostgreSQL's manual: NOTIFY).
-Looking whether a notification has arrived costs no round trip. Any role of the database may send
-one: it is only a hint to ask for the revision, which only editors can raise.
+Checking for a received notification costs no round trip. Any role of the database may send one: it
+is only a hint to poll the revision, and only editors can raise that.
 
-The revision is also asked for now and then without a hint: for servers that refuse LISTEN, as a
-standby does, for writers that do not notify, and for an environment that was dropped and made anew,
-whose table has another oid.
+The revision is also polled without a hint, every `HEARING_S` or `DEAF_S`: for servers without
+LISTEN, such as standbys, for writers without NOTIFY, and for an environment dropped and created
+anew, with another oid of its table.
 """
 
 import hashlib
@@ -21,17 +21,17 @@ from hapticdb.store.postgres.connecting.connection import ServerConnection
 
 REVISION = "SELECT revision, tableoid::bigint FROM environment WHERE id = 1"
 DIGEST_DIGITS = 32
-"""Hex digits of the digest that replaces too long a name. Fewer digits risk equal channels."""
+"""Hex digits of the digest in place of a long name. Fewer: equal channels become possible."""
 HEARING_S = 1.0
-"""Longest time until a commit without a notification is noticed, where LISTEN works."""
+"""Longest delay of a commit without a notification, where LISTEN works, s."""
 DEAF_S = 0.02
-"""Longest time until a commit is noticed where LISTEN does not work."""
+"""Longest delay of a commit where LISTEN does not work, s."""
 HINTED_S = 0.005
-"""Shortest time between two hinted round trips: 200 a second under forged notifications."""
+"""Shortest time between two hinted round trips, s: 200 a second under forged notifications."""
 
 
 def channel_of(environment: str) -> str:
-    """Name of an environment's channel, at most 63 bytes. A channel belongs to the database."""
+    """Name of an environment's channel in its database, at most 63 bytes."""
     channel = f"hapticdb_{environment}"
     if len(channel.encode()) <= LONGEST_NAME:
         return channel
@@ -40,9 +40,9 @@ def channel_of(environment: str) -> str:
 
 
 class Watch:
-    """Commits of others that one connection has noticed.
+    """Newest revision seen by one connection, with its notifications.
 
-    revision : the newest noticed.
+    revision : the newest one.
     """
 
     def __init__(self, connection: ServerConnection, identity: int) -> None:
@@ -55,7 +55,7 @@ class Watch:
         self._due = self._asked = 0.0
 
     def begin(self, *, is_prompt: bool = False) -> None:
-        """Notice commits from now on; see `Store.watch`."""
+        """Begin to notice commits; see `Store.watch`."""
         self._connection.check_outside()
         self._connection.is_prompt = is_prompt
         self._connection.again(self._listen)
@@ -67,7 +67,7 @@ class Watch:
 
         Costs a round trip after a notification, after `HEARING_S` or `DEAF_S` without one, and
         after a lost connection; then true, because notifications may have been missed. Raises
-        ConnectionLostError when the environment was remade.
+        ConnectionLostError when the environment was recreated.
         """
         self._connection.check_outside()
         self.look(HINTED_S)
@@ -75,9 +75,9 @@ class Watch:
         return before != self._told
 
     def look(self, pause: float = 0.0) -> bool:
-        """Ask for `revision` if there may be another; whether it was asked for.
+        """Poll `revision` if it may have changed; returns whether it was polled.
 
-        pause : shortest time between two hinted round trips.
+        pause : shortest time between two hinted round trips, s.
         """
         if self._connection.again(self._listen):
             self._told = -1
@@ -90,7 +90,7 @@ class Watch:
         return True
 
     def _listen(self) -> bool:
-        """Receive notifications, or begin to listen on a new connection; whether it is new."""
+        """Receive notifications, or LISTEN on a new connection; returns whether it is new."""
         driver = self._connection.driver
         if driver is self._listening_on:
             self._connection.hear()
@@ -105,14 +105,14 @@ class Watch:
                 raise
             self._is_deaf = True
         self._listening_on = driver
-        self._due = 0.0  # if the query that follows fails, the next call asks again
+        self._due = 0.0  # if the following query fails, the next call repeats it
         return True
 
     def _hear(self, _: psycopg.Notify) -> None:
         self._is_hinted = True
 
     def _ask(self) -> None:
-        # cleared before the question, so that a commit after the answer sets it again
+        # cleared before the query: a commit after its result sets it again
         self._is_hinted = False
         found, identity = self._connection.fetch(REVISION)
         if wire.read_int8(identity or b"") != self._identity:

@@ -1,1 +1,1 @@
-"""SQLite's engine: one file, its log, its checksums, its copies."""
+"""SQLite as an engine: one file with its write-ahead log, checksums, copies."""

@@ -1,9 +1,9 @@
-"""Whole copies of SQLite environments, made while others write, and put in place safely.
+"""Whole copies of SQLite environments during writes, moved into place atomically.
 
-SQLite's backup API copies pages in steps. It begins again when another connection has written
-between two steps: with a busy writer it never ends. Here one read transaction covers all steps; in
-WAL mode no writer changes the pages that this transaction reads, and the log grows meanwhile.
-VACUUM INTO could copy, too, but it sorts all rows again, in one statement that reports no progress.
+SQLite's backup API copies pages in steps, and restarts after another connection's write between two
+steps: with a busy writer it never ends. Here one read transaction covers all steps; in WAL mode no
+writer changes the pages of this transaction, and the log grows meanwhile. VACUUM INTO could copy,
+too, but sorts all rows again, in one statement without progress reports.
 """
 
 import contextlib
@@ -30,15 +30,15 @@ from hapticdb.store.sqlite.file import named_errors
 from hapticdb.store.sqlite.raw import PAGE_BYTES
 
 STEP_PAGES = 512
-"""Pages copied between two reports of progress: 4 MiB. With a larger value the bar jumps."""
+"""Pages copied between two progress reports: 4 MiB. Larger: the bar jumps."""
 SOURCE_CACHE_KIB = 4096
-"""KiB of the source's page cache. A larger cache gains nothing: each page is read once."""
+"""KiB of the source's page cache. Larger: no gain, each page is read once."""
 
 
 def back_up(
     source: Path, target: Path, *, replace: bool, progress: Progress | None
 ) -> BackupReport:
-    """Copy an environment as of one moment into a file, which appears whole or not at all."""
+    """Copy an environment as of one moment into a file, created whole or not at all."""
     real = target.resolve()
     _check_target(source, real, replace=replace)
     with sqlite_file.unfinished_beside(real) as unfinished:
@@ -55,7 +55,7 @@ def back_up(
 
 
 def _check_target(source: Path, target: Path, *, replace: bool) -> None:
-    """Refuse a place that a copy cannot be put into, before anything is copied."""
+    """Refuse an unsuitable target path before anything is copied."""
     if target == source.resolve():
         raise UsageError(f"{source} cannot be copied onto itself: give another path")
     if not replace and target.exists():
@@ -85,7 +85,7 @@ def _check_target(source: Path, target: Path, *, replace: bool) -> None:
 def _copied(
     source: Path, unfinished: Path, target: Path, progress: Progress | None
 ) -> tuple[int, int]:
-    """Copy all pages as of one moment; revision and number of objects; errors name `target`."""
+    """Copy all pages as of one moment; returns revision and number of objects."""
     connection, file = sqlite_file.open_file(source, read_only=True)
     with contextlib.closing(connection), named_errors(str(source)):
         connection.execute(f"PRAGMA cache_size = -{SOURCE_CACHE_KIB}")
@@ -99,7 +99,7 @@ def _copied(
         ):
             _copy_pages(connection, made, progress)
             _check_pages(made)
-        file.look()  # the path must still lead to the file that was copied
+        file.look()  # the path must still lead to the copied file
         if file.stamp is not None:
             file.check_stamp()
     return int(str(revision)), int(str(objects))
@@ -108,7 +108,7 @@ def _copied(
 def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progress | None) -> None:
     made.execute(f"PRAGMA page_size = {PAGE_BYTES}")
     made.execute("PRAGMA journal_mode = OFF").fetchall()
-    made.execute("PRAGMA synchronous = OFF")  # nobody uses the file yet; `_sync` comes later
+    made.execute("PRAGMA synchronous = OFF")  # the file is still private; `_sync` comes later
     with made.backup("main", source, "main") as copying:
         while not copying.done:
             copying.step(STEP_PAGES)
@@ -118,7 +118,7 @@ def _copy_pages(source: apsw.Connection, made: apsw.Connection, progress: Progre
 
 
 def _check_pages(made: apsw.Connection) -> None:
-    """Refuse a copy whose structure is damaged."""
+    """Refuse a copy with a damaged structure."""
     found = made.execute("PRAGMA quick_check(1)").fetchall()
     if found != [("ok",)]:
         raise DamagedError(
@@ -128,17 +128,17 @@ def _check_pages(made: apsw.Connection) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Write a file to disk that no connection has open."""
+    """Write a file without open connections to disk (fsync)."""
     with path.open("rb") as file:
         os.fsync(file.fileno())
 
 
 @contextlib.contextmanager
 def _alone(path: Path) -> Iterator[None]:
-    """Lock all others out of an existing database inside; BusyError if another has it open.
+    """Lock out all others from an existing database inside; BusyError if another has it open.
 
-    A reader in WAL mode holds a lock until it is closed; one that cannot write the folder holds
-    none, and notices the change by the file's time.
+    A reader in WAL mode has a lock until it closes; one without write access to the folder has
+    none, and detects the change by the file's time.
     """
     with contextlib.ExitStack() as held:
         if path.exists():
@@ -155,7 +155,10 @@ def _alone(path: Path) -> Iterator[None]:
 
 
 def _put_in_place(unfinished: Path, path: Path) -> None:
-    """Replace a database, its log first: SQLite would apply it to the new file after a kill."""
+    """Replace a database, deleting its log first.
+
+    After a kill, SQLite would apply the log to the new file.
+    """
     with _alone(path):
         for suffix in ("-wal", "-shm"):
             Path(f"{path}{suffix}").unlink(missing_ok=True)

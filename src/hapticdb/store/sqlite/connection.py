@@ -1,4 +1,4 @@
-"""A connection to one file: statements, snapshots, transactions, and the thread that may use it."""
+"""Connection to one file: statements, snapshots, transactions, owning thread."""
 
 import atexit
 import contextlib
@@ -16,17 +16,17 @@ from hapticdb.store.sqlite.raw import PAGE_BYTES
 from hapticdb.store.threads import check_thread, this_thread
 
 MOST_COMPACTED = 1 << 29
-"""Bytes of a file up to which `compact` writes it anew; other writers wait 1 s for 100 MB."""
+"""Largest file rewritten by `compact`, bytes; other writers wait 1 s for 100 MB."""
 NO_ROOM = (apsw.BusyError, apsw.FullError, apsw.CantOpenError, apsw.IOError)
-"""Errors on which `compact` leaves the file as it is: also where no temporary file can be made."""
+"""Errors after which `compact` leaves the file unchanged, also on creating its temporary file."""
 
 
 class FileConnection:
-    """One connection to one environment's file; belongs to the thread that opened it.
+    """One connection to one environment's file; only the thread that opened it may use it.
 
-    Instead of locks, which take 13 % of a lookup of 40 bricks, every call checks its thread.
+    Locks would take 13 % of a lookup of 40 bricks; instead, every call checks its thread.
 
-    driver : apsw's connection; file : the opened file, and whether its path still leads to it.
+    driver : apsw's connection; file : identity of the opened file.
     """
 
     def __init__(self, path: Path, *, read_only: bool) -> None:
@@ -45,7 +45,7 @@ class FileConnection:
         self.driver.close()
 
     def check_thread(self) -> None:
-        """Refuse a call from any thread but the connection's owner."""
+        """Refuse a call from any thread but the connection's own."""
         check_thread(self._thread, self.url)
 
     def fetch(self, sql: str, bindings: Sequence[Any] = ()) -> list[Any]:
@@ -74,7 +74,7 @@ class FileConnection:
 
     @contextlib.contextmanager
     def writing(self) -> Iterator[None]:
-        """One transaction that begins by taking the write lock."""
+        """One transaction, with the write lock from its beginning."""
         check_thread(self._thread, self.url)
         with sqlite_file.named_errors(self.url):
             self.driver.execute("BEGIN IMMEDIATE")
@@ -88,7 +88,7 @@ class FileConnection:
             self.file.look(has_committed=True)
 
     def compact(self) -> None:
-        """Write the file anew with full pages, unless it is large, in use, or the disk is full."""
+        """Rewrite the file with full pages, unless it is large, in use, or the disk is full."""
         if self.driver.pragma("page_count") * PAGE_BYTES > MOST_COMPACTED:
             return
         self.driver.pragma("temp_store", "file")
@@ -99,26 +99,26 @@ class FileConnection:
     def version(self) -> int:
         """SQLite's data version: changes when another connection's commit has been seen."""
         seen = self.driver.data_version()
-        # a new one is perhaps of another file: files that had one path share a log
+        # a new one may belong to another file: files of the same path share a log
         if seen != self._seen or time.monotonic() >= self.file.due:
             self.file.look()
             self._seen = seen
         return seen
 
     def newest(self) -> int:
-        """As `version`, of the file's log as it is now: the pragma reads that."""
+        """As `version`, from the present state of the log, read by the pragma."""
         self.fetch("PRAGMA data_version")
         return self.version()
 
     def watch(self, *, is_prompt: bool = False) -> None:  # noqa: ARG002 - a file's loss always is
-        """Begin to notice commits from now on; may be called again."""
+        """Begin to notice commits; may be called again."""
         self.has_changed()
 
     def has_changed(self) -> bool:
         """Whether another connection has committed since `watch` or the last call.
 
-        The pragma reads the file's log; apsw's own `data_version` is that of the last read. An
-        immutable file is judged by its stamp, and once changed, stays so. Raises
+        The pragma reads the file's log; apsw's own `data_version` is as of the last read. An
+        immutable file is compared with its stamp; once changed, it counts as changed. Raises
         ConnectionLostError when the path leads to another file than before.
         """
         check_outside(self._depth, self.url)
@@ -136,7 +136,7 @@ _OPEN: "weakref.WeakSet[FileConnection]" = weakref.WeakSet()
 
 @atexit.register
 def _close_all() -> None:
-    """Close what is still open when the program ends, so that no log stays beside a file."""
+    """Close open connections at exit, so that no log stays with a file."""
     for connection in list(_OPEN):
         with contextlib.suppress(Exception):
             connection.close()

@@ -1,4 +1,4 @@
-"""Opening and making SQLite files, and SQLite's errors turned into those of `hapticdb.errors`."""
+"""Opening and creating SQLite files; SQLite's errors as errors of `hapticdb.errors`."""
 
 import contextlib
 import glob
@@ -24,27 +24,27 @@ from hapticdb.store.sqlite import raw as sqlite_bytes
 from hapticdb.store.sqlite.place import OpenedFile
 
 APPLICATION_ID = int.from_bytes(b"hapt")
-"""Mark in the header of each file, as `schema.sql` sets it."""
+"""Application id in the header of each file, set by `schema.sql`."""
 BEFORE_FORMAT_1 = int.from_bytes(b"HAPT")
-"""Mark of files made before 0.1."""
+"""Application id before 0.1."""
 SCHEMA = Path(__file__).with_name("schema.sql")
 BUSY_TIMEOUT_MS = 10_000
-"""Milliseconds that a write waits for another process's write before it gives up."""
+"""Milliseconds of a write's wait for another process's write, before BusyError."""
 CACHE_KIB = 256 * 1024 - DECODED_BYTES // 1024
-"""KiB of a connection's page cache: with decoded bricks, enough for a large car; taken as pages are
-read."""
+"""KiB of a connection's page cache, filled by reads: with decoded bricks, enough for a large car.
+"""
 SHARED_BYTES = 32 << 10
-"""Bytes of the file -shm, without which no connection reads an environment in WAL mode."""
+"""Bytes of the file -shm, required by each connection in WAL mode."""
 MOUNTS = Path("/proc/self/mountinfo")
 NETWORKS = {"nfs", "nfs4", "cifs", "smb3"}
-"""Types of file systems whose machines share no memory, which the index of a log needs."""
+"""File systems without memory shared between machines, which the index of a log needs."""
 HEADER_BYTES = 100
 MAGIC = b"SQLite format 3\0"
 
 
 @contextlib.contextmanager
 def named_errors(path: str) -> Iterator[None]:
-    """Turn SQLite's errors into hapticdb's, which say what, where, and what next."""
+    """Raise SQLite's errors as hapticdb's, with cause, path and remedy."""
     try:
         yield
     except (apsw.CorruptError, apsw.NotADBError, apsw.FormatError, UnicodeDecodeError) as error:
@@ -68,19 +68,19 @@ def named_errors(path: str) -> Iterator[None]:
     except apsw.CantOpenError as error:
         raise DatabaseError(f"{path} cannot be opened: check its folder's rights") from error
     except (apsw.SQLError, apsw.MismatchError, apsw.ConstraintError) as error:
-        # the statements are right for an environment's tables, so these are other tables
+        # the statements fit an environment's tables, so these are other tables
         raise damaged(path, str(error)) from error
 
 
 def _is_full(path: str) -> bool:
-    """Whether no file can grow beside this one, such as the index of what a reader may read."""
+    """Whether no file can grow in this folder, such as the -shm of a readable database."""
     with contextlib.suppress(OSError):
         return shutil.disk_usage(Path(path).parent).free < SHARED_BYTES
     return False
 
 
 def damaged(path: str, cause: str) -> DamagedError:
-    """Build the error for an environment whose contents are broken."""
+    """Build the error for an environment with broken contents."""
     return DamagedError(
         f"{path} is damaged ({cause}): 'hapticdb backup COPY {path} --replace' puts a copy in its "
         "place; or import the files again"
@@ -88,10 +88,10 @@ def damaged(path: str, cause: str) -> DamagedError:
 
 
 def _check_kind(path: Path) -> None:
-    """Refuse a missing file, a folder, a file of another kind, a file that is cut off.
+    """Refuse a missing file, a folder, a file of another kind, a truncated file.
 
     Reads the header of 100 bytes (https://sqlite.org/fileformat2.html, section 1.3) before SQLite
-    opens the file, so that a foreign file is never touched.
+    opens the file, so a foreign file is never touched.
     """
     try:
         is_there = path.exists()
@@ -129,7 +129,7 @@ def _check_kind(path: Path) -> None:
 
 
 def application_id(header: bytes) -> int:
-    """The mark of the program that made a file."""
+    """Application id of a file's header."""
     return int.from_bytes(header[68:72])
 
 
@@ -167,7 +167,7 @@ def create_file(path: Path, fill: Callable[[apsw.Connection], None]) -> None:
 
 
 def check_free(path: Path) -> None:
-    """Refuse a path where a file is, or where the log of a deleted file is."""
+    """Refuse the path of an existing file, or of a deleted file's log."""
     if path.exists():
         raise EnvironmentExistsError(f"{path} exists already; open it, or give another path")
     log = Path(f"{path}-wal")
@@ -179,7 +179,7 @@ def check_free(path: Path) -> None:
 
 
 def check_folder(path: Path) -> None:
-    """Refuse a path whose folder is missing or cannot be written."""
+    """Refuse a path without a writable folder."""
     if not path.parent.is_dir():
         raise EnvironmentNotFoundError(f"folder {path.parent} does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
@@ -188,7 +188,7 @@ def check_folder(path: Path) -> None:
 
 @contextlib.contextmanager
 def unfinished_beside(path: Path) -> Iterator[Path]:
-    """Name for a file that is moved to `path` when it is complete; removed if it is still there."""
+    """Path of a temporary file for `path`, removed at the end unless it was moved."""
     _sweep_unfinished(path)
     unfinished = path.with_name(f".{path.name}.{os.getpid()}.new")
     try:
@@ -199,9 +199,9 @@ def unfinished_beside(path: Path) -> Iterator[Path]:
 
 
 def publish(unfinished: Path, path: Path) -> None:
-    """Give a finished file its path, unless another has taken it."""
+    """Link a finished file to its path, unless the path exists."""
     try:
-        os.link(unfinished, path)  # unlike renaming, a link never replaces another file
+        os.link(unfinished, path)  # unlike a rename, a link never replaces another file
     except FileExistsError as error:
         raise EnvironmentExistsError(f"{path} exists already; open it") from error
     except OSError:
@@ -209,13 +209,13 @@ def publish(unfinished: Path, path: Path) -> None:
 
 
 def remove_file(path: Path) -> None:
-    """Delete a database and the files that SQLite keeps beside it."""
+    """Delete a database with its -wal and -shm."""
     for suffix in ("", "-wal", "-shm"):
         Path(f"{path}{suffix}").unlink(missing_ok=True)
 
 
 def _sweep_unfinished(path: Path) -> None:
-    """Remove the unfinished file of a process that was killed while it made this file."""
+    """Remove the temporary files of killed processes for this path."""
     for left in path.parent.glob(f".{glob.escape(path.name)}.*.new*"):
         pid = left.name.split(".")[-2]
         if pid.isdigit() and not Path(f"/proc/{pid}").exists():
@@ -223,13 +223,13 @@ def _sweep_unfinished(path: Path) -> None:
 
 
 def roll_back(connection: apsw.Connection) -> None:
-    """Undo a transaction, unless SQLite itself has done so, as when the disk is full."""
+    """Undo a transaction, unless SQLite itself has done so, as on a full disk."""
     if connection.in_transaction:
         connection.execute("ROLLBACK")
 
 
 def network_of(path: Path) -> str | None:
-    """Type of the network file system on which a file or its folder is, None on another."""
+    """Type of the network file system of a file's folder, None on a local one."""
     device = path.resolve().parent.stat().st_dev
     with contextlib.suppress(OSError):  # not Linux
         for line in MOUNTS.read_text().splitlines():
@@ -243,8 +243,8 @@ def network_of(path: Path) -> str | None:
 def needs_immutable(path: Path) -> bool:
     """Whether this file can only be opened as immutable.
 
-    A database in WAL mode needs its ``-shm`` beside it. Where this user cannot make that, or on a
-    network file system, SQLite can still read the file alone, if there is no log.
+    A database in WAL mode needs its ``-shm`` in the same folder. Without the right to create it, or
+    on a network file system, SQLite can still read the file alone, if there is no log.
     """
     real, network = path.resolve(), network_of(path)
     if not network and (os.access(real.parent, os.W_OK) or Path(f"{real}-shm").exists()):
@@ -278,7 +278,7 @@ def _connect_to_read(path: Path) -> apsw.Connection:
 
 def _connect_to_write(path: Path) -> apsw.Connection:
     if not (os.access(path, os.W_OK) and os.access(path.parent, os.W_OK)):
-        needs_immutable(path)  # or else a backup could not be made
+        needs_immutable(path)  # raises if a backup could not be made
         raise ReadOnlyError(
             f"{path} can only be read: 'hapticdb backup {path} COPY' makes one to write to"
         )
@@ -288,7 +288,7 @@ def _connect_to_write(path: Path) -> apsw.Connection:
     flags = apsw.SQLITE_OPEN_READWRITE | apsw.SQLITE_OPEN_NOMUTEX
     connection = apsw.Connection(str(path), flags=flags)
     _settle(connection)
-    # a statement of many rows notes the pages that it changes, to undo it: 65 of 164 MB of a write
+    # the statement journal of many rows contains the changed pages: 65 of 164 MB of a write
     connection.execute("PRAGMA temp_store = MEMORY")
     return connection
 
@@ -297,7 +297,7 @@ def _settle(connection: apsw.Connection) -> None:
     connection.set_busy_timeout(BUSY_TIMEOUT_MS)
     connection.execute(f"PRAGMA cache_size = -{CACHE_KIB}")
     # in WAL mode NORMAL survives the death of the process; only a power cut can lose the last
-    # commits, and leaves the database valid even then
+    # commits, and even then the database stays valid
     connection.execute("PRAGMA synchronous = NORMAL")
     # never read a blob as text, nor a string in double quotes as a literal
     connection.config(apsw.SQLITE_DBCONFIG_DQS_DML, 0)

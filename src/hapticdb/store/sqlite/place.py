@@ -1,7 +1,7 @@
-"""The file that an open database is, and whether its path still leads to it.
+"""Identity of an opened database file, and checks of its path.
 
-In WAL mode SQLite does not check the path. It goes on writing into a file that was deleted or
-replaced, and reports every commit as done.
+In WAL mode SQLite does not check the path. It goes on writing into a deleted or replaced file, and
+reports every commit as done.
 """
 
 import time
@@ -10,16 +10,16 @@ from pathlib import Path
 from hapticdb.errors import BusyError, ConnectionLostError
 
 LOOK_SECONDS = 0.25
-"""Longest time until a reader notices that its path leads to another file."""
+"""Longest delay until a reader notices another file at its path, s."""
 
 Stamp = tuple[int, int, bool]
-"""Time of the last write, size, and whether a log is there."""
+"""Time of the last write, size, existence of a log."""
 
 
 class OpenedFile:
-    """The file that a path led to when it was opened; ConnectionLostError when it is gone.
+    """The file of a path at its opening; ConnectionLostError when it is gone.
 
-    identity : device and inode; stamp : of a file that was opened as immutable, else None.
+    identity : device and inode; stamp : of an immutable file, else None.
     """
 
     def __init__(self, path: Path) -> None:
@@ -29,13 +29,13 @@ class OpenedFile:
         self.identity = self._found()
 
     def settle(self, *, is_immutable: bool) -> None:
-        """Note the stamp after the first read; ConnectionLostError for another file."""
+        """Record the stamp after the first read; ConnectionLostError for another file."""
         if is_immutable:
             self.stamp = _stamp(self._path)
         self.look()
 
     def check(self) -> None:
-        """Call `look` if the last one is `LOOK_SECONDS` ago: cheap enough for each read."""
+        """Call `look` if the last call was `LOOK_SECONDS` ago: cheap enough for each read."""
         if time.monotonic() >= self.due:
             self.look()
 
@@ -49,12 +49,12 @@ class OpenedFile:
         self.due = time.monotonic() + LOOK_SECONDS
 
     def check_stamp(self) -> None:
-        """Raise `BusyError` after a write to an immutable file, on which SQLite takes no locks."""
+        """Raise `BusyError` after a write to an immutable file, opened without SQLite's locks."""
         if self.has_new_stamp():
             raise BusyError(f"{self._path} has been written since it was opened: open it again")
 
     def has_new_stamp(self) -> bool:
-        """Whether somebody has written or removed a file that was opened as immutable."""
+        """Whether an immutable file has been written or removed."""
         return _stamp(self._path) != self.stamp
 
     def _found(self) -> tuple[int, int]:

@@ -1,9 +1,9 @@
-"""The bytes of a database file, read beside SQLite.
+"""Raw bytes of database files, read without SQLite.
 
-This module never uses `open`: a process that closes any descriptor of a file loses all POSIX locks
-that it holds on that file, also those of its open connections
-(https://sqlite.org/howtocorrupt.html, section 2.2). SQLite's own file object, used here, closes its
-descriptor when these locks are released.
+This module never uses `open`: closing any descriptor of a file releases all POSIX locks of the
+process on this file, also those of its open connections (https://sqlite.org/howtocorrupt.html,
+section 2.2). SQLite's own file object, used here, closes its descriptor when these locks are
+released.
 """
 
 import contextlib
@@ -17,13 +17,13 @@ import apsw
 READ_MAIN = apsw.SQLITE_OPEN_MAIN_DB | apsw.SQLITE_OPEN_READONLY
 DESCRIPTORS = Path("/proc/self/fd")
 PAGE_BYTES = 8192
-"""Bytes of a page: the block size of the paper."""
+"""Bytes of a page: the paper's block size."""
 
 
 @contextlib.contextmanager
 def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
-    """Access to the bytes of a database file inside; OSError when it may not be read."""
-    os.stat(path)  # noqa: PTH116 - its error says why; SQLite's would not
+    """Access to the bytes of a database file inside; OSError without the right to read it."""
+    os.stat(path)  # noqa: PTH116 - its error has the cause; SQLite's has not
     if not os.access(path, os.R_OK):
         raise PermissionError(errno.EACCES, os.strerror(errno.EACCES), str(path))
     try:
@@ -37,17 +37,17 @@ def opened_bytes(path: Path, flags: int = READ_MAIN) -> Iterator[apsw.VFSFile]:
 
 
 def read_bytes(path: Path, amount: int, offset: int = 0) -> bytes:
-    """Bytes of a database file; fewer if the file ends before."""
+    """Bytes of a database file; fewer at its end."""
     with opened_bytes(path) as file:
         try:
             there = max(min(amount, file.xFileSize() - offset), 0)
             return file.xRead(there, offset) if there else b""
-        except apsw.IOError as error:  # or cut off since its size was asked
+        except apsw.IOError as error:  # or truncated since its size was read
             raise OSError(errno.EIO, os.strerror(errno.EIO), str(error)) from error
 
 
 def descriptor_of(identity: tuple[int, int]) -> int | None:
-    """A descriptor that this process has of the file with that device and inode, if any."""
+    """A descriptor of this process for the file of this device and inode, if any."""
     for entry in DESCRIPTORS.iterdir():
         with contextlib.suppress(OSError):  # closed since it was listed
             status = os.fstat(int(entry.name))
@@ -57,7 +57,7 @@ def descriptor_of(identity: tuple[int, int]) -> int | None:
 
 
 def forget_pages(path: Path) -> None:
-    """Drop the operating system's cached pages of a database that this process has open."""
+    """Drop the operating system's cached pages of a database opened by this process."""
     status = path.stat()
     descriptor = descriptor_of((status.st_dev, status.st_ino))
     if descriptor is not None:
@@ -66,7 +66,7 @@ def forget_pages(path: Path) -> None:
 
 
 def sync_folder(path: Path) -> None:
-    """Write the names in a file's folder to disk: after that, a renaming survives a power cut."""
+    """Write a file's folder to disk (fsync): afterwards a rename survives a power cut."""
     descriptor = os.open(path.parent, os.O_RDONLY | os.O_DIRECTORY)
     try:
         os.fsync(descriptor)

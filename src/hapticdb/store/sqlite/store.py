@@ -1,7 +1,7 @@
 """SQLite through apsw: the embedded engine, paths and ``sqlite:///path``, one file an environment.
 
 Three traps of the binding, each covered by a test: an ``np.int64`` binds as an eight-byte blob, a
-bare array to ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
+bare array for ``carray(?)`` binds as nothing (both in silence), and an empty array cannot be bound.
 So keys are passed as ``apsw.carray`` of contiguous, non-empty int64 arrays, and single numbers as
 Python's own.
 """
@@ -59,12 +59,12 @@ SELECT {LISTS[columns].replace(" distances", " coalesce(distances, x'')")} FROM 
     for columns, table in TABLES.items()
 }
 PREFIX = "sqlite:///"
-# libpq's other form of an address, and a URL without its slashes: either may hold a password
+# libpq's keyword form, or a URL without its slashes: either may contain a password
 KEYWORDS = re.compile(r"^postgres(ql)?:|(^|\s)\w*password\s*=", re.IGNORECASE)
 
 
 class SQLiteStore(FileTables):
-    """An environment in one SQLite file. Open with `open`, make with `create`."""
+    """An environment in one SQLite file: `open` or `create`."""
 
     def __init__(self, connection: FileConnection) -> None:
         super().__init__(connection)
@@ -92,7 +92,7 @@ class SQLiteStore(FileTables):
     def create(
         cls, path: str | Path, grid: Grid, layout: Layout = "brick", *, distances: bool = False
     ) -> "SQLiteStore":
-        """Make a new environment with its grid; its file appears whole or not at all."""
+        """Make a new environment with its grid; its file is created whole or not at all."""
         row = (grid.voxel_size, *grid.origin, grid.bits, grid.curve, layout, int(distances))
 
         def fill(connection: apsw.Connection) -> None:
@@ -108,7 +108,7 @@ class SQLiteStore(FileTables):
 
     @contextlib.contextmanager
     def loading(self) -> Iterator[None]:
-        """At the end, fill the pages of one that was empty: an eighth of them is unused."""
+        """Compact a formerly empty environment at the end: an eighth of its pages is unused."""
         was_empty = not self.revision()
         yield
         if was_empty and self.revision():
@@ -156,7 +156,7 @@ class SQLiteStore(FileTables):
 
 
 def _rows_of(url: str, found: list[Any], columns: Columns) -> Rows:
-    """Rows from the tuples of a statement, which lists `ranges.LISTS`."""
+    """Rows from the tuples of a statement with the columns of `ranges.LISTS`."""
     if not found:
         return no_rows(distances=columns == "distances")
     keys, ids, *more = zip(*found, strict=True)
@@ -182,7 +182,7 @@ def _rows_of(url: str, found: list[Any], columns: Columns) -> Rows:
 
 
 def _pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
-    """Pairs (n, 2) of whole numbers that a statement returned."""
+    """Pairs (n, 2) of integers from a statement."""
     try:
         return np.array(found, dtype=np.int64).reshape(-1, 2)
     except (TypeError, ValueError, OverflowError) as error:
@@ -190,7 +190,7 @@ def _pairs_of(url: str, found: list[Any]) -> NDArray[np.int64]:
 
 
 class _SQLiteEngine:
-    """Environments in files."""
+    """Operations on paths and URLs of files."""
 
     title = "SQLite"
 
@@ -215,7 +215,7 @@ ENGINE = _SQLiteEngine()
 
 
 def _path_of(url: str) -> Path:
-    """Path of the file that a URL or a path means."""
+    """Path of the file that a URL or a path names."""
     text = url
     if text.startswith(PREFIX):
         text = text.removeprefix(PREFIX)

@@ -1,1 +1,1 @@
-"""A connection to a server: how it is made, waits, comes back after a loss, and reports errors."""
+"""Connection to a server: settings, time limits, reconnecting, errors."""

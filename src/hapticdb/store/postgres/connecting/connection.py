@@ -1,4 +1,4 @@
-"""A connection to one environment's schema: statements, transactions, reconnecting."""
+"""Connection to one environment's schema: statements, transactions, reconnecting."""
 
 import contextlib
 import time
@@ -20,19 +20,19 @@ from hapticdb.store.threads import check_thread, this_thread
 Result = TypeVar("Result")
 
 RECONNECT_SECONDS = 15.0
-"""Seconds of tries to reach a lost server, after which a read raises its error."""
+"""Seconds of attempts to reach a lost server, before a read raises its error."""
 FIRST_PAUSE_SECONDS = 0.05
-"""Pause between the first two tries to connect again; each next pause is twice as long."""
+"""Pause between the first two attempts to reconnect; doubled after each."""
 MOST_PAUSE_SECONDS = 0.5
-"""Longest pause between two tries. A larger value asks a struggling server less often."""
+"""Longest pause between two attempts. Larger: fewer attempts at a struggling server."""
 WRITE_TRIES = 3
-"""Tries of a write whose server goes away. A larger value survives more losses in a row."""
+"""Attempts at a write on losses of the server. Larger: survives more losses in a row."""
 
 
 class ServerConnection(Link, Closes):
-    """One connection to one environment's schema; belongs to the thread that opened it.
+    """One connection to one environment's schema; only the thread that opened it may use it.
 
-    is_loading : during `Loading`; is_closed : by `close`; a lost connection comes back by itself.
+    is_loading : during `Loading`; is_closed : by `close`. A lost connection is replaced.
     """
 
     def __init__(self, address: Address, *, read_only: bool = False) -> None:
@@ -50,7 +50,7 @@ class ServerConnection(Link, Closes):
         self.drop()
 
     def _reconnect(self) -> None:
-        """Connect again and again, for up to `RECONNECT_SECONDS`; then raise the last error."""
+        """Reconnect within `RECONNECT_SECONDS`, by several attempts; then raise the last error."""
         self.drop()
         deadline = time.monotonic() + RECONNECT_SECONDS
         pause = FIRST_PAUSE_SECONDS
@@ -67,7 +67,7 @@ class ServerConnection(Link, Closes):
                 return
 
     def check_thread(self) -> None:
-        """Refuse a call from any thread but the connection's owner."""
+        """Refuse a call from any thread but the connection's own."""
         check_thread(self._thread, self.shown)
 
     @property
@@ -76,14 +76,14 @@ class ServerConnection(Link, Closes):
         return self._depth > 0
 
     def check_outside(self) -> None:
-        """Refuse to look for the commits of others inside a transaction."""
+        """Refuse to query for commits of others inside a transaction."""
         check_outside(self._depth, self.shown)
 
     def again(self, read: Callable[[], Result]) -> Result:
-        """Run a read; when the connection is lost, connect again and run it once more.
+        """Run a read; after a loss of the connection, reconnect and run it once more.
 
-        Not inside a snapshot: its earlier reads saw the revision of the lost connection; nor where
-        a loss shall be reported promptly.
+        Not inside a snapshot: its earlier reads saw the lost connection's revision. Not with
+        `is_prompt`.
         """
         self.check_thread()
         if self.is_closed:
@@ -103,7 +103,7 @@ class ServerConnection(Link, Closes):
     # -- statements --------------------------------------------------------------------------
 
     def fetch(self, text: str, *parameters: Parameter) -> list[bytes | None]:
-        """First row of a prepared statement, every value in its binary form."""
+        """First row of a prepared statement, in binary format."""
 
         def read() -> list[bytes | None]:
             result = self.run(text, parameters)
@@ -122,7 +122,7 @@ class ServerConnection(Link, Closes):
     def execute(
         self, text: str | sql.Composed, parameters: Sequence[Any] = ()
     ) -> psycopg.Cursor[tuple[Any, ...]]:
-        """One statement through psycopg, without a second try."""
+        """One statement through psycopg, without a second attempt."""
         return self.driver.execute(text, parameters or None)
 
     # -- transactions ------------------------------------------------------------------------
@@ -145,9 +145,9 @@ class ServerConnection(Link, Closes):
     ) -> Result:
         """Run `work` in one transaction, without a frame's time limit.
 
-        When the connection is lost before the commit was sent, everything is done again. When it is
+        When the connection is lost before the commit was sent, everything is repeated. When it is
         lost during the commit, `is_committed` decides on the new connection; without it, `work`
-        must be harmless when it is done twice.
+        must be idempotent.
         """
         self.check_thread()
         for tries_left in reversed(range(WRITE_TRIES)):
@@ -168,7 +168,7 @@ class ServerConnection(Link, Closes):
         )
 
     def _finds(self, is_committed: Callable[[], bool]) -> bool:
-        """Whether a commit that was sent but not confirmed was done. Never guesses."""
+        """Whether an unconfirmed commit was done; ConnectionLostError if that stays unknown."""
         try:
             self._reconnect()
             return is_committed()
@@ -183,7 +183,7 @@ class ServerConnection(Link, Closes):
         if self.is_closed:
             raise DatabaseError(f"{self.shown} has been closed: open it again")
         limits = ["statement_timeout", "idle_in_transaction_session_timeout"]
-        if self.is_loading:  # another loader may be making the index
+        if self.is_loading:  # another loader may be building the index
             limits.append("lock_timeout")
         with failures.named_errors(self.shown), self.unhurried():
             self._depth += 1
@@ -206,10 +206,10 @@ class ServerConnection(Link, Closes):
         return result, True
 
     def begin(self, *settings: str) -> None:
-        """Begin a transaction that writes, with settings of its own, in one round trip.
+        """Begin a writing transaction with its own settings, in one round trip.
 
-        Refuses a pooler in transaction mode, which gives each transaction another server
-        connection: it would write to another schema than that of the search path.
+        Refuses a pooler in transaction mode: each transaction gets another server connection, and
+        would write to another schema than that of the search path.
         """
         local = [f"SET LOCAL {setting}" for setting in settings]
         asked = "SELECT current_setting('search_path')"
@@ -232,9 +232,9 @@ class ServerConnection(Link, Closes):
 
     @contextlib.contextmanager
     def without_limit(self, *limits: str) -> Iterator[None]:
-        """Lift the named time limits inside; `statement_timeout` if none is named."""
+        """Suspend the named time limits inside; `statement_timeout` if none is named."""
         names = limits or ("statement_timeout",)
-        # the connection may have been lost since it was last used
+        # the connection may have been lost since its last use
         before = self.again(lambda: [self._shown_setting(name) for name in names])
         with failures.named_errors(self.shown), self.unhurried():
             for name in names:
@@ -251,7 +251,7 @@ class ServerConnection(Link, Closes):
         return row[0] if row else "0"
 
     def is_owner(self) -> bool:
-        """Whether this user owns the environment's tables, and so may make indexes and grant."""
+        """Whether this user owns the environment's tables, and so may create indexes and grant."""
         found = self.rows(
             "SELECT pg_has_role(relowner, 'USAGE') FROM pg_class"
             " WHERE oid = 'environment'::regclass"

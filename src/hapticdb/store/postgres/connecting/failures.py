@@ -1,4 +1,4 @@
-"""The errors of psycopg turned into those of `hapticdb.errors`."""
+"""Errors of psycopg as errors of `hapticdb.errors`."""
 
 import contextlib
 import re
@@ -22,9 +22,9 @@ from hapticdb.errors import (
 from hapticdb.store.parsing import damaged
 
 IS_STANDBY = "server is in hot standby mode"
-"""What libpq says of a standby where it was asked for a primary."""
+"""libpq's message for a standby in place of a primary."""
 EACH_HOST = "All failures were:"
-"""What psycopg says before it lists the failure of each host."""
+"""psycopg's line before the failures of each host."""
 ATTEMPT = re.compile(
     r"(?:- host: '?(?P<host>.*?)'?, port: '?(?P<port>.*?)'?, hostaddr: (?:None|'.*?'): )?"
     r"(?:connection (?:failed|is bad): )?"
@@ -32,13 +32,13 @@ ATTEMPT = re.compile(
     r'|at "(?P<address>[^"]*)"(?: \([^)]*\))?, port (?P<at>\d+)) failed: )?'
     r"(?:FATAL: +)?(?P<why>.*)"
 )
-"""What psycopg and libpq say of one attempt to connect."""
+"""Message of psycopg and libpq for one attempt to connect."""
 FULL = "too many clients|too many connections|slots are reserved|no more connections allowed"
 
 
 @contextlib.contextmanager
 def named_errors(shown: str) -> Iterator[None]:
-    """Turn psycopg's errors into hapticdb's. `shown` is the URL as messages may show it."""
+    """Raise psycopg's errors as hapticdb's. shown : the redacted URL."""
     try:
         yield
     except psycopg.Error as error:
@@ -51,14 +51,14 @@ MEANINGS: dict[type[HapticDBError], str] = {
     BusyError: "{} was changed or is being written by another: try again later ({})",
     ReadOnlyError: "{}: this user may not do that ({}); its owner can allow it with "
     "'hapticdb grant URL ROLE --as editor'",
-    # to a user without rights, a schema looks as if it did not exist
+    # without rights, a schema seems not to exist
     DamagedError: "{} is damaged ({}), or this user may no longer use it: ask its owner, "
     "restore a copy, or import the files again",
     DatabaseError: "{}: the server has no room left ({}); nothing is half done",
     ConnectionLostError: "{}: one of its partitions cannot be reached ({}); what was committed is "
     "safe, so run the same again when it is back",
 }
-"""Words of our errors for errors of a server that answers: the URL, and the cause."""
+"""Messages for errors of a reachable server: the URL, and the cause."""
 NAMED: dict[type[psycopg.Error], type[HapticDBError]] = {
     errors.QueryCanceled: StuckError,
     errors.LockNotAvailable: BusyError,
@@ -94,7 +94,7 @@ def named(error: psycopg.Error, shown: str) -> HapticDBError:
 
 
 def is_lost(error: BaseException) -> bool:
-    """Whether the error is of the connection and not of the statement."""
+    """Whether the error concerns the connection and not the statement."""
     return isinstance(
         error,
         (
@@ -110,7 +110,7 @@ def is_lost(error: BaseException) -> bool:
 
 def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
     """Error for a failed connection, by its text: libpq gives no code here."""
-    if _line(error).startswith("connection is bad: invalid"):  # what libpq does not know
+    if _line(error).startswith("connection is bad: invalid"):  # unknown to libpq
         return unusable(_line(error), shown)
     hosts = _reasons(str(error))
     cause = "; ".join(hosts)
@@ -127,7 +127,7 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
             f"{shown} has no free connection ({cause}): end programs that use this server, or "
             "raise max_connections there"
         )
-    if IS_STANDBY in cause:  # only where a primary was asked for
+    if IS_STANDBY in cause:  # only with a primary in the URL
         others = [host for host in hosts if IS_STANDBY not in host]
         if not others:
             return standby(shown)
@@ -139,11 +139,11 @@ def refused(error: psycopg.OperationalError, shown: str) -> HapticDBError:
 
 
 def _reasons(text: str) -> list[str]:
-    """Why a connection could not be made, in short: each reason of each host of the URL once."""
+    """Reasons of a failed connection, each one of each host of the URL once."""
     found: dict[str, None] = {}
     for line in text.rpartition(EACH_HOST)[2].splitlines():
         one = ATTEMPT.fullmatch(line)
-        if one and one["why"] and not line.startswith("\t"):  # where libpq's advice is
+        if one and one["why"] and not line.startswith("\t"):  # libpq's advice
             host, port = (one["host"], one["port"]) if one["host"] else (one["address"], one["at"])
             where = one["socket"] if not host else host if port == "None" else f"{host}:{port}"
             found[f"{where}: {one['why']}" if where else one["why"]] = None
@@ -151,10 +151,10 @@ def _reasons(text: str) -> list[str]:
 
 
 def unusable(cause: str, shown: str) -> UsageError:
-    """Error for a URL that libpq refuses.
+    """Error for a URL refused by libpq.
 
-    libpq quotes what it does not understand, perhaps a piece of a password: the quotation is shown
-    only if the redacted URL contains it.
+    libpq quotes unparsable text, perhaps a piece of a password: the quotation is shown only if the
+    redacted URL contains it.
     """
     cause = " ".join(cause.removeprefix("connection is bad: ").split())
     if not cause or any(words not in shown for words in re.findall(r'"([^"]*)"', cause)):
@@ -166,7 +166,7 @@ def unusable(cause: str, shown: str) -> UsageError:
 
 
 def denied(shown: str, name: str) -> AccessError:
-    """Build the error for an environment that this user may not even read."""
+    """Build the error for an environment without the right to read it."""
     return AccessError(
         f"{shown}: this user may not read the environment {name!r}; its owner can allow it with "
         "'hapticdb grant URL ROLE --as viewer'"
@@ -174,7 +174,7 @@ def denied(shown: str, name: str) -> AccessError:
 
 
 def standby(shown: str) -> ReadOnlyError:
-    """Build the error for a server that cannot be written."""
+    """Build the error for a server without writes."""
     return ReadOnlyError(
         f"{shown} is a standby: it can only be read; to write, name its primary, or all servers "
         "with target_session_attrs=primary"
@@ -182,12 +182,12 @@ def standby(shown: str) -> ReadOnlyError:
 
 
 def remade(shown: str) -> ConnectionLostError:
-    """Build the error for an environment that was dropped and made anew."""
+    """Build the error for an environment dropped and created anew."""
     return ConnectionLostError(f"{shown} is another environment than before: open it again")
 
 
 def pooled(shown: str) -> DatabaseError:
-    """Build the error for a transaction on another server connection than the one that was set."""
+    """Build the error for a transaction on another server connection than the prepared one."""
     return DatabaseError(
         f"{shown} seems to be behind a pooler in transaction mode, which may write to another "
         "schema: connect to the server itself, or use session pooling; nothing was written"
@@ -195,7 +195,7 @@ def pooled(shown: str) -> DatabaseError:
 
 
 def no_editor(shown: str) -> ReadOnlyError:
-    """Build the error for a user who may write to the environment, but not to its objects."""
+    """Build the error for a user with rights on the environment, but not on its objects."""
     return ReadOnlyError(
         f"{shown}: this user may not change objects; its owner can allow it with "
         "'hapticdb grant URL ROLE --as editor'"

@@ -1,12 +1,12 @@
-"""The link to a server: psycopg's connection with our settings, waited for with a limit.
+"""psycopg's connection with hapticdb's settings and time limits on every wait.
 
 The hot path uses libpq's own calls (`psycopg.pq`): a cursor's `execute` costs 15 to 30 us more a
-statement. psycopg waits in short steps, so that Ctrl-C interrupts a wait, and a server that hangs
-causes an error, also during statements that may take long.
+statement. Waits are short steps, so Ctrl-C interrupts them, and a hanging server causes an error,
+also during long statements.
 
-Such a statement may be silent for minutes because the server works on it. A server that works also
-answers a new client's SSLRequest ("SSL Session Encryption" in PostgreSQL's manual), which needs no
-password and none of the server's connections; one that hangs, or whose network is cut, does not.
+A server may be silent for minutes during a long statement. A working one still answers a new
+client's SSLRequest ("SSL Session Encryption" in PostgreSQL's manual), without a password and
+without using one of its connections; a hanging or disconnected one does not.
 """
 
 import contextlib
@@ -37,47 +37,47 @@ SETTINGS = {
     "plan_cache_mode": "force_generic_plan",
     # a frame reads a few dozen rows, which takes less time than starting a worker
     "max_parallel_workers_per_gather": "0",
-    # the planner cannot know how short the ranges are and would take a bitmap scan, which reads the
+    # the planner cannot estimate the short ranges and would choose a bitmap scan, which reads the
     # heap and loses the order of the keys
     "enable_bitmapscan": "off",
-    # a plan that was made while the table was small is kept: it must not scan the whole table
+    # a plan made for a small table is cached: it must not scan the whole table
     "enable_seqscan": "off",
     # rows on partitions are counted there
     "enable_partitionwise_aggregate": "on",
     # readers never wait for locks; a writer that waits longer gets an error
     "lock_timeout": "10s",
-    # a frame that takes longer is stuck; writes, indexes and statistics lift this limit
+    # a longer frame is stuck; writes, indexes and statistics lift this limit
     "statement_timeout": "10s",
     "client_min_messages": "warning",
 }
 CONNECT_SECONDS = 10
-"""Seconds that a server may take to accept a connection, unless the URL says otherwise."""
+"""Seconds for a server to accept a connection, unless set in the URL."""
 GRACE_MS = 3000
-"""Milliseconds that the network and a busy server may add to the server's own time limit."""
+"""Milliseconds of network and busy server, added to the server's own time limit."""
 STEP_S = 0.05
-"""Seconds between two looks at the limit of a wait. A larger value exceeds it by more."""
+"""Seconds between two checks of a wait's limit. Larger: exceeds it by more."""
 SILENCE_S, PROMPT_SILENCE_S = 5.0, 0.1
-"""Seconds without a byte from a server, after which its answer to a new client is tested; the
-second where a loss shall be reported promptly. Smaller: slow statements cause more such tests."""
+"""Seconds without a byte before a test of the server by a new client; the second value with
+`is_prompt`. Smaller: more such tests during slow statements."""
 ANSWER_S, PROMPT_ANSWER_S = 5.0, 0.15
-"""Seconds that a server has to accept such a test, and again to answer it; likewise. Smaller: a
-busy server is taken for one that hangs."""
+"""Seconds for a server to accept such a test, and again to answer it; likewise. Smaller: a busy
+server counts as hanging."""
 SSL_REQUEST = struct.pack("!ii", 8, 80877103)
 
 
 class SilentServerError(StuckError):
-    """A server that sent nothing for longer than it may take, or that does not answer at all."""
+    """A server silent beyond its time limit, or without an answer to a new client."""
 
 
 class Peer(NamedTuple):
-    """Where a connected server listens, as `socket.connect` takes it."""
+    """Socket address of a connected server, for `socket.connect`."""
 
     family: socket.AddressFamily
     address: str | tuple[str | int, ...]
 
     @classmethod
     def of(cls, pgconn: pq.abc.PGconn) -> "Peer | None":
-        """The server of a connection; None if its address cannot be told."""
+        """The server of a connection; None for an unknown address."""
         try:
             with socket.socket(fileno=os.dup(pgconn.socket)) as connected:
                 family = socket.AddressFamily(connected.family)
@@ -103,12 +103,12 @@ class Peer(NamedTuple):
 
 
 class _Connection(psycopg.Connection[tuple[Any, ...]]):
-    """psycopg's connection with the time limit of its link; psycopg alone would wait for ever."""
+    """psycopg's connection with the time limit of its link; psycopg's own wait is unlimited."""
 
     link: "Link"
 
     def wait(self, gen: Generator[Any, Any, Result], *args: Any, **options: Any) -> Result:  # noqa: ANN401 - psycopg's own
-        """Let a statement run to its end. Closes the connection when it takes too long."""
+        """Run a statement to its end. Closes the connection at the time limit."""
         if self.link.given_up is not None:  # the end of a COPY that was given up
             raise self.link.given_up
         try:
@@ -120,11 +120,11 @@ class _Connection(psycopg.Connection[tuple[Any, ...]]):
 
 
 class Link:
-    """Holds one psycopg connection at a time; `connect` makes a new one.
+    """One psycopg connection at a time; `connect` replaces it.
 
     shown : the redacted URL; driver : psycopg's connection, autocommit, for statements outside
-    frames; given_up : the error for which psycopg's wait was given up, else None; is_prompt :
-    whether a lost or silent server is reported within 0.4 s, and not waited for.
+    frames; given_up : the error of psycopg's abandoned wait, else None; is_prompt : report a lost
+    or silent server within 0.4 s instead of waiting for it.
     """
 
     is_prompt = False
@@ -154,7 +154,7 @@ class Link:
                 fallback_application_name="hapticdb",
                 connect_timeout=None if given else math.ceil(seconds),
             )
-        # from None: psycopg's message, which a traceback would show, may hold the password
+        # from None: a traceback would show psycopg's message, perhaps with the password
         except psycopg.OperationalError as error:
             raise failures.refused(error, self.shown) from None
         except psycopg.Error as error:
@@ -200,12 +200,12 @@ class Link:
 
     @property
     def server_version(self) -> int:
-        """As libpq counts: 150018 is 15.18."""
+        """In libpq's form: 150018 is 15.18."""
         return self._pgconn.server_version
 
     @property
     def is_standby(self) -> bool:
-        """Whether the server is a standby; one that is promoted reports so with its next answer."""
+        """Whether the server is a standby; a promotion shows in the server's next answer."""
         return self._was_standby and self._pgconn.parameter_status(b"in_hot_standby") != b"off"
 
     def drop(self) -> None:
@@ -214,7 +214,7 @@ class Link:
 
     @property
     def is_lost(self) -> bool:
-        """Whether the connection was closed or given up."""
+        """Whether the connection is closed, also after a loss or at a time limit."""
         return self.driver.closed
 
     def is_usable(self) -> bool:
@@ -225,12 +225,12 @@ class Link:
     # -- statements --------------------------------------------------------------------------
 
     def command(self, text: str) -> pq.abc.PGresult:
-        """Result of the last of some statements without parameters, in one round trip."""
+        """Result of the last of several statements without parameters, in one round trip."""
         self._pgconn.send_query(text.encode())
         return self._result()
 
     def run(self, text: str, parameters: Sequence[Parameter]) -> pq.abc.PGresult:
-        """Result of a statement, which is prepared when it is first run."""
+        """Result of a statement, prepared at its first run."""
         name = self._prepared.get(text)
         if name is None:
             name = f"hapticdb_{len(self._prepared)}".encode()
@@ -243,9 +243,9 @@ class Link:
         return self._result()
 
     def hear(self) -> None:
-        """Give notifications that have arrived to the notify handlers. Never waits.
+        """Pass received notifications to the notify handlers. Never waits.
 
-        Those that arrive during a statement stay in libpq until then, or psycopg gives them.
+        Those received during a statement stay in libpq until then, or psycopg passes them on.
         """
         self._pgconn.consume_input()
         while (notify := self._pgconn.notifies()) and self._pgconn.notify_handler:
@@ -260,7 +260,7 @@ class Link:
 
     @contextlib.contextmanager
     def unhurried(self) -> Iterator[None]:
-        """Wait as long as the server answers others inside: for statements that may take long."""
+        """Wait inside as long as the server answers a new client: for long statements."""
         self._leisure += 1
         try:
             yield
@@ -268,7 +268,7 @@ class Link:
             self._leisure -= 1
 
     def _result(self) -> pq.abc.PGresult:
-        """Result of the statement that was sent. Closes the connection when no result comes."""
+        """Result of the statement in flight. Closes the connection when no result comes."""
         try:
             # the driver's own wait would take 10 s to end after Ctrl-C while a server hangs
             answer = self.until_out_of_patience(generators.execute(self._pgconn))
@@ -279,7 +279,7 @@ class Link:
             if failures.is_lost(error):
                 self.driver.close()
             raise
-        except BaseException:  # Ctrl-C or a timeout: the next statement would get a late result
+        except BaseException:  # Ctrl-C or a timeout: the next statement would get this result
             self.driver.close()
             raise
         return found
@@ -287,7 +287,7 @@ class Link:
     def until_out_of_patience(
         self, answer: Generator[Any, Any, Result]
     ) -> Generator[Any, Any, Result]:
-        """Run psycopg's own waiting for a statement; give up when the server is silent too long."""
+        """Run psycopg's generator of a wait; raise SilentServerError at the time limit."""
         started = heard = time.monotonic()
         try:
             wanted = next(answer)
@@ -306,7 +306,7 @@ class Link:
             return cast("Result", end.value)
 
     def _check_answers(self, seconds: float) -> None:
-        """Give the statement up if the server does not answer a new client in `seconds` either."""
+        """Raise SilentServerError without an answer to a new client within `seconds`."""
         if self._peer is not None and not self._peer.answers(seconds):
             raise SilentServerError(
                 f"{self.shown} sends nothing and did not answer a new client within "

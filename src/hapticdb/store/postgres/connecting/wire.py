@@ -1,4 +1,4 @@
-"""Arrays in PostgreSQL's binary format, packed and read by NumPy without a Python loop.
+"""Arrays in PostgreSQL's binary format, packed and parsed by NumPy without a Python loop.
 
 A header (dimensions, flags, element type, length, lower bound), then the length and the value of
 each element, all big-endian (array_send in arrayfuncs.c; for COPY the manual, "Binary Format").
@@ -23,11 +23,11 @@ _STRIDE = _INT8S.itemsize
 COPY_HEADER = b"PGCOPY\n\xff\r\n\0" + bytes(8)
 COPY_TRAILER = b"\xff\xff"
 NULL = b"\xff\xff\xff\xff"
-"""Length of a field that is NULL."""
+"""Length of a NULL field."""
 
 
 class Parameter(NamedTuple):
-    """A parameter of a statement: the OID of its type, and its binary form."""
+    """A statement's parameter: OID of its type, and its binary form."""
 
     oid: int
     value: bytes
@@ -74,12 +74,12 @@ def shell(frame: LocatedShell) -> list[Parameter]:
 
 
 def read_int8(value: bytes) -> int:
-    """Read one bigint."""
+    """Parse one bigint."""
     return int.from_bytes(value, "big", signed=True)
 
 
 def read_int8s(value: bytes | None) -> NDArray[np.int64]:
-    """Read a bigint[] without NULLs; NULL itself gives an empty array."""
+    """Parse a bigint[] without NULLs; NULL itself gives an empty array."""
     if value is None or len(value) < HEADER_BYTES:
         return np.empty(0, np.int64)
     count = (len(value) - HEADER_BYTES) // _STRIDE
@@ -87,7 +87,7 @@ def read_int8s(value: bytes | None) -> NDArray[np.int64]:
 
 
 def read_float8s(value: bytes) -> NDArray[np.float64]:
-    """Read a double precision[] without NULLs."""
+    """Parse a double precision[] without NULLs."""
     count = (len(value) - HEADER_BYTES) // _STRIDE
     return np.ndarray((count,), ">f8", value, HEADER_BYTES + 4, (_STRIDE,)).astype(np.float64)
 

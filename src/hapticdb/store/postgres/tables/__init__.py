@@ -1,1 +1,1 @@
-"""The tables of an environment on a server: read, written, loaded, their statistics."""
+"""Tables of an environment on a server: statements, writes, bulk loading, statistics."""

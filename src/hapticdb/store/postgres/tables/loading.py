@@ -1,9 +1,9 @@
-"""Loading: many objects at once into an empty environment, whose index is made afterwards.
+"""Bulk loading of objects into an empty environment, with its index built at the end.
 
 Measured on 15 million voxel rows: COPY and then the index take 21 s. COPY into an index takes 57 s,
-and that index is half as large again. A loader that was killed leaves no index; the next user who
-opens the environment to write makes it. Every commit waits for the disk, a millisecond each. So
-an object that was reported as written is there after a crash, and an import can go on after it.
+and this index is half as large again. After a killed loader there is no index; the next user to
+open the environment for writing builds it. Every commit waits for the disk, a millisecond each, so
+reported objects survive a crash, and an import can be resumed.
 """
 
 import contextlib
@@ -18,32 +18,31 @@ from hapticdb.store.postgres import schema_of
 from hapticdb.store.postgres.connecting import failures
 from hapticdb.store.postgres.connecting.connection import ServerConnection
 
-# Advisory locks of an environment: one for its loaders, one for the maker of the index.
-# The key is the oid of a table of the environment. An oid has 32 bits without a sign, a key 32 bits
-# with a sign.
+# Advisory locks of an environment: one for its loaders, one for the builder of the index. The key
+# is the oid of a table of the environment. An oid has 32 unsigned bits, a key 32 signed bits.
 LOADERS, MAKERS = 0x48415054, 0x48415055
 KEY = "%s, ('environment'::regclass::oid::bigint - 2147483648)::int"
 
 
 class _Index:
-    """The index of an environment's rows, and its table; None where partitions have them."""
+    """Index of an environment's rows, and their table; table None for rows on partitions."""
 
     def __init__(self, connection: ServerConnection, table: Layout | None) -> None:
         self._connection = connection
         self.table = table
 
     def is_there(self) -> bool:
-        """Whether the index is not missing."""
+        """Whether the index exists, or is not needed here."""
         text = "SELECT to_regclass(%s) IS NOT NULL"
         return self.table is None or self._connection.rows(text, (f"{self.table}_key",))[0][0]
 
     def has_no_rows(self) -> bool:
-        """Whether there is a table, and it is empty."""
+        """Whether the table exists, and is empty."""
         text = f"SELECT EXISTS (SELECT 1 FROM {self.table})"
         return self.table is not None and self._connection.rows(text) == [(False,)]
 
     def drop(self) -> None:
-        """Drop the index. If somebody is reading, it stays, and nobody waits."""
+        """Drop the index; while others read, it stays, after 50 ms."""
         connection = self._connection
         with contextlib.suppress(psycopg.errors.LockNotAvailable):
             try:
@@ -56,7 +55,7 @@ class _Index:
                 raise
 
     def make(self) -> None:
-        """Make the missing index, while readers go on and writers wait."""
+        """Build the missing index, while readers go on and writers wait."""
         connection = self._connection
         connection.command("SET maintenance_work_mem = '256MB'")
         connection.command(
@@ -65,12 +64,12 @@ class _Index:
         connection.command("RESET maintenance_work_mem")
 
     def vacuum(self) -> None:
-        """Let frames read the index only."""
+        """Update the visibility map, for frames by index-only scans."""
         self._connection.command(f"VACUUM {self.table}")
 
 
 class Loading:
-    """The context in which a connection writes many objects; those of partitions stay."""
+    """Context for the writes of many objects by one connection; partitions keep their indexes."""
 
     def __init__(self, connection: ServerConnection, layout: Layout, *, is_spread: bool) -> None:
         self._connection = connection
@@ -109,9 +108,9 @@ class Loading:
         self._depth -= 1
         self._connection.is_loading = self._depth > 0
         if self._depth or isinstance(error, ConnectionLostError):
-            return  # the next one who opens the environment to write makes the index
+            return  # the next user to open the environment for writing builds the index
         connection = self._connection
-        if connection.driver.closed:  # Ctrl-C came in the middle of a statement
+        if connection.driver.closed:  # Ctrl-C in the middle of a statement
             try:
                 connection.connect()
             except ConnectionLostError:
@@ -120,13 +119,13 @@ class Loading:
             try:
                 if self._is_owner and self._index.table is not None:
                     self._make_index()
-                    if self._has_written:  # so that frames read the index only
+                    if self._has_written:  # for frames by index-only scans
                         self._index.vacuum()
             finally:
                 self._unlock("_shared", LOADERS)
 
     def _check_editor(self) -> None:
-        """Refuse a user who may not edit objects, before minutes of reading files."""
+        """Refuse a user without the right to edit objects, before minutes of reading files."""
         ((may_edit,),) = self._connection.rows(
             "SELECT has_column_privilege('environment', 'revision', 'UPDATE')"
         )
@@ -134,11 +133,11 @@ class Loading:
             raise failures.no_editor(self._connection.shown)
 
     def note(self) -> None:
-        """Remember that something was written inside."""
+        """Note a write inside the context."""
         self._has_written = True
 
     def mend(self) -> None:
-        """Make the index that a killed loader left out, unless somebody is loading now."""
+        """Build the index missing after a killed loader, unless somebody is loading now."""
         connection = self._connection
         if not connection.is_owner() or self._index.is_there():
             return
@@ -150,7 +149,7 @@ class Loading:
                 self._make_index()
 
     def drop_unused(self) -> None:
-        """Delete the environment if nothing was ever written to it and nobody is loading."""
+        """Delete the environment if it has no commit and nobody is loading."""
         connection = self._connection
         with self._alone() as is_alone:
             if is_alone and not connection.rows("SELECT 1 FROM environment WHERE revision > 0"):
@@ -158,7 +157,7 @@ class Loading:
 
     @contextlib.contextmanager
     def _alone(self) -> Iterator[bool]:
-        """Whether nobody else is loading. Inside, nobody can begin to load."""
+        """Whether nobody else is loading. Inside, no loader can begin."""
         found = self._connection.rows(f"SELECT pg_try_advisory_lock({KEY})", (LOADERS,))
         try:
             yield bool(found[0][0])
@@ -169,11 +168,11 @@ class Loading:
     def _unlock(self, kind: str, lock: int) -> None:
         """Release a lock, unless it was lost with the connection."""
         if not self._connection.driver.closed:
-            with contextlib.suppress(psycopg.Error):  # the environment itself may be gone
+            with contextlib.suppress(psycopg.Error):  # the environment itself may be deleted
                 self._connection.execute(f"SELECT pg_advisory_unlock{kind}({KEY})", (lock,))
 
     def _make_index(self) -> None:
-        """Make the index, one connection at a time: IF NOT EXISTS alone would let two begin."""
+        """Build the index, one connection at a time: IF NOT EXISTS alone would let two begin."""
         connection = self._connection
         connection.execute(f"SELECT pg_advisory_lock({KEY})", (MAKERS,))
         try:

@@ -1,4 +1,4 @@
-"""The tables on a server: how statements run, what is written, sizes and quantiles of the keys."""
+"""Tables on a server: statements, writes, sizes, quantiles of the keys."""
 
 from collections.abc import Callable, Sequence
 from typing import Any, TypeVar
@@ -21,19 +21,18 @@ from hapticdb.store.tables import Tables
 Result = TypeVar("Result")
 
 WRITE_LOCK = "SELECT 1 FROM environment WHERE id = 1 FOR UPDATE"
-# writers take revisions one after the other, and no reader waits for this lock
+# writers take revisions one after the other; no reader waits for this lock
 NEXT_REVISION = "UPDATE environment SET revision = revision + 1 WHERE id = 1 RETURNING revision"
 COPY_CHUNK = 1 << 14
-"""Rows that are packed for COPY at a time. A larger value takes more memory, not less time."""
+"""Rows packed for COPY at a time. Larger: more memory, not less time."""
 COLUMNS: dict[Layout, str] = {
     "voxel": "z_val, id",
     "brick": "z_val, id, occupancy, distances",
 }
-# not from a sequence, which also counts rolled-back writes: an import that is run again would
-# give other ids
+# not from a sequence, which also counts rolled-back writes: a repeated import would give other ids
 HIGHEST_ID = "SELECT coalesce(max(id), 0) FROM change WHERE revision > %s"
 NEXT_ID = "SELECT setval('object_id_seq', greatest(nextval('object_id_seq'), %s))"
-# of the table `pair`, a column each
+# columns of the table `pair`
 PAIR_TYPES = (
     "bigint[]", "bigint[]", "text[]", *["double precision[]"] * 8, "text[]", "bigint[]", "text[]",
 )  # fmt: skip
@@ -46,11 +45,11 @@ DELETE FROM pair USING unnest(%s::bigint[], %s::bigint[]) AS gone (a, b)
 SIZE_OF_PARTITIONS = "SELECT sum(bytes), sum(pages) FROM size"
 SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(octet_length(geometry)), 0) FROM surface"
 SERVER_RESOLUTION = 10_000
-"""Buckets of the server's histogram: the most that it keeps, and the paper's best resolution."""
+"""Buckets of the server's histogram: the server's maximum, and the paper's best resolution."""
 ENOUGH_ROWS = 10 * SERVER_RESOLUTION
-"""Rows from which the server's statistics are used. With fewer, an exact histogram is quick."""
+"""Least number of rows for the server's statistics. With fewer, an exact histogram is fast."""
 
-# returns one row, which holds NULLs before the first ANALYZE
+# one row, of NULLs before the first ANALYZE
 STATISTICS = """
 SELECT histogram_bounds::text::bigint[], most_common_vals::text::bigint[],
        most_common_freqs::float8[],
@@ -70,7 +69,7 @@ SELECT percentile_disc((SELECT array_agg((r - 0.5) / $2 ORDER BY n)
 
 
 class ServerTables(Tables):
-    """The tables on a server. They remember the revision that the last read has seen."""
+    """Tables on a server, with the revision seen by the last read."""
 
     AMONG = "id = ANY (ARRAY(SELECT json_array_elements_text(%s::json)::bigint))"
     LISTED = "SELECT json_array_elements_text(%s::json)"
@@ -86,7 +85,7 @@ class ServerTables(Tables):
         self._seen = -1
         self._loading = Loading(connection, self.layout, is_spread=self._is_spread)
         self._written: tuple[Any, ...] = ()
-        self._highest_id = (0, 0)  # at which revision
+        self._highest_id = (0, 0)  # and its revision
 
     def _rows(
         self, text: str, parameters: Sequence[Any] = (), *, binary: bool = False
@@ -114,7 +113,7 @@ class ServerTables(Tables):
         return values.reshape(-1).tolist()
 
     def version(self) -> int:
-        """The revision that the last read has seen."""
+        """Revision seen by the last read; -1 after an own write."""
         return self._seen
 
     def revision(self) -> int:
@@ -132,7 +131,7 @@ class ServerTables(Tables):
         self._do(PUT_PAIRS, [list(column) for column in columns])
 
     def drop_rows(self, object_id: int) -> None:
-        """Delete the rows that a crash has left of an object that is not there."""
+        """Delete the orphan rows of a crash, unless the object exists."""
 
         def work() -> None:
             if not self._do("SELECT 1 FROM object WHERE id = %s", (object_id,)):
@@ -141,9 +140,9 @@ class ServerTables(Tables):
         self._alone(work)
 
     def _new_id(self, revision: int) -> int:
-        """One above all ids ever given, under the write lock.
+        """One above all ids ever assigned, under the write lock.
 
-        On partitions an id of an add that failed is never given again: rows of it may be there.
+        On partitions the id of a failed add is never reused: its orphan rows may exist.
         """
         since, highest = self._highest_id
         found = self._do(HIGHEST_ID, (since,))
@@ -159,7 +158,7 @@ class ServerTables(Tables):
         return result
 
     def _note(self, change: tuple[Any, ...]) -> None:
-        """Write the row of `change`, and notify those who watch when it is committed."""
+        """Write the row of `change`, and notify the channel at the commit."""
         ((transaction, _),) = self._do(
             "INSERT INTO change VALUES (%s, %s, %s, %s)"
             " RETURNING xmin::text, pg_notify(%s, revision::text)",
@@ -169,13 +168,13 @@ class ServerTables(Tables):
 
     def _is_written(self) -> bool:
         """Whether a write was committed although the connection broke during its commit."""
-        # the commit may still be under way: wait for its lock before looking
+        # the commit may still be in progress: wait for its lock first
         self._rows(WRITE_LOCK)
         found = "SELECT 1 FROM change WHERE (revision, action, id, xmin::text) = (%s, %s, %s, %s)"
         return bool(self._rows(found, self._written))
 
     def _put(self, rows: Rows, object_id: int) -> None:
-        """Write the rows of an object that has none."""
+        """Write the rows of an object without rows."""
         target = f"{self.layout} ({COLUMNS[self.layout]})"
         with self._connection.driver.cursor().copy(
             f"COPY {target} FROM STDIN (FORMAT binary)"
@@ -186,9 +185,9 @@ class ServerTables(Tables):
             copy.write(wire.COPY_TRAILER)
 
     def _take(self, known: Object, ranges: Ranges, keys: Keys = NO_KEYS) -> Keys:
-        """Delete the rows of an object as it is now; returns their keys.
+        """Delete the present rows of an object; returns their keys.
 
-        keys : of its new rows; on partitions a try that failed may have left such rows.
+        keys : of its new rows; on partitions a failed attempt may have left such rows.
         """
         lows, highs = ranges
         if self._is_spread and keys.size:
@@ -205,7 +204,7 @@ class ServerTables(Tables):
             counted = (
                 "SELECT count(*) FROM brick"
                 if self.layout == "brick"
-                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row for each voxel
+                else "SELECT coalesce(sum(voxels), 0) FROM object"  # a row a voxel
             )
             ((rows,),) = self._connection.execute(counted).fetchall()
             total, index = self._bytes()
@@ -216,16 +215,16 @@ class ServerTables(Tables):
             return Size(int(rows), total, max(index, 1), *map(int, surfaces))
 
     def quantiles(self, resolution: int) -> Histogram:
-        """At 10,000 from the server's statistics once there are enough rows."""
+        """At 10,000 from the server's statistics, from `ENOUGH_ROWS` rows on."""
         found = self._server_histogram() if resolution == SERVER_RESOLUTION else None
         return found or super().quantiles(resolution)
 
     def _server_histogram(self) -> Histogram | None:
         """Histogram of 10,000 buckets from `pg_stats`; None for few rows, or without an ANALYZE.
 
-        The bounds of `pg_stats` leave out the most common keys, which have shares of all rows. The
-        rows of a bucket count at its upper bound, those of a common key at that key. Bound i is the
-        least key up to which the share of rows is i / R, right to within a bucket.
+        The bounds of `pg_stats` omit the most common keys, which have shares of all rows. The rows
+        of a bucket count at its upper bound, those of a common key at the key itself. Bound i is
+        the least key with a cumulative share of rows of i / R, exact to within a bucket.
         """
         parameters = wire.text(self._connection.address.environment), wire.text(self.layout)
         *found, frequencies, n_rows = self._connection.fetch(STATISTICS, *parameters)
@@ -247,7 +246,7 @@ class ServerTables(Tables):
         return Histogram(equal, rows, "server statistics")
 
     def _measured(self, resolution: int) -> tuple[int, int, Keys | None]:
-        """The server's own statistics once there are enough rows."""
+        """The server's own statistics, from `ENOUGH_ROWS` rows on."""
         if resolution == SERVER_RESOLUTION:
             revision, n_rows = self.revision(), self.size().rows
             if n_rows >= ENOUGH_ROWS:
@@ -257,7 +256,7 @@ class ServerTables(Tables):
         return super()._measured(resolution)
 
     def _exact(self, resolution: int) -> tuple[Keys, int]:
-        """By the paper's Definition 2: bound i is the key of the row of rank ceil(i N / R)."""
+        """The paper's Definition 2: bound i is the key of the row of rank ceil(i N / R)."""
         connection = self._connection
         with connection.snapshot(), connection.without_limit():
             counted = connection.execute(f"SELECT count(*) FROM {self.layout}").fetchone()
@@ -271,7 +270,7 @@ class ServerTables(Tables):
         return wire.read_int8s(bounds), n_rows
 
     def _bytes(self) -> tuple[int, int]:
-        """Bytes of all tables and indexes of the schema, and pages of the index of its rows."""
+        """Bytes of all tables and indexes of the schema, and pages of the rows' index."""
         ((total, pages),) = self._connection.execute(
             "SELECT (SELECT coalesce(sum(pg_total_relation_size(oid)), 0) FROM pg_class"
             "         WHERE relkind = 'r'"

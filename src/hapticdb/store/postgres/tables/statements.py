@@ -1,7 +1,7 @@
-"""The SQL of the haptic query on PostgreSQL: one statement, which returns one row of packed arrays.
+"""SQL of the haptic query on PostgreSQL: one statement, with one result row of packed arrays.
 
 Every statement also returns its revision, so a reader notices an edit without another round trip.
-Rows come in the order of the index; `PostgresStore` checks that.
+Rows are in index order; `PostgresStore` verifies the order.
 """
 
 from typing import NamedTuple
@@ -22,12 +22,12 @@ HELD: dict[Columns, str] = {
     "brick": "occupancy IS NOT NULL",
     "distances": "distances IS NOT NULL",
 }
-"""Condition on a row that a read returns."""
+"""Condition on the rows of a read."""
 SEEN = "(SELECT revision FROM environment WHERE environment.id = 1)"
 
 
 def _packed(source: str) -> dict[Columns, str]:
-    """Packed rows with each choice of columns, and the revision."""
+    """Statement of packed rows and the revision, for each choice of columns."""
     return {
         columns: f"\nSELECT {PACKED[columns]}, {SEEN}\n"
         + source.replace("TABLE", table).replace("HELD", HELD[columns])
@@ -35,7 +35,7 @@ def _packed(source: str) -> dict[Columns, str]:
     }
 
 
-# PostgreSQL 17 and later read each leaf page once for all of the sorted keys on it
+# PostgreSQL 17 and later read each leaf page once for all of its sorted keys
 LOOKUP = _packed("  FROM TABLE\n WHERE z_val = ANY ($1) AND HELD")
 LOOKUP_ONE = _packed("  FROM TABLE\n WHERE z_val = $1 AND HELD")
 SCAN = _packed("""  FROM unnest($1, $2) AS range(low, high) JOIN TABLE
@@ -100,10 +100,10 @@ SELECT array_agg(n), array_agg(id), {SEEN}
 
 
 def without_excluded(sql: str, layout: Layout, number: int) -> str:
-    """Exclude objects from a statement.
+    """Statement without excluded objects.
 
-    Its parameters from that number on: least and greatest excluded id, and a bytea with a bit for
-    each in between. The server would compare each row with each element of an array of ids.
+    Its parameters from `number` on: least and greatest excluded id, and a bytea bitmap of the ids
+    between them. An array of ids would be compared element by element with each row.
     """
     test = KEY_TEST[layout]
     low, high, bits = f"${number}", f"${number + 1}", f"${number + 2}"
@@ -112,13 +112,13 @@ def without_excluded(sql: str, layout: Layout, number: int) -> str:
 
 
 def without_few(sql: str, layout: Layout, number: int) -> str:
-    """Exclude objects whose ids, the parameter of that number, are too far apart for bits."""
+    """Statement without objects of sparse ids, an array as the parameter of this number."""
     test = KEY_TEST[layout]
     return sql.replace(test, f"{test} AND id <> ALL (${number})")
 
 
 class Texts(NamedTuple):
-    """Statements by columns or layout, as the constants above have them."""
+    """Statements by columns or layout, from the constants above."""
 
     lookup: dict[Columns, str]
     lookup_one: dict[Columns, str]
@@ -133,14 +133,14 @@ class Texts(NamedTuple):
 ONE_SERVER = Texts(LOOKUP, LOOKUP_ONE, SCAN, AFTER, ROWS_OF, COUNT, WRENCH, HITS)
 
 
-# Rows on partitions (docs/postgresql.md): the same questions, so that a condition on keys reaches
-# the partitions. OFFSET 0 makes the planner ask them for each range or key, by its value; a join
-# would fetch all of their rows. Rows of no object, which a crash has left, are passed over.
+# Rows on partitions (docs/postgresql.md): the same queries, in a form whose condition on keys
+# reaches the partitions. OFFSET 0 forces a remote scan for each range or key, by its value; a join
+# would fetch all of their rows. Orphan rows of a crash are skipped.
 KNOWN = "EXISTS (SELECT 1 FROM object WHERE object.id = {0}.id)"
 
 
 def _known(table: str, where: str) -> str:
-    """Rows of a table with a condition on `z_val`, as a subquery; only those of objects."""
+    """Subquery of a table's rows with a condition on `z_val`, without orphan rows."""
     return f"(SELECT * FROM {table} WHERE {where} AND {KNOWN.format(table)} OFFSET 0) AS {table}"
 
 

@@ -1,1 +1,1 @@
-"""The tables of an environment in a file: read, written, their statistics."""
+"""Tables of an environment in a file: statements, writes, statistics."""

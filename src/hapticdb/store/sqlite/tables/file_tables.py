@@ -1,4 +1,4 @@
-"""The tables in a file: how statements run, what is written, sizes and quantiles of the keys."""
+"""Tables in a file: statements, writes, sizes, quantiles of the keys."""
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -21,14 +21,14 @@ KINDS = """
 SELECT name, CASE WHEN sql LIKE 'CREATE VIRTUAL%' THEN 'virtual table' ELSE type END
   FROM sqlite_master"""
 
-# whole arrays are bound at once: 8 times faster than executemany, without the interpreter lock
+# whole arrays bound at once: 8 times faster than executemany, without the interpreter lock
 INSERT = {
     "voxel": "INSERT INTO voxel SELECT value, ?2 FROM carray(?1)",
     "brick": """INSERT INTO brick SELECT value, ?2, nth(?3, rowid, 0), nth(?4, rowid, 0)
                   FROM carray(?1)""",
 }
 CHUNK = 1 << 14
-"""Rows that one statement inserts; to undo it takes up to a page of memory for each."""
+"""Rows inserted by one statement; to undo it takes up to a page of memory for each."""
 PUT_PAIR = PUT.format(values=f"VALUES ({', '.join('?' * 14)})")
 DELETE_PAIR = "DELETE FROM pair WHERE (a, b) = (?, ?)"
 DELETE: dict[Layout, str] = {
@@ -39,7 +39,7 @@ SIZE_OF_SURFACES = "SELECT count(*), coalesce(sum(length(geometry)), 0) FROM sur
 
 
 def read_environment(connection: FileConnection) -> tuple[Grid, Layout, bool]:
-    """Grid and layout of an environment, and whether it wants distances, all checked."""
+    """Grid and layout of an environment, and whether imports compute distances, all checked."""
     kinds = dict(connection.fetch(KINDS))
     parsing.check_tables(connection.url, kinds)
     rows = connection.fetch(
@@ -69,7 +69,7 @@ class FileTables(Tables):
         text: str,
         parameters: Sequence[Any] = (),
         *,
-        binary: bool = False,  # noqa: ARG002 - a file gives values in one way
+        binary: bool = False,  # noqa: ARG002 - a file has one format
     ) -> list[Any]:
         self._connection.file.check()
         return self._connection.fetch(text.replace("%s", "?"), parameters)
@@ -90,7 +90,7 @@ class FileTables(Tables):
         return self.revision() + 1
 
     def _new_id(self, revision: int) -> None:
-        """None: the table gives one that no object ever had."""
+        """None: the table assigns an id that no object ever had."""
 
     def _packed(self, values: NDArray[Any]) -> bytes:
         return np.ascontiguousarray(values, values.dtype.newbyteorder("<")).tobytes()
@@ -147,7 +147,7 @@ class FileTables(Tables):
         """Bounds (v + 1,) of the v-quantile vector (the paper's Definition 2), and the rows N.
 
         Bound i is the key of the row of rank ceil(i N / v), bound 0 the lowest. Each step skips,
-        inside the engine, from one rank to the next. ``sqlite_stat4`` holds only 24 samples.
+        inside the engine, from one rank to the next. ``sqlite_stat4`` has only 24 samples.
         """
 
         def row_of(sql: str, *bindings: int) -> tuple[int, int]:

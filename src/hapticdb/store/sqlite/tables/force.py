@@ -1,8 +1,8 @@
 """The paper's Figure 3 on SQLite: a frame's wrench by one statement and the aggregate `force`.
 
 The PointShell is bound as parallel arrays in the order of its points: ordinal and key through
-``carray`` (its rowid and its value), point and normal through a pointer that `force` indexes by the
-ordinal. On bricks the key is an address: the brick's key, and nine bits that name the voxel in it.
+``carray`` (its rowid and its value), point and normal through a pointer, indexed by `force` with
+the ordinal. On bricks the key is an address: the brick's key, and nine bits for the voxel in it.
 """
 
 from typing import Any, cast
@@ -22,7 +22,7 @@ TEST: dict[Layout, str] = {
     "brick": "z_val = shell.value >> 9"
     " AND occupancy IS NOT NULL AND has_voxel(occupancy, shell.value & 511)",
 }
-"""The condition of the statements on a row."""
+"""Condition of the statements on a row."""
 WRENCH: dict[Layout, str] = {
     layout: f"""
 SELECT force(?1, shell.rowid, shell.value)
@@ -40,18 +40,18 @@ SELECT shell.rowid, id
 
 
 def wrench_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
-    """Text and bindings of the statement that returns the wrench."""
+    """Text and bindings of the wrench's statement."""
     bindings = (apsw.pyobject(frame), apsw.carray(frame.addresses))
     return _without_excluded(WRENCH[layout], layout, bindings, frame)
 
 
 def hits_statement(layout: Layout, frame: LocatedShell) -> tuple[str, tuple[Any, ...]]:
-    """Text and bindings of the statement that returns ordinal and object id of each hit."""
+    """Text and bindings of the statement for ordinal and object id of each hit."""
     return _without_excluded(HITS[layout], layout, (apsw.carray(frame.addresses),), frame)
 
 
 def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
-    """Give a connection the functions that the statements call."""
+    """Register the statements' functions on a connection."""
 
     def force() -> _Force:
         return _Force(grid, layout)
@@ -75,7 +75,7 @@ def register(connection: apsw.Connection, grid: Grid, layout: Layout) -> None:
 class _Force:
     """The user-defined aggregate ``force(shell, ordinal, key)``.
 
-    It sums at the end, in the order of the ordinals: SQLite would drop a bound pointer in a sort.
+    It sums at the end, in order of the ordinals: SQLite would drop a bound pointer in a sort.
     """
 
     def __init__(self, grid: Grid, layout: Layout) -> None:
@@ -85,7 +85,7 @@ class _Force:
         self._hits: list[tuple[int, int]] = []
 
     def step(self, frame: LocatedShell, ordinal: int, address: int) -> None:
-        """Collect one hit; ordinals count from 1 here, as rowids do."""
+        """Collect one hit; ordinals count from 1 here, like rowids."""
         self._frame = frame
         self._hits.append((ordinal - 1, address))
 
@@ -108,7 +108,7 @@ class _Force:
 def _without_excluded(
     sql: str, layout: Layout, bindings: tuple[Any, ...], frame: LocatedShell
 ) -> tuple[str, tuple[Any, ...]]:
-    """Leave objects out of a statement by one more condition on the row's id.
+    """Statement without excluded objects, by one more condition on the row's id.
 
     A set in Python: SQLite's index of thousands of ids takes longer than the frame.
     """
@@ -120,14 +120,14 @@ def _without_excluded(
 
 
 class _LastExcluded:
-    """The excluded ids of the last frame as a set; most frames exclude what the last one did."""
+    """The excluded ids of the last frame as a set; most frames exclude the same ones."""
 
     def __init__(self) -> None:
         self._ids: Keys | None = None
         self._set: frozenset[int] = frozenset()
 
     def is_felt(self, exclude: Keys, object_id: int) -> bool:
-        """Whether an object is not among the excluded ones."""
+        """Whether an object is not excluded."""
         if exclude is not self._ids:
             self._ids, self._set = exclude, frozenset(exclude.tolist())
         return object_id not in self._set

@@ -1,7 +1,7 @@
-"""How ranges of keys reach SQLite: one prepared statement for any number of ranges.
+"""Key ranges as parameters of SQLite: one prepared statement for any number of ranges.
 
-One integer carries the lower end and the width of a range if it has room, as in every frame on a
-grid of 11 bits. Otherwise the SQL function `nth` returns the upper ends (docs/decisions/0004).
+One integer packs the lower end and the width of a range if it has room, as in every frame on a grid
+of 11 bits. Otherwise the SQL function `nth` returns the upper ends (docs/decisions/0004).
 """
 
 from typing import Any, cast
@@ -25,8 +25,8 @@ HELD: dict[Columns, str] = {
     "brick": "occupancy IS NOT NULL",
     "distances": "distances IS NOT NULL",
 }
-"""Condition on a row that a read returns."""
-# SQLite never reorders a CROSS JOIN, so the rows keep the order of the keys asked for
+"""Condition on the rows of a read."""
+# SQLite never reorders a CROSS JOIN, so the rows are in the order of the given keys
 NARROW: dict[Columns, str] = {
     columns: f"""
   FROM carray(?1) AS range CROSS JOIN {table}
@@ -45,7 +45,7 @@ class RangeStatements:
     """Statements of ranges on one environment, with the values of their first three parameters."""
 
     def __init__(self, connection: apsw.Connection, layout: Layout, bits: int) -> None:
-        # the bits that a row key leaves free hold the width of a range
+        # the bits free in a row key contain the width of a range
         self._width_bits = KEY_BITS - max(3 * bits - row_shift(layout), 1)
         self._mask = (1 << self._width_bits) - 1
         self._key_end = 1 << (KEY_BITS - self._width_bits)
@@ -77,6 +77,6 @@ def _ends(highs: Keys) -> object:
     return apsw.pyobject(highs.tolist())
 
 
-def _nth(values: list[Any], ordinal: int, _: int) -> Any:  # noqa: ANN401 - what SQLite holds
-    """Value of a bound list by ordinal, from 1: the other end of a range, or a row's bytes."""
+def _nth(values: list[Any], ordinal: int, _: int) -> Any:  # noqa: ANN401 - any SQLite value
+    """Value of a bound list by ordinal, from 1: the upper end of a range, or a row's bytes."""
     return values[ordinal - 1]

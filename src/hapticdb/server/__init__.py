@@ -1,1 +1,1 @@
-"""What other machines reach: relay, access, health."""
+"""HTTP and WebSocket server of the browser view: relay, access, limits, health."""

@@ -1,8 +1,8 @@
-"""Who may do what on the server: roles, the tokens that name them, and browsers' cookies.
+"""Roles, bearer tokens and session cookies of the server.
 
-A viewer sees, a toucher also feels, an editor also moves objects. A client shows its token once. A
-browser gets a cookie for it; a program that reads figures sends the token in the header
-``Authorization: Bearer``. Only digests of tokens and cookies are kept.
+A viewer sees, a toucher also gets forces, an editor also moves objects. A browser sends its token
+once and gets a cookie; a program that reads figures sends it in the header ``Authorization:
+Bearer``. The server stores only digests of tokens and cookies.
 """
 
 import hashlib
@@ -19,17 +19,17 @@ from hapticdb.errors import UsageError
 COOKIE = "hapticdb"
 """Name of the cookie. Browsers send a cookie to all ports of a machine, so the port is appended."""
 SIGNED_IN_SECONDS = 3600.0
-"""Seconds that a cookie is good for after it was last used. Larger: so is a stolen one."""
+"""Lifetime of a cookie after its last use, seconds. Larger: the same for a stolen one."""
 MOST_SIGNED_IN = 1024
-"""Greatest number of valid cookies. The one that was used longest ago makes room for a new one."""
+"""Valid cookies, at most; a new one replaces the least recently used."""
 LEAST_TOKEN = 16
-"""Fewest characters of a token that a person chooses. Smaller: it can be guessed."""
+"""Fewest characters of a person's own token. Smaller: guessable."""
 LONGEST_TOKEN = 256
-"""Most characters of a token. A longer one is wrong and is not hashed."""
+"""Most characters of a token. A longer one is wrong, and only its first part is hashed."""
 
 
 class Role(IntEnum):
-    """What a client may do; a greater role may also do all that a smaller one may."""
+    """Role of a client; a greater role includes the rights of a smaller one."""
 
     VIEWER = 1
     TOUCHER = 2
@@ -37,12 +37,12 @@ class Role(IntEnum):
 
     @property
     def word(self) -> str:
-        """Its name as people write it."""
+        """Name in options and messages, lower case."""
         return self.name.lower()
 
     @classmethod
     def of(cls, word: str) -> "Role":
-        """Find the role of that name; a UsageError if there is none."""
+        """Role of this name; UsageError for an unknown one."""
         known = {role.word: role for role in cls}
         if word not in known:
             raise UsageError(f"no role {word!r}: choose one of {', '.join(known)}")
@@ -51,16 +51,16 @@ class Role(IntEnum):
 
 @dataclass
 class _SignedIn:
-    """A browser that has shown its token."""
+    """A cookie's role, and its end on the clock."""
 
     role: Role
     until: float
 
 
 class Access:
-    """The tokens of one server with their roles, and the browsers that have shown one.
+    """Tokens of one server with their roles, and valid cookies.
 
-    open_role : of clients that show nothing; port : of the server, for the name of the cookie.
+    open_role : of clients without a token; port : of the server, for the name of the cookie.
     """
 
     def __init__(
@@ -85,7 +85,7 @@ class Access:
         return f"{COOKIE}-{self.port}"
 
     def role_of_token(self, token: str) -> Role | None:
-        """Find the role that a token gives; None for a wrong one. Takes equally long for both."""
+        """Role of a token; None for a wrong one. Takes equally long for both."""
         shown = _digest(token[: LONGEST_TOKEN + 1])
         found = None
         for digest, role in self._roles:
@@ -94,10 +94,10 @@ class Access:
         return found
 
     def role_of_headers(self, headers: Mapping[str, str]) -> Role | None:
-        """Role of a client by its request's headers, whose names are in lower case.
+        """Role of a client by its request's headers, with names in lower case.
 
-        It is that of its bearer token or its cookie, whose time begins anew; else the open role.
-        None if it may do nothing: also if it shows a bearer token that is wrong.
+        That of its bearer token, or of its cookie, which is renewed; else the open role. None for
+        no role, and for a wrong bearer token.
         """
         scheme, _, token = headers.get("authorization", "").partition(" ")
         if scheme.lower() == "bearer":
@@ -114,11 +114,11 @@ class Access:
         return "" if morsel is None else morsel.value
 
     def renew(self, cookie: str) -> bool:
-        """Begin the time of a cookie anew; returns whether it was still valid."""
+        """Renew a cookie; returns whether it was still valid."""
         return self._known(cookie) is not None
 
     def sign_in(self, token: str) -> str | None:
-        """Value of a new cookie for a browser that shows this token; None for a wrong token."""
+        """Value of a new cookie for the browser with this token; None for a wrong token."""
         role = self.role_of_token(token)
         if role is None:
             return None
@@ -128,7 +128,7 @@ class Access:
         return cookie
 
     def _known(self, cookie: str) -> _SignedIn | None:
-        """Find a valid cookie by its digest, which tells nothing about the cookie, and renew it."""
+        """Find and renew a valid cookie by its digest, from which no cookie can be computed."""
         known = self._signed_in.get(_digest(cookie[:LONGEST_TOKEN])) if cookie else None
         now = self._clock()
         if known is None or now >= known.until:
@@ -137,7 +137,7 @@ class Access:
         return known
 
     def _forget_old(self) -> None:
-        """Drop cookies whose time is over, and make room for one more."""
+        """Drop expired cookies, and the oldest of too many."""
         now = self._clock()
         valid = {key: known for key, known in self._signed_in.items() if now < known.until}
         oldest = sorted(valid, key=lambda key: valid[key].until)
@@ -152,7 +152,7 @@ def make_token() -> str:
 
 
 def check_token(token: str) -> None:
-    """Refuse a token that can be guessed or cannot be written into a URL."""
+    """Refuse a token of the wrong length, or with letters to be escaped in a URL."""
     if not LEAST_TOKEN <= len(token) <= LONGEST_TOKEN:
         raise UsageError(
             f"a token of {len(token)} characters: choose one of {LEAST_TOKEN} to {LONGEST_TOKEN}, "

@@ -1,4 +1,4 @@
-"""The application: which path leads where."""
+"""The ASGI application: routes."""
 
 import asyncio
 
@@ -15,9 +15,9 @@ from hapticdb.server.relay import Relay
 from hapticdb.server.served import Served
 
 LOOPBACK = frozenset({"127.0.0.1", "::1", "localhost"})
-"""Addresses of this machine; a request that came by a proxy has the proxy's client instead."""
+"""Addresses of this machine; behind a proxy, a request has the proxy's client instead."""
 FORWARDED = ("forwarded", "x-forwarded-for", "x-forwarded-host", "via")
-"""Headers by which proxies tell that they passed a request on."""
+"""Headers of forwarding proxies."""
 
 
 def application(
@@ -30,7 +30,7 @@ def application(
     title: str,
     host_names: tuple[str, ...] = (),
 ) -> ASGIApp:
-    """Put the parts of a server together; `prefix`, `title` and `host_names` as of `Serving`."""
+    """Application of a server's parts; `prefix`, `title` and `host_names` as of `Serving`."""
     door = FrontDoor(served.access, page, served.limits, prefix, title)
 
     async def healthz(_: Request) -> Response:
@@ -43,7 +43,7 @@ def application(
                 "this needs a token, or a request from the same machine\n", 403
             )
         await doctor.health()  # measures the database
-        text = await asyncio.to_thread(served.figures.text)  # sessions may be beginning
+        text = await asyncio.to_thread(served.figures.text)  # sessions may be starting
         return Response(text, media_type="text/plain; version=0.0.4")
 
     routes: list[BaseRoute] = [
@@ -53,14 +53,14 @@ def application(
         Route("/metrics", metrics, methods=["GET"]),
         WebSocketRoute("/", relay.browser),
     ]
-    # viser's client leaves out the last slash of the page's address
+    # viser's client omits the last slash of the page's address
     bare: list[BaseRoute] = [WebSocketRoute(prefix, relay.browser)] if prefix else []
     app = Starlette(routes=[*bare, Mount(prefix, routes=routes)] if prefix else routes)
     return Guards(app, host_names)
 
 
 def _may_read_figures(request: Request, served: Served) -> bool:
-    """Whether a request comes from this machine and by no proxy, or shows a token."""
+    """Whether a request comes from this machine without a proxy, or has a valid token."""
     shown = request.headers.get("authorization") or served.access.cookie_of(request.headers)
     if shown and served.access.role_of_headers(request.headers) is not None:
         return True

@@ -1,14 +1,14 @@
-"""What the server counts, for Prometheus."""
+"""Metrics of the server for Prometheus."""
 
 from prometheus_client import CollectorRegistry, Counter, Gauge, Histogram, generate_latest
 from prometheus_client.registry import Collector
 
 DATABASE_BUCKETS = (0.0005, 0.001, 0.002, 0.005, 0.01, 0.02, 0.05, 0.1, 0.2, 0.5, 1.0, 5.0)
-"""Limits in seconds between which answers of the database are counted."""
+"""Bucket bounds of the database's response times, seconds."""
 
 
 class Figures:
-    """Counters of one server."""
+    """Metrics of one server."""
 
     def __init__(self) -> None:
         self.registry = known = CollectorRegistry()
@@ -51,9 +51,9 @@ class Figures:
             self.relayed.labels(direction)
 
     def add(self, collector: Collector) -> None:
-        """Add figures that are read when they are asked for."""
+        """Add metrics computed at each scrape."""
         self.registry.register(collector)
 
     def text(self) -> bytes:
-        """All figures in the text format of Prometheus."""
+        """All metrics in the text format of Prometheus."""
         return generate_latest(self.registry)

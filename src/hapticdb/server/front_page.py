@@ -1,7 +1,7 @@
-"""The first pages of a browser: a token becomes a cookie, and the cookie opens viser's client.
+"""First pages of a browser: sign-in by token, and viser's client.
 
-The client is one HTML file that holds its program packed. A small script unpacks it and adds it to
-the document. The content security policy names both scripts by their digests, so no other script
+The client is one HTML file with its program packed. A small script unpacks it and adds it to the
+document. The content security policy allows these two scripts by their digests, so no other script
 runs, and no text of a part can become one.
 """
 
@@ -46,13 +46,13 @@ HIDING = (
     "content:'Connecting ...';position:fixed;inset:0;z-index:9999;display:grid;"
     "place-items:center;background:#fafbfc;font:16px system-ui,sans-serif}</style>"
 )
-"""Hides viser's note about drawing in software, its words in an empty tab, and its settings, which
+"""Hides viser's note about software rendering, its text in an empty tab, and its settings, which
 begin with the server's address, with their buttons. They stay laid out, because viser measures
-them. Covers everything while viser's panel bears its sign for no connection."""
+them. Covers everything while viser's panel shows its sign for a lost connection."""
 
 
 class ClientPage(NamedTuple):
-    """The page of a browser, also packed by gzip; a tag that changes with it, and its policy."""
+    """The page of a browser, plain and gzipped; its ETag, and its content security policy."""
 
     html: bytes
     packed: bytes
@@ -61,7 +61,7 @@ class ClientPage(NamedTuple):
 
 
 def client_page(title: str) -> ClientPage:
-    """Read viser's client and give it a title; MissingExtraError without a known one."""
+    """Client of viser with a title; MissingExtraError without viser, or for another client."""
     spec = importlib.util.find_spec("viser")
     if spec is None or spec.origin is None:
         raise MissingExtraError(f"the browser view needs more packages: {pip_line('view')}")
@@ -81,7 +81,7 @@ def client_page(title: str) -> ClientPage:
 
 
 def _policy(scripts: list[bytes]) -> str:
-    """Policy under which exactly these scripts run, and nothing is fetched from elsewhere."""
+    """Content security policy for exactly these scripts, without other origins."""
     digests = " ".join(f"'{digest_source(script)}'" for script in scripts)
     return "; ".join(
         [
@@ -101,7 +101,7 @@ def _policy(scripts: list[bytes]) -> str:
 
 
 def digest_source(script: bytes) -> str:
-    """Source expression of a policy that allows exactly this inline script or style."""
+    """Source expression of a policy for exactly this inline script or style."""
     return f"sha256-{base64.b64encode(hashlib.sha256(script).digest()).decode()}"
 
 
@@ -118,7 +118,7 @@ def _program(loader: re.Match[str]) -> bytes:
 
 
 def _bytes_of(digits: NDArray[np.uint8]) -> bytes:
-    """Bytes of a text in base 88; the last digits hold one byte less than they are."""
+    """Bytes of a text in base 88; the last n < 5 digits make n - 1 bytes."""
     value_of = np.zeros(256, np.int64)
     value_of[np.frombuffer(ALPHABET, np.uint8)] = np.arange(88)
     values = value_of[digits]
@@ -131,7 +131,7 @@ def _bytes_of(digits: NDArray[np.uint8]) -> bytes:
 
 
 MOST_ADDRESSES = 4096
-"""Addresses whose attempts at tokens are counted; the oldest one makes room. Smaller: who has many
+"""Addresses with counted sign-in attempts; a new one replaces the oldest. Smaller: a client of many
 addresses gets more attempts."""
 STYLE = (
     "body{font:16px system-ui,sans-serif;max-width:24rem;margin:20vh auto;padding:0 1rem}"
@@ -149,8 +149,8 @@ ONWARD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><title>{title}</title>
 <meta http-equiv="refresh" content="0;url={prefix}/"></head><body></body></html>
 """
-"""Leads on to the view without the token in the address. A redirect would lose the cookie, which is
-SameSite=Strict, where the link stands on another site."""
+"""Leads to the view, with a URL without the token. After a link from another site, a redirect would
+lose the cookie, which is SameSite=Strict."""
 POLICY = (
     f"default-src 'none'; style-src '{digest_source(STYLE.encode())}'; form-action 'self'; "
     "frame-ancestors 'none'; base-uri 'none'"
@@ -158,7 +158,7 @@ POLICY = (
 
 
 class FrontDoor:
-    """Answers a browser's first requests: the view, or the form that asks for a token."""
+    """Sign-in and view: the view with a valid cookie, otherwise the form for a token."""
 
     def __init__(
         self, access: Access, page: ClientPage, limits: Limits, prefix: str, title: str
@@ -176,7 +176,7 @@ class FrontDoor:
         return self._view(request)
 
     async def sign_in(self, request: Request) -> Response:
-        """Answer the form."""
+        """Answer the posted form."""
         body = b""
         try:
             async with asyncio.timeout(self._limits.request_seconds):
@@ -207,7 +207,7 @@ class FrontDoor:
         answer.set_cookie(
             self._access.cookie_name,
             cookie,
-            path=self._prefix or "/",  # the socket of viser has no slash behind the prefix
+            path=self._prefix or "/",  # viser's socket has no slash behind the prefix
             secure=request.url.scheme == "https",
             httponly=True,
             samesite="strict",
@@ -215,7 +215,7 @@ class FrontDoor:
         return answer
 
     def _may_try(self, request: Request) -> bool:
-        """Whether an address may try a token now; an IPv6 address stands for its network of /64."""
+        """Whether an address may try a token now; an IPv6 address counts as its network of /64."""
         address = "" if request.client is None else request.client.host
         address = ":".join(address.split(":")[:4])
         limits = self._limits

@@ -1,9 +1,9 @@
-"""What every request must satisfy before an endpoint sees it, and headers of every answer.
+"""Checks of Host and Origin on every request, and security headers of every response.
 
-A page of another site can make a browser send requests to this server. It cannot choose the headers
-Host and Origin, so both are checked: Host against rebound names (DNS rebinding), Origin on every
-WebSocket and on every request that changes something. A WebSocket without Origin passes: browsers
-always send one there, so a program opens it, with the token of a role.
+A page of another site can make a browser send requests to this server, but cannot set the headers
+Host and Origin. Host is checked against DNS rebinding, Origin against cross-site requests: on every
+WebSocket and every changing request. A WebSocket without Origin passes: browsers always send one,
+so the client is a program, with the token of a role.
 """
 
 import logging
@@ -19,7 +19,7 @@ from hapticdb.server.served import is_address
 
 LOG = logging.getLogger("hapticdb.server")
 SAFE_METHODS = frozenset({"GET", "HEAD", "OPTIONS"})
-"""Methods that change nothing, and that browsers send without an Origin."""
+"""Methods without changes, sent by browsers without an Origin."""
 HEADERS = {
     "x-content-type-options": "nosniff",
     "referrer-policy": "same-origin",
@@ -29,14 +29,14 @@ HEADERS = {
     "cache-control": "no-store",
     "content-security-policy": "default-src 'none'; frame-ancestors 'none'; base-uri 'none'",
 }
-"""Headers of every answer, unless its endpoint sets its own."""
+"""Default headers of every response."""
 
 
 class Guards:
-    """Checks Host and Origin of everything that comes in, and adds headers to what goes out.
+    """Middleware: checks Host and Origin of requests, adds headers to responses.
 
-    host_names : under which the server may be reached, beside addresses in digits, ``localhost``
-    and the machine's own name.
+    host_names : accepted names of the server, besides numeric addresses, ``localhost`` and the
+    machine's own name.
     """
 
     def __init__(self, app: ASGIApp, host_names: Sequence[str] = ()) -> None:
@@ -67,7 +67,7 @@ class Guards:
         await self._app(scope, receive, send_guarded)
 
     def _refusal(self, scope: Scope, headers: Headers) -> str:
-        """Why a request is refused; empty if it passes."""
+        """Reason to refuse a request; empty if it passes."""
         host = headers.getlist("host")
         if len(host) != 1 or not self._is_ours(host[0]):
             return "this server does not answer under that host name"
@@ -80,7 +80,7 @@ class Guards:
         return ""
 
     def _is_ours(self, host: str) -> bool:
-        """Whether a Host header names this server; digits cannot be rebound."""
+        """Whether a Host header names this server; numeric addresses cannot be rebound."""
         try:
             parts = urlsplit(f"//{host}")
             name = parts.hostname or ""
@@ -91,6 +91,6 @@ class Guards:
 
 
 def _is_same(origin: str, host: str) -> bool:
-    """Whether an origin is the host that the request went to; a proxy may have ended TLS."""
+    """Whether an origin is the request's host; a proxy may have terminated TLS."""
     scheme, mark, authority = origin.lower().partition("://")
     return bool(mark) and scheme in {"http", "https"} and authority == host.lower()

@@ -1,4 +1,4 @@
-"""Whether each part of a running server answers, and the figures of sessions and their tables."""
+"""Health checks of a running server, and metrics of sessions and their tables."""
 
 import asyncio
 import contextlib
@@ -21,13 +21,13 @@ from hapticdb.store.connect import open_store
 
 LOG = logging.getLogger("hapticdb.server")
 GOOD_FOR = 1.0
-"""Seconds that an answer is given again without asking the parts."""
+"""Lifetime of a cached result, seconds."""
 PATIENCE = 5.0
-"""Seconds that the database has to answer."""
+"""Time limit of the database's response, seconds."""
 
 
 class Health(NamedTuple):
-    """Whether each part answers."""
+    """Health of each part: true if it responds."""
 
     database: bool
     fetching: bool
@@ -36,17 +36,17 @@ class Health(NamedTuple):
 
     @property
     def is_well(self) -> bool:
-        """Whether all do."""
+        """Whether all parts respond."""
         return all(self)
 
     def words(self) -> dict[str, str]:
-        """For people and for probes; nothing that helps an attacker."""
+        """Status for people and probes, without details of use to an attacker."""
         parts = {name: "ok" if is_well else "failing" for name, is_well in self._asdict().items()}
         return {"status": "ok" if self.is_well else "failing"} | parts
 
 
 class Doctor:
-    """Asks the parts of a server whether they work."""
+    """Health checks of a server's parts."""
 
     def __init__(self, served: Served, keeper: PageKeeper) -> None:
         self._served, self._keeper = served, keeper
@@ -57,7 +57,7 @@ class Doctor:
         self._asking = asyncio.Lock()
 
     async def health(self) -> Health:
-        """Whether each part answers, at most `GOOD_FOR` old."""
+        """Health of each part, at most `GOOD_FOR` old."""
         async with self._asking:
             now = time.monotonic()
             if self._last is not None and now - self._last[0] < GOOD_FOR:
@@ -88,7 +88,7 @@ class Doctor:
             return False
 
     def _ask(self) -> bool:
-        """Ask the database for its revision, in the thread that has it open."""
+        """Query the database's revision, in the thread of its connection."""
         try:
             if self._env is None:
                 self._env = Environment(open_store(self._served.host.url, read_only=True))
@@ -108,13 +108,13 @@ class Doctor:
 
 
 class HostCollector(Collector):
-    """Figures of a host's sessions and tables, read when they are asked for."""
+    """Metrics of a host's sessions and tables, computed at each scrape."""
 
     def __init__(self, host: SessionHost) -> None:
         self._host = host
 
     def collect(self) -> Iterator[Metric]:
-        """Yield one figure after another: sums, and of times and shares the worst."""
+        """Yield each metric: sums; of times and shares the worst."""
         figures = self._figures()
         sessions = [loop for loop, _ in figures]
         unknown, held, stale = (
@@ -146,7 +146,7 @@ class HostCollector(Collector):
             yield GaugeMetricFamily(f"hapticdb_{name}", words, float(value))
 
     def _figures(self) -> list[tuple[LoopFigures, dict[str, Any]]]:
-        """Times and counts of the sessions that run; one may end meanwhile."""
+        """Times and counts of the running sessions; one may end meanwhile."""
         found = []
         for session in self._host.sessions():
             with contextlib.suppress(UsageError):

@@ -1,4 +1,4 @@
-"""How much a client may ask for; docs/serving.md has a table, and a test compares them."""
+"""Limits of a client's requests; docs/serving.md has a table, and a test compares them."""
 
 import time
 from collections.abc import Callable
@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 @dataclass(frozen=True)
 class Limits:
-    """What one server allows, for a dozen people on one machine: average rates, and bursts."""
+    """Limits of one server, for a dozen people on one machine: average rates, and bursts."""
 
     browsers: int = 32
     browsers_per_second: float = 10.0
@@ -32,7 +32,7 @@ class Limits:
 
 
 class TokenBucket:
-    """Lets an amount pass each second, on average, and a burst at once after a pause."""
+    """Token bucket: an average rate a second, and a burst after a pause."""
 
     def __init__(
         self, rate: float, burst: float, clock: Callable[[], float] = time.monotonic
@@ -44,7 +44,7 @@ class TokenBucket:
         self._at = clock()
 
     def take(self, amount: float = 1.0) -> bool:
-        """Take an amount, if there is enough; returns whether there was."""
+        """Take an amount, if available; returns whether it was."""
         self._fill()
         if amount > self._left:
             return False
@@ -52,7 +52,7 @@ class TokenBucket:
         return True
 
     def wait(self, amount: float = 1.0) -> float:
-        """Seconds until that amount can be taken; infinite if it never can."""
+        """Seconds until an amount is available; infinite above the burst."""
         if amount > self.burst:
             return float("inf")
         self._fill()

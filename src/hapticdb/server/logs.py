@@ -1,4 +1,4 @@
-"""The server's log: a line for each event on standard error, plain or as JSON."""
+"""Log of the server: a line for each event on standard error, plain or as JSON."""
 
 import json
 import logging
@@ -8,17 +8,17 @@ from contextlib import contextmanager
 from typing import Literal
 
 STANDARD = frozenset(vars(logging.makeLogRecord({}))) | {"message", "asctime", "color_message"}
-"""Fields that every record has; all others were given with the event."""
+"""Fields of every record; all others come from the event."""
 TIME = "%Y-%m-%dT%H:%M:%S"
 LOGGERS = ("hapticdb", "uvicorn.error", "websockets.client")
-"""What is written. uvicorn's log of requests is not: their addresses can hold a token."""
+"""Loggers written. uvicorn's access log is not: its URLs can contain a token."""
 
 
 class _PlainLine(logging.Formatter):
-    """Time, level, words, and what belongs to the event."""
+    """Time, level, message, and fields of the event."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Put an event on one line."""
+        """Format an event as one line."""
         more = "".join(f" {name}={value}" for name, value in fields_of(record).items())
         return (
             f"{self.formatTime(record, TIME)} {record.levelname.lower()} {words_of(record)}{more}"
@@ -29,7 +29,7 @@ class _JsonLine(logging.Formatter):
     """One JSON object an event."""
 
     def format(self, record: logging.LogRecord) -> str:
-        """Put an event on one line."""
+        """Format an event as one line."""
         line = {
             "time": f"{self.formatTime(record, TIME)}.{int(record.msecs):03d}",
             "level": record.levelname.lower(),
@@ -40,12 +40,12 @@ class _JsonLine(logging.Formatter):
 
 
 def fields_of(record: logging.LogRecord) -> dict[str, object]:
-    """Fields that were given with an event."""
+    """Fields of an event."""
     return {name: value for name, value in vars(record).items() if name not in STANDARD}
 
 
 def words_of(record: logging.LogRecord) -> str:
-    """Words of an event on one line; of an exception its type and its own words."""
+    """Message of an event on one line, with type and message of an exception."""
     words = record.getMessage()
     if record.exc_info and record.exc_info[1] is not None:
         error = record.exc_info[1]

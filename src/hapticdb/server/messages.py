@@ -1,8 +1,8 @@
-"""Which messages of a browser reach the page, and in which form.
+"""Validation of a browser's messages, before they reach the page.
 
 viser's page process trusts its clients: a message may set any attribute of a widget, open a public
-tunnel, or hold a large upload in memory. So the relay decodes each message here, checks the type,
-size and range of every field, and sends on what it has encoded itself, never the client's bytes.
+tunnel, or upload a large file into memory. So the relay decodes each message, checks the type, size
+and range of every field, and forwards its own encoding, never the client's bytes.
 """
 
 from typing import Annotated, Literal, NamedTuple
@@ -18,7 +18,7 @@ LARGEST = 16 << 10
 """Most bytes of a message; a long text field fits. Larger: more to decode for each."""
 
 Real = Annotated[float, Meta(ge=-FARTHEST, le=FARTHEST)]
-"""A finite number: "not a number" is outside of msgspec's bounds, too."""
+"""A finite number: msgspec's bounds exclude NaN, too."""
 Whole = Annotated[int, Meta(ge=-(10**9), le=10**9)]
 Name = Annotated[str, Meta(max_length=512)]
 Text = Annotated[str, Meta(max_length=2048)]
@@ -30,11 +30,11 @@ Value = bool | Whole | Real | Text | Some | None
 
 
 class _Message(msgspec.Struct, forbid_unknown_fields=True):
-    """A message of a browser; its name and those of its fields are viser's."""
+    """A message of a browser; viser defines the names of messages and fields."""
 
 
 class ViewerCameraMessage(_Message, tag=True):
-    """Where the eye is."""
+    """Camera of the view."""
 
     wxyz: Four
     position: Three
@@ -58,7 +58,7 @@ class ScenePointerMessage(_Message, tag=True):
 
 
 class TransformControlsUpdateMessage(_Message, tag=True):
-    """A gizmo moves."""
+    """Motion of a gizmo."""
 
     name: Name
     wxyz: Four
@@ -67,31 +67,31 @@ class TransformControlsUpdateMessage(_Message, tag=True):
 
 
 class TransformControlsDragStartMessage(_Message, tag=True):
-    """A gizmo is taken."""
+    """Start of a gizmo's drag."""
 
     name: Name
     owner: Name = ""
 
 
 class TransformControlsDragEndMessage(TransformControlsDragStartMessage, tag=True):
-    """A gizmo is let go."""
+    """End of a gizmo's drag."""
 
 
 class _ValueUpdate(msgspec.Struct, forbid_unknown_fields=True):
-    """The only attribute of a widget that a browser sets."""
+    """The only attribute of a widget with browser access."""
 
     value: Value
 
 
 class GuiUpdateMessage(_Message, tag=True):
-    """A widget has a new value."""
+    """New value of a widget."""
 
     uuid: Name
     updates: _ValueUpdate
 
 
 class _Tag(msgspec.Struct):
-    """The type of any message."""
+    """Type of any message."""
 
     type: str
 
@@ -109,7 +109,7 @@ FOR_HANDS = (
     TransformControlsDragStartMessage,
     TransformControlsDragEndMessage,
 )
-"""Messages of someone who holds a tool; a viewer holds none."""
+"""Messages of a dragged tool; not for viewers."""
 
 _decoder = msgspec.msgpack.Decoder(Known)
 _tag_decoder = msgspec.msgpack.Decoder(_Tag)
@@ -119,10 +119,10 @@ Reason = Literal["malformed", "type", "role", "size"]
 
 
 class Verdict(NamedTuple):
-    """What becomes of a message: the bytes that the page gets, or the reason why there are none.
+    """Verdict on a message: the bytes for the page, or the reason of a refusal.
 
-    ``malformed``: it is not what viser's client writes; ``type``: a type that our page does not
-    use; ``role``: one that the browser's role may not send; ``size``: too large.
+    ``malformed``: not from viser's client; ``type``: unused by our page; ``role``: not allowed for
+    the browser's role; ``size``: above `LARGEST`.
     """
 
     passed: bytes | None
@@ -130,7 +130,7 @@ class Verdict(NamedTuple):
 
 
 def judged(message: bytes, role: Role) -> Verdict:
-    """Decode a browser's message, and encode anew what may pass."""
+    """Decode a browser's message, and encode it anew if it may pass."""
     if len(message) > LARGEST:
         return Verdict(None, "size")
     try:
@@ -145,7 +145,7 @@ def judged(message: bytes, role: Role) -> Verdict:
 
 
 def _is_known(message: bytes) -> bool:
-    """Whether a message that does not hold what it should has a type of ours, or none."""
+    """Whether a message with invalid fields has a type of ours, or none."""
     try:
         tag = _tag_decoder.decode(message).type
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError):
@@ -154,4 +154,4 @@ def _is_known(message: bytes) -> bool:
 
 
 TYPES = frozenset(kind.__name__ for kind in Known.__args__)
-"""Names of the types that may pass."""
+"""Names of the accepted types."""

@@ -1,4 +1,4 @@
-"""The page process seen from the server: started, and started again if it dies."""
+"""Supervisor of the page process: start, restart after its death, messages."""
 
 import asyncio
 import contextlib
@@ -14,24 +14,24 @@ from hapticdb.session.processes.process import Process
 
 LOG = logging.getLogger("hapticdb.server")
 START_PATIENCE = 120.0
-"""Seconds that a page process has to become ready; it reads and prepares the whole scene."""
+"""Time limit of a page's start, seconds; it reads and prepares the whole scene."""
 ANSWER_PATIENCE = 2.0
-"""Seconds that the page has to answer a ping. Larger: that it hangs is noticed later."""
+"""Time limit of a page's pong, seconds. Larger: a hang is noticed later."""
 FIRST_PAUSE = 0.5
-"""Seconds before a page that died is started again; doubled each time that it dies again."""
+"""Seconds before a dead page is restarted; doubled at each further death."""
 LONGEST_PAUSE = 30.0
-"""Greatest such pause. Larger: a page that cannot start costs less, and comes back later."""
+"""Greatest such pause. Larger: a failing page costs less, and comes back later."""
 LASTING = 60.0
-"""Seconds that a page must live so that its pause begins small again."""
+"""Least lifetime of a page to reset the pause, seconds."""
 
 
 class PageKeeper:
-    """Keeps a page process running.
+    """Runs a page process, and restarts it when it ends.
 
-    work : function of the process, as `Process` takes it; it sends ``ready`` with its port.
-    request : makes the request of a process, of its sockets to the server and to the host, and of
-    the secret that the server's connections show. serve_host : takes the socket at whose other end
-    the page begins its sessions.
+    work : function of the process, as of `Process`; it sends ``ready`` with its port.
+    request : makes the request of a process from its sockets to the server and to the host, and
+    from the secret of the server's connections.
+    serve_host : receives the host's end of the socket for the page's sessions.
     """
 
     def __init__(
@@ -52,7 +52,7 @@ class PageKeeper:
 
     @property
     def is_ready(self) -> bool:
-        """Whether browsers can be let in now."""
+        """Whether browsers can connect now."""
         return self._process is not None and self._process.is_alive and self.port != 0
 
     @property
@@ -63,8 +63,8 @@ class PageKeeper:
     async def start(self) -> None:
         """Start a page process and wait until it is ready.
 
-        Raises `HapticDBError` with which the page ended, or because it did not become ready. Raises
-        `OSError` if the machine has no room for another process, or for its sockets.
+        Raises `HapticDBError` from a failed start of the page, or at the time limit; `OSError` if
+        the machine has no room for another process or its sockets.
         """
         process, ours, host_ours = await self._begun()
         self._process = process  # `stop` can end it from now on
@@ -81,7 +81,7 @@ class PageKeeper:
         LOG.info("the page is ready", extra={"pid": process.pid})
 
     async def _begun(self) -> tuple[Process, socket.socket, socket.socket]:
-        """Begin a page process; it, and our ends of its sockets to us and to the host."""
+        """Start a page process; returns it, and our ends of its sockets to us and to the host."""
         with contextlib.ExitStack() as ours:
             pairs = []
             with contextlib.ExitStack() as theirs:
@@ -96,7 +96,7 @@ class PageKeeper:
         return process, pairs[0][0], pairs[1][0]
 
     async def keep(self) -> None:
-        """Listen to the page, and start it again each time that it ends; until `stop`."""
+        """Receive the page's messages, and restart it whenever it ends; until `stop`."""
         loop = asyncio.get_running_loop()
         pause = FIRST_PAUSE
         while True:
@@ -116,16 +116,16 @@ class PageKeeper:
                 LOG.error("the page cannot start: %s", error)  # noqa: TRY400 - its message says all
 
     def headers(self, name: str, role: str) -> dict[str, str]:
-        """Headers by which the page lets in the connection of a browser of that name and role."""
+        """Headers for a browser's connection of this name and role, with the secret."""
         return {SECRET: self._secret, NAME: name, ROLE: role}
 
     def tell(self, word: str, text: str = "") -> None:
-        """Send the page a message of words; does nothing without a page."""
+        """Send the page a message; no effect without a page."""
         if self._writer is not None:
             self._writer.write(line(word, text))
 
     async def answers(self) -> bool:
-        """Whether the page answers now."""
+        """Whether the page responds now, within `ANSWER_PATIENCE`."""
         if not self.is_ready:
             return False
         self._has_answered.clear()
@@ -137,12 +137,12 @@ class PageKeeper:
         return self.is_ready
 
     async def stop(self) -> None:
-        """End the page process, which ends its sessions first."""
+        """End the page process, after its sessions."""
         self._is_stopping = True
         await self._end()
 
     async def _listen(self) -> None:
-        """Take the page's messages until it ends."""
+        """Receive the page's messages until it ends."""
         reader = self._reader
         if reader is None:
             return
@@ -165,7 +165,7 @@ class PageKeeper:
 
 
 def _port_of(process: Process) -> int:
-    """Wait until a page process is ready; its port."""
+    """Port of a page process, once it is ready."""
     message = process.receive(START_PATIENCE)
     if message is None:
         raise HapticDBError("the page process ended before it was ready")

@@ -1,7 +1,7 @@
-"""Relays the WebSocket of a browser to the page, message by message, within limits.
+"""Relay between a browser's WebSocket and the page, message by message, within limits.
 
-From the browser only what `messages.judged` lets pass, as fast as the limits allow; to the browser
-everything, and no faster than it reads.
+From the browser only messages accepted by `messages.judged`, at the limits' rates; to the browser
+everything, at its own rate.
 """
 
 import asyncio
@@ -23,22 +23,22 @@ from hapticdb.server.page_keeper import PageKeeper
 
 LOG = logging.getLogger("hapticdb.server")
 VERSION = re.compile(r"viser-v[0-9A-Za-z.+-]{1,32}")
-"""The subprotocol by which viser's client names its version; the page compares it."""
+"""WebSocket subprotocol with the version of viser's client, compared by the page."""
 WAITING_MESSAGES = 4
-"""Messages of the page that wait for one browser."""
+"""Queued messages of the page for one browser."""
 CONNECT_PATIENCE = 5.0
-"""Seconds for the connection to the page."""
+"""Time limit of the connection to the page, seconds."""
 CLOSING_PATIENCE = 5.0
-"""Seconds that a browser has to take the close frame."""
+"""Time limit of a browser's close handshake, seconds."""
 RENEW_EVERY = 60.0
-"""Seconds between two looks at a browser's cookie."""
+"""Seconds between two checks of a browser's cookie."""
 
 GOING_AWAY, POLICY, TRY_LATER, SIGNED_OUT = 1001, 1008, 1013, 4401
 """WebSocket close codes; the last one is ours."""
 
 
 class Closing(Exception):  # noqa: N818 - an end, and not always an error
-    """Ends a browser's connection with code and words; `reason` is the figure that counts it."""
+    """Ends a browser's connection: code and words for it, `reason` as label of the metric."""
 
     def __init__(self, code: int, words: str, reason: str) -> None:
         super().__init__(words)
@@ -46,7 +46,7 @@ class Closing(Exception):  # noqa: N818 - an end, and not always an error
 
 
 class Relay:
-    """Connects browsers with the page, within their roles and the limits; counts what passes."""
+    """Connections between browsers and the page, within roles and limits, with metrics."""
 
     def __init__(
         self, access: Access, keeper: PageKeeper, limits: Limits, figures: Figures
@@ -57,7 +57,7 @@ class Relay:
         self._numbers: set[int] = set()
 
     async def browser(self, websocket: WebSocket) -> None:
-        """Serve one browser until it or the page leaves, or a limit ends it."""
+        """Serve one browser until it or the page closes, or a limit is exceeded."""
         reason = "refused"
         try:
             reason = await self._served(websocket)
@@ -72,13 +72,13 @@ class Relay:
             self._figures.connections.labels(reason).inc()
 
     async def _served(self, websocket: WebSocket) -> str:
-        """Serve a browser; returns why it ended."""
+        """Serve a browser; returns the reason of its end."""
         role = self._access.role_of_headers(websocket.headers)
         if role is None:
             raise Closing(POLICY, "sign in first", "refused")
         cookie = self._access.cookie_of(websocket.headers)
         if not self._access.renew(cookie):
-            cookie = ""  # an old one, which the role does not come from
+            cookie = ""  # expired: the role comes from elsewhere
         if len(self._numbers) >= self._limits.browsers or not self._arrivals.take():
             raise Closing(TRY_LATER, "too many browsers; try again later", "full")
         offered = [Subprotocol(p) for p in websocket.scope["subprotocols"] if VERSION.fullmatch(p)]
@@ -100,7 +100,7 @@ class Relay:
 
     @contextlib.contextmanager
     def _numbered(self) -> Iterator[int]:
-        """Give a browser the smallest number that is free."""
+        """Smallest free number, for one browser."""
         number = next(n for n in range(1, len(self._numbers) + 2) if n not in self._numbers)
         self._numbers.add(number)
         try:
@@ -117,7 +117,7 @@ class Relay:
                 f"ws://127.0.0.1:{self._keeper.port}/",
                 additional_headers=self._keeper.headers(name, role.word),
                 subprotocols=[version],
-                compression=None,  # it costs more time than the loopback interface needs
+                compression=None,  # costs more time than the loopback interface
                 max_size=None,
                 max_queue=WAITING_MESSAGES,
                 ping_interval=None,
@@ -131,7 +131,7 @@ class Relay:
     async def _up(
         self, websocket: WebSocket, upstream: ClientConnection, role: Role, cookie: str
     ) -> str:
-        """Pass on what the browser sends, as far as it may; while its cookie, if any, is valid."""
+        """Forward the browser's accepted messages, while its cookie, if any, is valid."""
         strict = _Strictness(self._limits, self._figures)
         renewed = 0.0
         while True:
@@ -161,7 +161,7 @@ class Relay:
                 return "page ended"
 
     async def _down(self, websocket: WebSocket, upstream: ClientConnection) -> str:
-        """Pass on what the page sends."""
+        """Forward the page's messages."""
         sent = self._figures.relayed.labels("out")
         with contextlib.suppress(ConnectionClosed, WebSocketDisconnect):
             async for message in upstream:
@@ -169,13 +169,13 @@ class Relay:
                     sent.inc(len(message))
                     await websocket.send_bytes(message)
             code = upstream.close_code or GOING_AWAY
-            # 1002 tells viser's client that its version is another one
+            # 1002 is viser's code for another version of its client
             raise Closing(code if code == 1002 else GOING_AWAY, "the page has ended", "page ended")
         return "page ended" if upstream.close_code is not None else "left"
 
 
 class _Strictness:
-    """Slows down a browser that sends too much, and ends one that goes on."""
+    """Rate limits of one browser: it waits at first, and is disconnected if it continues."""
 
     def __init__(self, limits: Limits, figures: Figures) -> None:
         self._limits, self._figures = limits, figures
@@ -185,7 +185,7 @@ class _Strictness:
         self._throttled = 0.0
 
     async def wait_for(self, message: bytes) -> None:
-        """Wait until the browser may send that message; the browser's own queue grows meanwhile."""
+        """Wait for the rate limits; meanwhile the browser's own queue grows."""
         size = len(message)
         wait = max(self._messages.wait(), self._bytes.wait(size))
         if wait > 0.0:
@@ -200,7 +200,7 @@ class _Strictness:
         self._bytes.take(size)
 
     def refuse(self, reason: str) -> None:
-        """Count a message that does not pass."""
+        """Count a refused message."""
         self._figures.dropped.labels(reason).inc()
         self._n_bad += 1
         if self._n_bad > self._limits.bad_messages:
@@ -208,7 +208,7 @@ class _Strictness:
 
 
 async def _either(*works: Coroutine[None, None, str]) -> str:
-    """Run both directions until one ends, and end the other."""
+    """Run both directions until one ends, then cancel the other."""
     tasks = [asyncio.create_task(work) for work in works]
     try:
         done, _ = await asyncio.wait(tasks, return_when=asyncio.FIRST_COMPLETED)

@@ -1,4 +1,4 @@
-"""A server from its start to its end: the processes, the order in which they begin and stop."""
+"""Start and shutdown of a server and its processes, in order."""
 
 import asyncio
 import contextlib
@@ -30,15 +30,15 @@ if TYPE_CHECKING:
 
 LOG = logging.getLogger("hapticdb.server")
 PING_EVERY = 20.0
-"""Seconds between two pings to a browser. Larger: a browser that vanished is noticed later."""
+"""Seconds between two pings to a browser. Larger: a vanished browser is noticed later."""
 PING_PATIENCE = 60.0
-"""Seconds for the answer to a ping, which waits behind the scene on a slow network."""
+"""Time limit of a browser's pong, seconds: on a slow network it waits behind the scene."""
 HEADER_BYTES = 16 << 10
-"""Most bytes of the headers of a request."""
+"""Most bytes of a request's headers."""
 
 
 class _Server(uvicorn.Server):
-    """uvicorn without its signal handlers: the verb has its own."""
+    """uvicorn without its signal handlers, in favour of the verb's."""
 
     @contextlib.contextmanager
     def capture_signals(self) -> Iterator[None]:
@@ -46,7 +46,7 @@ class _Server(uvicorn.Server):
 
 
 def listening(serving: Serving) -> socket.socket:
-    """Bind the server's socket; a UsageError if the address cannot be had."""
+    """Bind the server's socket; UsageError for an unavailable address."""
     try:
         found = socket.getaddrinfo(
             serving.host, serving.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -64,12 +64,12 @@ async def run(
     ready: Callable[[int], None],
     stop: asyncio.Event,
 ) -> None:
-    """Serve until `stop` is set; then end in order, so that no recording is lost.
+    """Serve until `stop` is set; then shut down in order, so that no recording is lost.
 
-    First no connection is taken any more and browsers are told to go; then the page ends its
-    sessions; then the host ends those that are left and finishes their recordings.
+    First the server refuses connections and closes the browsers'; then the page ends its sessions;
+    then the host ends the remaining ones and finishes their recordings.
 
-    ready : called with the port when browsers can come; stop : set when the server shall end.
+    ready : called with the port once browsers can connect; stop : event to end the server.
     """
     check(serving)
     page = await asyncio.to_thread(client_page, serving.title)
@@ -116,7 +116,7 @@ def _page_request(serving: Serving, server: int, host: int, secret: str) -> Page
 
 
 async def _unless(stop: asyncio.Event, work: Awaitable[None]) -> bool:
-    """Wait for work; returns False as soon as `stop` is set before its end."""
+    """Await work; returns False if `stop` is set before its end."""
     stopping = asyncio.create_task(stop.wait())
     working = asyncio.ensure_future(work)
     try:
@@ -143,7 +143,7 @@ def _config(app: "ASGIApp", serving: Serving) -> uvicorn.Config:
         app,
         http=http,
         ws=websocket,
-        ws_max_size=64 * LARGEST,  # a smaller one that is too large is dropped, and counted
+        ws_max_size=64 * LARGEST,  # a smaller one above the limit is dropped, and counted
         ws_per_message_deflate=False,  # compressing costs more time than it saves here
         ws_ping_interval=PING_EVERY,
         ws_ping_timeout=PING_PATIENCE,

@@ -1,4 +1,4 @@
-"""What a server is started with, and what its parts share; reading this loads nothing slow."""
+"""Settings of a server, and the objects shared by its parts; a light import."""
 
 import ipaddress
 import re
@@ -17,20 +17,20 @@ if TYPE_CHECKING:
     from hapticdb.session.host import SessionHost
 
 PAGE = "hapticdb.page.process:work"
-"""The page's process."""
+"""Function of the page's process."""
 PREFIX = re.compile(r"(/[A-Za-z0-9_-]+)*")
-"""What a prefix may be."""
+"""Form of a prefix."""
 
 
 @dataclass(frozen=True)
 class Serving:
-    """What a server is started with.
+    """Settings of a server.
 
-    urls : the environment's address for each role; tools : files; tokens : the role that each
-    gives; open_role : of clients without a token; port : 0 is a free one; prefix : path under which
-    it is reached, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder for
-    recordings of sessions, None: nobody records; rendering : as of `SessionHost`; page : function
-    of the page's process.
+    urls : the environment's URL for each role; tools : files; tokens : with their roles; open_role
+    : of clients without a token; port : 0 for a free one; prefix : path of the server behind a
+    proxy, such as ``/hapticdb``; certificate, key : files of TLS; recordings : folder of recorded
+    sessions, None without recording; rendering : as of `SessionHost`; page : function of the page's
+    process.
     """
 
     urls: Mapping[Role, str]
@@ -50,7 +50,7 @@ class Serving:
     page: str = PAGE
 
     def address(self, port: int, token: str = "") -> str:
-        """Address for a browser on this machine."""
+        """URL for a browser on this machine."""
         scheme = "http" if self.certificate is None else "https"
         host = {"0.0.0.0": "127.0.0.1", "::": "[::1]"}.get(self.host, self.host)  # noqa: S104 - compared
         if ":" in host and not host.startswith("["):
@@ -60,7 +60,7 @@ class Serving:
 
 
 def check(serving: Serving) -> None:
-    """Refuse, by UsageError, a server in reach without a token; a wrong prefix or TLS file."""
+    """Refuse, by UsageError, a reachable server without a token; a wrong prefix or TLS file."""
     if not is_near(serving.host) and serving.open_role is not None:
         raise UsageError(
             f"--host {serving.host}: other machines can reach that address, so clients need a "
@@ -80,14 +80,14 @@ def check(serving: Serving) -> None:
 
 
 def is_near(host: str) -> bool:
-    """Whether only this machine reaches that address."""
+    """Whether an address is a loopback address."""
     if is_address(host):
         return ipaddress.ip_address(host).is_loopback
     return host == "localhost"
 
 
 def is_address(name: str) -> bool:
-    """Whether a host is an address in digits."""
+    """Whether a host is a numeric address."""
     try:
         ipaddress.ip_address(name)
     except ValueError:
@@ -97,7 +97,7 @@ def is_address(name: str) -> bool:
 
 @dataclass(frozen=True)
 class Served:
-    """What the parts of a server share."""
+    """Objects shared by the parts of a server."""
 
     access: Access
     limits: Limits

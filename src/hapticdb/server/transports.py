@@ -1,4 +1,4 @@
-"""uvicorn's protocols with limits that it does not have itself."""
+"""uvicorn's HTTP and WebSocket protocols with further limits."""
 
 import asyncio
 import socket
@@ -17,47 +17,46 @@ PROTOCOL_ERROR, POLICY = 1002, 1008
 
 
 class _PatientHttp(H11Protocol):
-    """Begins every connection; cuts those that do not send each request in time.
+    """HTTP protocol of every connection, with a time limit for each request.
 
-    silent : connections whose next request has not come, the one that has waited longest first.
+    silent : connections without their next request, longest wait first.
     """
 
     limits: ClassVar[Limits] = Limits()
     silent: ClassVar[dict["_PatientHttp", None]] = {}
 
     def connection_made(self, transport: asyncio.Transport) -> None:  # type: ignore[override]
-        """Begin the time for the first request; let small messages leave at once."""
+        """Start the timer of the first request; set TCP_NODELAY for small messages."""
         super().connection_made(transport)
-        # asyncio does so only for sockets that know their protocol's number, which accepted ones
-        # do not
+        # asyncio does so only for sockets with a protocol number, which accepted ones lack
         connection = transport.get_extra_info("socket")
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         self._silence: asyncio.TimerHandle | None = None
         self._expect_request()
 
     def connection_lost(self, exc: Exception | None) -> None:
-        """Wait no longer."""
+        """Stop the timer."""
         self.silent.pop(self, None)
         super().connection_lost(exc)
 
     def handle_events(self) -> None:
-        """Take what came, which may be the request."""
+        """Handle received bytes, perhaps a request's last."""
         super().handle_events()
         if self.cycle is not self._last:
             self.silent.pop(self, None)
 
     def handle_websocket_upgrade(self, event: Request) -> None:
-        """Hand the connection over."""
+        """Hand over the connection to the WebSocket protocol."""
         self.silent.pop(self, None)
         super().handle_websocket_upgrade(event)
 
     def on_response_complete(self) -> None:
-        """Begin the time for the next request."""
+        """Start the timer of the next request."""
         self._expect_request()
         super().on_response_complete()
 
     def _expect_request(self) -> None:
-        """Begin the time for a request, which becomes a cycle when its headers are complete."""
+        """Start the timer of a request; complete headers make it a cycle."""
         if self._silence is not None:
             self._silence.cancel()
         self._silence = self.loop.call_later(self.limits.request_seconds, self._cut_if_silent)
@@ -74,10 +73,9 @@ class _PatientHttp(H11Protocol):
 
 
 class StrictWebSocket(WebSocketsSansIOProtocol):
-    """Ends connections that send messages in too many pieces, or too many pings.
+    """WebSocket protocol with limits of fragments and pings.
 
-    A connection whose client does not read is cut, because asyncio would keep it until the client
-    has read everything.
+    A connection is cut if its client does not read: asyncio would wait for the client without end.
     """
 
     limits: ClassVar[Limits] = Limits()
@@ -87,39 +85,39 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
         self._pings = TokenBucket(self.limits.pings_per_second, self.limits.pings_at_once)
 
     def handle_cont(self, event: Frame) -> None:
-        """Take a further piece of a message."""
+        """Handle a further fragment of a message."""
         if len(self.frames) >= self.limits.fragments:
             self._fail(PROTOCOL_ERROR, "a message in too many pieces")
             return
         super().handle_cont(event)
 
     def handle_ping(self) -> None:
-        """Answer a ping."""
+        """Answer a ping, within the limit."""
         if self._pings.take():
             super().handle_ping()
         else:
             self._fail(POLICY, "too many pings")
 
     def handle_pong(self, event: Frame) -> None:
-        """Take a pong, which may be unasked."""
+        """Accept a pong, perhaps unsolicited, within the limit."""
         if self._pings.take():
             super().handle_pong(event)
         else:
             self._fail(POLICY, "too many pongs")
 
     async def send(self, message: ASGISendEvent) -> None:
-        """Send; an HTTP answer completes the handshake, which else is logged as an error."""
+        """Send; an HTTP response completes the handshake, otherwise logged as an error."""
         await super().send(message)
         if self.initial_response is not None and self.close_sent:
             self.handshake_complete = True
 
     def keepalive_timeout(self) -> None:
-        """Cut a client that has not answered a ping; whoever waits to send to it goes on."""
+        """Cut a client without a pong, so that waiting senders continue."""
         super().keepalive_timeout()
         self.transport.abort()
 
     def on_task_complete(self, task: "asyncio.Task[None]") -> None:
-        """Give a client that is no longer served a little time to read the last messages."""
+        """Give a client `close_timeout` to read the last messages, then cut it."""
         super().on_task_complete(task)
         self.loop.call_later(self.close_timeout, self.transport.abort)
 
@@ -134,7 +132,7 @@ class StrictWebSocket(WebSocketsSansIOProtocol):
 
 
 def limited(limits: Limits) -> tuple[type[_PatientHttp], type[StrictWebSocket]]:
-    """Protocols under these limits."""
+    """Protocol classes under these limits."""
     return (
         type("LimitedHttp", (_PatientHttp,), {"limits": limits, "silent": {}}),
         type("LimitedWebSocket", (StrictWebSocket,), {"limits": limits}),

@@ -1,4 +1,4 @@
-"""An opened database: what is asked about a tool, and what changes the scene."""
+"""Environment: an opened database, with queries for a tool and edits of the scene."""
 
 import os
 
@@ -10,14 +10,14 @@ from hapticdb.store.connect import create_store, open_store
 __all__ = ["Environment", "create", "open"]
 
 
-def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - the word users expect, as in tarfile.open
+def open(url: str | os.PathLike[str], *, read_only: bool = False) -> Environment:  # noqa: A001 - as tarfile.open
     """Open an environment.
 
     url : a path, ``sqlite:///path``, or ``postgresql://user@host/database?environment=NAME``;
-    read_only : refuse every write; works on files and folders that cannot be written.
+    read_only : refuse every write; works on files and folders without write access.
 
     Raises `EnvironmentNotFoundError`, `NotAnEnvironmentError`, `NewerVersionError` or
-    `DamagedError` if there is no environment, something else, or one that cannot be read.
+    `DamagedError` if there is no environment, something else, or an unreadable one.
     """
     return Environment(open_store(url, read_only=read_only), url)
 
@@ -31,10 +31,10 @@ def create(
 ) -> Environment:
     """Make an environment with a given grid and open it.
 
-    layout : rows of its index table; distances : whether parts get distances for the force law
-    distance; bricks do unless told otherwise.
+    layout : rows of its index table; distances : whether imports compute distances, for the force
+    law distance; unless given, with bricks.
 
-    Raises `EnvironmentExistsError` if something exists there already; `UsageError` for bricks in
+    Raises `EnvironmentExistsError` for an existing file or schema; `UsageError` for bricks in
     lexicographic order, or distances on the layout voxel.
     """
     return Environment(create_store(url, grid, layout, distances=distances), url)

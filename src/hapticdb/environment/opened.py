@@ -1,4 +1,4 @@
-"""Environment: an opened database."""
+"""Class `Environment`: objects, edits and statistics of an opened database."""
 
 import os
 from collections.abc import Iterable
@@ -64,7 +64,7 @@ class Environment(Queries, Closes):
 
     @property
     def grid(self) -> Grid:
-        """Converts between metres, voxels and keys."""
+        """Grid: converts between metres, voxels and keys."""
         return self._store.grid
 
     @property
@@ -74,15 +74,15 @@ class Environment(Queries, Closes):
 
     @property
     def store(self) -> Store:
-        """The store of the engine: for tools that query it directly, such as benchmarks."""
+        """Store of the engine: for direct queries, such as benchmarks."""
         return self._store
 
     @property
     def has_distances(self) -> bool:
         """Whether there is an object, and every object has distances to its surface.
 
-        As of the revision that was read last. Costs a statement only before the first frame and
-        after an edit of this environment.
+        As of the last revision read. Costs a statement only before the first frame and after an
+        edit of this environment.
         """
         if self._query.known.version is None:
             self.objects()
@@ -95,23 +95,23 @@ class Environment(Queries, Closes):
     # -- objects -----------------------------------------------------------------------------
 
     def objects(self) -> list[Object]:
-        """All objects, ordered by id. Only those are read that were written since the last time."""
+        """All objects, ordered by id; reads only those written since the last call."""
         return self._query.known.newest()
 
     def object(self, object_id: int) -> Object:
-        """One object; raises `ObjectNotFoundError` if no object has this id."""
+        """One object; raises `ObjectNotFoundError` for an unknown id."""
         return self._store.object(as_id(object_id))
 
     def find(self, *words: int | str) -> list[Object]:
-        """Objects that ids, names, patterns and attributes choose, each once, ordered by id.
+        """Objects selected by ids, names, patterns and attributes, each once, ordered by id.
 
-        ``env.find(7, "wheel*", "body/door_*", "material=steel")``: rules and errors are those of
+        ``env.find(7, "wheel*", "body/door_*", "material=steel")``: rules and errors as of
         `hapticdb.store.finding.find_objects`.
         """
         return find_objects(self, words)
 
     def felt(self, where: Words = (), exclude: Words = ()) -> list[Object]:
-        """Objects under a touch's `where` and `exclude`, ordered by id; errors as for `touch`."""
+        """Objects selected by `where` and `exclude`, ordered by id; errors as for `touch`."""
         return Filter(where, exclude).felt(self.objects(), self.url)
 
     def shell(
@@ -122,13 +122,13 @@ class Environment(Queries, Closes):
         seed: int = 0,
         inset: float | None = None,
     ) -> PointShell:
-        """Make one rigid tool from objects at their places.
+        """Make one rigid tool from objects at their present poses.
 
-        The shell is in the world's frame, metres: its present pose is the identity, and the poses
-        of a path are displacements. Exclude the objects from the force: ``exclude=words``.
-        Arguments are as for `find` and `tool`, for all surfaces together.
+        The shell is in the world frame, metres: its present pose is the identity, and the poses of
+        a path are displacements. Exclude the objects from the force: ``exclude=words``. Arguments
+        as for `find` and `tool`, for all surfaces together.
 
-        Raises `ObjectNotFoundError` if a word chooses nothing; `UsageError` for no word, or for a
+        Raises `ObjectNotFoundError` for a word without a match; `UsageError` for no word, or for a
         point cloud, which has no surface.
         """
         drawn = self._inset if inset is None else inset
@@ -144,11 +144,11 @@ class Environment(Queries, Closes):
         seed: int = 0,
         inset: float | None = None,
     ) -> PointShell:
-        """Make a tool of a file as the verbs and the page do.
+        """Make a tool of a file, like the verbs and the page.
 
         file, points, spacing, unit, seed : as for `PointShell.from_file`
-        inset : how far points are drawn inward, metres. Unless given, so far that contact begins at
-            the tool's surface: 1.5 voxels where objects have distances, for the distance law.
+        inset : inward offset of the points, metres; unless given, chosen so that contact begins at
+            the tool's surface: 1.5 voxels where objects have distances, for the distance law
         """
         drawn = self._inset if inset is None else inset
         return PointShell.from_file(
@@ -173,18 +173,15 @@ class Environment(Queries, Closes):
         """Import a file's parts on this environment's grid, each in a transaction of its own.
 
         file : mesh, CAD or point-cloud file; see `hapticdb.mesh.read_file`
-        unit : unit of a file that names none, one of `hapticdb.mesh.UNITS`; metres unless given
-        jobs : threads that voxelize; one for each processor unless given
-        keep_removed : skip parts that were removed from the environment; otherwise they are added
-            again
-        replace : replace objects whose parts have changed in the file, and remove objects whose
-            parts it no longer has
-        chord : greatest chord error wanted of a STEP or IFC file's tessellation, metres; unless
-            given as for `hapticdb.mesh.read_file`
+        unit : unit of a file without one, of `hapticdb.mesh.UNITS`; metres unless given
+        jobs : threads of voxelization; one for each processor unless given
+        keep_removed : skip parts removed from the environment; otherwise they are added again
+        replace : replace objects of changed parts, and remove objects without a part in the file
+        chord : greatest chord error of a STEP or IFC file's tessellation, metres; unless given as
+            for `hapticdb.mesh.read_file`
         progress : called after each part with a `hapticdb.ingest.files.ImportProgress`
 
-        Raises `FileError` if the file cannot be used, or a part lies outside the grid; then nothing
-        is written.
+        Raises `FileError` for an unusable file or a part outside the grid; then nothing is written.
         """
         self._check_writable()
         options = ImportOptions(
@@ -210,7 +207,7 @@ class Environment(Queries, Closes):
         return removed
 
     def restore(self, removed: Object) -> Object:
-        """Put back an object as `remove` has returned it, with its id, in one transaction.
+        """Put back an object returned by `remove`, with its id, in one transaction.
 
         Raises `EnvironmentExistsError` if the part is in the environment; `UsageError` if neither
         `removed` nor the environment has its surface.
@@ -221,12 +218,12 @@ class Environment(Queries, Closes):
         return self.object(object_id)
 
     def move(self, object_id: int, transform: ArrayLike, *, revision: int | None = None) -> Object:
-        """Move an object to a new placement, in one transaction.
+        """Move an object to a new pose, in one transaction.
 
-        transform (4, 4) : world_from_part, metres; replaces the present transform with its scale.
+        transform (4, 4) : world_from_part, metres; replaces the present transform, scale included.
 
         Raises `ConflictError` if `revision` is given and the object has been written since;
-        `OutsideGridError` if the object would leave the grid.
+        `OutsideGridError` for a pose beyond the grid.
         """
         self._check_writable()
         old = self.object(object_id)
@@ -246,7 +243,7 @@ class Environment(Queries, Closes):
         return shifted
 
     def voxels(self, object_id: int) -> NDArray[np.int64]:
-        """Voxels (n, 3) that an object's surface touches, in the order of their keys."""
+        """Voxels (n, 3) touched by an object's surface, in order of their keys."""
         with self._store.snapshot():
             obj = self.object(object_id)
             rows = self._store.rows_of(obj.id, *object_ranges(self.grid, self.layout, obj))
@@ -259,7 +256,7 @@ class Environment(Queries, Closes):
         return QuantileVector.of(self._store, resolution)
 
     def analyze(self) -> QuantileVector:
-        """Renew the statistics that grouping by cost uses, even if they are up to date."""
+        """Renew the statistics of the strategy ``cbgroup``, even if they are up to date."""
         self._check_writable()
         return self._figures.analyze()
 
@@ -271,7 +268,7 @@ class Environment(Queries, Closes):
         return self._figures.calibrate(keep=keep, cold=cold)
 
     def _forget(self) -> None:
-        """Drop cached values that an edit of this environment has made stale."""
+        """Drop the values cached before an edit of this environment."""
         self._figures.rows_changed()
         self._query.known.forget()
 

@@ -1,4 +1,4 @@
-"""What an opened environment is asked about a tool: at one pose, or at many."""
+"""Queries of an opened environment for a tool, at one pose or at many."""
 
 from collections.abc import Generator, Iterator
 from functools import partial
@@ -25,12 +25,12 @@ if TYPE_CHECKING:
 
 
 class Queries:
-    """The haptic queries of `hapticdb.environment.Environment`, which is one of these."""
+    """Haptic queries, a base of `hapticdb.environment.Environment`."""
 
     def __init__(self, store: Store, figures: QueryFigures, address: str) -> None:
         self._store = store
         self.address = address
-        """What opens it in another process: the URL as given, or a whole path."""
+        """URL for another process: as given, or an absolute path."""
         self._strategies = Strategies(store, figures.both)
         self._query = self._strategies.query
         self._filters = FiltersOfWords()
@@ -77,28 +77,28 @@ class Queries:
         device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> "Touch | TouchBatch":
-        """Force and torque that the environment exerts on the tool at one pose, or at many.
+        """Force and torque of the environment on the tool, at one pose or at many.
 
         Points outside the grid miss. All statements of a touch read one committed revision.
 
         shell : points in metres and inward unit normals, tool frame
-        pose (4, 4) : world_from_tool, rigid, metres. A `Touch` is returned.
+        pose (4, 4) : world_from_tool, rigid, metres; returns a `Touch`
         poses (B, 4, 4) : many of them instead, for a `TouchBatch`, the same bit for bit, by all
             processors
         objects, progress, device : for many poses, as for `Feeler.touch` and `feeler`
         strategy : for one pose, form of the query: ``statement``, ``array``, ``points``,
             ``maxgap``, ``cbgroup``, which all read the database, or ``auto``: decoded bricks stay
-            in memory, and missing ones are read as by ``array``, or many as by ``cbgroup``.
-            All strategies find the same hits, ids and wrench, bit for bit.
-        where, exclude : felt are the objects that `where` chooses, all if it is empty, without
-            those of `exclude`: a part that is taken out must not hit itself. Ids, names, patterns
-            and ``attribute=value``, as for `find`; read again whenever others have written.
+            in memory, and missing ones are read as by ``array``, or many as by ``cbgroup``. All
+            strategies find the same hits, ids and wrench, bit for bit.
+        where, exclude : filter of the contacts: objects of `where`, all if it is empty, less those
+            of `exclude`: a part that is moved must not collide with itself. Ids, names, patterns
+            and ``attribute=value``, as for `find`; evaluated again after other writers' commits.
         maxgap : for the strategy ``maxgap``: greatest distance, in keys, of neighbours in one range
         law : by default ``distance`` (`DistanceField`) where `has_distances`, else ``plane``, with
             1000 N/m. The strategy ``statement`` computes ``plane`` alone.
 
-        Raises `UsageError` if a pose is not rigid, the strategy unknown, or objects lack what the
-        law reads; `ObjectNotFoundError` if a word of `where` or `exclude` chooses no object.
+        Raises `UsageError` for a pose that is not rigid, an unknown strategy, or objects without
+        the law's input; `ObjectNotFoundError` for a word of `where` or `exclude` without a match.
         """
         if (pose is None) == (poses is None):
             raise UsageError("touch: give either one pose, or poses=...")
@@ -121,12 +121,12 @@ class Queries:
         law: ForceLaw | LawName | None = None,
         on: str = "cpu",
     ) -> Generator["TouchBatch", None, None]:
-        """Touch at more poses than fit into memory, piece by piece, in their order.
+        """Touch at more poses than fit into memory, in batches, in their order.
 
-        poses (B, 4, 4) : may lie in a file
+        poses (B, 4, 4) : may be mapped from a file
         shell, where, exclude, law : as for `touch`
         on : ``cpu``, ``cuda``, or a scheduler of dask.distributed, ``tcp://host:8786``. Its workers
-            reach the environment by the URL that opened it. They feel the same, bit for bit.
+            reach the environment by the URL that opened it. Results are the same, bit for bit.
         """
         from hapticdb.batches import feeler as feeling  # noqa: PLC0415 - loads numba
         from hapticdb.cluster.place import Whereabouts  # noqa: PLC0415
@@ -158,7 +158,7 @@ class Queries:
         device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> NDArray[np.bool_]:
-        """Whether the tool hits anything at rigid poses (B, 4, 4): `touch` has hits there.
+        """Whether the tool collides at rigid poses (B, 4, 4): `touch` has hits there.
 
         Arguments as for `touch`, `feeler` and `Feeler.touch`; errors as for `touch`.
         """
@@ -179,14 +179,14 @@ class Queries:
     ) -> "ClearanceBatch":
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
-        With `exact`, the distance of the tool's surface from the nearest one of an object, with
-        the index of the point nearest to the place; some hundred times slower, on processors alone.
+        With `exact`, the distance between the surfaces of the tool and the nearest object, with the
+        index of the shell's point nearest to it; some hundred times slower, on processors alone.
 
         poses (B, 4, 4) : world_from_tool, rigid, metres, in any order
-        reach : greatest distance that is searched, metres; 32 voxels unless given
+        reach : greatest distance searched, metres; 32 voxels unless given
 
-        Raises `UsageError` if a pose is not rigid, the reach not positive, or the memory too small
-        for it; `ObjectNotFoundError` as for `touch`.
+        Raises `UsageError` for a pose that is not rigid, a reach that is not positive, or one too
+        large for the memory; `ObjectNotFoundError` as for `touch`.
         """
         if exact:
             from hapticdb.batches.exact import exact_clearance  # noqa: PLC0415 - loads kernels
@@ -210,16 +210,16 @@ class Queries:
         jobs: int | None = None,
         device: "BatchDevice" = "cpu",
     ) -> "Feeler":
-        """Make a tool that keeps cells in memory from one batch of poses to the next.
+        """Make a tool with cells resident in memory from one batch of poses to the next.
 
-        shell, where, exclude, law : as for `touch`; the law stays the one for the present objects
+        shell, where, exclude, law : as for `touch`; the law is chosen for the present objects
         budget_bytes : memory for cells, never exceeded; 256 MiB unless given
         jobs : threads; one for each processor unless given
-        device : the processors, or a GPU of NVIDIA with the extra ``gpu`` and its memory
+        device : the processors, or an NVIDIA GPU with the extra ``gpu`` and its memory
 
-        Raises `MissingExtraError` if there is no GPU that numba can use; `UsageError` in
-        lexicographic order, which has no cells; if the budget is too small, or larger than this
-        machine's memory; if objects lack what the law reads.
+        Raises `MissingExtraError` without a GPU for numba; `UsageError` in lexicographic order,
+        which has no cells, for a budget too small or above this machine's memory, or for objects
+        without the law's input.
         """
         from hapticdb.batches.feeler import Feeler  # noqa: PLC0415 - loads numba
 

@@ -1,7 +1,7 @@
-"""Imports files as objects, rows and surfaces: one transaction an object, in the file's order.
+"""Import of files as objects, rows and surfaces: a transaction for each object, in file order.
 
-Objects are written in the order of the files and of their parts, whatever the number of jobs. So an
-import that was interrupted and is run again ends with the same rows and ids as an undisturbed one.
+Objects are written in the order of the files and of their parts, for any number of jobs. So a rerun
+of an interrupted import ends with the same rows and ids as an undisturbed one.
 """
 
 import contextlib
@@ -59,26 +59,26 @@ class FileReport:
 
     link: str
     status: Literal["imported", "complete", "failed"]
-    """Objects were written; all objects were there already; the file was skipped, see `error`."""
+    """Objects were written; all objects were present already; the file was skipped, see `error`."""
     added: tuple[Object, ...] = ()
-    """Objects written now, in the file's order."""
+    """Newly written objects, in the file's order."""
     present: int = 0
-    """Objects that were in the environment already."""
+    """Number of objects in the environment before."""
     restored: int = 0
-    """Added parts that had been removed from the environment before."""
+    """Number of added parts that had been removed from the environment before."""
     kept_removed: int = 0
-    """Removed parts that were skipped: `ImportOptions.keep_removed`."""
+    """Number of removed parts that were skipped: `ImportOptions.keep_removed`."""
     replaced: int = 0
     dropped: int = 0
-    """Objects replaced and removed: `ImportOptions.replace`."""
+    """Numbers of objects replaced and removed: `ImportOptions.replace`."""
     defects: Defects = field(default_factory=Defects)
     notes: tuple[str, ...] = ()
-    """What the file holds that was not read, or not as it is meant."""
+    """Content of the file that was not read, or read otherwise than meant."""
     error: HapticDBError | None = None
     chord: float = 0.0
-    """Greatest chord error of the file's parts where it places them, metres; 0.0 if it has none."""
+    """Greatest chord error of the placed parts, metres, world frame; 0.0 for exact triangles."""
     is_unit_assumed: bool = False
-    """Whether neither the file nor the options give a unit, so its numbers were read as metres."""
+    """Whether metres were assumed, because neither the file nor the options give a unit."""
 
     def __repr__(self) -> str:
         what = f"objects added: {len(self.added)}, there before: {self.present}"
@@ -86,10 +86,10 @@ class FileReport:
 
 
 MOST_AHEAD = 1 << 29
-"""Bytes of geometry kept from files read ahead. Less: more files are read twice."""
+"""Most bytes of geometry in memory of files read ahead. Less: more files are read twice."""
 VOXEL_LIMIT = 1e9
 """Default of `ImportOptions.voxel_limit`: a minute of one processor with distances, a quarter of
-that without. Larger: a file that was meant for larger voxels keeps a person waiting."""
+that without. Larger: longer imports of files meant for larger voxels."""
 _READING = ("unit", "time_limit", "memory_limit", "chord")
 
 
@@ -98,33 +98,33 @@ class ImportOptions:
     """Options of reading and voxelizing files."""
 
     unit: str | None = None
-    """Unit of files that name none, one of `hapticdb.mesh.UNITS`; metres unless given."""
+    """Unit of files without one, one of `hapticdb.mesh.UNITS`; metres unless given."""
     grid: GridOptions = field(default_factory=GridOptions)
     """Grid of a new environment; must agree with an existing one, as layout and distances must."""
     layout: Layout | None = None
     """Bricks unless given."""
     jobs: int | None = None
-    """Threads that voxelize; one for each processor unless given."""
+    """Voxelizer threads; one for each processor unless given."""
     on: str | None = None
-    """Scheduler of dask.distributed, ``tcp://host:8786``, whose workers voxelize instead."""
+    """Scheduler of dask.distributed, ``tcp://host:8786``; its workers voxelize instead."""
     keep_removed: bool = False
-    """Skip parts that were removed from the environment; otherwise they are added again."""
+    """Skip parts removed from the environment before; otherwise they are added again."""
     time_limit: float | None = None
     memory_limit: int | None = None
     """Greatest time (s) and memory (bytes) for reading one file, see `hapticdb.mesh.read_file`."""
     voxel_limit: float = VOXEL_LIMIT
-    """Voxels that the surfaces of one file may meet, estimated by their area."""
+    """Most voxels met by the surfaces of one file, estimated by their area."""
     chord: float | None = None
-    """Greatest chord error wanted of the tessellations of STEP and IFC files, metres; unless given
-    as for `hapticdb.mesh.read_file`. They are stored with the surfaces, see `Part.chord`."""
+    """Greatest chord error of the tessellations of STEP and IFC files, metres; unless given as for
+    `hapticdb.mesh.read_file`. The resulting ones are stored with the surfaces, see `Part.chord`."""
     replace: bool = False
-    """Also replace objects, under their ids, whose geometry, placement or unit is another now, and
-    remove those whose parts the file lacks."""
+    """Also replace objects, under their ids, after a change of geometry, placement, attributes or
+    unit, and remove those of parts missing in the file."""
     skip_unusable: bool = False
-    """Import the other files if one cannot be used; its report has the error."""
+    """Import the other files if one is unusable; its report has the error."""
     distances: bool | None = None
-    """Whether parts of a new environment get distances to their surfaces, which the force
-    law needs. Unless given, they do in the layout brick. The layout voxel has none."""
+    """Whether parts of a new environment get distances to their surfaces, needed by the force law.
+    By default they do in the layout brick. The layout voxel has none."""
 
     def __post_init__(self) -> None:
         limits = {
@@ -143,7 +143,7 @@ class ImportOptions:
 
     @property
     def reading(self) -> dict[str, Any]:
-        """Options of `read_file` that are given, by their names there."""
+        """Given options of `read_file`, by name."""
         named = {name: getattr(self, name) for name in _READING}
         return {name: value for name, value in named.items() if value is not None}
 
@@ -154,9 +154,9 @@ def import_files(
     options: ImportOptions | None = None,
     progress: ImportCallback | None = None,
 ) -> list[FileReport]:
-    """Import files into an environment, which is made if it does not exist.
+    """Import files into an environment, created if it does not exist.
 
-    The grid of a new environment holds all of them; one without any object is removed again.
+    The grid of a new environment contains all of them; one without any object is removed again.
 
     Returns a report for each file, in order.
 
@@ -183,7 +183,7 @@ def import_files(
 
 
 class _Sources:
-    """Files of an import. Those read ahead, for their bounds, are kept up to `MOST_AHEAD` bytes."""
+    """Files of an import; those read ahead, for their bounds, stay up to `MOST_AHEAD` bytes."""
 
     def __init__(self, files: Sequence[str | os.PathLike[str]], reading: dict[str, Any]) -> None:
         self.files, self._reading = files, reading
@@ -201,7 +201,7 @@ class _Sources:
         raise found
 
     def bounds_from(self, n: int, first: MeshFile) -> NDArray[np.float64]:
-        """Bounds (2, 3) of file n, which is read, and of all usable files after it."""
+        """AABB (2, 3) of file n, already read, and of all usable files after it."""
         boxes = [first.bounds]
         for later in range(n + 1, len(self.files)):
             try:
@@ -232,7 +232,7 @@ def _import_file(
     progress: ImportCallback | None,
     workers: Cluster | None,
 ) -> FileReport:
-    """Import file n; if it cannot be used, the report says why."""
+    """Import file n; the report of an unusable one has the error."""
     try:
         mesh_file = sources.read(n)
         store = target.store_for(mesh_file, lambda: sources.bounds_from(n, mesh_file))
@@ -244,7 +244,7 @@ def _import_file(
 
 
 class _Target:
-    """The environment of an import: opened, or made with a grid for all usable files."""
+    """The environment of an import: opened, or created with a grid for all usable files."""
 
     def __init__(self, url: str | os.PathLike[str], options: ImportOptions) -> None:
         self._url, self._options = url, options
@@ -264,7 +264,7 @@ class _Target:
         return self
 
     def __exit__(self, *_: object) -> None:
-        """Close the store; remove an environment that was made here if nothing was written."""
+        """Close the store; discard an environment created here without a write."""
         if self.store is None:
             return
         if self._is_new and not self.store.revision():
@@ -275,7 +275,7 @@ class _Target:
     def store_for(self, mesh_file: MeshFile, bounds: Callable[[], NDArray[np.float64]]) -> Store:
         """Return the store, ready to load a file; bounds : (2, 3) of this file and the later ones.
 
-        The first usable file makes the environment.
+        The first usable file creates the environment.
         """
         grid_options = self._options.grid
         if self.store is None:
@@ -294,7 +294,7 @@ class _Target:
         return self.store
 
     def _create_or_join(self, grid: Grid) -> None:
-        """Make the environment, or open the one that another process has made meanwhile."""
+        """Create the environment, or open it if another process has created it meanwhile."""
         try:
             wish = self._options.distances
             self.store = create_store(self._url, grid, self._layout, distances=wish)
@@ -304,7 +304,7 @@ class _Target:
             self._join(self._layout, same)
 
     def _join(self, layout: Layout | None, grid: GridOptions) -> None:
-        """Open the environment; refuse options that are not its own."""
+        """Open the environment; refuse options that contradict it."""
         store = open_store(self._url)
         try:
             _check_options(store, layout, self._options.distances)
@@ -322,10 +322,10 @@ def ingest_file(
     progress: ImportCallback | None = None,
     workers: Cluster | None = None,
 ) -> FileReport:
-    """Write the parts of a file that the environment does not have yet.
+    """Write the parts of a file that the environment lacks.
 
     Raises `OutsideGridError` if a part leaves the grid; then nothing is written. Raises
-    `GeometryChangedError` if a part that is not to be replaced has another geometry.
+    `GeometryChangedError` for a changed part without `ImportOptions.replace`.
     """
     check_names(mesh_file)
     known = KnownParts(store, mesh_file.link)
@@ -373,7 +373,7 @@ def _write_parts(
     n_parts = len(mesh_file.parts)
     n_done = n_parts - len(todo)
     places = {part.name: n for n, part in enumerate(todo, start=n_done + 1)}
-    # what another process has added meanwhile is left out before it is voxelized
+    # skip parts that another process has added meanwhile, before they are voxelized
     parts = (part for part in todo if part.name in id_of or not known.has(part))
     added: list[int] = []
     n_replaced = voxels = 0
@@ -396,7 +396,7 @@ def _write_parts(
 
 
 def _check_options(store: Store, layout: Layout | None, distances: bool | None) -> None:  # noqa: FBT001 - an option as given
-    """Refuse a wish about layout or distances that is not the environment's."""
+    """Refuse a layout or distances other than the environment's."""
     if layout is not None and layout != store.layout:
         raise UsageError(
             f"{store.url} has the layout {store.layout}, not {layout}; leave --layout out"

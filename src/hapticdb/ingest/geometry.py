@@ -1,4 +1,4 @@
-"""Stored objects: their geometry, read from the surfaces in the database, and their rows."""
+"""Stored objects: geometry from the surfaces in the database, and rows of the index."""
 
 from collections import Counter
 from collections.abc import Iterator, Sequence
@@ -16,17 +16,17 @@ from hapticdb.store.covering import Ranges, object_ranges
 from hapticdb.store.parsing import damaged
 
 AT_ONCE = 16
-"""Surfaces that one statement reads. A larger value needs fewer statements and more memory."""
+"""Surfaces of one statement. A larger value needs fewer statements and more memory."""
 MOST_BYTES = 1_000_000_000
-"""Bytes of a packed surface that each engine can store in a row."""
+"""Greatest packed surface, bytes, that each engine can store in a row."""
 MOST_ROWS = 1 << 19
-"""Rows of the index that one statement may read, far less than a second's work."""
+"""Most rows of the index in one statement, far less than a second's work."""
 
 
 def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, Part]]:
     """Yield objects, in their order, with their geometry; DamagedError for an object without.
 
-    A surface is read once, and kept as long as a later object has it.
+    A surface is read once, and stays in memory up to its last object.
     """
     uses = Counter(obj.digest for obj in objects)
     asked: set[str] = set()
@@ -48,7 +48,7 @@ def parts_of(store: Store, objects: Sequence[Object]) -> Iterator[tuple[Object, 
 
 
 def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
-    """Geometry of an object from its packed surface; DamagedError if its digest is another."""
+    """Geometry of an object from its packed surface; DamagedError if its digest differs."""
     if surface is None:
         raise damaged(url, f"object {obj.id} ({obj.name}) has no surface")
     try:
@@ -62,7 +62,7 @@ def unpacked_part(url: str, obj: Object, surface: bytes | None) -> Part:
 
 
 def packed_surface(part: Part) -> bytes:
-    """Pack the geometry of a part; FileError if it is more than a database holds in a row."""
+    """Packed geometry of a part; FileError if too large for a database row."""
     surface = packing.pack(part.vertices, part.faces, part.colours, part.chord)
     if len(surface) > MOST_BYTES:
         raise FileError(
@@ -80,7 +80,7 @@ def shell_of_objects(
     seed: int,
     inset: float = 0.0,
 ) -> PointShell:
-    """Make one shell of several objects at their places; see `Environment.shell`."""
+    """One shell of several objects at their placements; see `Environment.shell`."""
     if not objects:
         raise UsageError("a shell of no objects: name at least one")
     triangles, chord = [], 0.0
@@ -100,7 +100,7 @@ def shell_of_objects(
 def rows_of_object(
     store: Store, obj: Object, quantiles: QuantileVector, *, distances: bool = False
 ) -> Iterator[Rows]:
-    """All rows of an object in batches, ascending by key; one statement reads one batch."""
+    """All rows of an object in batches, ascending by key; a statement for each batch."""
     ranges = object_ranges(store.grid, store.layout, obj)
     return _batches(store, obj, ranges, quantiles, distances=distances)
 

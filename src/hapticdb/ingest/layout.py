@@ -1,4 +1,4 @@
-"""Converts voxels to rows of the index table and back, by way of bricks in Z-order."""
+"""Conversion between voxels and rows of the index table, by way of bricks in Z-order."""
 
 from typing import NamedTuple
 
@@ -11,14 +11,14 @@ from hapticdb.kernels.surfaces import voxelize
 from hapticdb.store.base import BRICK_BYTES, NO_OCCUPANCY, Band, Keys, Layout, Rows
 
 BRICKS_AT_ONCE = 1 << 15
-"""Bricks whose voxels are unpacked together. A larger value takes more memory: 24 bytes a voxel."""
+"""Bricks of a batch, unpacked to voxels. A larger value takes more memory: 24 bytes a voxel."""
 
 
 class Bricks(NamedTuple):
     """Voxels as bricks in Z-order, for any curve of the environment.
 
     keys (B,) int64, ascending, distinct; occupancy (B, 64) uint8: bit n, least significant first,
-    is the voxel whose (i, j, k) modulo 8 has Z-order n; distances: as `Rows` has them.
+    is the voxel with Z-order n of its (i, j, k) modulo 8; distances: as in `Rows`.
     """
 
     keys: Keys
@@ -86,7 +86,7 @@ def voxels_of_rows(rows: Rows, grid: Grid, layout: Layout) -> NDArray[np.int64]:
 
 
 def merged(pieces: list[Bricks]) -> Bricks:
-    """Merge bricks without distances, voxels united; empties the list to save memory."""
+    """Union of bricks without distances; empties the list to save memory."""
     if len(pieces) == 1:
         return pieces.pop()
     keys = np.unique(np.concatenate([piece.keys for piece in pieces]))

@@ -1,4 +1,4 @@
-"""Moves objects: voxelizes their surfaces at the new place, and replaces their rows."""
+"""Moves of objects: voxelization of their surfaces at the new placement, and new rows."""
 
 from collections.abc import Iterable, Iterator
 from dataclasses import replace
@@ -27,7 +27,7 @@ def move_object(store: Store, old: Object, transform: ArrayLike, revision: int |
 
 
 def restore_object(store: Store, record: Object) -> int:
-    """Write an object that was removed, at its place and with its id; see `Environment.restore`."""
+    """Write a removed object again, with its placement and id; see `Environment.restore`."""
     surface = record.surface or store.surfaces([record.digest]).get(record.digest)
     if surface is None:
         raise UsageError(
@@ -52,13 +52,13 @@ def restore_object(store: Store, record: Object) -> int:
 
 
 def rewrite_object(store: Store, obj: Object) -> None:
-    """Write an object's rows anew from its surface, wherever rows of it may be."""
+    """Write an object's rows anew from its surface; deletes old rows outside its bounds, too."""
     ((_, part),) = parts_of(store, [obj])
     store.replace(*_moved(store, obj, part, obj.transform), everywhere=True)
 
 
 def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Object]:
-    """Shift objects by the same vector; see `Environment.shift`."""
+    """Translate objects by one vector; see `Environment.shift`."""
     shift = np.eye(4)
     shift[:3, 3] = _as_way(way)
     chosen = as_ids(ids).tolist()
@@ -76,7 +76,7 @@ def shift_objects(store: Store, ids: Iterable[int], way: ArrayLike) -> list[Obje
 
 
 def _moved(store: Store, old: Object, part: Part, placed: Floats) -> tuple[Object, Rows]:
-    """Record and rows of an object whose part is at the placement `placed` (4, 4)."""
+    """Record and rows of an object with its part at the placement `placed` (4, 4)."""
     bounds = bounds_inside(part, old.link, store.grid, placed)
     rows, n_voxels = rows_of_part(
         part, store.grid, store.layout, placed, distances=old.has_distances

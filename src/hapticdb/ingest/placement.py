@@ -1,4 +1,4 @@
-"""Checks an object's transform, bounds and rows against its surface, and the grid with them."""
+"""Check of an object's transform, bounds and rows against its surface and the grid."""
 
 from collections.abc import Iterator
 
@@ -11,17 +11,18 @@ from hapticdb.mesh import Part
 from hapticdb.store.base import Object, Store
 
 SAMPLES = 1024
-"""Vertices of a surface, and middles of triangles, that must lie in voxels of its object each."""
+"""Most vertices of a surface, and most triangle centroids, tested against its object's voxels."""
 ROUNDING = 1e-9
-"""Share of the greatest coordinate by which another machine may round bounds."""
+"""Tolerance of bounds from another machine, as a share of the greatest coordinate."""
 INSIDE = 1e-4
-"""Voxels: a sample so near the side of a voxel may be counted to its neighbour."""
+"""Voxels: samples this near a voxel's side are skipped, as rounding may assign them to its
+neighbour."""
 OTHER_BOUNDS = "its bounds are not those of its surface at its transform"
-"""The fault of an object whose rows are where its surface is."""
+"""Fault of an object with its rows at its surface, but with other bounds."""
 
 
 def placement_faults(store: Store, obj: Object, part: Part) -> Iterator[str]:
-    """What contradicts an object's surface at its transform: its bounds, the grid, its rows."""
+    """Contradictions between an object and its placed surface: bounds, grid, rows."""
     if (obj.transform[3] != (0, 0, 0, 1)).any():
         yield "its transform is no placement"
         return

@@ -1,4 +1,4 @@
-"""What an import writes: a file compared with the grid, and with the parts that are there."""
+"""Plan of an import: a file compared with the grid and with the stored parts."""
 
 import contextlib
 from collections.abc import Iterable, Mapping
@@ -21,15 +21,16 @@ from hapticdb.store.base import Object, Rows, Store
 from hapticdb.units import length_text
 
 MOST_ATTEMPTS = 100
-"""Attempts to add a part that other processes add and remove meanwhile; then an error is raised."""
+"""Attempts to add a part against other processes that add and remove it; then an error is
+raised."""
 FACES_AT_ONCE = 1 << 20
-"""Triangles whose area is computed at once. A larger value takes more memory."""
+"""Triangles of a batch for their area. A larger value takes more memory."""
 AT_BORDER = 1e-6
-"""Voxels by which a part may lie beyond the grid's border: rounding."""
+"""Tolerance at the grid's border, voxels, for rounding."""
 
 
 def check_names(mesh_file: MeshFile) -> None:
-    """Refuse names that not every engine can store as text."""
+    """Refuse names that some engine cannot store as text."""
     for name in (mesh_file.link, *(part.name for part in mesh_file.parts)):
         try:
             name.encode()
@@ -42,15 +43,15 @@ def check_names(mesh_file: MeshFile) -> None:
 
 
 def check_inside(parts: Iterable[Part], link: str, grid: Grid) -> None:
-    """Refuse a part of the file `link` that leaves the grid at its placement in the file."""
+    """Refuse a part of the file `link` outside the grid, at its placement in the file."""
     for part in parts:
         bounds_inside(part, link, grid)
 
 
 def check_cost(parts: Iterable[Part], link: str, grid: Grid, most: float) -> None:
-    """Refuse parts of the file `link` that meet more than `most` voxels, estimated by their area.
+    """Refuse parts of the file `link` on more than `most` voxels, estimated by their area.
 
-    A triangle soup of 5 MB may meet 10^10 voxels, which takes ten minutes.
+    A triangle soup of 5 MB may meet 10^10 voxels, ten minutes of work.
     """
     size = grid.voxel_size
     met = sum(_area(part) for part in parts) / size**2
@@ -100,10 +101,10 @@ def _box(bounds: NDArray[np.float64]) -> str:
 
 
 class KnownParts:
-    """Parts of a file that an environment has, updated from the environment's log of changes.
+    """Stored parts of a file, updated from the environment's log of changes.
 
-    by_name : the objects, by the names of the parts. Of two imports of one file of 1,500 parts at
-    once the second took 4.6 s, but 33 s with a new listing for each part that the other had added.
+    by_name : their objects, by the names of the parts. Of two imports of one file of 1,500 parts at
+    once the second took 4.6 s, but 33 s with a new listing for each part added by the other.
     """
 
     def __init__(self, store: Store, link: str) -> None:
@@ -121,7 +122,7 @@ class KnownParts:
         return known is not None and known.digest == part.digest
 
     def refresh(self) -> None:
-        """Update from the writes since the last call."""
+        """Apply the changes since the last call."""
         changes = list(self._store.changes(self._revision))
         for object_id in {change.id for change in changes}:
             self.by_name.pop(self._name_of.pop(object_id, ""), None)
@@ -139,7 +140,7 @@ class KnownParts:
 def added_or_present(
     store: Store, part: Object, rows: Rows, surface: bytes, known: KnownParts
 ) -> list[int]:
-    """Add a part; returns its id, or nothing if another process has added the same part meanwhile.
+    """Add a part: its id, or nothing if another process has added the same part meanwhile.
 
     Raises `EnvironmentExistsError` for a part of that name with another geometry.
     """
@@ -157,11 +158,11 @@ def added_or_present(
 
 
 class Plan(NamedTuple):
-    """What an import writes, in this order.
+    """Writes of an import, in this order.
 
     replaced : parts, in the file's order, with the ids of their objects; added : new parts, in the
-    file's order; dropped : ids of objects whose parts the file lacks; removed : names of the file's
-    parts that were removed from the environment before.
+    file's order; dropped : ids of objects without a part in the file; removed : names of the file's
+    parts removed from the environment before.
     """
 
     replaced: list[tuple[Part, int]]
@@ -181,18 +182,16 @@ def planned(
     keep_removed: bool,
     voxel_limit: float,
 ) -> Plan:
-    """Compare a file with an environment; nothing is read or written.
+    """Plan of a file's import into an environment; nothing is read or written.
 
-    file, unit : the file's parts, and the unit in which it was read
-    grid : the environment's
-    known : the environment's objects of this file, by the names of their parts
-    removed : names of parts that were removed from the environment
-    replace, keep_removed, voxel_limit : as in `hapticdb.ingest.files.ImportOptions`
+    file, unit : the file's parts, and the unit of its reading; grid : the environment's; known :
+    the environment's objects of this file, by the names of their parts; removed : names of parts
+    removed from the environment; replace, keep_removed, voxel_limit : as in
+    `hapticdb.ingest.files.ImportOptions`.
 
-    Raises `OutsideGridError` if a part that is to be written leaves the grid; `FileError` if they
-    meet too many voxels;
-    `GeometryChangedError` if a part has another geometry than the object of its name, which is not
-    to be replaced.
+    Raises `OutsideGridError` if a part to be written leaves the grid; `FileError` if they meet too
+    many voxels; `GeometryChangedError` for a part with another geometry than the object of its
+    name, without `replace`.
     """
     missing = [part for part in file.parts if part.name not in known]
     there = [(part, known[part.name]) for part in file.parts if part.name in known]
@@ -214,7 +213,7 @@ def planned(
 
 
 def _differs(part: Part, obj: Object, unit: str | None) -> bool:
-    """Whether geometry, placement, attributes, or the unit that the file was read in are others."""
+    """Whether geometry, placement, attributes or unit have changed."""
     return (
         obj.digest != part.digest
         or obj.attributes.get("unit") != unit

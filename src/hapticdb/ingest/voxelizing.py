@@ -1,4 +1,4 @@
-"""Voxelizes parts into rows: a part in pieces of bounded size, several parts at once."""
+"""Voxelization of parts into rows: a part in pieces of bounded size, several parts at once."""
 
 from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator
@@ -25,19 +25,19 @@ from hapticdb.store.base import BRICK_BYTES, Band, Keys, Layout, Object, Rows, S
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 ShareCallback = Callable[[float], None]
-"""Called often with the share of a part that is done, 0 to 1; its error ends the work."""
+"""Called often with the finished share of a part, 0 to 1; an error from it ends the work."""
 SHARE_EVERY_S = 0.2
-"""Seconds between two shares of a long part. A larger value tells of it less often."""
+"""Seconds between two progress reports of a long part. A larger value reports less often."""
 BYTES_A_BRICK = 8 + BRICK_BYTES
 """Memory of a brick, bytes: its key and its occupancy."""
 _BYTES_A_ROW = 8 + 8 + BRICK_BYTES
-"""Memory of a row with distances but for their packed bytes: its key, their end, its occupancy."""
+"""Memory of a row with distances, bytes, without the packed ones: key, their end, occupancy."""
 POINTS_AT_ONCE = 1 << 22
-"""Points of a cloud that one call marks: less than a second of work."""
+"""Points of a cloud in one kernel call: less than a second of work."""
 _VOXELS_SHARE = 0.1
-"""Share of a part's time that its voxels take where distances are computed, too."""
+"""Share of the voxels in a part's time if distances are computed, too."""
 _MERGE_FROM = 8 * voxelize.MOST_BRICKS
-"""Bricks in all pieces at which they are merged for the first time."""
+"""Bricks in all pieces at their first merge."""
 
 
 def rows_of_part(
@@ -49,15 +49,15 @@ def rows_of_part(
     *,
     distances: bool = False,
 ) -> tuple[Rows, int]:
-    """Voxelize a part; returns its rows, ascending by key, and the number of its voxels.
+    """Voxelize a part: its rows, ascending by key, and the number of its voxels.
 
     A triangle marks every voxel whose closed box it meets; a point marks its voxel.
 
     world_from_part (4, 4) : placement in metres, the file's unless given; progress : called with
-    the share of a large part that is done; distances : whether the rows get distances to the
-    part's surface, or to the points of a cloud: then there are rows for all bricks near it.
+    the finished share of a large part; distances : whether the rows get distances to the part's
+    surface, or to the points of a cloud: then there are rows for all bricks near it.
 
-    Raises `FileError` if this would take more memory than the machine has left.
+    Raises `FileError` if this would take more memory than the machine has available.
     """
     what = f"part {part.name!r}"
     voxels_alone = _VOXELS_SHARE if distances else 1.0
@@ -86,8 +86,8 @@ def _with_distances(
 ) -> Bricks:
     """Bricks near a part, with distances to its surface.
 
-    bricks : those that the part meets; corners (T, 3, 3) of triangles, or (P, 1, 3) points of a
-    cloud, in voxels from the grid's origin; check_room : called with the least bytes of the result.
+    bricks : those met by the part; corners (T, 3, 3) of triangles, or (P, 1, 3) points of a cloud,
+    in voxels from the grid's origin; check_room : called with the least bytes of the result.
     """
     keys: list[Keys] = []
     packed: list[NDArray[np.uint8]] = []
@@ -110,14 +110,14 @@ def _with_distances(
 
 
 def _portion(progress: ShareCallback | None, low: float, high: float) -> ShareCallback | None:
-    """Tell `progress` that a share of the portion low to high of the work is done."""
+    """Callback for a stage of the work, which spans the shares low to high of the whole."""
     if progress is None:
         return None
     return lambda share: progress(low + share * (high - low))
 
 
 def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
-    """Points (..., 3) in voxels; points that rounding moved over the border are set onto it."""
+    """Points (..., 3) in voxels; points that rounding moved over the border are clipped to it."""
     scaled = grid.to_voxel_units(points)
     return np.clip(scaled, 0.0, float(grid.side), out=scaled)
 
@@ -125,7 +125,7 @@ def _on_grid(points: NDArray[np.float64], grid: Grid) -> NDArray[np.float64]:
 def pieces_of_points(
     points: NDArray[np.float64], bits: int
 ) -> Iterator[tuple[float, NDArray[np.int64], NDArray[np.uint8]]]:
-    """Bricks of the voxels that hold points, as `voxelize.voxelize_pieces` yields them."""
+    """Bricks of the voxels of points, in pieces as of `voxelize.voxelize_pieces`."""
     end = max(len(points), 1)
     for first in range(0, end, POINTS_AT_ONCE):
         some = points[first : first + POINTS_AT_ONCE]
@@ -137,7 +137,7 @@ def bricks_of_pieces(
     what: str,
     progress: ShareCallback | None = None,
 ) -> Bricks:
-    """Bricks of a part from pieces: the share that is done, keys and occupancy.
+    """Bricks of a part from its pieces: finished share, keys, occupancy.
 
     Takes the memory of twice the result and one piece; `what` is its name in a `FileError`.
     """
@@ -157,7 +157,7 @@ def bricks_of_pieces(
 
 
 def check_room(n_bytes: int, what: str) -> None:
-    """Raise an error if `n_bytes` is more memory than the machine has left."""
+    """Raise FileError if `n_bytes` exceeds the memory available."""
     left = bytes_available()
     if n_bytes > left:
         raise FileError(
@@ -167,7 +167,7 @@ def check_room(n_bytes: int, what: str) -> None:
 
 
 class Recipe(NamedTuple):
-    """What the rows of a part depend on beside the part."""
+    """Settings that determine the rows of a part."""
 
     link: str
     attributes: dict[str, object]
@@ -178,7 +178,7 @@ class Recipe(NamedTuple):
     def object_of(
         self, item: tuple[Part, bool], progress: ShareCallback | None = None
     ) -> tuple[Object, Rows, bytes | None]:
-        """Object and rows of a part at its placement in the file; with its surface, if wanted."""
+        """Object, rows and, if requested, packed surface of a part at its placement in the file."""
         part, is_wanted = item
         try:
             rows, n_voxels = rows_of_part(
@@ -198,9 +198,9 @@ class Recipe(NamedTuple):
 def voxelize_parts(
     parts: Iterable[Part], file: MeshFile, store: Store, unit: str | None, jobs: int | Cluster
 ) -> Generator[tuple[Object, Rows, bytes] | float, None, None]:
-    """Yield objects, rows and packed surfaces of parts, in order, a few of them made in advance.
+    """Yield objects, rows and packed surfaces of parts, in order, a few computed in advance.
 
-    Between them come shares of long parts, as from `in_threads`: the voxelizer runs without the
+    Shares of long parts come between them, as from `in_threads`: the voxelizer releases the
     interpreter lock. unit : of the file, stored with the objects; jobs : threads or workers.
     """
     given = {"unit": unit, "up": file.up}
@@ -235,9 +235,9 @@ def in_threads(
 ) -> Generator[Done | float, None, None]:
     """Yield the results of `work` on items, in order; `jobs` threads compute a few in advance.
 
-    While the next result is not there, the share of it that is done comes instead, 0 to 1, five
-    times a second. `work` gets an item and a callback for its share, which raises an error after
-    this generator has ended.
+    While the next result is pending, its finished share, 0 to 1, is yielded five times a second.
+    `work` gets an item and a callback for its share; the callback raises an error after the end of
+    this generator.
     """
     shares: dict[int, float] = {}
     ended = Event()

@@ -1,4 +1,4 @@
-"""The band of distances around surfaces: its lattice, its packed form, its interpolants."""
+"""The band of unsigned distances: lattice, packed form, interpolants, force law."""
 
 from hapticdb.kernels._later import later_modules
 

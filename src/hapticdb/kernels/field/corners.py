@@ -1,7 +1,7 @@
 """Trilinear interpolation in a resident cell, with the 8 corners in vector registers.
 
-The arithmetic is that of `lattice.trilinear`, so the results are equal bit for bit. With 8 bytes
-loaded one by one, a frame of 100,000 contacts takes a tenth longer.
+The arithmetic is that of `lattice.trilinear`, bit for bit. With 8 single-byte loads, a frame of
+100,000 contacts takes a tenth longer.
 """
 
 import numpy as np
@@ -12,28 +12,28 @@ from numba.extending import intrinsic
 from hapticdb.kernels.field.lattice import CELL_SIDE, STEPS, trilinear
 
 FIRST_OF_PAIRS = (0, CELL_SIDE, CELL_SIDE * CELL_SIDE, CELL_SIDE * (CELL_SIDE + 1))
-"""Places of the corners with the lower k, from that of the lowest corner."""
+"""Offsets of the corners with the lower k from the lowest corner."""
 
 if config.DISABLE_JIT:
 
     def interpolated(payload, at, x, y, z):
-        """Steps between the 8 corners from index `at` of payload (S, 34^3) on; see below."""
+        """Trilinear value, in steps, as of the intrinsic below."""
         values = payload.reshape(-1)
         corners = [values[int(at) + first + k] for first in FIRST_OF_PAIRS for k in (0, 1)]
         return trilinear(*np.minimum(corners, STEPS).astype(np.int64), x, y, z)
 
     def fetch_corners(payload, at):
-        """Do nothing: there is no cache to fetch into."""
+        """Prefetch: nothing without the JIT."""
 
 else:
 
     def _shuffled(builder, one, other, places):
-        """Vector of the elements at those places of two vectors."""
+        """Vector of the elements at some places of two vectors."""
         kind = ir.VectorType(ir.IntType(32), len(places))
         return builder.shuffle_vector(one, other, ir.Constant(kind, list(places)))
 
     def _between(builder, low, high, share):
-        """Values between two vectors: low + share (high - low)."""
+        """Linear interpolation of two vectors: low + share (high - low)."""
         count = low.type.count
         nothing = ir.Constant(low.type, ir.Undefined)
         first = builder.insert_element(nothing, share, ir.Constant(ir.IntType(32), 0))
@@ -41,7 +41,7 @@ else:
         return builder.fadd(low, builder.fmul(shares, builder.fsub(high, low)))
 
     def _corners(builder, data, at):
-        """The 8 corners, at most STEPS, as floats: those with the lower k, then the others."""
+        """The 8 corners, at most STEPS, as doubles: those with the lower k, then the others."""
         pair, eight = ir.VectorType(ir.IntType(8), 2), ir.VectorType(ir.IntType(8), 8)
         pairs = []
         for first in FIRST_OF_PAIRS:
@@ -61,9 +61,9 @@ else:
 
     @intrinsic
     def interpolated(typing_context, payload, at, x, y, z):  # noqa: ARG001 - numba's signature
-        """Steps between the 8 corners from index `at` of payload (S, 34^3) on, as of one axis.
+        """Trilinear value, in steps, of the 8 corners from index `at` of payload (S, 34^3) on.
 
-        at: uint64, not checked; x, y, z: 0 to 1 from the lowest corner. BEYOND counts as STEPS.
+        at : uint64, unchecked; x, y, z : 0 to 1 from the lowest corner. BEYOND counts as STEPS.
         """
         real = types.float64
 
@@ -83,7 +83,7 @@ else:
 
     @intrinsic
     def fetch_corners(typing_context, payload, at):  # noqa: ARG001 - numba's signature
-        """Begin to fetch the corners that `interpolated` will read into the processor's cache."""
+        """Prefetch the corners of `interpolated` into the processor's cache."""
 
         def generate(context, builder, signature, arguments):
             payload, at = arguments
@@ -93,7 +93,7 @@ else:
             fetch = builder.module.declare_intrinsic("llvm.prefetch", [byte], fnty=kind)
             for first in FIRST_OF_PAIRS:
                 where = builder.gep(data, [builder.add(at, ir.Constant(at.type, first))])
-                # to read, into the nearest cache, as data
+                # read access, highest locality, data cache
                 hints = [ir.Constant(number, hint) for hint in (0, 3, 1)]
                 builder.call(fetch, [builder.bitcast(where, byte), *hints])
             return context.get_dummy_value()

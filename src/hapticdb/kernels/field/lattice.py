@@ -1,24 +1,24 @@
-"""The band: unsigned distances to surfaces at voxel centres, in rows and in resident cells.
+"""The band: quantised unsigned distances at voxel centres, in rows and in resident cells.
 
-A distance u is in voxels, from a voxel's centre to the nearest triangle of an object, or to the
-nearest point of a point cloud. It is stored in 8 bits: q = min(round(254 u / h), 254), and 255
-where u is above h, the half width of the band.
+A distance u, in voxels, is that of a voxel's centre to the nearest triangle of an object, or to the
+nearest point of a point cloud. It is stored in 8 bits: q = min(round(254 u / h), 254), and 255 for
+u above h, the half width of the band.
 
 A row of the table `brick` belongs to one brick and one object. It has the distances at 10^3
-centres: the brick's own 8^3 and one more on each side. So each point in the brick finds in this one
-row the 8 centres around it that trilinear interpolation needs, and the 27 that a quadratic B-spline
-needs. A resident cell has 34^3 distances for the same reason. In both, k runs fastest.
+centres: the brick's own 8^3 and one more on each side. So one row has the 8 centres of trilinear
+interpolation, and the 27 of a quadratic B-spline, around each point of the brick. A resident cell
+has 34^3 distances for the same reason. In both, k runs fastest.
 """
 
 from hapticdb.kernels._jit import leaf
 
 HALF_WIDTH = 2.75
-"""h, voxels: distances up to h are stored. Larger: smoother forces and larger databases. It is part
-of the file format."""
+"""h, voxels: greatest stored distance. Larger: smoother forces and larger databases. Part of the
+file format."""
 STEPS = 254
 """Steps from distance 0 to h."""
 BEYOND = 255
-"""Stored value where the surface is farther away than h."""
+"""Stored value of distances above h."""
 ROW_SIDE = 10
 """Centres of a row on each axis: a brick's 8, and one on each side."""
 ROW_VALUES = ROW_SIDE**3
@@ -41,19 +41,19 @@ def step_of(distance):
 
 @leaf
 def row_place(x, y, z):
-    """Index into a row's distances of centre (x, y, z), counted from the brick's first: -1 to 8."""
+    """Index in a row of centre (x, y, z), relative to the brick's first: -1 to 8."""
     return ((x + 1) * ROW_SIDE + (y + 1)) * ROW_SIDE + (z + 1)
 
 
 @leaf
 def cell_place(x, y, z):
-    """Index into a cell's distances of centre (x, y, z), from the cell's first: -1 to 32."""
+    """Index in a cell of centre (x, y, z), relative to the cell's first: -1 to 32."""
     return ((x + 1) * CELL_SIDE + (y + 1)) * CELL_SIDE + (z + 1)
 
 
 @leaf
 def place_before(x, y, z):
-    """Way in a cell's distances from centre (0, 0, 0) to centre (x, y, z), of any cell."""
+    """Index offset in a cell from centre (0, 0, 0) to centre (x, y, z), of any cell."""
     return (x * CELL_SIDE + y) * CELL_SIDE + z
 
 

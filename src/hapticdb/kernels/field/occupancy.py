@@ -1,12 +1,12 @@
-"""Occupancies of bricks packed without loss: only bytes that are not 0, behind a mask of them.
+"""Lossless packing of brick occupancies: a mask of the nonzero bytes, and these bytes.
 
-Bit n of a mask of 64 bits, 8 bytes, the lowest of each byte first, is 1 where byte n of the
-occupancy is not 0; then come these bytes in order. Byte n is a cube of 2 x 2 x 2 voxels, so a
-surface through a brick meets about 16 of the 64, which takes 24 bytes. An SQL expression finds the
-bit of a voxel by counting the bits of the mask before it.
+Bit n of a mask of 64 bits, 8 bytes, least significant first, is 1 if byte n of the occupancy is not
+0; then these bytes follow in order. Byte n is a cube of 2 x 2 x 2 voxels, so a surface through a
+brick meets about 16 of the 64, in 24 bytes. An SQL expression finds the bit of a voxel by counting
+the bits of the mask before it.
 
-Bricks follow one another without lengths: a mask says how many bytes follow it. A mask of zeros
-alone is a brick without a voxel, of which nothing is stored.
+Bricks follow one another without lengths: a mask gives the number of its bytes. A mask of zeros
+alone is a brick without a voxel; nothing is stored of it.
 """
 
 import numpy as np
@@ -23,10 +23,10 @@ MASK_BYTES = BYTES_OF_BRICK // 8
 
 @entry(READ_BYTES, BYTES)
 def unpack_kernel(data, out):
-    """Unpack bricks, one after the other, into out (64 R,), which is zero -> bytes read, or -1.
+    """Unpack bricks, one after the other, into out (64 R,), initially zero -> bytes read, or -1.
 
-    -1 where data (n,) ends before the last brick does. Indices are unsigned, which takes two thirds
-    of the time of signed ones, and 32 bits of the mask are read at once.
+    -1 if data (n,) ends before the last brick. Indices are unsigned, in two thirds of the time of
+    signed ones, and 32 bits of the mask are read at once.
     """
     at, end = np.uint64(0), np.uint64(data.shape[0])
     for first in range(np.uint64(0), np.uint64(out.shape[0]), np.uint64(64)):
@@ -50,7 +50,7 @@ def unpack_kernel(data, out):
 
 
 def pack(occupancy: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Pack occupancies (64 R,) -> packed bytes (n,), and where each brick ends in them (R,).
+    """Packed bytes (n,) of occupancies (64 R,), and the end of each brick in them (R,).
 
     A brick without a voxel has no bytes.
     """
@@ -63,12 +63,12 @@ def pack(occupancy: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.in
 
 
 def unpack(data: bytes, n_bricks: int) -> NDArray[np.uint8]:
-    """Unpack bricks, each with its mask: occupancies (64 R,), read-only.
+    """Occupancies (64 R,) of packed bricks, each with its mask; read-only.
 
     Raises
     ------
     ValueError
-        If these are not the bytes of so many bricks.
+        If the data are not those of `n_bricks` bricks.
     """
     out = np.zeros(BYTES_OF_BRICK * n_bricks, np.uint8)
     if unpack_kernel(np.frombuffer(data, np.uint8), out) != len(data):

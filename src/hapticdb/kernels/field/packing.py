@@ -1,30 +1,30 @@
-"""Rows of distances packed without loss: predicted from their neighbours, then few bits a residual.
+"""Lossless packing of distance rows: Lorenzo prediction, then few bits a residual.
 
 A row (`lattice`) is 10 planes of 10 lines of 10 values. Each value is predicted from the 7 before
 it in its cube of 2^3, with 255 outside the row: the three-dimensional Lorenzo predictor of Ibarria,
 Lindstrom, Rossignac and Szymczak, "Out-of-core compression and decompression of large n-dimensional
-scalar fields", 2003. The residual, modulo 256, is 0 beyond the band, and wherever the distance is a
+scalar fields", 2003. The residual, modulo 256, is 0 beyond the band, and for a distance that is a
 sum of functions of two coordinates each, as along a flat surface.
 
-The bits of a row, the lowest of each byte first, are, for each plane:
+The bits of a row, from the least significant bit of each byte on, are, for each plane:
 
-- a bit that is 1 where every line's mask equals that of the same line in the plane before;
-- for each line, its mask, unless that bit told it, and then its residuals other than 0.
+- a bit: 1 if every line's mask equals that of the same line in the plane before;
+- for each line, its mask, unless that bit is 1, and then its nonzero residuals.
 
-A mask has a bit for each value of the line whose residual is not 0. Masks before the first line or
-plane are 0. A mask is coded as
+A mask has a bit for each value of the line, 1 for a nonzero residual. Masks before the first line
+or plane are 0. A mask is coded as
 
 - 0: that of the plane before;
-- 1, 0: that of the line before, only where the two differ;
-- 1, where they do not differ, or 1, 1: another; its 10 bits follow.
+- 1, 0: that of the line before, only if the two differ;
+- 1, if they are equal, or 1, 1: another; its 10 bits follow.
 
 A residual r of -127 to 128 is the number 2 r - 1 if r is positive, and -2 r if not. Its highest bit
-has number n; 3 bits for n and the n bits below it are stored. A row ends at a whole byte; the bits
-left over are 0.
+has number n; 3 bits for n and the n bits below it are stored. A row ends at a whole byte; the
+remaining bits are 0.
 
-No row takes more than `MOST_ROW_BYTES`, whatever its bits are. `unpack` copies the bytes of one row
-into a buffer of that size, so damaged bytes give wrong distances and never an access beyond an
-array. A row with more or fewer bytes than its bits need is damaged.
+No row takes more than `MOST_ROW_BYTES`, for any bits. `unpack` copies the bytes of one row into a
+buffer of that size, so damaged bytes give wrong distances and never an access beyond an array. A
+row with more or fewer bytes than its bits need is damaged.
 """
 
 import numpy as np
@@ -37,11 +37,11 @@ from hapticdb.kernels.field.lattice import BEYOND, ROW_SIDE, ROW_VALUES
 LINES = ROW_SIDE * ROW_SIDE
 """Lines of a row."""
 PADDED = ROW_SIDE + 1
-"""Side of a row with one value before it on each axis."""
+"""Side of a padded row, with one value before it on each axis."""
 MOST_ROW_BYTES = (ROW_SIDE + LINES * 12 + ROW_VALUES * 10 + 7) // 8
 """Most bytes of a packed row: 1 bit a plane, 12 a mask, 10 a residual."""
 ROWS_AT_ONCE = 2048
-"""Rows that are packed together, into a buffer of 3 MB. Fewer need less memory and more calls."""
+"""Rows of a batch, with a buffer of 3 MB. Fewer: less memory, more calls."""
 LOW_BITS = np.uint64(0x7F7F7F7F7F7F7F7F)
 """The seven low bits of each of eight bytes."""
 ALL_BEYOND = np.uint64(BEYOND * 0x0101010101010101)
@@ -50,11 +50,11 @@ EACH_BYTE = np.uint64(0x0101010101010101)
 """Factor that copies a byte into each of eight bytes."""
 NONE, ONE = np.uint64(0), np.uint64(1)
 FULL_MASK = np.uint64((1 << ROW_SIDE) - 1)
-"""Mask of a line in which no residual is 0."""
+"""Mask of a line without a residual of 0."""
 
 
 def _codes() -> NDArray[np.uint64]:
-    """Code and number of its bits (2, 256) of each residual modulo 256; 0 has none."""
+    """Code and its length in bits (2, 256) of each residual modulo 256; length 0 for 0."""
     codes = np.zeros((2, 256), np.uint64)
     for residual in range(1, 256):
         number = 2 * residual - 1 if residual <= 128 else 2 * (256 - residual)
@@ -68,7 +68,7 @@ CODES = _codes()
 
 @leaf
 def _put_bits(out, at, held, n_held, value, n):
-    """Append the n bits of value to the bits held; 32 of them go to out from place `at` on."""
+    """Append the n bits of value to the bit buffer `held`; 32 of them move to out[at ...]."""
     held |= value << n_held
     n_held += n
     if n_held >= np.uint64(32):
@@ -82,15 +82,15 @@ def _put_bits(out, at, held, n_held, value, n):
 
 @leaf
 def _place_padded(line):
-    """Index of a line's first value in a padded row (11^3)."""
+    """Index of a line's first value in a padded row (11^3,)."""
     return ((line // ROW_SIDE + 1) * PADDED + line % ROW_SIDE + 1) * PADDED + 1
 
 
 @leaf
 def _set_residuals(values, n, padded, residuals):
-    """Set the residuals of row n of values (R, 1000), in the layout of `padded`.
+    """Set the residuals of row n of values (R, 1000), in the padded layout.
 
-    padded, residuals (11^3,) uint8. One loop without branches, which LLVM computes in vectors.
+    padded, residuals (11^3,) uint8. One loop without branches, which LLVM vectorises.
     """
     for line in range(LINES):
         to = _place_padded(line)
@@ -129,7 +129,7 @@ def _put_mask(out, at, held, n_held, mask, back, up):
 
 @leaf
 def _put_residuals(out, at, held, n_held, residuals, line, mask):
-    """Append the residuals of a line that its mask names."""
+    """Append the nonzero residuals of a line."""
     first = np.uint64(_place_padded(line))
     while mask:
         residual = residuals[first + np.uint64(lowest_bit(np.int64(mask)))]
@@ -173,10 +173,10 @@ def _pack_row(masks, residuals, out, at):
 
 @entry(BYTES2, INT, INTS, BYTES)
 def pack_kernel(values, first, ends, out):
-    """Pack rows of values (R, 1000) from row `first` on; return how many bytes were written.
+    """Pack rows of values (R, 1000) from row `first` on; return the number of bytes written.
 
-    As many rows as ends (P,) has places; ends counts from the first byte of out, which has room
-    for P times `MOST_ROW_BYTES`.
+    ends (P,) sets the number of rows, and receives their ends in out, which has room for P times
+    `MOST_ROW_BYTES`.
     """
     padded = np.full(PADDED**3, BEYOND, np.uint8)
     residuals = np.empty(PADDED**3, np.uint8)
@@ -192,7 +192,7 @@ def pack_kernel(values, first, ends, out):
 
 @leaf
 def _bits_at(row, at):
-    """Return 25 bits or more of a row's bytes from bit `at` on. Reads 4 bytes."""
+    """25 bits or more of a row's bytes from bit `at` on. Reads 4 bytes."""
     byte = at >> np.uint64(3)
     word = np.uint64(row[byte]) | (np.uint64(row[byte + ONE]) << np.uint64(8))
     word |= np.uint64(row[byte + np.uint64(2)]) << np.uint64(16)
@@ -202,13 +202,13 @@ def _bits_at(row, at):
 
 @leaf
 def added(a, b):
-    """Sum of the eight bytes of a and of b, each modulo 256."""
+    """Bytewise sum of eight bytes in a and in b, each modulo 256."""
     return ((a & LOW_BITS) + (b & LOW_BITS)) ^ ((a ^ b) & ~LOW_BITS)
 
 
 @leaf
 def _take_mask(row, at, back, up):
-    """Return a line's mask and the bit behind its code."""
+    """A line's mask, and the bit after its code."""
     word = _bits_at(row, at)
     if not word & ONE:
         return back, at + ONE
@@ -227,9 +227,9 @@ def below(word, n):
 
 @leaf
 def _take_line(row, at, mask):
-    """Read the residuals of a line that its mask names, and sum them up along the line.
+    """Read the nonzero residuals of a line, and sum them up along the line.
 
-    Returns the sums in bytes, 8 in the first word and 2 in the second, and the bit behind.
+    Returns the prefix sums in bytes, 8 in the first word and 2 in the second, and the next bit.
     """
     low, high, total = NONE, NONE, NONE
     while mask:
@@ -263,10 +263,10 @@ def _put_line(out, n, at, low, high):
 
 @leaf
 def _unpack_row(row, masks, lines, out, n):
-    """Unpack the bytes in `row` into row n of out (R, 1000); return how many bits they were.
+    """Unpack the bytes in `row` into row n of out (R, 1000); return the number of bits.
 
     masks (10,) and lines (20,) uint64 are the last plane's masks and values. All numbers are
-    unsigned: an index that cannot be negative lets LLVM join loads and stores of single bytes.
+    unsigned: without negative indices LLVM joins loads and stores of single bytes.
     """
     for y in range(ROW_SIDE):
         masks[y] = NONE
@@ -275,7 +275,7 @@ def _unpack_row(row, masks, lines, out, n):
     for _ in range(ROW_SIDE):
         is_same = _bits_at(row, at) & ONE
         at += ONE
-        has_residuals = some or not is_same  # else the plane is the one before
+        has_residuals = some or not is_same  # else the plane equals the one before
         up = some = NONE
         low, high = NONE, NONE  # change of the line's values from plane to plane
         for y in range(ROW_SIDE):
@@ -296,7 +296,7 @@ def _unpack_row(row, masks, lines, out, n):
 
 @maker
 def unpacking_memory():
-    """Arrays in which `unpack_one` works."""
+    """Scratch of `unpack_one`."""
     row = np.zeros(MOST_ROW_BYTES + 4, np.uint8)
     return row, np.empty(ROW_SIDE, np.uint64), np.empty(2 * ROW_SIDE, np.uint64)
 
@@ -305,7 +305,7 @@ def unpacking_memory():
 def unpack_one(data, ends, n, memory, out, to):
     """Unpack row n of packed rows into row `to` of out (R, 1000); whether it is sound.
 
-    data (n,), ends (R,) as `pack` gives them, or damaged; memory of `unpacking_memory`.
+    data (n,), ends (R,) : as from `pack`, or damaged; memory : of `unpacking_memory`.
     """
     row, masks, lines = memory
     start = ends[n - 1] if n else np.int64(0)
@@ -321,10 +321,10 @@ def unpack_one(data, ends, n, memory, out, to):
 
 @entry(READ_BYTES, INTS, BOOLS, BYTES2)
 def unpack_kernel(data, ends, wanted, out):
-    """Unpack the wanted rows; return the first of these that is damaged, or -1.
+    """Unpack the selected rows; return the first damaged one of them, or -1.
 
-    data (n,), ends (R,) as `pack` gives them; wanted (R,) bool; out (R, 1000), left as it is in
-    rows that are not wanted.
+    data (n,), ends (R,) : as from `pack`; wanted (R,) bool; out (R, 1000), unchanged in the other
+    rows.
     """
     memory = unpacking_memory()
     for n in range(ends.shape[0]):
@@ -334,9 +334,9 @@ def unpack_kernel(data, ends, wanted, out):
 
 
 def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64]]:
-    """Pack rows of distances (R, 1000) -> packed bytes (n,), and where each row ends in them (R,).
+    """Packed bytes (n,) of rows of distances (R, 1000), and the end of each row in them (R,).
 
-    Equal rows give equal bytes, whatever stands beside them.
+    Equal rows give equal bytes, independent of other rows.
     """
     rows = np.ascontiguousarray(values, dtype=np.uint8).reshape(-1, ROW_VALUES)
     ends = np.empty(len(rows), dtype=np.int64)
@@ -355,15 +355,15 @@ def pack(values: NDArray[np.uint8]) -> tuple[NDArray[np.uint8], NDArray[np.int64
 def unpack(
     data: NDArray[np.uint8], ends: NDArray[np.int64], wanted: NDArray[np.bool_] | None = None
 ) -> NDArray[np.uint8]:
-    """Unpack the wanted rows (R,) of distances, or all: (R, 1000), unset where not wanted.
+    """Rows of distances (R, 1000), selected by `wanted` (R,), or all; the others are unset.
 
-    data (n,) and ends (R,) as `pack` gives them, or damaged, and wanted, are contiguous.
+    data (n,) and ends (R,), as from `pack` or damaged, and `wanted` are contiguous.
 
     Raises
     ------
     ValueError
-        If the bytes of a wanted row are no packed row, or an end lies outside the data. Not every
-        damage is found, since many changed rows are rows, too.
+        If the bytes of a selected row are no packed row, or an end lies outside the data. Not every
+        damage is detected, since many changed rows are rows, too.
     """
     if data.flags.writeable:
         data = data.view()

@@ -1,10 +1,9 @@
-"""A resident cell's distances at a point: smooth value and gradient, and a proved lower bound.
+"""Quadratic B-spline of a resident cell's distances, and proved lower bounds of the distance.
 
-The value is a quadratic B-spline over the 27 centres around the point. It is exact where the
-distance is linear, and its gradient is continuous, so forces that follow the gradient are those of
-a potential. The lower bound needs no smoothness: a distance changes by at most the way between two
-places, so the distance at a point is at least u_i - |p - c_i| for each centre c_i, less half a step
-of storing.
+The spline covers the 27 centres around the point. It is exact for a linear distance, and its
+gradient is continuous, so forces along the gradient are those of a potential. The lower bound needs
+no smoothness: a distance is 1-Lipschitz, so at a point it is at least u_i - |p - c_i| for each
+centre c_i, less half a quantisation step.
 """
 
 import math
@@ -21,22 +20,22 @@ from hapticdb.kernels.field.lattice import (
 )
 
 FREE_BEYOND = math.sqrt(HALF_WIDTH * HALF_WIDTH - 0.5)
-"""Voxels. Where all centres of a block of voxels and one more on each side are BEYOND, no surface
-is nearer to the block, grown by half a voxel, than this: the balls of radius h about the centres
-cover that space. It follows from `HALF_WIDTH`."""
+"""Lower bound, voxels, of the distance to a block of voxels, grown by half a voxel, if all its
+centres and one more on each side are BEYOND: the balls of radius h about the centres cover that
+space. It follows from `HALF_WIDTH`."""
 ALONG_I, ALONG_J = CELL_SIDE * CELL_SIDE, CELL_SIDE
-"""Steps in a cell's distances from a centre to the next one along i and j."""
+"""Index offsets in a cell from a centre to the next one along i and j."""
 
 
 @leaf
 def _spline_weights(t):
-    """Weights of the centres before, at and after a point at t from the middle one, |t| <= 1/2."""
+    """B-spline weights of three centres, at a point at t from the middle one, |t| <= 1/2."""
     return 0.5 * (0.5 - t) * (0.5 - t), 0.75 - t * t, 0.5 * (0.5 + t) * (0.5 + t)
 
 
 @leaf
 def _from_center(x):
-    """Way from the centre of the voxel that holds a coordinate to it, voxels, -1/2 to 1/2."""
+    """Coordinate relative to the centre of its voxel, voxels, -1/2 to 1/2."""
     return x - math.floor(x) - 0.5
 
 
@@ -64,9 +63,9 @@ def _plane_of_nine(payload, slot, at, by, hy, ay, ty, bz, hz, az, tz):
 
 @inlined
 def spline(payload, slot, x, y, z):
-    """Distance at a point of the slot's cell and its gradient: u, gx, gy, gz, in voxels.
+    """Distance at a point of the slot's cell and its gradient: u, gx, gy, gz; u in voxels.
 
-    (x, y, z): the point in voxels from the grid's origin. What is beyond the band counts as h.
+    (x, y, z) : in voxels from the grid's origin. Values beyond the band count as h.
     """
     tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     bx, hx, ax = _spline_weights(tx)
@@ -120,12 +119,12 @@ def second_derivatives(payload, slot, x, y, z):
 
 @inlined
 def lower_bound(payload, slot, x, y, z):
-    """Voxels: no surface is nearer to a point of the slot's cell, by the 8 centres around it."""
+    """Lower bound of the distance at a point of the slot's cell, voxels, by its 8 centres."""
     tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     bx, by, bz = np.int64(tx < 0.0), np.int64(ty < 0.0), np.int64(tz < 0.0)
     at = cell_place((np.int64(x) & 31) - bx, (np.int64(y) & 31) - by, (np.int64(z) & 31) - bz)
     lx, ly, lz = tx + bx, ty + by, tz + bz
-    # squares of the ways to the lower and the upper centres
+    # squared offsets to the lower and the upper centres
     ux, uy, uz = (1.0 - lx) * (1.0 - lx), (1.0 - ly) * (1.0 - ly), (1.0 - lz) * (1.0 - lz)
     lx, ly, lz = lx * lx, ly * ly, lz * lz
     best = 0.0
@@ -141,7 +140,7 @@ def lower_bound(payload, slot, x, y, z):
 
 @inlined
 def nearest_bound(payload, slot, x, y, z):
-    """As `lower_bound`, by the nearest centre alone: lower, and a third of the time."""
+    """As `lower_bound`, by the nearest centre alone: looser, in a third of the time."""
     tx, ty, tz = _from_center(x), _from_center(y), _from_center(z)
     at = cell_place(np.int64(x) & 31, np.int64(y) & 31, np.int64(z) & 31)
     u = min(payload[slot, at], STEPS) * VOXELS_A_STEP

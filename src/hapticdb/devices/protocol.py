@@ -92,7 +92,7 @@ class SupportsRewind(Protocol):
 
 
 class Reader:
-    """Readings of a device in the form of the kernels, without need of a further check.
+    """Readings of a device, checked and converted for the kernels.
 
     A pose (4, 4) and a velocity (6,) are arrays of float64. Arrays of other real numbers (float32,
     integers), of another memory order or read-only are copied; lists, masked arrays, objects and

@@ -100,7 +100,7 @@ class _Scripted:
 
 
 class Player(_Scripted):
-    """A hand on timed poses, interpolated linearly, rotations by slerp.
+    """A hand that follows timed poses, interpolated linearly, rotations by slerp.
 
     Parameters
     ----------
@@ -152,7 +152,7 @@ class Player(_Scripted):
 
 
 class Path(Player):
-    """A hand on the poses of a file (`hapticdb.read_poses`).
+    """A hand that follows the poses of a file (`hapticdb.read_poses`).
 
     Parameters
     ----------

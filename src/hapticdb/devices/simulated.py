@@ -26,8 +26,7 @@ STEP = 1e-4
 """Time step of the integration, s. Larger: less work a read, but only softer grips."""
 
 INERTIA, TURN_GRIP, MAX_TORQUE = 1e-4, 1e-3, 0.2
-"""Moment of inertia, kg m^2; rotational stiffness of a grip, N m/rad for each N/m; torque cap, N
-m."""
+"""Moment of inertia, kg m^2; rotational stiffness of a grip, N m/rad per N/m; torque cap, N m."""
 LEAST_CAP = 1e-6
 """Cap, N, in the profile of a device without motors. Smaller: contacts become softer."""
 LONGEST = 0.05

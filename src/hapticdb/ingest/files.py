@@ -63,7 +63,7 @@ class FileReport:
     added: tuple[Object, ...] = ()
     """Newly written objects, in the file's order."""
     present: int = 0
-    """Number of objects in the environment before."""
+    """Number of objects already in the environment."""
     restored: int = 0
     """Number of added parts that had been removed from the environment before."""
     kept_removed: int = 0

@@ -18,7 +18,7 @@ class Bricks(NamedTuple):
     """Voxels as bricks in Z-order, for any curve of the environment.
 
     keys (B,) int64, ascending, distinct; occupancy (B, 64) uint8: bit n, least significant first,
-    is the voxel with Z-order n of its (i, j, k) modulo 8; distances: as in `Rows`.
+    is the brick's voxel of Z-order n by (i, j, k) modulo 8; distances: as in `Rows`.
     """
 
     keys: Keys

@@ -103,7 +103,7 @@ class NameBudget:
 
 
 def require(is_read: bool, what: str) -> None:  # noqa: FBT001 - what is asked
-    """Raise UnreadableError for a required feature, `what`, without support."""
+    """Raise UnreadableError unless a required feature, `what`, is supported."""
     if not is_read:
         raise UnreadableError(f"it requires the {what}, which is not read: save it without")
 

@@ -83,7 +83,7 @@ class Interior:
     def holds(self, positions: Floats) -> NDArray[np.bool_]:
         """Whether positions (Q, 3), metres, surface's frame, are inside: (Q,).
 
-        By the parity of crossings of lines; either result on the surface itself.
+        By the parity of crossings of lines; undefined on the surface itself.
         """
         if self._ball is not None:
             return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)

@@ -51,8 +51,8 @@ last is 1.6e-7 of the requested radius, and finds walls of a hundredth of that."
 LINES = 12
 """Lines of the vote on matter behind an open surface."""
 MATTER = 0.5
-"""Share of lines that must cross an open surface on both sides of a position for matter there: 2 w
-- 1 for a winding number w. Larger: fewer open surfaces count as solids with a hole."""
+"""Share of lines that must cross an open surface on both sides of a position for matter there,
+equal to 2 w - 1 for a winding number w. Larger: fewer open surfaces count as solids with a hole."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -317,8 +317,8 @@ def _smaller(
 ) -> Floats:
     """Radii (Q,) of balls free of the touched points (Q, 3) of the surface.
 
-    The ball through x and y with its centre on the normal n at x has the radius |y - x|^2 / (2 n .
-    (y - x)).
+    The ball through x and y with its centre on the normal n at x has the radius
+    |y - x|^2 / (2 n . (y - x)).
     """
     is_inside = ((centers - touched) ** 2).sum(axis=1) < ((1.0 - SLACK) * radii) ** 2
     chord = touched - positions

@@ -42,7 +42,7 @@ def made_tool(path: str, points: int | None, *, unit: str | None, seed: int, ins
 
 
 def kept_tool(path: str, points: int | None, *, unit: str | None, seed: int, inset: float) -> Tool:
-    """Tool as by `made_tool`, from the cache if possible: bit for bit equal, without triangles."""
+    """Tool as by `made_tool`, bit for bit, but without triangles if it is from the cache."""
     began = time.time()
     n_points = DEFAULT_POINTS if points is None else points
     entry = _entry(Path(path), (n_points, unit, seed, inset))

@@ -1,6 +1,6 @@
 """Vendors' devices, each driven through a package or service.
 
-Import and use of hardware wait for `open`, so a device can be pickled into its process.
+Imports and hardware access wait for `open`, so a device can be pickled into its process.
 """
 
 import importlib
@@ -25,7 +25,7 @@ def load(module: str, extra: str) -> ModuleType:
     MissingExtraError
         If its package is not installed.
     DeviceError
-        If the package is installed, but the vendor's own library below it is not.
+        If the package is installed, but not the vendor's own library that it calls.
     """
     try:
         return importlib.import_module(module)

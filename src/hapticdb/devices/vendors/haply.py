@@ -106,7 +106,7 @@ class HaplyDevice:
             raise
 
     def _find(self) -> str:
-        """Name of the device, from the service's first message, a list."""
+        """Name of the device, from the list in the service's first message."""
         found = [each.get("device_id") for each in self._receive().get("inverse3", [])]
         if not found or self.device_id not in {None, *found}:
             which = "no Inverse3" if self.device_id is None else f"no Inverse3 {self.device_id}"

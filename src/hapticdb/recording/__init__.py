@@ -1,1 +1,1 @@
-"""Recorded sessions: the file format, its writer and reader."""
+"""Recorded sessions: file format, writer and reader."""

@@ -1,8 +1,7 @@
 """Recorded sessions: one file (.hdbrec) each, a header and rows of frames, bit for bit.
 
-docs/format.md describes the bytes; `numpy.memmap` reads the rows. A torn last row, of a recorder
-that was killed, is not read. A recorder stops by itself at its size limit, and before the disk is
-full.
+docs/format.md describes the bytes; `numpy.memmap` reads the rows. A torn last row, after a killed
+recorder, is not read. A recorder stops at its size limit, and before the disk is full.
 """
 
 import contextlib
@@ -26,17 +25,17 @@ __all__ = ["FRAME", "Frames", "Header", "Recorder", "Recording", "State"]
 DEFAULT_LIMIT = 4 << 30
 """Default of the greatest size of a recording, bytes: 3.5 hours at 1 kHz."""
 LEFT_FREE = 64 << 20
-"""Bytes of the disk that a recorder leaves free for other writers, such as the database."""
+"""Disk space reserved for other writers, such as the database, bytes."""
 UNSAFE_FRAMES = 64
-"""Oldest frames of the ring that are not read, because the loop may overwrite them meanwhile.
-Larger: frames are lost after shorter pauses."""
+"""Oldest frames of the ring that are not read: the loop may be overwriting them. Larger: frames are
+lost after shorter pauses."""
 
 
 class Recording:
-    """A recorded session, to be read.
+    """Reader of a recorded session.
 
-    Frames that are added to the file later are not read. Raises `FileError` if the file is missing,
-    is no recording, or is cut off or damaged within its header.
+    Frames appended to the file later are not read. Raises `FileError` if the file is missing, is no
+    recording, or is cut off or damaged within its header.
 
     Attributes
     ----------
@@ -45,13 +44,13 @@ class Recording:
     header : Header
         Environment, tool and settings of the session.
     n_torn : int
-        Bytes behind the last whole row; more than 0 if the recorder was killed.
+        Bytes behind the last whole row; more than 0 after a killed recorder.
     """
 
     def __init__(self, path: str | os.PathLike[str]) -> None:
         self.path = Path(path)
         try:
-            if self.path.exists() and not self.path.is_file():  # a pipe would wait for ever
+            if self.path.exists() and not self.path.is_file():  # opening a pipe would wait for ever
                 raise FileError(f"{self.path} is no file; give a recording")
             with io.FileIO(self.path, "rb") as file:
                 self.header, self._start = Header.read(file, str(self.path))
@@ -82,9 +81,9 @@ class Recording:
     def environment_beside(self) -> Path:
         """Path of the recorded environment: an SQLite file in the recording's own folder.
 
-        Whoever wrote the recording chose what its header names. So nothing else is opened from it:
-        no server's address, no file in another folder, no symbolic link to one. `UsageError` if the
-        header names anything else.
+        The recording's author chose the name in its header. So nothing else is opened from it: no
+        server's URL, no file in another folder, no symbolic link to one. `UsageError` if the header
+        names anything else.
         """
         name = self.header.environment
         if not re.search(r"[/\\?:\0]", name):
@@ -101,8 +100,8 @@ class Recording:
 class Recorder(Closes):
     """Writes the frames of one session to a recording; a context manager, which closes it.
 
-    `open` makes the file, `begin` writes its header, `append` and `take` write frames. Rows that
-    were written survive the process. `close` writes all to the disk (fsync).
+    `open` creates the file, `begin` writes its header, `append` and `take` write frames. Written
+    rows survive the death of the process. `close` writes all to the disk (fsync).
 
     Parameters
     ----------
@@ -110,20 +109,20 @@ class Recorder(Closes):
         The file, `.hdbrec` by custom.
     replace : bool
         Replace an existing recording. The old one stays until the first frames of the new one are
-        written; until then the new one is a file beside it, ``.NAME.PID.new``.
+        written; until then the new one has the temporary name ``.NAME.PID.new``.
     limit_bytes : int or None
         Greatest size of the file; None: the disk's free space less `LEFT_FREE`, which always
-        applies. The first frame beyond the limit and all later ones are left out: see `ended`.
+        applies. The first frame beyond the limit and all later ones are dropped: see `ended`.
 
     Attributes
     ----------
     path : Path
         The file.
     ended : str or None
-        One line: why the recording has ended before the session; None while it takes frames. The
-        file is whole and closed when this is set.
+        One line: reason of an end before the session's; None while frames are accepted. The file
+        is complete and closed when this is set.
     n_lost : int
-        Frames that the loop has overwritten before they were copied from the ring.
+        Frames overwritten by the loop before they were copied from the ring.
     """
 
     def __init__(
@@ -148,7 +147,7 @@ class Recorder(Closes):
         return self._n_written
 
     def open(self) -> None:
-        """Make the file.
+        """Create the file.
 
         Raises
         ------
@@ -169,7 +168,7 @@ class Recorder(Closes):
             )
         try:
             self._file = io.FileIO(self._made, "xb")
-        except FileExistsError:  # another process has made it meanwhile
+        except FileExistsError:  # another process has created it meanwhile
             self._made = None
             raise UsageError(f"{self.path} is being recorded: give another name") from None
         except OSError as error:
@@ -177,14 +176,14 @@ class Recorder(Closes):
         self._check_room(0)
 
     def begin(self, header: Header, first_frame: int = 0) -> None:
-        """Write the header. `take` takes frames from number `first_frame` on, which has time 0."""
+        """Write the header. `take` begins with frame `first_frame`, at time 0."""
         content = header.packed()
         self._check_room(len(content))
         self._write(content)
         self._n_taken, self._began = first_frame, None if first_frame else 0.0
 
     def append(self, frames: Frames) -> None:
-        """Write frames (n,) of `FRAME`, as many as there is room for; nothing if `ended` is set.
+        """Write frames (n,) of `FRAME`, as many as have room; no effect after `ended`.
 
         If the disk is full or fails, `FileError`: the recorder is then closed, and the frames
         written before stay.
@@ -204,11 +203,11 @@ class Recorder(Closes):
             self.close()
 
     def take(self, ring: Frames, n_frames: int) -> None:
-        """Record the frames that are new since the last call; an error is stored in `ended`.
+        """Record the new frames since the last call; an error is stored in `ended`.
 
         ring (R,) of `FRAME` : frame n is at index n modulo R; n_frames : number of frames so far.
         """
-        if self.ended is not None or not self._end:  # it has not begun
+        if self.ended is not None or not self._end:  # not begun
             return
         size = len(ring)
         if n_frames - self._n_taken > size - UNSAFE_FRAMES:
@@ -228,7 +227,7 @@ class Recorder(Closes):
             self.close()
 
     def discard(self) -> None:
-        """Remove the file if `open` made it; for a session that did not begin."""
+        """Remove the file created by `open`; for a session that did not begin."""
         self._end = 0  # no frame is taken any more
         if self._file is not None:
             self._file.close()
@@ -237,7 +236,7 @@ class Recorder(Closes):
                 self._made.unlink()
 
     def close(self) -> None:
-        """Wait until all is on the disk, and close the file."""
+        """Write all to the disk (fsync), and close the file."""
         if self._file is None or self._file.closed:
             return
         try:
@@ -255,14 +254,14 @@ class Recorder(Closes):
             self.ended = str(error)
 
     def _check_old(self) -> None:
-        """Refuse to replace what is no recording."""
+        """Refuse to replace a file other than a recording."""
         with self._as_file_errors("replace"), io.FileIO(self.path, "rb") as old:
             start = old.read(len(MAGIC))
             if start and start[: len(OLDER)] != OLDER and start != MAGIC:
                 raise FileError(f"{self.path} is no recording of hapticdb: give another name")
 
     def _keep_old(self) -> None:
-        """Keep the old recording if no frame was written: remove the new file."""
+        """Remove the new file if no frame was written; the old recording stays."""
         if self._made is not None and self._made != self.path:
             self._made.unlink(missing_ok=True)
 
@@ -273,7 +272,7 @@ class Recorder(Closes):
             self._made = None
 
     def _room(self) -> tuple[int, str]:
-        """Bytes left for frames, and the words for what limits them."""
+        """Bytes free for frames, and the words for their limit."""
         assert self._file is not None  # noqa: S101 - it is open
         free = free_bytes(self._file) - LEFT_FREE
         limit = free if self._limit is None else self._limit - self._end
@@ -282,7 +281,7 @@ class Recorder(Closes):
         return free, f"since its disk has no more than {_size(LEFT_FREE)} left"
 
     def _check_room(self, n_bytes: int) -> None:
-        """Raise an error if no frame would fit behind a header of `n_bytes` bytes."""
+        """Raise an error without room for a header of `n_bytes` bytes and one frame."""
         least = n_bytes + FRAME.itemsize
         if self._limit is not None and least > self._limit:
             raise UsageError(
@@ -323,7 +322,7 @@ class Recorder(Closes):
 
 
 def free_bytes(file: io.FileIO) -> int:
-    """Bytes that this process may still write on the disk of an open file."""
+    """Free bytes for this process on the disk of an open file."""
     found = os.fstatvfs(file.fileno())
     return found.f_bavail * found.f_frsize
 

@@ -1,4 +1,4 @@
-"""Header of a recording: everything that a replay needs, except the database."""
+"""Header of a recording: all inputs of a replay, except the database."""
 
 import datetime as dt
 import io
@@ -34,11 +34,11 @@ FIRST_LINE = re.compile(MAGIC + rb"(\d{1,9}) (\d{12}) ([0-9a-f]{8})\n")
 LINE_BYTES = 43
 """Bytes of the first line, while the format has one digit."""
 OLDER = b"HDBREC\r\n"
-"""First bytes of recordings that were made before the first release."""
+"""First bytes of recordings from before the first release."""
 MOST_BYTES = 1 << 32
 """Greatest size of a header, bytes. Larger: tools with more points fit."""
 ROWS_AT = 64
-"""Rows begin at a multiple of this, bytes: a cache line."""
+"""Alignment of the first row, bytes: a cache line."""
 
 Value = str | int | float | bool | None | list[Any] | dict[str, Any]
 
@@ -47,7 +47,7 @@ class Start(NamedTuple):
     """State of a session before its first recorded frame: memory of the loop (`kernels.records`).
 
     servo, follower : a record of SERVO and of FOLLOWER; kept, near, bends : records of POINT, NEAR
-    and BENDS, empty where the tool has just been placed.
+    and BENDS, empty directly after the tool was placed.
     """
 
     servo: bytes = b""
@@ -66,30 +66,30 @@ class Header:
     """Environment, tool and settings of a recorded session.
 
     Raises `UsageError` if the rate is no positive number, the parameters cannot be JSON, or the law
-    is a user's own, which no file can name.
+    is a user's own, without a name in the format.
     """
 
     environment: str
     """URL of the environment, without a password."""
     grid: Grid
     revision: int
-    """Of the environment when the session began."""
+    """Revision of the environment at the session's start."""
     shell: PointShell
     rate: float
-    """Frames a second that the session was set to."""
+    """Frames a second, as set for the session."""
     law: ForceLaw = field(default_factory=TangentPlane)
     exclude: Words = ()
     coupling: Mapping[str, Value] = field(default_factory=dict)
-    """Parameters of the rendering by their names, when the session began."""
+    """Parameters of the rendering by their names, at the session's start."""
     version: str = field(default_factory=lambda: version("hapticdb"))
     started: str = field(default_factory=_now)
-    """When the recording began: ISO 8601, UTC."""
+    """Start of the recording: ISO 8601, UTC."""
     where: Words = ()
-    """With `exclude`, which objects were felt: words as of `hapticdb.store.filtering.Filter`, since
-    others may have added objects during the session that the words do not choose."""
+    """With `exclude`, the filter of contacts: words of `hapticdb.store.filtering.Filter`, which
+    also apply to objects added during the session."""
     rendering: Literal["coupled", "direct"] = "direct"
     frames_on: str = "cpu"
-    """What computed the frames: "cpu" or "cuda"."""
+    """Processor of the frames: "cpu" or "cuda"."""
     build: str = field(default_factory=build)
     """Digest of the kernels' sources, of the compiler and of the processor."""
     start: Start = field(default_factory=Start)
@@ -116,7 +116,7 @@ class Header:
         object.__setattr__(self, "rate", float(self.rate))
 
     def packed(self) -> bytes:
-        """Return the header's bytes."""
+        """Bytes of the header."""
         shell = self.shell
         text = json.dumps(
             {
@@ -151,7 +151,7 @@ class Header:
 
     @classmethod
     def read(cls, file: io.RawIOBase, where: str) -> tuple[Self, int]:
-        """Read the header of an open recording; return it and the offset of the rows, bytes.
+        """Read the header of an open recording; returns it and the offset of the rows, bytes.
 
         Raises `FileError` if the file is no recording, has another format, or is cut off or damaged
         in its header.

@@ -1,8 +1,8 @@
-"""A sample that needs no download: a car of 217 parts, a spanner, and a path of it over the car.
+"""A sample without a download: a car of 217 parts, a spanner, and a path of it over the car.
 
 The files are data of the package, compressed. Parts of the car that are instances of one shape
-share its triangles. World frame of the car: metres, x forward, y left, z up; the origin on the
-ground between the wheels.
+share its triangles. World frame of the car: metres, right-handed, x forward, z up; the origin on
+the ground between the wheels.
 """
 
 from hapticdb.sample.write import SampleFiles, write_sample

@@ -12,7 +12,7 @@ from hapticdb.errors import FileError, UsageError
 
 
 class SampleFiles(NamedTuple):
-    """Where the sample was written."""
+    """Paths of the written files."""
 
     car: Path
     wrench: Path
@@ -26,7 +26,7 @@ def _content(name: str) -> bytes:
 
 
 def _write(path: Path, content: bytes) -> Path:
-    """Write a file whole or not at all."""
+    """Write a file atomically."""
     partial = path.with_name(f".{path.name}.{os.getpid()}.partial")
     try:
         partial.write_bytes(content)
@@ -42,8 +42,9 @@ def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFil
     """Write car.glb, wrench.stl and path.csv into a folder, made when missing.
 
     The path slides the wrench over hood, windscreen, roof, rear window and boot. It comes down from
-    above. Then its deepest point is 1 mm below the surface, so that it touches whatever the edge of
-    the voxels that the car is imported with. `count` of its poses are written, evenly spread.
+    above. Then its deepest point is 1 mm below the surface, so it is in contact at any voxel size
+    of the imported car. `count` of its poses are written, evenly spread; UsageError if the path has
+    fewer.
 
     The wrench is 0.25 m long: its handle lies along x with the ring at +x, the flat sides towards
     -z and +z, the origin halfway along and halfway through.

@@ -1,1 +1,1 @@
-"""Work by a scheduler of dask.distributed: its workers, and where they find an environment."""
+"""Distributed work on a dask.distributed scheduler, and workers' access to an environment."""

@@ -1,4 +1,4 @@
-"""An opened environment as workers elsewhere find it."""
+"""Address and identity of an environment for workers on other machines."""
 
 from typing import NamedTuple
 
@@ -16,12 +16,12 @@ class Whereabouts(NamedTuple):
 
     @classmethod
     def of(cls, store: Store, url: str) -> "Whereabouts":
-        """Where an opened environment is."""
+        """Address of an opened environment."""
         revision = store.revision()
         return cls(url, revision, _write(store, revision))
 
     def open(self) -> Store:
-        """Open it in a worker, to read; ClusterError where it is not there, or another one is."""
+        """Open it read-only in a worker; ClusterError for a missing or another environment."""
         try:
             store = open_store(self.url, read_only=True)
         except DatabaseError as error:

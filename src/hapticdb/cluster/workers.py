@@ -1,7 +1,7 @@
 """Work on other machines, by a running scheduler of dask.distributed.
 
-A task is one call that can be pickled and writes nothing. So dask can run it again where its worker
-is lost, and an interrupted command leaves what the same work leaves here.
+A task is one call that can be pickled and writes nothing. So dask can repeat it after the loss of a
+worker, and an interrupted command has the same effect as without a cluster.
 """
 
 import pickle
@@ -19,17 +19,17 @@ from hapticdb.errors import ClusterError, MissingExtraError, pip_line
 Item = TypeVar("Item")
 Done = TypeVar("Done")
 LONGEST_S = 10.0
-"""Seconds that connecting may take, and that there may be no worker."""
+"""Seconds until a timeout of the connection, and of a scheduler without workers."""
 LOOK_EVERY_S = 1.0
-"""Seconds after which it is asked again whether there are workers."""
+"""Seconds between checks for workers."""
 AHEAD = 3
-"""Tasks for each thread of the workers that are given out at once."""
+"""Tasks submitted in advance for each thread of the workers."""
 QUIET = dict.fromkeys(("distributed", "distributed.client"), "critical")
-"""What dask logs: whatever a user must know is an error of ours."""
+"""Log levels of dask: all messages for a user are errors of ours."""
 
 
 class Cluster:
-    """The workers of a scheduler; `connected` makes it."""
+    """Workers of a scheduler; made by `connected`."""
 
     def __init__(self, address: str, client: Any) -> None:  # noqa: ANN401 - dask is an extra
         self.address = address
@@ -38,13 +38,13 @@ class Cluster:
         self._there = time.monotonic()
 
     def submit(self, work: Callable[[], object]) -> Any:  # noqa: ANN401 - dask's future
-        """Give a task out."""
+        """Submit a task."""
         # pickled here, so that the scheduler needs no hapticdb, and copies no arrays
         with self._telling():
             return self._client.submit(_task(), self._version, pickle.dumps(work, 5), pure=False)
 
     def result(self, task: Any) -> Any:  # noqa: ANN401
-        """Wait for what a task returns, or raise what it raised."""
+        """Wait for a task; return its result or raise its error."""
         from distributed import KilledWorker  # noqa: PLC0415 - an extra
 
         while True:
@@ -53,7 +53,7 @@ class Cluster:
                     error = task.exception(timeout=LOOK_EVERY_S)
                     if error is None:
                         found, packed = task.result(timeout=LONGEST_S)
-                except TimeoutError:  # it is not done, or its worker was lost meanwhile
+                except TimeoutError:  # not done, or its worker was lost meanwhile
                     self._threads()
                     continue
             if isinstance(error, KilledWorker):
@@ -86,7 +86,7 @@ class Cluster:
             self.cancel(waiting)
 
     def cancel(self, tasks: Iterable[Any]) -> None:
-        """Take back what no worker has begun."""
+        """Cancel tasks that no worker has begun."""
         self._client.cancel([*tasks])
 
     def _threads(self) -> int:
@@ -94,7 +94,7 @@ class Cluster:
             try:
                 ask = self._client.scheduler.ncores
                 threads: dict[str, int] = self._client.sync(ask, callback_timeout=LONGEST_S)
-            except TimeoutError as error:  # its process or its machine stands still
+            except TimeoutError as error:  # its process or its machine is suspended
                 raise OSError(error) from error
         n_threads = sum(threads.values())
         now = time.monotonic()
@@ -107,7 +107,7 @@ class Cluster:
 
     @contextmanager
     def _telling(self) -> Iterator[None]:
-        """Say in a line that the scheduler went away."""
+        """Raise ClusterError if the scheduler went away."""
         from distributed import CancelledError  # noqa: PLC0415 - an extra
 
         try:
@@ -120,7 +120,7 @@ class Cluster:
 
 @contextmanager
 def connected(address: str | None) -> Iterator[Cluster | None]:
-    """Connect to a scheduler, ``tcp://host:8786``, while the block runs; None without an address.
+    """Connect to a scheduler, ``tcp://host:8786``, for the block; None without an address.
 
     Raises `MissingExtraError` if dask.distributed is not installed; `ClusterError` if no scheduler
     answers there.
@@ -128,7 +128,7 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
     if address is None:
         yield None
         return
-    import asyncio  # noqa: PLC0415 - 15 ms, which every verb that opens an environment would take
+    import asyncio  # noqa: PLC0415 - 15 ms of the start of most verbs
 
     try:
         import dask  # noqa: PLC0415 - an extra
@@ -146,7 +146,7 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
             await asyncio.wait_for(scheduler.identity(), LONGEST_S)
 
     try:
-        # a client would wait for ever for one that is silent; a notebook has a loop of its own
+        # a client waits for a silent scheduler without a limit; a notebook has its own event loop
         with ThreadPoolExecutor(1) as pool:
             pool.submit(asyncio.run, greet()).result()
         client = Client(address, timeout=LONGEST_S, set_as_default=False)
@@ -162,7 +162,7 @@ def connected(address: str | None) -> Iterator[Cluster | None]:
 
 
 def _task() -> Callable[[str, bytes], tuple[str, bytes]]:
-    """What a worker runs; sent as it is, so it also runs where no hapticdb is installed."""
+    """Function of a worker, pickled by value, so it also runs without an installed hapticdb."""
 
     def run(wanted: str, packed: bytes) -> tuple[str, bytes]:
         import pickle  # noqa: PLC0415

@@ -1,1 +1,1 @@
-"""The strategies of Kriegel et al. (the paper, sections 4 and 5): grouping, and its cost model."""
+"""Strategies of Kriegel et al. (the paper, sections 4 and 5): grouping, and its cost model."""

@@ -1,4 +1,4 @@
-"""The cost model fitted to the opened database, by real scans around its own surface."""
+"""Fit of the cost model to the opened database, by real scans around its own surface."""
 
 import statistics
 import time
@@ -38,7 +38,7 @@ class _Probe(NamedTuple):
 def calibrate(
     store: Store, *, repeats: int = 5, budget: float = 0.5, cold: bool = False
 ) -> CostModel:
-    """Measure what queries cost on this database, in real scans around its own surface.
+    """Measure the costs of queries on this database, in real scans around its own surface.
 
     Spheres of shell points of several sizes are placed on occupied voxels drawn by the quantile
     vector. Their keys are scanned in ranges of several widths, and the medians of the times are
@@ -46,12 +46,12 @@ def calibrate(
 
     store : an environment with at least one row
     repeats : timings of each statement, after an untimed run. Their median is used.
-    budget : seconds after which no further place is measured. At least 12 places are measured, or 4
-        where that takes eight times as long, as on partitions.
-    cold : empty all caches before each query, to measure frames at places that are new to the hand
+    budget : seconds after which no further position is measured. At least 12 are measured, or 4 if
+        that takes eight times as long, as on partitions.
+    cold : empty all caches before each query, for the times of frames at new positions
 
-    Raises `UsageError` when the environment is empty, or when cold is asked of a server, whose
-    caches hapticdb cannot empty.
+    Raises `UsageError` for an empty environment, and for `cold` on a server, whose caches hapticdb
+    cannot empty.
     """
     size = store.size()
     if size.rows == 0:
@@ -76,7 +76,7 @@ def calibrate(
 
 
 class _Trials:
-    """Timings of scans at several places, and their fit."""
+    """Timings of scans at several positions, and their fit."""
 
     def __init__(
         self,
@@ -157,7 +157,7 @@ def _cautious(
     quantiles: QuantileVector,
     count: Callable[[Keys, Keys], int],
 ) -> CostModel:
-    """The model with the caution that costs least over frames, given by their row keys (U,)."""
+    """The model with the caution of least cost over frames, given by their row keys (U,)."""
     trials = []
     for caution in CAUTIONS:
         cautious = replace(model, caution=caution)
@@ -166,13 +166,13 @@ def _cautious(
             lows, highs = cbgroup(keys, keys, quantiles, cautious)
             ranges += len(lows)
             rows += count(lows, highs)
-        # Of two equal costs the greater caution is taken: it reads fewer rows.
+        # of equal costs, the greater caution: it reads fewer rows
         trials.append((model.descent * ranges + model.row_scanned * rows, -caution))
     return replace(model, caution=-min(trials)[1])
 
 
 def _times_dearer(more_time: float, rows: float, row_scanned: float) -> float:
-    """How many times dearer rows are that take `more_time` in all; 1 where none were measured."""
+    """Ratio of the costs of rows with and without `more_time`; 1 without measured rows."""
     if more_time <= 0.0 or rows <= 0.0 or row_scanned <= 0.0:
         return 1.0
     return 1.0 + more_time / (rows * row_scanned)
@@ -199,8 +199,8 @@ def _least_squares(
 def _non_negative(design: Floats, wanted: Floats) -> tuple[Floats, float]:
     """Figures >= 0 of the best fit, and the length of its residual.
 
-    The best of all choices of columns whose own fit has no figure below 0. ``scipy.optimize``
-    takes as long to load as all timings.
+    The best fit over all subsets of columns without a figure below 0. ``scipy.optimize`` takes as
+    long to load as all timings.
     """
     best, least = np.zeros(design.shape[1]), float(np.linalg.norm(wanted))
     for chosen in product((False, True), repeat=design.shape[1]):

@@ -1,4 +1,4 @@
-"""The cost model of grouping: what the parts of a query cost (the paper, section 5)."""
+"""Cost model of grouping (the paper, section 5)."""
 
 import platform
 from collections.abc import Mapping
@@ -8,24 +8,23 @@ from functools import cached_property
 
 @dataclass(frozen=True)
 class CostModel:
-    """What the parts of a query cost on one engine and machine, microseconds.
+    """Costs of the parts of a query on one engine and machine, microseconds.
 
     A frame of R ranges that reads S rows costs ``statement + descent R + row_scanned S``, with
-    ``row_scanned = block / rows_per_block + row``: the paper's C(s) = C_io(s) + C_cpu(s), where
-    C_io is the navigation (descent) plus the scan (leaf blocks), and C_cpu = k C_scan is what each
-    row costs the client.
+    ``row_scanned = block / rows_per_block + row``: the paper's C(s) = C_io(s) + C_cpu(s). There
+    C_io is the navigation (descent) plus the scan (leaf blocks), and C_cpu = k C_scan the client's
+    cost of the rows.
 
     statement : fixed cost of a statement of ranges
     descent : each range: a descent of the index and the start of a scan
     block : each leaf block scanned inside the engine
     row : each row passed to the client
     rows_per_block : rows N divided by leaf blocks B
-    caution : factor on the expected rows of a gap when CBGroup decides whether to close it. It is
-        the factor with the least cost at the places measured. Small gaps near a surface are empty
-        or full and seldom hold the expected number of rows. A larger factor closes fewer gaps.
-    distances : cost of the rows in a range when their distances are read, too, divided by their
-        cost without. It counts rows of the index, so it includes that there are more rows of
-        distances. 1 where there are no distances.
+    caution : factor on the expected rows of a gap in CBGroup's decision to close it, of least cost
+        at the measured positions. Small gaps near a surface are empty or full, and seldom have the
+        expected number of rows. A larger factor closes fewer gaps.
+    distances : ratio of the costs of a range's rows with and without their distances. It counts
+        rows of the index, so it includes the larger number of rows of distances. 1 without any.
     spread : relative standard error of each fitted figure
     """
 
@@ -45,7 +44,7 @@ class CostModel:
 
     @cached_property
     def row_in_gap(self) -> float:
-        """Cost of one row that the quantile vector expects in a gap, multiplied by `caution`."""
+        """Cost of an expected row of the quantile vector in a gap, multiplied by `caution`."""
         return self.row_scanned * self.caution
 
     @cached_property
@@ -57,14 +56,14 @@ class CostModel:
         return replace(self, row=self.row_scanned * self.distances - in_blocks, distances=1.0)
 
     def figures(self) -> dict[str, float]:
-        """All figures by name, the spreads as ``name.spread``, as a store keeps them."""
+        """All figures by name, the spreads as ``name.spread``, in the form of a store."""
         plain = asdict(self)
         spread = plain.pop("spread")
         return plain | {f"{name}.spread": value for name, value in spread.items()}
 
     @classmethod
     def of_equal_parts(cls) -> "CostModel":
-        """Return a model whose figures are all 1, for an environment without rows to measure."""
+        """Model with all figures 1, for an environment without rows to measure."""
         return cls(1.0, 1.0, 1.0, 1.0, 1.0)
 
     @classmethod
@@ -76,5 +75,5 @@ class CostModel:
 
 
 def machine_name() -> str:
-    """Name of this machine, under which a store keeps the figures measured on it."""
+    """Name of this machine, the key of its figures in a store."""
     return f"{platform.node()} {platform.machine()}"

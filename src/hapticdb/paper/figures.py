@@ -1,4 +1,4 @@
-"""Statistics and costs of an opened database, on which grouping by cost decides."""
+"""Statistics and costs of an opened database, for grouping by cost."""
 
 from contextlib import suppress
 
@@ -13,7 +13,7 @@ STALE = 0.2
 
 
 class QueryFigures:
-    """The quantile vector and the cost model of a store, read or measured when first needed."""
+    """Quantile vector and cost model of a store, read or measured at their first use."""
 
     def __init__(self, store: Store) -> None:
         self._store = store
@@ -22,8 +22,8 @@ class QueryFigures:
         self._n_objects: int | None = None
 
     def both(self) -> tuple[QuantileVector, CostModel]:
-        """Quantile vector and cost model; a cost model is fitted in less than a second."""
-        if self._quantiles is None or not self._quantiles.n_rows:  # others may have filled it
+        """Quantile vector and cost model; fitting the latter takes less than a second."""
+        if self._quantiles is None or not self._quantiles.n_rows:  # another may have added rows
             self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
         if not self._quantiles.n_rows:
             return self._quantiles, CostModel.of_equal_parts()
@@ -33,7 +33,7 @@ class QueryFigures:
         return self._quantiles, self._costs
 
     def analyze(self) -> QuantileVector:
-        """Compute the store's statistics again, even if they are up to date."""
+        """Recompute the store's statistics, even if they are up to date."""
         self._store.analyze(DEFAULT_RESOLUTION, anew=True)
         self._quantiles = QuantileVector.of(self._store, DEFAULT_RESOLUTION)
         return self._quantiles
@@ -47,7 +47,7 @@ class QueryFigures:
         return costs
 
     def rows_changed(self) -> None:
-        """Read the statistics anew when next needed; renew them after many writes, if possible."""
+        """Invalidate the statistics; recompute them after many writes, if possible."""
         self._quantiles = None
         with suppress(DatabaseError):
             n_writes = self._store.freshness(DEFAULT_RESOLUTION).changes

@@ -7,14 +7,14 @@ from hapticdb.store.base import Keys
 from hapticdb.store.covering import Ranges
 
 DEFAULT_MAXGAP = 500
-"""The paper's MAXGAP, in voxel keys. A larger value gives fewer ranges, which hold more rows."""
+"""The paper's MAXGAP, in voxel keys. Larger: fewer ranges, with more rows."""
 
 
 def maxgap(keys: Keys, first: Keys, last: Keys, gap: int) -> Ranges:
     """Group neighbouring keys p < q if and only if q - p <= gap, in voxel keys on both layouts.
 
     keys (U,) int64 : distinct row keys, ascending; first, last (U,) int64 : lowest and highest
-    voxel key asked for under each row key; gap : MAXGAP; 0 is the point query sequence.
+    requested voxel key under each row key; gap : MAXGAP; 0 is the point query sequence.
     """
     # Keys have at most 63 bits, and so have the gaps between them.
     return Ranges(*kernels.group_by_gap(keys, first, last, min(int(gap), 2**63 - 1)))

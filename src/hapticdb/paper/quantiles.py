@@ -11,7 +11,7 @@ from hapticdb.store.parsing import damaged
 DEFAULT_RESOLUTION = 10_000
 """Buckets of the quantile vector: the paper's best value. Larger: more exact, slower to make."""
 MAX_RESOLUTION = 1_000_000
-"""Largest resolution that may be asked for: 8 MB."""
+"""Largest resolution: 8 MB."""
 
 
 @dataclass(frozen=True)
@@ -19,7 +19,7 @@ class QuantileVector:
     """Equi-count histogram of the row keys (the paper's Definition 2).
 
     bounds (R + 1,) int64 : ascending; bound i is the key of the row of rank ceil(i N / R), bound 0
-    the lowest key; n_rows : N, rows of the index table; source : where the bounds come from:
+    the lowest key; n_rows : N, rows of the index table; source : of the bounds:
     ``computed``, ``kept`` since the last write, or the engine's own ``server statistics``.
     """
 

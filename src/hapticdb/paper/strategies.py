@@ -1,4 +1,4 @@
-"""The strategies of a frame's query (the paper, sections 4.2 and 5), beside the product's own."""
+"""The paper's strategies of a frame's query (sections 4.2 and 5), and the product's own."""
 
 import time
 from collections.abc import Callable
@@ -51,7 +51,7 @@ class Strategies:
         felt: Filter = ALL,
         law: ForceLaw | None = None,
     ) -> Touch:
-        """Look a shell up at one pose; see `hapticdb.environment.Environment.touch`."""
+        """Touch of a shell at one pose; see `hapticdb.environment.Environment.touch`."""
         if gap < 0:
             raise UsageError(f"MAXGAP {gap}: give 0 or more")
         form = None
@@ -69,14 +69,14 @@ class Strategies:
 
 @dataclass(frozen=True, eq=False)
 class _Form:
-    """Frames by one strategy, and MAXGAP where it is ``maxgap``."""
+    """Frames by one strategy; gap : MAXGAP of ``maxgap``."""
 
     frames: Strategies
     strategy: Strategy
     gap: int
 
     def touch(self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int) -> Touch:
-        """Touch of a located shell; started : when the frame began, ns."""
+        """Touch of a located shell; started : begin of the frame, ns."""
         if self.strategy == "statement":
             return self._by_statement(located, exclude, law, started)
         query, reads = self.frames.query, reads_distances(law.for_kernels)
@@ -103,7 +103,7 @@ class _Form:
     def _by_statement(
         self, located: contact.Located, exclude: Keys, law: ForceLaw, started: int
     ) -> Touch:
-        """Run Figure 3, and a second statement for the ids that EXISTS drops, in one snapshot."""
+        """Run Figure 3, and a second statement for the ids dropped by its EXISTS, in a snapshot."""
         store, query = self.frames.store, self.frames.query
         if not isinstance(law, TangentPlane):
             raise UsageError(

@@ -1,1 +1,1 @@
-"""Pictures: the demo's, and the page of clashes."""
+"""Pictures: the demo's image, and reports of clashes."""

@@ -1,4 +1,4 @@
-"""Triangles to pixels: a parallel view with a depth buffer, lit by one sun."""
+"""Software rasterizer: orthographic view, depth buffer, one directional light."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -9,16 +9,16 @@ from hapticdb.grid import corners_of
 Floats = NDArray[np.float64]
 
 TOWARDS, SUN = (0.50, 0.76, 0.44), (0.30, 0.45, 0.84)
-"""Directions to the eye and to the light: ahead, left, up."""
+"""Directions to the eye and to the light, as for `turned`."""
 DEPTH = 1.5
-"""Half depth of the view, in half diagonals of the boxes; what lies outside is cut away."""
+"""Half depth of the view, in half diagonals of the boxes; surfaces outside are clipped."""
 SAMPLES = 2
-"""Pixels computed for each pixel shown, an axis. More: smoother edges, more time."""
+"""Samples for each pixel, an axis. More: smoother edges, more time."""
 
 GROWTH = 1.5
-"""Ratio of the widths, or heights, of triangles that are drawn together at most."""
+"""Greatest ratio of the widths, or heights, of triangles in one batch."""
 AT_ONCE = 1 << 18
-"""Pixels that are looked at together. More: more memory, hardly less time."""
+"""Pixels of a batch. More: more memory, hardly less time."""
 
 
 def turned(direction: tuple[float, float, float], up: int) -> Floats:
@@ -27,10 +27,10 @@ def turned(direction: tuple[float, float, float], up: int) -> Floats:
 
 
 class Canvas:
-    """A picture of a scene, seen from far away.
+    """An orthographic picture of a scene.
 
-    boxes : (B, 2, 3) in view, metres; size : width and height, pixels; window : (2, 2) corners that
-    the boxes fill, pixels; paper : (3,) colour behind the scene, 0 to 1; up : axis that points up.
+    boxes : (B, 2, 3) in view, metres; size : width and height, pixels; window : (2, 2) corners of
+    the boxes' area, pixels; paper : (3,) background colour, 0 to 1; up : axis that points up.
     """
 
     def __init__(
@@ -81,7 +81,7 @@ class Canvas:
         low: NDArray[np.int64],
         window: tuple[int, int],
     ) -> None:
-        """Draw triangles (T, 3, 3), pixels and metres, that windows of one size at `low` hold."""
+        """Draw triangles (T, 3, 3), pixels and metres, within windows of one size at `low`."""
         first, edges = placed[:, 0, :, None, None], placed[:, 1:] - placed[:, :1]
         (ax, ay, az), (bx, by, bz) = np.moveaxis(edges, (1, 2), (0, 1))[..., None, None]
         column = (low[:, 0, None] + np.arange(window[0]))[:, None]
@@ -102,7 +102,7 @@ class Canvas:
         self._image.reshape(-1, 3)[pixels[is_nearest]] = colours[of[is_nearest]]
 
     def _light(self, triangles: Floats) -> Floats:
-        """Brightness (T,), 0.3 to 1, of the sides of triangles that face the eye."""
+        """Brightness (T,), 0.3 to 1, of the sides of triangles towards the eye."""
         sides = (triangles[:, 1:] - triangles[:, :1]) @ self._axes.T
         normals = np.cross(sides[:, 0], sides[:, 1])
         normals *= -np.sign(normals[:, 2:])
@@ -110,7 +110,7 @@ class Canvas:
         return np.asarray(0.3 + 0.7 * np.clip(normals @ self._sun / lengths, 0.0, 1.0))
 
     def picture(self) -> Image.Image:
-        """The picture of what was drawn."""
+        """The picture, averaged over its samples."""
         width, height = self._size
         small = self._image.reshape(height, SAMPLES, width, SAMPLES, 3).mean(axis=(1, 3))
         return Image.fromarray((255.0 * np.clip(small, 0.0, 1.0)).astype(np.uint8))

@@ -1,4 +1,4 @@
-"""The page of a search for clashes, in one file: counts, pictures, a matrix, and the table."""
+"""HTML page of a search for clashes, in one file: counts, pictures, a matrix, and the table."""
 
 import base64
 import html
@@ -23,20 +23,20 @@ from hapticdb.verdicts import Kind
 Floats = NDArray[np.float64]
 
 PICTURES = 10
-"""Groups of which a pair is drawn, open ones first, then the gravest."""
+"""Groups with a picture of a pair, open ones first, then the gravest."""
 MOST_ROWS = 5_000
-"""Rows of the table. More: a browser opens the page more slowly."""
+"""Rows of the table, at most. More: a browser opens the page more slowly."""
 MOST_UNITS = 24
 """Sub-assemblies in the matrix, those of most overlaps, then of most pairs; the rest is one row."""
 NAME = 40
-"""Letters of a name beside the matrix."""
+"""Letters of a name in the matrix, at most."""
 REST = "all others"
 SIZE = (400, 300)
 """Pixels of a picture."""
 TINTS = ((0.92, 0.41, 0.08), (0.14, 0.39, 0.63))
 """Colours of the first part and of the second one, 0 to 1."""
 MARK = "#ffed33"
-"""Colour of the circle at the place."""
+"""Colour of the circles at a pair's two points."""
 PAPER = (0.94, 0.95, 0.96)
 STYLE = """
 body{font:14px/1.45 system-ui,sans-serif;color:#1c2530;margin:2em auto;max-width:80em;padding:0 1em}
@@ -52,9 +52,10 @@ figcaption{overflow-wrap:anywhere}img{width:100%;border-radius:6px}
 def clashes_page(
     env: Environment, found: Clashes, told: Sequence[Clash], groups: Sequence[Group]
 ) -> str:
-    """Write the page of pairs, the gravest first: HTML that needs no other file.
+    """Self-contained HTML page of pairs, the gravest first.
 
-    env : with the surfaces of its objects, as they were searched; told, groups : of found pairs.
+    env : with the surfaces of its objects, at the search's revision; `told`, `groups` : pairs of
+    the search, and their groups.
     """
     objects = env.objects()
     counts = ", ".join(f"{n:,} {kind}" for kind, n in found.counts().items() if n) or "no pair"
@@ -81,7 +82,7 @@ def clashes_page(
 
 
 def _text(words: str | None) -> str:
-    """Words as HTML shows them, without letters that cannot be printed."""
+    """Words in HTML, with question marks for unprintable letters."""
     shown = "".join(letter if letter.isprintable() else "?" for letter in words or "(gone)")
     return html.escape(shown)
 
@@ -98,7 +99,7 @@ def _table(told: Sequence[Clash]) -> str:
 
 
 def _matrix(told: Sequence[Clash]) -> str:
-    """Numbers of pairs between sub-assemblies: those that overlap, of all."""
+    """Numbers of pairs between sub-assemblies: overlapping ones, of all."""
     there = [one for one in told if one.status != "gone" and one.a_name and one.b_name]
     depth = _common([name.split("/") for one in there for name in (one.a_name, one.b_name) if name])
     pairs = [(_unit(one.a_name, depth), _unit(one.b_name, depth)) for one in there]
@@ -124,13 +125,13 @@ def _matrix(told: Sequence[Clash]) -> str:
 
 
 def _shortened(name: str) -> str:
-    """A name of at most `NAME` letters; the middle of a longer one is left out."""
+    """A name of at most `NAME` letters; a longer one without its middle."""
     half = (NAME - 1) // 2
     return name if len(name) <= NAME else f"{name[:half].rstrip()}…{name[-half:].lstrip()}"
 
 
 def _common(paths: Sequence[Sequence[str]]) -> int:
-    """Number of elements that all paths have in common, before their last ones."""
+    """Number of common leading elements of all paths, before their last ones."""
     depth = 0
     while paths and all(len(path) > depth + 1 and path[depth] == paths[0][depth] for path in paths):
         depth += 1
@@ -170,7 +171,7 @@ def _figures(
 
 
 def sight(one: Clash, pair: tuple[Object, Object]) -> tuple[Floats, float]:
-    """Middle (3,) of a pair's two places, and half the edge of the view, metres."""
+    """Middle (3,) of a pair's two points, and half the edge of the view, metres."""
     places = np.array(one.place).reshape(2, 3)
     edge = min(float(np.linalg.norm(obj.bounds[1] - obj.bounds[0])) for obj in pair)
     radius = max(0.4 * edge, 2.0 * float(np.linalg.norm(places[1] - places[0])), 1e-6)
@@ -178,7 +179,7 @@ def sight(one: Clash, pair: tuple[Object, Object]) -> tuple[Floats, float]:
 
 
 def snapshot(store: Store, one: Clash, pair: tuple[Object, Object], up: int) -> bytes:
-    """PNG of both surfaces around their places; up : axis, 0 to 2."""
+    """PNG of both surfaces around their two points; up : axis, 0 to 2."""
     middle, radius = sight(one, pair)
     box = np.stack([middle - radius, middle + radius])[None]
     canvas = Canvas(box, SIZE, np.array([[0.0, 0.0], SIZE]), np.array(PAPER), up)

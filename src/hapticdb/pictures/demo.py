@@ -1,4 +1,4 @@
-"""The picture of a demo: the scene, the tool on its path, the objects that it hit, the force."""
+"""The demo's picture: the scene, the tool on its path, objects in contact, the force."""
 
 from collections import Counter
 from pathlib import Path
@@ -22,20 +22,20 @@ if TYPE_CHECKING:
 SIZE, SCENE = (1600, 1000), (1600, 740)
 """Pixels of the picture, and of the scene in its upper part."""
 WINDOW = ((170, 30), (1480, 712))
-"""Corners of the part of the scene that the objects fill, pixels."""
+"""Corners of the objects' area in the scene, pixels."""
 BASE, TOP = 970, 790
 """Rows of no force and of the greatest one."""
 PAPER, FAINT, BODY, TOOL = "#0f1419", "#7d8896", "#6f7b89", "#e8e2d4"
 COLORS = ("#ffb000", "#35c6f4", "#ff5d73", "#7ee081", "#c792ff", "#ff8f4d")
 """Of the objects hit most, the most hit one first."""
 TOOLS_SHOWN = 9
-"""Poses at which the tool is drawn."""
+"""Number of poses with a picture of the tool."""
 LEFT, LINE = 35, 24
-"""Pixels from the left edge to the words, and from one line to the next."""
+"""Pixels from the edge to the words, and from one line to the next."""
 
 
 def draw(path: Path, scene: "DemoScene", comparison: "Comparison") -> None:
-    """Draw the first environment of a demo, what its tool felt, and write it as a PNG."""
+    """Draw the first environment of a demo and its contacts, and write a PNG."""
     with open_environment(scene.imported[0].url, read_only=True) as env:
         picture = _compose(env, scene, comparison)
     try:
@@ -78,7 +78,7 @@ def _write(
     comparison: "Comparison",
     legend: list[tuple[str, str]],
 ) -> None:
-    """Write what is seen, and the names of the objects hit most, each in its colour."""
+    """Write the facts, and the names of the objects hit most, each in its colour."""
     one, median_us = comparison.layouts[0].imported, comparison.layouts[0].median_us("auto")
     facts = (
         (
@@ -97,7 +97,7 @@ def _write(
 
 
 def _draw_force(pen: ImageDraw.ImageDraw, trace: "Trace") -> None:
-    """Draw the force along the path, its greatest value beside it."""
+    """Draw the force along the path, with its greatest value."""
     most = float(trace.force.max(initial=0.0))
     across = np.linspace(LEFT, SIZE[0] - LEFT, len(trace.force))
     down = BASE - (BASE - TOP) * trace.force / max(most, 1e-9)

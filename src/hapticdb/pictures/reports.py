@@ -25,12 +25,12 @@ from hapticdb.units import place_text
 from hapticdb.verdicts import Kind
 
 MOST_LINES = 100
-"""Pairs of a group in a report; more are counted."""
+"""Pairs of a group in a report, at most; the others are counted."""
 MOST_SNAPSHOTS = 100
 """Topics of a BCF file with a picture, the gravest. More: a larger file, and a tenth of a second
 each."""
 GUIDS = uuid.UUID("5e2f6d4c-1f0b-5b53-9d0e-6a2b8f1c7a90")
-"""Namespace of the GUIDs of topics; another one makes all topics new to other tools."""
+"""Namespace of the GUIDs of topics; with another one, all topics are new to other tools."""
 GLOBAL_ID = re.compile(r"[0-9A-Za-z_$]{22}")
 
 
@@ -52,9 +52,10 @@ def write_reports(
     groups: Sequence[Group],
     kinds: Sequence[Kind],
 ) -> None:
-    """Write the page `html`, `junit` and `bcf`, as far as files are given.
+    """Write the reports `html`, `junit` and `bcf`, if their files are given.
 
-    told, groups : pairs of the page and their groups; kinds : asked for, or none.
+    `told`, `groups` : pairs of the page and their groups; `kinds` : requested ones, the default if
+    empty.
     """
     asked = kinds or ASKED
     if "html" in files:
@@ -67,7 +68,7 @@ def write_reports(
 
 
 def junit(found: Clashes, groups: Iterable[Group], asked: Sequence[Kind]) -> bytes:
-    """JUnit's XML: a test case for each group of the kinds asked for, and for each rule.
+    """JUnit's XML: a test case for each group of the requested kinds, and for each rule.
 
     A group fails while a pair of it is open, and so does the first rule about an open pair. A rule
     without pairs is skipped; unmeasured pairs are an error.
@@ -93,8 +94,8 @@ def junit(found: Clashes, groups: Iterable[Group], asked: Sequence[Kind]) -> byt
 def write_bcf(path: Path, env: Environment, groups: Iterable[Group]) -> None:
     """Write a BCF 2.1 file: a topic for each group, closed if all of its pairs are decided.
 
-    The viewpoint selects the gravest pair and looks at its place. Topics keep their GUIDs as long
-    as groups keep their ids.
+    The viewpoint selects the gravest pair and shows its two points. Topics have the same GUIDs as
+    long as groups have the same ids.
     """
     objects = {obj.id: obj for obj in env.objects()}
     up, now = up_axis(objects.values()), datetime.now(UTC).isoformat(timespec="seconds")
@@ -135,7 +136,7 @@ def _rules(found: Clashes, asked: Sequence[Kind]) -> Iterator[_Case]:
 
 
 def _lines(pairs: Sequence[Clash]) -> str:
-    """A line for each pair: names, ids, kind, length, place."""
+    """A line for each pair: names, ids, kind, length, position."""
     lines = [
         f"{one.a_name} ({one.a}), {one.b_name} ({one.b}): {one.kind} {one.length_text()}, "
         f"{one.because or one.status}"
@@ -170,7 +171,7 @@ def _markup(group: Group, topic: uuid.UUID, now: str, *, has_picture: bool) -> E
 
 
 def _viewpoint(topic: uuid.UUID, one: Clash, pair: tuple[Object, Object], up: int) -> Element:
-    """Parallel view of a pair's place, both objects selected."""
+    """Orthographic view of a pair's points, both objects selected."""
     root = Element("VisualizationInfo", Guid=str(uuid.uuid5(topic, "viewpoint")))
     components = _child(root, "Components")
     selection = _child(components, "Selection")

@@ -1,14 +1,14 @@
-"""Feel a virtual environment too large for memory: haptic queries on an SQL database.
+"""Haptic queries on an SQL database: contact forces in environments too large for memory.
 
 The nine names to begin with; `dir(hapticdb)` lists the others:
 
-- import_files(url, files): files into an environment, which is made if it does not exist
+- import_files(url, files): files into an environment, made if it does not exist
 - open(url): an environment; create(url, grid): an empty one
 - Environment: objects(), find(), tool(), shell(), touch(), move(), remove(), clearance()
 - PointShell: a tool; env.tool(file) makes it as the verbs and the page do
 - read_poses(path): a path of a tool, (n, 4, 4), world_from_tool, metres
-- sweep(env, shell, poses): is the path free? extract(env, words): a way out
-- Session(url, shell, device): feel it in real time
+- sweep(env, shell, poses): first collisions on a path; extract(env, words): a removal path
+- Session(url, shell, device): a haptic session in real time
 
 Errors are in `hapticdb.errors`.
 
@@ -75,8 +75,8 @@ __version__ = "0.1.0"
 _LINES = Path(__file__).read_text("utf-8").splitlines()
 _WORDS = [line.split() for line in _LINES if line.startswith("    from hapticdb.")]
 _HOME_OF = {words[3]: words[1] for words in _WORDS}
-"""Modules of the public names, read from the lines above, which type checkers read. A module is
-imported when its name is first used: a program pays for what it uses."""
+"""Modules of the public names, parsed from the imports above, the ones for type checkers. A module
+is imported at the first use of its name."""
 __all__ = [*sorted(_HOME_OF)]  # noqa: PLE0604 - they are strings
 
 

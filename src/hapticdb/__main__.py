@@ -12,7 +12,7 @@ def main() -> int:
 
     try:
         return run()
-    except KeyboardInterrupt:  # after the verb, when nobody else answers
+    except KeyboardInterrupt:  # after the verb
         interrupting.tell()
         return interrupting.EXIT_CODE
     finally:

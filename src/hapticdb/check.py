@@ -1,4 +1,4 @@
-"""Checks whether an environment is sound: what is stored against what it derives from."""
+"""Integrity check of an environment: stored data against its sources, and the repair."""
 
 import os
 from collections import defaultdict
@@ -38,22 +38,22 @@ from hapticdb.store.pairs import PairRow
 from hapticdb.store.parsing import Checksum
 
 ROWS_AT_ONCE = 1 << 14
-"""Rows that are read at a time; 1,000 bytes each when their distances are unpacked."""
+"""Rows of a batch; 1,000 bytes each with unpacked distances."""
 MOST_FINDINGS = 1000
-"""Most findings that a report keeps. The report counts all findings."""
+"""Findings in a report, at most; it counts all of them."""
 
 
 @dataclass
 class CheckReport:
     """Result of a check.
 
-    url : the environment, as messages name it
+    url : the environment, as in messages
     findings : one line for each fault, at most the first `MOST_FINDINGS`
     n_findings : number of all faults
-    objects, voxels, rows, surfaces : numbers of objects, voxels, rows and surfaces that were read
-    wrong : objects whose rows or distances are not those that were written
-    strays : ids of rows or distances that no object has
-    pairs : rows of pairs that are not what their surfaces are
+    objects, voxels, rows, surfaces : numbers of objects, voxels, rows and surfaces read
+    wrong : ids of objects with other rows, distances or bounds than written
+    strays : ids of rows or distances without an object
+    pairs : rows of pairs that contradict their surfaces
     lacks_pairs : whether rows of pairs are missing
     """
 
@@ -75,7 +75,7 @@ class CheckReport:
 
     @property
     def is_sound(self) -> bool:
-        """Whether the check found no fault."""
+        """Whether the environment has no fault."""
         return self.n_findings == 0
 
     @property
@@ -95,18 +95,19 @@ class CheckReport:
 def check_environment(
     url: str | os.PathLike[str], *, progress: Progress | None = None
 ) -> CheckReport:
-    """Read all of an environment and say what is wrong with it.
+    """Read all of an environment and report its faults.
 
     The engine checks its own structure. Every row must belong to an object, be in order, and lie in
-    the grid and in its object's bounds. A brick must hold a voxel, and none outside the grid. Every
-    object must have its number of voxels, the checksums of its rows and distances, and distances in
-    every brick with a voxel. Every surface must have its digest and an object, whose bounds and
-    voxels are at its transform, within the grid. Every pair is judged again. The log of changes
-    must have no gaps and agree with the objects. Memory does not grow with the number of rows.
+    the grid and in its object's bounds. A brick must contain a voxel, and none outside the grid.
+    Every object must have its number of voxels, the checksums of its rows and distances, and
+    distances in every brick with a voxel. Every surface must have its digest and an object, whose
+    bounds and voxels are at its transform, within the grid. Every pair is judged again. The log of
+    changes must have no gaps and agree with the objects. Memory is independent of the number of
+    rows.
 
-    progress : called after each batch with the rows that were read, and that there are.
+    progress : called after each batch with the rows read, and their total.
 
-    Raises `DatabaseError` when the environment cannot be read for another reason than damage.
+    Raises `DatabaseError` if the environment is unreadable for another reason than damage.
     """
     report = CheckReport(os.fspath(url))
     try:
@@ -121,11 +122,11 @@ def check_environment(
 def repair_environment(
     url: str | os.PathLike[str], report: CheckReport, *, progress: Progress | None = None
 ) -> None:
-    """Mend what a check has found about rows and pairs: a transaction an object.
+    """Mend the faults of rows and pairs in a report: a transaction an object.
 
-    Wrong rows and bounds are made anew from the object's surface. Rows of no object, as a crash
-    between the servers of partitions leaves them, are removed. Pairs are marked for the next search
-    for clashes; they stay accepted.
+    Wrong rows and bounds are recomputed from the object's surface. Rows without an object, the
+    result of a crash between the servers of partitions, are removed. Pairs are marked for the next
+    search for clashes; they stay accepted.
     """
     with closing(open_store(url)) as store:
         total = len(report.wrong) + len(report.strays)
@@ -143,7 +144,7 @@ def repair_environment(
 
 
 def _mark_pairs(store: Store, wrong: list[PairRow]) -> None:
-    """Note that pairs are of no search: the next one measures them, and all that are missing."""
+    """Mark pairs as of no search: the next one measures them, and all missing ones."""
     there, revision = {obj.id for obj in store.objects()}, store.revision()
     gone = [row for row in wrong if row.revision > revision or not {row.a, row.b} <= there]
     anew = [row._replace(setting="", revision=revision) for row in wrong if row not in gone]
@@ -185,7 +186,7 @@ def _check(store: Store, report: CheckReport, progress: Progress | None) -> None
 
 
 def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
-    """Gaps in the log of changes, and objects that do not agree with it."""
+    """Gaps in the log of changes, and objects at variance with it."""
     last: dict[int, Change] = {}
     expected = 1
     key_end = 1 << 3 * store.grid.bits
@@ -217,7 +218,7 @@ def _log_findings(store: Store, objects: dict[int, Object]) -> Iterator[str]:
 
 
 class _Sum:
-    """Voxels and checksums of an object, from the rows read so far."""
+    """Voxel counts and checksums of an object, over the rows so far."""
 
     def __init__(self) -> None:
         self.voxels = self.voxels_measured = self.rows_measured = 0
@@ -246,7 +247,7 @@ class _Sums:
         self.disorder: str | None = None
 
     def batches(self) -> Iterator[Rows]:
-        """All rows, added to the sums; ends where they are in `disorder`."""
+        """All rows, added to the sums; ends at the first `disorder`."""
         key, object_id = -1, 0
         for rows in all_rows(self._store, ROWS_AT_ONCE):
             if not is_ascending(np.append(key, rows.keys), np.append(object_id, rows.ids)):
@@ -294,7 +295,7 @@ def _row_findings(
 
 
 def _band_findings(rows: Rows) -> Iterator[str]:
-    """Distances that are no packed rows."""
+    """Faults of packed distances."""
     assert rows.distances is not None  # noqa: S101 - of measured rows
     try:
         packing.unpack(*rows.distances)
@@ -325,7 +326,7 @@ def _faults_of(obj: Object, found: _Sum) -> Iterator[str]:
 def _surface_findings(
     store: Store, objects: dict[int, Object], report: CheckReport
 ) -> Iterator[str]:
-    """Surfaces that are damaged, missing, of no object, or elsewhere."""
+    """Surfaces that are damaged, missing, misplaced, or without an object."""
     of_digest: dict[str, list[Object]] = {}
     for obj in objects.values():
         of_digest.setdefault(obj.digest, []).append(obj)
@@ -352,7 +353,7 @@ def _surface_findings(
 
 
 class _Places:
-    """Where rows may lie: in the grid, and within the bounds of their objects."""
+    """Permitted keys of rows: within the grid, and within the bounds of their objects."""
 
     def __init__(self, store: Store, objects: dict[int, Object]) -> None:
         grid = store.grid
@@ -363,7 +364,7 @@ class _Places:
         self._boxes = np.array(boxes, dtype=np.int64).reshape(-1, 2, 3)
 
     def findings(self, rows: Rows) -> Iterator[str]:
-        """Faults in the places of a batch: the first row of each kind of fault."""
+        """Faults in the keys of a batch: the first row of each kind of fault."""
         outside = (rows.keys < 0) | (rows.keys >= self._key_end)
         if outside.any():
             yield f"key {int(rows.keys[outside][0])} lies outside the grid"
@@ -399,7 +400,7 @@ class _Places:
 
 
 def _voxel_box(grid: Grid, obj: Object) -> NDArray[np.int64]:
-    """Lowest and highest voxel (2, 3) of an object's bounds, a voxel wider on each side."""
+    """Lowest and highest voxel (2, 3) of an object's bounds, with a margin of a voxel."""
     with np.errstate(invalid="ignore", over="ignore"):
         places = (obj.bounds - np.array(grid.origin)) / grid.voxel_size
     box: NDArray[np.int64] = np.floor(places.clip(-1.0, grid.side)).astype(np.int64)
@@ -408,7 +409,7 @@ def _voxel_box(grid: Grid, obj: Object) -> NDArray[np.int64]:
 
 
 def _cause(error: DamagedError) -> str:
-    """Text between the brackets of a message; the report names the place itself."""
+    """Text between the brackets of a message, since the report names the environment itself."""
     text = str(error)
     start, end = text.find("is damaged ("), text.rfind("): ")
     return text[start + len("is damaged (") : end] if 0 <= start < end else text

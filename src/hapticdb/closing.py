@@ -1,11 +1,11 @@
-"""What is closed at the end of its `with` block."""
+"""Context managers that close themselves."""
 
 from abc import ABC, abstractmethod
 from typing import Self
 
 
 class Closes(ABC):
-    """Something that a `with` block closes at its end."""
+    """Base of classes with `close`, called at the end of a `with` block."""
 
     def __enter__(self) -> Self:
         return self
@@ -15,7 +15,7 @@ class Closes(ABC):
 
     @abstractmethod
     def close(self) -> None:
-        """Close it."""
+        """Release the resources."""
 
     def __deepcopy__(self, _: object = None) -> Self:
         raise TypeError(f"a {type(self).__name__} cannot be copied: a copy would close it, too")

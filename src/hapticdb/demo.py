@@ -1,7 +1,7 @@
-"""The demo: the sample imported in both layouts, touched by every strategy, measured and compared.
+"""The demo: the sample in both layouts, under every strategy, timed and compared.
 
 Hits, ids and wrench of every pose are compared bit for bit over strategies and layouts, under the
-tangent-plane law, which all of them have. Times are warm: each strategy has run before, and the
+tangent-plane law, the one common to all. Times are warm: each strategy has run before, and the
 strategies take turns at going first.
 """
 
@@ -28,7 +28,7 @@ from hapticdb.store.base import Layout
 
 COMPARED: tuple[Strategy, ...] = ("statement", "points", "array", "maxgap", "cbgroup", "auto")
 YARDSTICK: Strategy = "points"
-"""The paper's point query sequence, to which the other strategies are compared."""
+"""The paper's point query sequence, the reference of the comparison."""
 WARM_POSES = 20
 """Untimed poses of each strategy. More take longer and change little."""
 
@@ -39,7 +39,7 @@ class Imported(NamedTuple):
     layout: Layout
     url: str
     engine: str
-    seconds: float  # that the import took
+    seconds: float  # of the import
     objects: int
     voxels: int
     rows: int
@@ -49,7 +49,7 @@ class Imported(NamedTuple):
 
 @dataclass(frozen=True)
 class DemoScene:
-    """What the demo works on: the sample's files and the environments made from them."""
+    """Files and environments of the demo."""
 
     folder: Path
     files: SampleFiles
@@ -61,7 +61,7 @@ class DemoScene:
 
 @dataclass(frozen=True)
 class LayoutFigures:
-    """All strategies on one layout: how each asked the database, pose by pose."""
+    """Query figures of all strategies on one layout, pose by pose."""
 
     imported: Imported
     felt: dict[Strategy, list[Query]]
@@ -73,7 +73,7 @@ class LayoutFigures:
 
 @dataclass
 class Trace:
-    """What the tool felt along the path, for the picture; the same for every strategy."""
+    """Contacts along the path, for the picture; the same for every strategy."""
 
     force: NDArray[np.float64]  # (M,) newtons
     hits: NDArray[np.int64]  # (M,) number at each pose
@@ -84,7 +84,7 @@ class Trace:
 
 @dataclass(frozen=True)
 class Comparison:
-    """All strategies on all layouts, and whether they agreed."""
+    """All strategies on all layouts, and their disagreements."""
 
     layouts: tuple[LayoutFigures, ...]
     trace: Trace
@@ -93,7 +93,7 @@ class Comparison:
 
     @property
     def verdict(self) -> str:
-        """One line: whether all found the same."""
+        """One line: whether all results are equal."""
         if self.disagreed:
             return f"DISAGREED: {self.disagreed[0]} ({len(self.disagreed)} frames in all)"
         return (
@@ -102,7 +102,7 @@ class Comparison:
         )
 
     def against_paper(self) -> str:
-        """One line: `auto` on bricks beside the paper's point queries on its layout of voxels."""
+        """One line: `auto` on bricks against the paper's point queries on voxels."""
         known = {measured.imported.layout: measured for measured in self.layouts}
         ours, theirs = known["brick"].median_us("auto"), known["voxel"].median_us(YARDSTICK)
         return (
@@ -121,8 +121,8 @@ def prepare(
 ) -> DemoScene:
     """Write the sample and import it in both layouts.
 
-    folder : where everything goes; bits : of an axis of the grid; frames : poses of the path;
-    points : of the tool's shell; progress : as for `hapticdb.import_files`.
+    folder : of all files; bits : of an axis of the grid; frames : poses of the path; points : of
+    the tool's shell; progress : as for `hapticdb.import_files`.
     """
     options = GridOptions(bits=bits)
     home = Path(folder)
@@ -160,7 +160,7 @@ def _import(
 
 
 def compare(scene: DemoScene) -> Comparison:
-    """Touch every pose by every strategy on every layout; time it, and compare what was found."""
+    """Touch at every pose by every strategy on every layout; time and compare the results."""
     disagreed: list[str] = []
     layouts = []
     reference: list[Any] = []
@@ -178,7 +178,7 @@ def compare(scene: DemoScene) -> Comparison:
 def _race(
     env: Environment, scene: DemoScene, reference: list[Any], disagreed: list[str]
 ) -> dict[Strategy, list[Query]]:
-    """Queries of each strategy; the first one's answers become the `reference` of all."""
+    """Queries of each strategy; the first strategy's results become the `reference`."""
     for strategy in COMPARED:
         for pose in scene.poses[:: max(1, len(scene.poses) // WARM_POSES)]:
             env.touch(scene.shell, pose, strategy, law="plane")
@@ -198,7 +198,7 @@ def _race(
 
 
 def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
-    """Everything that must be equal, bit for bit."""
+    """Fields to be equal, bit for bit."""
     return (
         touched.force.tobytes(),
         touched.torque.tobytes(),
@@ -208,7 +208,7 @@ def _found(touched: Touch) -> tuple[bytes, bytes, bytes, tuple[int, ...]]:
 
 
 def _trace_of(env: Environment, shell: PointShell, poses: NDArray[np.float64]) -> Trace:
-    """Touch along a path once, and keep force, hits and their places."""
+    """Force, hits and their positions along a path."""
     force, hits, points, ids, frames = [], [], [], [], []
     for index, pose in enumerate(poses):
         touched = env.touch(shell, pose, law="plane")

@@ -1,4 +1,4 @@
-"""Compares what two environments hold, whatever their engines, layouts and curves."""
+"""Comparison of two environments, whatever their engines, layouts and curves."""
 
 import zlib
 from collections.abc import Sequence
@@ -21,7 +21,7 @@ Hashes = NDArray[np.uint64]
 Sums = tuple[dict[int, int], dict[int, int]]
 """Sums of hashes by object, of both environments."""
 ROWS_AT_ONCE = 1 << 14
-"""Rows that are read at a time, 512 bytes each when they are unpacked."""
+"""Rows of a batch, 512 bytes each when unpacked."""
 
 
 def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
@@ -30,36 +30,36 @@ def moved_by(a: Object, b: Object) -> NDArray[np.float64]:
 
 
 def farthest_corner(a: Object, b: Object) -> float:
-    """Longest way of a bounding box's corner, metres; longer than `moved_by` after a turn."""
+    """Largest displacement of a box's corner, metres; more than `moved_by` after a turn."""
     return float(np.linalg.norm(np.abs(b.bounds - a.bounds).max(axis=0)))
 
 
 @dataclass(frozen=True)
 class Difference:
-    """How two environments differ. Objects with the same link and name are the same part."""
+    """Differences of two environments. Objects with the same link and name are the same part."""
 
     a: str
     b: str
     grids: tuple[Grid, Grid]
     only_in_a: tuple[Object, ...]
     only_in_b: tuple[Object, ...]
-    """Parts that the other environment lacks."""
+    """Parts absent from the other environment."""
     surfaces: tuple[Pair, ...]
     """The same part with another surface: geometry, colours or chord error."""
     moved: tuple[Pair, ...]
-    """The same part in another place (`transform`)."""
+    """The same part at another `transform`."""
     attributes: tuple[Pair, ...]
     boxes: tuple[Pair, ...]
     voxels: tuple[Pair, ...]
     distances: tuple[Pair, ...]
-    """Other attributes; other boxes, voxels and distances of the same surface in the same place."""
+    """Other attributes; other boxes, voxels and distances of an equal surface and transform."""
     renumbered: tuple[Pair, ...]
     """The same part with another id, which is no difference."""
     compared: int
     n_voxels: int
-    """Objects with the same surface in the same place, whose rows were compared; their voxels."""
+    """Objects with the same surface and transform, whose rows were compared; their voxels."""
     with_distances: tuple[int, int]
-    """Compared objects that have distances in a, and in b."""
+    """Compared objects with distances in a, and in b."""
 
     def __repr__(self) -> str:
         return (
@@ -75,7 +75,7 @@ class Difference:
 
     @property
     def is_equal(self) -> bool:
-        """Whether both hold the same; ids may differ."""
+        """Whether the contents are equal; ids may differ."""
         return self.is_same_grid and not any((
             self.only_in_a, self.only_in_b, self.surfaces, self.moved, self.attributes, self.boxes,
             self.voxels, self.distances,
@@ -125,7 +125,7 @@ def diff_environments(a_url: Url, b_url: Url, *, progress: Progress | None = Non
 
 
 def _other_surfaces(a: Store, b: Store, pairs: Sequence[Pair]) -> list[Pair]:
-    """Pairs whose digests or stored surfaces differ; each surface is read once, by itself."""
+    """Pairs with different digests or stored surfaces; each surface is read once, by itself."""
     same = {one.digest: (one, other) for one, other in pairs if one.digest == other.digest}
     apart = {digest for digest, pair in same.items() if not _is_same_surface(a, b, pair)}
     return [
@@ -149,7 +149,7 @@ def _is_same_surface(a: Store, b: Store, pair: Pair) -> bool:
 def _other_rows(
     a: Store, b: Store, pairs: Sequence[Pair], progress: Progress | None
 ) -> tuple[list[Pair], list[Pair]]:
-    """Pairs whose voxels differ, and whose distances do."""
+    """Pairs with different voxels, and pairs with different distances."""
     measured = [pair for pair in pairs if pair[0].has_distances and pair[1].has_distances]
     done, total = 0, sum(store.size().rows for store in (a, b))
     voxels: Sums = {}, {}
@@ -166,12 +166,12 @@ def _other_rows(
 
 
 def _apart(pairs: Sequence[Pair], sums: Sums) -> list[Pair]:
-    """Pairs of which the sums differ."""
+    """Pairs with different sums."""
     return [(x, y) for x, y in pairs if sums[0].get(x.id, 0) != sums[1].get(y.id, 0)]
 
 
 def _add(sums: dict[int, int], rows: Rows, hashes: Hashes) -> None:
-    """Add the hashes (R,) of rows to the sums of their objects: the order does not matter."""
+    """Add the hashes (R,) of rows to the sums of their objects, independent of their order."""
     ids, of = np.unique(rows.ids, return_inverse=True)
     added = np.zeros(len(ids), np.uint64)
     np.add.at(added, of, hashes)
@@ -180,7 +180,7 @@ def _add(sums: dict[int, int], rows: Rows, hashes: Hashes) -> None:
 
 
 def _hashes_of(rows: Rows, store: Store) -> Hashes:
-    """Sums (R,) of the hashes of each row's voxels, the same on each layout and curve."""
+    """Sums (R,) of the hashes of each row's voxels, independent of layout and curve."""
     keys = _z_keys(rows, store)
     if store.layout == "voxel":
         return _mixed(keys)

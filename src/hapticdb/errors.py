@@ -1,31 +1,31 @@
-"""The errors that hapticdb raises on purpose.
+"""Errors of hapticdb.
 
 ::
 
     HapticDBError
-    ├── UsageError (ValueError)               options that contradict one another
-    │   └── GridError                         a grid that is not possible, or does not match
-    ├── FileError (ValueError)                an input file that cannot be used
-    │   ├── OutsideGridError                  a part that does not fit the grid
-    │   └── GeometryChangedError              a part has changed since it was imported
+    ├── UsageError (ValueError)               contradictory or out of range
+    │   └── GridError                         an impossible grid, or a mismatch
+    ├── FileError (ValueError)                an unusable input file
+    │   ├── OutsideGridError                  a part outside the grid
+    │   └── GeometryChangedError              a part changed since its import
     ├── MissingExtraError (ImportError)       a format or device needs an extra
     ├── ObjectNotFoundError (LookupError)     no object of that id
-    ├── DeviceError (OSError)                 a haptic device that is not there, or went away
-    ├── ClusterError (ConnectionError)        a scheduler of tasks, or its workers, cannot be used
-    └── DatabaseError                         the database cannot do what was asked
+    ├── DeviceError (OSError)                 a missing or unplugged haptic device
+    ├── ClusterError (ConnectionError)        an unusable scheduler, or its workers
+    └── DatabaseError                         the database cannot fulfil the request
         ├── EnvironmentNotFoundError (FileNotFoundError)
         ├── EnvironmentExistsError (FileExistsError)
         ├── NotAnEnvironmentError             a file of another kind
         ├── NewerVersionError                 written by a newer hapticdb
-        ├── DamagedError                      an environment whose contents are broken
-        ├── ReadOnlyError (PermissionError)   a write where only reading is possible
-        ├── AccessError (PermissionError)     the server does not let this user in
-        ├── ConflictError                     another has written the object meanwhile
+        ├── DamagedError                      damaged contents
+        ├── ReadOnlyError (PermissionError)   a write to a read-only database
+        ├── AccessError (PermissionError)     no permission for this user
+        ├── ConflictError                     a concurrent write to the object
         ├── ConnectionLostError (ConnectionError)  the server went away
-        ├── BusyError (TimeoutError)          another writer held the database too long
+        ├── BusyError (TimeoutError)          another writer had the database locked too long
         └── StuckError (TimeoutError)         the database took longer than a frame may
 
-Every message is one line: what is wrong, where, and what to do next. If a builtin error fits, the
+Every message is one line: the fault, its location, and the next step. If a builtin error fits, the
 class is a subclass of it, too.
 """
 
@@ -35,7 +35,7 @@ from pathlib import Path
 
 
 def pip_line(extra: str) -> str:
-    """Give the command that installs what an extra needs, into this Python's environment."""
+    """Command line to install an extra's packages into this Python's environment."""
     from importlib.metadata import requires  # noqa: PLC0415 - 30 ms, and only for an error
 
     packages = [
@@ -49,7 +49,7 @@ def pip_line(extra: str) -> str:
 
 
 class HapticDBError(Exception):
-    """Root of all errors that hapticdb raises on purpose."""
+    """Root of all errors of hapticdb."""
 
 
 class UsageError(HapticDBError, ValueError):
@@ -57,11 +57,11 @@ class UsageError(HapticDBError, ValueError):
 
 
 class GridError(UsageError):
-    """A grid that cannot be built, or that differs from the environment's."""
+    """A grid that cannot be built, or differs from the environment's."""
 
 
 class FileError(HapticDBError, ValueError):
-    """An input file that is missing, empty, damaged or of a kind that cannot be read."""
+    """An input file that is missing, empty, damaged or of an unreadable kind."""
 
 
 class OutsideGridError(FileError):
@@ -69,7 +69,7 @@ class OutsideGridError(FileError):
 
 
 class GeometryChangedError(FileError):
-    """A part of a file has another geometry than the object that was imported from it."""
+    """A part of a file with another geometry than the object imported from it."""
 
 
 class MissingExtraError(HapticDBError, ImportError):
@@ -85,11 +85,11 @@ class DeviceError(HapticDBError, OSError):
 
 
 class ClusterError(HapticDBError, ConnectionError):
-    """A scheduler of tasks that is not there, or whose workers cannot do what is asked."""
+    """A scheduler of tasks that is not there, or whose workers cannot run a task."""
 
 
 class DatabaseError(HapticDBError):
-    """The database cannot do what was asked."""
+    """A request the database cannot fulfil."""
 
 
 class EnvironmentNotFoundError(DatabaseError, FileNotFoundError):
@@ -109,15 +109,15 @@ class NewerVersionError(DatabaseError):
 
 
 class DamagedError(DatabaseError):
-    """An environment whose contents are broken."""
+    """An environment with damaged contents."""
 
 
 class ReadOnlyError(DatabaseError, PermissionError):
-    """A write to a database that can only be read."""
+    """A write to a read-only database."""
 
 
 class BusyError(DatabaseError, TimeoutError):
-    """Another writer held the database for longer than the time allowed."""
+    """Another writer had the database locked for longer than the time allowed."""
 
 
 class AccessError(DatabaseError, PermissionError):
@@ -125,7 +125,7 @@ class AccessError(DatabaseError, PermissionError):
 
 
 class ConflictError(DatabaseError):
-    """Somebody else has written the object since it was read."""
+    """Another write to the object since it was read."""
 
 
 class ConnectionLostError(DatabaseError, ConnectionError):

@@ -16,13 +16,13 @@ from hapticdb.units import place_text
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
 CURVE_CODES = {"lexicographic": 0, "z": 1, "hilbert": 2}
-"""Numbers of the curves, as in `kernels.curves`: to read them there would load numba."""
+"""Numbers of the curves, as in `kernels.curves`, without its import of numba."""
 MAX_BITS = 21
-"""Most bits on one axis: three axes fit into the 63 bits of a key."""
+"""Bits of an axis, at most: three axes fit into the 63 bits of a key."""
 BRICK_BITS = 3
-"""Bits on one axis of a voxel's place in its brick."""
+"""Bits of an axis within a brick."""
 CELL_BITS = 5
-"""Bits on one axis of a voxel's place in its cell."""
+"""Bits of an axis within a cell."""
 ROOM = 1.6
 """Edge of a fitted grid, in longest sides of the bounding box of all files."""
 
@@ -86,11 +86,11 @@ class Grid:
 
     @property
     def is_hierarchical(self) -> bool:
-        """Whether a key's leading bits name the cube that holds the voxel."""
+        """Whether a key's leading bits identify the cube around the voxel."""
         return self.curve != "lexicographic"
 
     def voxels_of(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Voxels (N, 3) that hold points (N, 3) in metres; they may lie outside the grid."""
+        """Voxels (N, 3) of points (N, 3) in metres; they may lie outside the grid."""
         scaled = self.to_voxel_units(np.asarray(points, dtype=np.float64))
         return np.floor(scaled).astype(np.int64)
 
@@ -112,7 +112,7 @@ class Grid:
         return inside
 
     def encode(self, ijk: ArrayLike) -> NDArray[np.int64]:
-        """Keys (N,) of voxels (N, 3); `GridError` when one lies outside, or is not of integers."""
+        """Keys (N,) of voxels (N, 3); `GridError` for a voxel outside, or not of integers."""
         given = np.asarray(ijk)
         if given.dtype.kind not in "iu" and given.size:
             raise GridError(f"voxels of type {given.dtype}: give integers, as voxels_of returns")
@@ -124,7 +124,7 @@ class Grid:
         return curves.encode(voxels, self.bits, self.curve_code)
 
     def decode(self, keys: ArrayLike) -> NDArray[np.int64]:
-        """Voxels (N, 3) of keys (N,); `GridError` when a key lies outside ``[0, 8^bits)``."""
+        """Voxels (N, 3) of keys (N,); `GridError` for a key outside ``[0, 8^bits)``."""
         given = np.asarray(keys)
         if given.dtype.kind not in "iu" and given.size:
             raise GridError(f"keys of type {given.dtype}: give integers, as encode returns")
@@ -136,7 +136,7 @@ class Grid:
         return curves.decode(values, self.bits, self.curve_code)
 
     def describe(self) -> str:
-        """One line for people: voxels on each axis, voxel size, curve."""
+        """One line for people: voxels on each axis, voxel size, origin, curve."""
         return (
             f"{self.side}^3 voxels of {self.voxel_size * 1000:.4g} mm, origin "
             f"{place_text(self.origin, self.voxel_size / 100)} m, {self.curve} order"
@@ -145,7 +145,7 @@ class Grid:
 
 @dataclass(frozen=True)
 class GridOptions:
-    """Options of a user for a grid. All others are fitted to the files."""
+    """A user's options for a grid; the others are fitted to the files."""
 
     bits: int | None = None
     """Bits on each axis; 10 unless the other options determine them."""
@@ -183,7 +183,7 @@ class GridOptions:
         return Grid(size, _triple(origin), bits, self.curve or "z")
 
     def _resolve(self, longest: float) -> tuple[int, float]:
-        """Bits on each axis and voxel size for a scene of that longest side."""
+        """Bits on each axis and voxel size for a scene with that longest side."""
         wanted = (self.extent or ROOM) * longest
         if self.voxel_size is None:
             bits = self.bits or 10
@@ -199,7 +199,7 @@ class GridOptions:
         return bits, self.voxel_size
 
     def check_matches(self, grid: Grid, bounds: NDArray[np.float64] | None = None) -> None:
-        """Refuse options that differ from an existing grid; `extent` needs the file's bounds."""
+        """Refuse options at variance with an existing grid; `extent` needs the file's bounds."""
         differences = []
         if self.bits is not None and self.bits != grid.bits:
             differences.append(f"bits {self.bits} instead of {grid.bits}")

@@ -1,8 +1,8 @@
 """Ctrl-C at any moment of the command line: one line, exit code 130, no traceback.
 
 A signal may raise its exception in any line of code. Within an import it may turn into another
-error, or into a traceback that Python prints and ignores. Within llvmlite, which gives an object to
-LLVM in one line and notes it in the next one, it may have the object freed twice. Until a verb
+error, or into a traceback that Python prints and ignores. Within llvmlite it may have an object
+freed twice: one line passes the object to LLVM, and the next one notes the transfer. Until a verb
 begins, nothing is open, so Ctrl-C ends the process at once. Afterwards the interrupt waits until
 neither is running.
 """
@@ -17,7 +17,7 @@ from typing import Literal
 EXIT_CODE = 130
 MESSAGE = b"hapticdb: interrupted\n"
 AGAIN_S = 0.01
-"""Seconds until an interrupt that came where none may be raised is tried again."""
+"""Seconds until the next try of a delayed interrupt."""
 
 LLVMLITE = f"{os.sep}llvmlite{os.sep}"
 """In the paths of llvmlite's modules."""
@@ -37,7 +37,7 @@ def begin() -> None:
 
 
 def work() -> None:
-    """Raise KeyboardInterrupt from now on: a verb begins, and cleans up when it is interrupted."""
+    """Raise KeyboardInterrupt from now on: a verb begins, and cleans up after an interrupt."""
     global _phase  # noqa: PLW0603
     if _phase == "starting":
         _phase = "working"
@@ -53,7 +53,7 @@ def leave() -> None:
 
 
 def tell() -> None:
-    """Write the one line, whatever state the program's streams are in."""
+    """Write the one line, independent of the state of the program's streams."""
     os.write(2, MESSAGE)
 
 
@@ -82,7 +82,7 @@ def _must_wait(frame: FrameType | None) -> bool:
 
 
 def _try_again() -> bool:
-    """Have the handler called again after `AGAIN_S`; False if the alarm has another handler."""
+    """Schedule the handler after `AGAIN_S`; False if the alarm has another handler."""
     if signal.getsignal(signal.SIGALRM) not in {signal.SIG_DFL, interrupt}:
         return False
     signal.signal(signal.SIGALRM, interrupt)
@@ -91,7 +91,7 @@ def _try_again() -> bool:
 
 
 def _note_unraisable(unraisable: "sys.UnraisableHookArgs") -> None:
-    """Raise an interrupt again that came within a finalizer; print every other exception."""
+    """Raise an interrupt from within a finalizer again; print every other exception."""
     is_interrupt = issubclass(unraisable.exc_type, KeyboardInterrupt)
     if not is_interrupt or (_phase == "working" and not _try_again()):
         sys.__unraisablehook__(unraisable)

@@ -1,8 +1,8 @@
 """Files of poses: a line for each pose, position in metres and unit quaternion, scalar first.
 
 The header names the columns, ``x,y,z,qw,qx,qy,qz``, in any order. Other columns are ignored, except
-``t``, seconds, when a caller asks for it. Quaternions are normalised; ``q`` and ``-q`` are the same
-pose. A warning says where their columns seem to be in another order than their names.
+``t``, seconds, for `read_timed_poses`. Quaternions are normalised; ``q`` and ``-q`` are the same
+pose. A warning is issued if the columns seem to be in another order than their names.
 """
 
 import codecs
@@ -22,7 +22,7 @@ from hapticdb.units import metres_of
 COLUMNS = ("x", "y", "z", "qw", "qx", "qy", "qz")
 
 FARTHEST = 1e9
-"""Largest coordinate of a position, metres. A larger value accepts less likely positions."""
+"""Largest coordinate of a position, metres. Larger: less likely positions are accepted."""
 
 _UPRIGHT = 0.5
 """Least scalar of a quaternion near the identity: turned by 120 degrees at most."""
@@ -30,7 +30,7 @@ _HINT = f"expected a header {','.join(COLUMNS)} and one pose a line"
 
 
 def as_floats(values: ArrayLike, name: str) -> NDArray[np.float64]:
-    """Values as a C-contiguous array of float64. Such an array is returned itself.
+    """Values as a C-contiguous array of float64, without a copy if they are one.
 
     Raises `UsageError` for complex numbers, masked arrays, text, lists of unequal lengths.
     """
@@ -187,7 +187,7 @@ def _read_rows(path: Path, optional: str | None = None) -> NDArray[np.float64]:
     text = _read_text(path)
     head = text.lstrip().split("\n", 1)[0]
     sign = next((sign for sign in ";\t" if sign in head and "," not in head), ",")
-    if sign != ",":  # as spreadsheets write it where a comma stands before decimals
+    if sign != ",":  # as spreadsheets write it with decimal commas
         text = text.replace(",", ".")
     reader = csv.reader(io.StringIO(text, newline=""), delimiter=sign, strict=True)
     places: dict[str, int] = {}

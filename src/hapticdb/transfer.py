@@ -31,10 +31,10 @@ Url = str | os.PathLike[str]
 class CopyReport:
     """Result of a copy.
 
-    source, target : the environments, as messages name them: without a password
+    source, target : the environments, as in messages, without a password
     copied, voxels : objects written now, and their voxels
-    present : objects that were there already
-    renumbered : objects written with another id, because their own was taken
+    present : objects in the target before
+    renumbered : objects written with another id, because their own was in use
     """
 
     source: str
@@ -53,21 +53,21 @@ def copy_environment(
     curve: CurveName | None = None,
     progress: Progress | None = None,
 ) -> CopyReport:
-    """Copy an environment's objects into another, which is made if it does not exist.
+    """Copy an environment's objects into another, made if it does not exist.
 
     Each object is copied in one transaction, with its id if that is free, its surface, and its
-    distances if the target wants them; a new target of bricks does if the source does. Objects that
-    are in the target already are left alone: an interrupted copy goes on when it is started again.
-    Everything is read at one revision. The memory needed is proportional to the largest object.
+    distances if the target stores them; a new target of bricks does if the source does. Objects
+    already in the target are skipped, so an interrupted copy can be continued by the same call.
+    Everything is read at one revision. Memory is proportional to the largest object.
 
-    layout : of a new target, by default the source's; an existing target must have it
+    layout : of a new target, by default the source's; must be that of an existing one
     curve : by the same rule
-    progress : called after each object that was written with the number of objects done, and of all
+    progress : called after each written object with the number of objects done, and of all
 
-    Raises `UsageError` or `GridError` when both URLs lead to one environment, when bricks are
-    requested in lexicographic order, or when the target has another grid, layout or curve;
-    `ConflictError`, before any write, when the target has a part with another geometry or place;
-    `DamagedError` when an object of the source does not have the voxels that its record counts.
+    Raises `UsageError` or `GridError` for two URLs of one environment, for bricks in lexicographic
+    order, or for a target with another grid, layout or curve; `ConflictError`, before any write,
+    for a part with another geometry or transform in the target; `DamagedError` for an object of the
+    source with another number of voxels than its record.
     """
     with closing(open_store(source_url, read_only=True)) as source:
         target, is_new = _target(target_url, source, layout, curve)
@@ -88,7 +88,7 @@ def copy_environment(
 def _target(
     url: Url, source: Store, layout: Layout | None, curve: CurveName | None
 ) -> tuple[Store, bool]:
-    """Open or make the target; also returns whether it was made."""
+    """Open or make the target; the flag: whether it was made."""
     if not exists(url):
         grid = source.grid if curve is None else replace(source.grid, curve=curve)
         with suppress(EnvironmentExistsError):  # another process may be faster
@@ -117,7 +117,7 @@ def _target(
 
 
 def _is_same_place(a: Store, b: Store) -> bool:
-    """Whether two URLs lead to one environment, also through links of the file system."""
+    """Whether two URLs refer to one environment, also through links of the file system."""
     with suppress(OSError, ValueError):
         return Path(a.url).samefile(b.url)
     return a.url == b.url
@@ -157,7 +157,7 @@ def _copy_objects(source: Store, target: Store, progress: Progress | None) -> Co
 
 
 def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Object]:
-    """Objects that the target lacks. Refuses objects that differ from those of the target."""
+    """Objects absent from the target; ConflictError for one at variance with the target's."""
     known = {part_of(obj): obj for obj in target.objects()}
     taken = {obj.id for obj in known.values()}
     missing = []
@@ -183,7 +183,7 @@ def _missing(objects: Iterable[Object], source: Store, target: Store) -> list[Ob
 
 
 def part_of(obj: Object) -> tuple[str, str]:
-    """Key by which an object is the same part in another environment."""
+    """Identity of a part across environments: link and name."""
     return obj.link, obj.name
 
 

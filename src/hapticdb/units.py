@@ -1,4 +1,4 @@
-"""Units of length, by the words that options and parameters take."""
+"""Units of length, by their names in options and parameters."""
 
 import math
 import re
@@ -19,7 +19,7 @@ UNITS = {
     "us-ft": 1200.0 / 3937.0,
     "yd": 0.9144,
 }
-"""Length of each, metres; `us-ft` is the US survey foot, which point clouds are measured in."""
+"""Length of each, metres; `us-ft` is the US survey foot, common in point clouds."""
 NAMES = {
     "um": "micrometres",
     "mm": "millimetres",
@@ -35,34 +35,34 @@ NAMES = {
 _LENGTH = re.compile(
     r"([-+]?(?:\d{1,99}(?:\.\d*)?|\.\d+)(?:e[-+]?\d{1,2})?)\s*([a-zµ-]+)?", re.IGNORECASE
 )
-"""A number below infinity, and a unit where it has one."""
+"""A finite number, and an optional unit."""
 _READABLE = ((1e3, "km", 10.0), (1.0, "m", 0.1), (1e-3, "mm", 0.1))
-"""Units that lengths are printed in: metres, sign, and the least number that is printed in it."""
+"""Units of printed lengths: metres, sign, and the least number printed in it."""
 _VOLUMES = ((1.0, "m³"), (1e-6, "cm³"), (1e-9, "mm³"))
 
 
 def length_text(length: float) -> str:
-    """Put a length, metres, in the unit that reads best: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
+    """A length, metres, in a readable unit: ``3.3 mm``, ``4.21 m``, ``12.5 km``."""
     size, word = readable_unit(length)
     return f"{length / size:.4g} {word}"
 
 
 def place_text(place: Iterable[float], step: float) -> str:
-    """Put coordinates, metres, in words, to a step, metres: ``(515369.12, 4918340.5, 0)``."""
+    """Coordinates, metres, rounded to a step, metres: ``(515369.12, 4918340.5, 0)``."""
     digits = min(max(math.ceil(-math.log10(step)), 0), 12) if step > 0.0 else 6
     numbers = (f"{round(x, digits) + 0.0:.{digits}f}" for x in place)
     return f"({', '.join(x.rstrip('0').rstrip('.') if '.' in x else x for x in numbers)})"
 
 
 def notebook_html(result: object, rows: Iterable[Iterable[object]]) -> str:
-    """HTML of a result for notebooks: its line, and rows of a table; their texts are escaped."""
+    """HTML of a result for notebooks: its `repr`, and a table of escaped texts."""
     cells = ("".join(f"<td>{escape(str(cell))}</td>" for cell in row) for row in rows)
     table = "".join(f"<tr>{row}</tr>" for row in cells)
     return f"<b>{escape(repr(result))}</b><table>{table}</table>"
 
 
 def readable_unit(length: float) -> tuple[float, str]:
-    """Metres of the unit in which a length, metres, reads best, and its sign."""
+    """Metres of the most readable unit for a length, metres, and its sign."""
     for size, sign, least in _READABLE:
         if length >= least * size:
             return size, sign
@@ -94,13 +94,13 @@ def volume_of(text: str) -> float:
 
 
 def volume_text(volume: float) -> str:
-    """Put a volume, cubic metres, in the unit that reads best: ``72.7 cm³``."""
+    """A volume, cubic metres, in a readable unit: ``72.7 cm³``."""
     size, word = next(pair for pair in _VOLUMES if volume >= 0.01 * pair[0] or pair[1] == "mm³")
     return f"{volume / size:.4g} {word}"
 
 
 def metres_of(unit: str) -> float:
-    """Length of a unit, metres; `UsageError` when it is none of `UNITS`."""
+    """Length of a unit, metres; `UsageError` for an unknown one."""
     if unit not in UNITS:
         raise UsageError(f"unknown unit '{unit}'; choose one of {', '.join(UNITS)}")
     return UNITS[unit]

@@ -1,7 +1,7 @@
-"""The user's cache: what takes long to make, and is named by a digest of all that shapes it.
+"""The user's cache of slow results, keyed by a digest of all their inputs.
 
-It lies beside the machine code of kernels. What is missing, damaged or of other sources is made
-anew.
+It is in the same folder as the machine code of kernels. Entries that are missing, damaged or of
+other sources are recomputed.
 """
 
 import contextlib
@@ -13,13 +13,13 @@ from pathlib import Path
 from hapticdb.kernels._cache import cache_folder, sources_digest
 
 MOST_BYTES = 256 << 20
-"""Most bytes of all entries of a kind. Larger: more of them are found again."""
+"""Bytes of all entries of a kind, at most. Larger: more hits."""
 DIGEST_BYTES = 32
-"""Bytes of a SHA-256, with which an entry begins."""
+"""Bytes of a SHA-256, the head of an entry."""
 
 
 def entry_of(kind: str, *shaping: object) -> Path:
-    """File of an entry that these values, and the sources of this package, shape."""
+    """File of an entry, keyed by these values and the sources of this package."""
     known = repr((sources_digest(Path(__file__).parent), *shaping))
     return cache_folder() / kind / hashlib.sha256(known.encode(errors="replace")).hexdigest()
 
@@ -33,13 +33,13 @@ def content_of(entry: Path) -> bytes | None:
         return None
     if hashlib.sha256(content).digest() != digest:
         return None
-    with contextlib.suppress(OSError):  # what is used goes last
+    with contextlib.suppress(OSError):  # time of the last use, for eviction
         os.utime(entry)
     return content
 
 
 def keep(entry: Path, content: bytes) -> None:
-    """Write an entry, at once as a whole; nothing if the folder cannot be written."""
+    """Write an entry atomically; no error for a folder without write access."""
     if len(content) > MOST_BYTES:
         return
     with contextlib.suppress(OSError):
@@ -55,7 +55,7 @@ def keep(entry: Path, content: bytes) -> None:
 
 
 def _make_room(folder: Path) -> None:
-    """Remove the entries that were not used for the longest time, down to `MOST_BYTES`."""
+    """Evict the least recently used entries, down to `MOST_BYTES`."""
     found = sorted((one.stat().st_mtime, one.stat().st_size, one) for one in folder.iterdir())
     left = sum(size for _, size, _ in found)
     for _, size, one in found:

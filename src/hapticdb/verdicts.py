@@ -8,7 +8,7 @@ from typing import Self
 class Kind(StrEnum):
     """Relation of two surfaces, the gravest first.
 
-    DUPLICATE: equal ones at one place; TOO_NEAR: nearer than a rule allows, never stored; FAR:
+    DUPLICATE: equal ones at one pose; TOO_NEAR: nearer than a rule allows, never stored; FAR:
     beyond the distance of the search.
     """
 
@@ -40,7 +40,7 @@ REPORTED = tuple(Kind)[:-1]
 class PathVerdict(StrEnum):
     """Result of a sweep, an extraction or a disassembly, the worst of a batch first.
 
-    exit_status : of the command line; line : what it means.
+    exit_status : of the command line; line : its meaning.
     """
 
     exit_status: int
@@ -64,12 +64,12 @@ class PathVerdict(StrEnum):
 
     @property
     def is_free(self) -> bool:
-        """Whether nothing is hit on the whole path, but for overlaps at the start."""
+        """Whether the whole path is free, but for overlaps at the start."""
         return self.exit_status in {0, PathVerdict.OVERLAPS.exit_status}
 
 
 def exit_codes(verdicts: Iterable[PathVerdict]) -> str:
-    """Exit status of each verdict and what it means, a sentence for help texts."""
+    """Exit status of each verdict with its meaning, a sentence for help texts."""
     found = "; ".join(f"{one.exit_status} {one}, {one.line}" for one in verdicts)
     return f"Exit codes: {found}."
 
@@ -81,4 +81,4 @@ SWEEP_VERDICTS = (
 EXTRACT_VERDICTS = (PathVerdict.COMES_OUT, *SWEEP_VERDICTS[1:-1], PathVerdict.NO_PATH)
 """Verdicts of sweeps, and of extractions and disassemblies."""
 WORST = tuple(dict.fromkeys(verdict.exit_status for verdict in PathVerdict))
-"""Exit statuses, the worst first: that of a batch is the first which a sweep of it has."""
+"""Exit statuses, the worst first: a batch has the first of them among its sweeps."""

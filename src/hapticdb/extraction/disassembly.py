@@ -29,8 +29,7 @@ DEFAULT_ORDER_SECONDS = 600.0
 DEFAULT_DEPTH = 3
 """Default length of the longest chain of objects, each of them blocking the one before."""
 MOST_BLOCKERS = 12
-"""Objects tried of those in the way of one part, at most. Larger: more sequences, and more time on
-parts without one."""
+"""Objects tried in the way of one part, at most. Larger: more sequences, and a slower failure."""
 LEAST = 0.1
 """Seconds of a search after the deadline: enough for one pull."""
 SHARE = 0.25
@@ -142,9 +141,9 @@ def disassemble(
 ) -> Disassembly:
     """Search for a sequence of removals after which parts come out.
 
-    If the parts have no proved removal path, the objects in their way are tried, most stopped pulls
-    first, and then the objects in the way of these. Each object is removed alone, on a path proved
-    as in `extract`. Then the parts are tried again.
+    Without a proved removal path of the parts, the objects in their way are tried, most stopped
+    pulls first, then the objects in the way of these. Each object is removed alone, on a path
+    proved as in `extract`. Then the parts are tried again.
 
     Parameters
     ----------
@@ -153,8 +152,7 @@ def disassemble(
     seconds : float
         Time of all searches together; one search has a quarter of it at most.
     motions : int
-        Motion queries of the planner in one search, at most; 0: straight pulls only. Objects in
-        the way are first tried by straight pulls alone.
+        Motion queries of one search, as for `extract`; objects in the way have none at first.
     depth : int
         Length of the longest chain of objects in the way of one another; 0: as `extract`.
     keep : iterable of int or str
@@ -166,7 +164,7 @@ def disassemble(
     Raises
     ------
     ObjectNotFoundError, UsageError
-        As for `extract`, about the parts. Other objects without their files are not removed.
+        For the parts, as for `extract`. Other objects without their files are not removed.
     MissingExtraError
         If straight pulls give no sequence, and the planner is not installed.
     """
@@ -238,9 +236,8 @@ class _OrderSearch:
     """State of one search for a sequence.
 
     steps : removals so far; failed : searches without a proved path; motions_of_others : motion
-    queries of the planner for objects in the way; missing : error of a planner that is not
-    installed (straight pulls only from then on); is_spent : whether the deadline prevented a
-    search.
+    queries of the planner for objects in the way; missing : error of a missing planner (straight
+    pulls only from then on); is_spent : whether the deadline prevented a search.
     """
 
     def __init__(

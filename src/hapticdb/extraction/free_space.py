@@ -3,8 +3,8 @@
 A pose is free if no shell point is in an occupied voxel; in the wide space, nor any point one voxel
 outside the surface. The search relies on this; proofs are by sweeps.
 
-Touching surfaces share voxels, so a part in contact is not free at its start. Its motion there is
-checked by sweeps.
+Touching surfaces share voxels, so a part in contact is not free at its start; there, sweeps check
+its motion.
 """
 
 from contextlib import ExitStack, closing
@@ -92,8 +92,7 @@ class Room:
 class FreeSpace(Closes):
     """Free space of a problem's parts; a context manager.
 
-    room : without clearance; wide : with `GUARD` voxels of clearance; start : contacts at the
-    start, of points in occupied voxels.
+    room : without clearance; wide : with `GUARD` voxels of it; start : contacts at the start pose.
     """
 
     def __init__(self, problem: Problem, budget_bytes: int) -> None:

@@ -22,8 +22,8 @@ from hapticdb.grid import corners_of
 Floats = NDArray[np.float64]
 
 MOST_GOALS = 6
-"""Goals for each rotation of the part, at most. Larger: more alternatives for the planner, more
-poses before it begins."""
+"""Goals for each rotation of the part, at most. Larger: more alternatives, a later start of the
+plan."""
 MOST_BLOCKERS = 8
 """Objects in the hull: those that stop most pulls."""
 AROUND = 4.0
@@ -31,7 +31,7 @@ AROUND = 4.0
 Larger: hulls of large objects extend beyond the part's surroundings."""
 FEW = 4
 """Goals outside the hull below which goals outside all objects are added, too. Larger: a larger
-configuration space for the planner."""
+space."""
 N_RANDOM = 18
 """Random directions after the axes. Larger: more candidate goals."""
 ROOM = 2.0

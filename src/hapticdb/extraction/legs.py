@@ -20,8 +20,8 @@ from hapticdb.extraction.problem import Exit, Problem
 Floats = NDArray[np.float64]
 
 STOPS = (1, 2, 4)
-"""Numbers of stops on a leg for the start of the next one, tried in turn. More: narrower doors, at
-the square of the number of motions."""
+"""Stops on a leg for the start of the next one, tried in turn. More: narrower doors, but the square
+of the number in motions."""
 BETWEEN, MOST_STOPS = 0.5, 8
 """Spacing of the second leg's stops, radii of the part, and their greatest number."""
 MOST_MOTIONS = 3000

@@ -26,25 +26,24 @@ Floats = NDArray[np.float64]
 MOST_STARTS = 12
 """Starts of the planner, at most. Larger: more directions in one plan."""
 LEAVING = 2.0
-"""Longest contact, voxels, of a pull trusted without a sweep. Larger: more starts on the far side
-of thin walls."""
+"""Longest contact, voxels, of a pull trusted without a sweep. Larger: more starts behind thin
+walls."""
 STRIDE = 0.5
 """Greatest distance of neighbouring states, radii of the part. Larger: fewer queries in open space,
 more of them refused in narrow passages."""
 SHARE_OF_WIDE = 0.6
-"""Share of queries and time for paths with clearance; narrower paths, refuted more often by sweeps,
-have the rest."""
+"""Share of queries and time for paths with clearance; sweeps refute more of the narrower ones."""
 SHARE_OF_SHIFTS = 0.3
 """Share of queries and time for plans without turns, which need far fewer queries."""
 SHARE_OF_LEGS = 0.3
-"""Greatest share of the time for straight legs along the axes. Their motions are no queries of the
-planner, and not counted as such."""
+"""Greatest share of the time for straight legs along the axes; these are no queries of the
+planner."""
 SHARE_OF_LOOSENING = 0.2
 """Share of queries and time for motions out of contact, if no pull is free. Larger: longer paths
 out of contact, less for the planner."""
 MOST_TURNS = 8
-"""Rotations for which goals are searched, at most. Larger: more goals, and more checks before the
-planner begins."""
+"""Rotations of the goals, at most. Larger: more goals, and more checks before the planner
+begins."""
 QUARTERS = np.array(
     [[[1, 0, 0], [0, 0, -1], [0, 1, 0]], [[0, 0, 1], [0, 1, 0], [-1, 0, 0]],
      [[0, -1, 0], [1, 0, 0], [0, 0, 1]]], dtype=np.float64,

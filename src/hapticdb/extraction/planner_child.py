@@ -1,6 +1,6 @@
 """The planner's process: OMPL's RRT-Connect, with motion queries sent to the search.
 
-OMPL prints reports when it is unloaded, and must end at a deadline: hence a process. It neither
+A process, because OMPL prints reports when it is unloaded, and must end at any time. It neither
 reads the database nor loads numba.
 """
 

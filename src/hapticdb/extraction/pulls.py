@@ -24,18 +24,16 @@ from hapticdb.store.base import Progress
 Floats = NDArray[np.float64]
 
 GROWTH = 1.2
-"""Factor of the hits at the start up to which a part still slides along its contacts. Larger: more
-pulls refuted by the proof."""
+"""Factor of the start's hits up to which a part slides along its contacts. Larger: more refuted
+pulls."""
 MOST_OPPOSED = 0.1
 """Greatest share of opposing contacts at the start of a pull. Larger: more refuted pulls."""
 MOST_LIKELY = 24
-"""Pulls along likely directions that are swept, at most. Larger: more oblique bores, more
-sweeps."""
+"""Pulls along likely directions that are swept, at most. Larger: more oblique bores and sweeps."""
 SHARE_OF_PULL = 0.5
 """Share of the remaining time for the sweep of one of them."""
 BLOCKS = (8, 64)
-"""Poses of the first check, since most pulls are blocked soon, and of the largest; each check has
-twice as many as the one before."""
+"""Poses of the first check, since most pulls are blocked soon, doubled up to those of the last."""
 
 
 class Pull(NamedTuple):
@@ -43,8 +41,8 @@ class Pull(NamedTuple):
 
     direction (3,) : unit vector; length : metres until the part is out; touching : metres in
     contact with the objects touched at the start; free : metres until the first other hit, `length`
-    without one; blockers : ids of the objects at the first hit; is_swept : measured by a sweep, not
-    by voxels.
+    without one; blockers : ids of the objects at the first hit; is_swept : measured on surfaces,
+    not voxels.
     """
 
     direction: Floats

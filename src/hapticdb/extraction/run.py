@@ -43,8 +43,8 @@ SHARE_OF_LIKELY = 0.3
 SHARE_OF_PROOF = 0.2
 """Share of the time reserved for sweeps of paths by voxels and of planned ones."""
 MOST_PLANS = 3
-"""Planned paths judged until one is not refuted, at most. Larger: more paths past obstacles that
-the search's voxels miss."""
+"""Planned paths judged until one is not refuted, at most. Larger: more paths past thin
+obstacles."""
 FARTHEST = 1e3
 """Longest path to a pose, sizes of the standing objects' box: a longer one has a wrong unit."""
 MOST_SEED = 1 << 31

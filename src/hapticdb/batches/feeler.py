@@ -123,8 +123,8 @@ class Feeler(Closes):
     ) -> TouchBatch:
         """Force and torque at many poses; bit for bit those of `Environment.touch` at each pose.
 
-        A GPU sums the points in another order, and may fuse multiplications with additions. Its
-        results are reproducible bit for bit.
+        A GPU sums the points in another order, and may fuse multiplications with additions; its
+        results are reproducible.
 
         poses (B, 4, 4) : world_from_tool, rigid, metres, in any order; a mapped array is read piece
             by piece

@@ -25,7 +25,7 @@ RUN = 16
 
 
 def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) -> Ints:
-    """Index (B,) of a point with a hit at each pose, or a negative number, in resident cells."""
+    """Point (B,) with a hit in a resident cell at each pose, `NOTHING` or `UNDECIDED`."""
     found = np.empty(len(poses), dtype=np.int64)
     cells, place = frames.residency.table.cells.without_distances(), frames.residency.place
 
@@ -41,8 +41,7 @@ def first_hits_at(frames: ResidentFrames, threads: BatchThreads, poses: Floats) 
 class NearestSearch:
     """Search for the voxels nearest to a shell, within a reach in voxels.
 
-    frames : of the shell, with the table for the cells around its points; threads : of the same
-    frames.
+    frames : of the shell, with the table for the cells around its points; threads : of `frames`.
 
     Raises `UsageError` if the cells within reach of one point exceed the table.
     """

@@ -306,15 +306,13 @@ class PairSearch:
     def _row(self, one: Object, other: Object, judged: Judged, revision: int) -> PairRow:
         """Row of a pair."""
         world_from_a = self._shapes.placement(one)[1]
-        on_a, on_b = (
-            world_from_a[:3, :3] @ place + world_from_a[:3, 3]
-            for place in (judged.on_a, judged.on_b)
-        )
+        turn, shift = world_from_a[:3, :3], world_from_a[:3, 3]
+        on_a, on_b = turn @ judged.on_a + shift, turn @ judged.on_b + shift
         if judged is DUPLICATE:
             on_a = on_b = one.bounds.mean(axis=0)
         return PairRow(
             one.id, other.id, judged.kind, judged.at_least,
-            judged.at_most if np.isfinite(judged.at_most) else None,
+            judged.at_most if judged.at_most < np.inf else None,
             (*on_a.tolist(), *on_b.tolist()), "new", revision, self._setting,
         )  # fmt: skip
 
@@ -435,7 +433,7 @@ def _are_same(one: Object, other: Object) -> bool:
 def _compared(row: PairRow, old: PairRow | None) -> PairRow:
     """A row with its status, and the acceptance of the former one."""
     if old is None:
-        return row._replace(status="same" if row.kind == Kind.FAR else "new")
+        return row._replace(status="same") if row.kind == Kind.FAR else row
     # an earlier call that came to no end has left what it would have told
     was_told = (old.kind != Kind.FAR and old.status != "new") or old.status == "gone"
     status: Status

@@ -6,6 +6,7 @@ depth (`kernels.triangles.depth`) from below. Conservative advancement proves th
 motion to another: all places move straight, and the surfaces stay apart.
 """
 
+import math
 from collections.abc import Callable, Iterator
 from itertools import product
 from typing import NamedTuple
@@ -34,8 +35,6 @@ CONTACT = 5e-5
 """Default of the contact tolerance, metres."""
 NORMALS = 4
 """Shifts along normals, tried before all others: they free most surfaces that touch."""
-AHEAD, BACK = [1, 2, 0], [2, 0, 1]
-"""Axes after each axis, and before it."""
 LEAST_BALL = 0.01
 """Least factor to which a ball shrinks."""
 SAME = 1e-6
@@ -238,7 +237,7 @@ class Separation:
         self._note_blocking(pairs)
         first, second = pairs[0]
         theirs = self._tool.tree.corners[second] @ pose[:3, :3].T
-        normals = _normals(np.array([self._object.tree.corners[first], theirs]))
+        normals = np.array([_normal(self._object.tree.corners[first]), _normal(theirs)])
         self._at_shifts = pose, np.concatenate([normals, -normals, DIRECTIONS])
         return self._at_shifts[1]
 
@@ -368,9 +367,10 @@ def _holds_piece(
     return interior is not None and bool(interior.holds(first[:n_in]).any())
 
 
-def _normals(triangles: Floats) -> Floats:
-    """Unit normals (N, 3) of triangles (N, 3, 3); zero where they have no area."""
-    u, v = triangles[:, 1] - triangles[:, 0], triangles[:, 2] - triangles[:, 0]
-    found = u[:, AHEAD] * v[:, BACK] - u[:, BACK] * v[:, AHEAD]  # `np.cross` takes ten times longer
-    lengths = np.array([[float(np.linalg.norm(normal))] for normal in found])
-    return np.asarray(found / np.where(lengths > 0.0, lengths, np.inf), dtype=np.float64)
+def _normal(triangle: Floats) -> tuple[float, ...]:
+    """Unit normal of a triangle (3, 3), zero without area: `numpy` takes ten times longer."""
+    (ax, ay, az), (bx, by, bz), (cx, cy, cz) = triangle.tolist()
+    ux, uy, uz, vx, vy, vz = bx - ax, by - ay, bz - az, cx - ax, cy - ay, cz - az
+    normal = uy * vz - uz * vy, uz * vx - ux * vz, ux * vy - uy * vx
+    length = math.hypot(*normal) or 1.0
+    return tuple(x / length for x in normal)

@@ -55,15 +55,14 @@ class Interior:
         local = surface.triangles - surface.center
         tree = sides.triangle_tree(local, surface.bodies)
         volumes = -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas
-        bodies, starts = np.unique(tree.bodies, return_index=True)
-        low = np.minimum.reduceat(tree.corners.min(axis=1), starts)
-        high = np.maximum.reduceat(tree.corners.max(axis=1), starts)
-        signs = np.where(np.bincount(surface.bodies, volumes)[bodies] > 0.0, 1, -1)
-        boxes, closed = np.stack([low, high], axis=1), bodies > 0
-        box = np.stack(
-            [low[closed].min(axis=0, initial=np.inf), high[closed].max(axis=0, initial=-np.inf)]
+        closed = np.unique(surface.bodies[surface.bodies > 0])
+        signs = np.where(np.bincount(surface.bodies, volumes)[closed] > 0.0, 1, -1)
+        boxes = sides.body_boxes(local, surface.bodies)[closed]
+        low, high = (
+            boxes[:, 0].min(axis=0, initial=np.inf),
+            boxes[:, 1].max(axis=0, initial=-np.inf),
         )
-        self.solid = Solid(tree, bodies[closed], signs[closed], boxes[closed], box)
+        self.solid = Solid(tree, closed, signs, boxes, np.stack([low, high]))
 
     def __bool__(self) -> bool:
         return self._ball is not None or len(self.solid.bodies) > 0

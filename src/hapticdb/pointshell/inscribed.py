@@ -298,9 +298,7 @@ def _solids_of(surface: "Surface") -> Ints:
         -(surface.normals * local.mean(axis=1)).sum(axis=1) * surface.areas,
         n_bodies,
     )
-    low, high = np.full((n_bodies, 3), np.inf), np.full((n_bodies, 3), -np.inf)
-    np.minimum.at(low, surface.bodies, local.min(axis=1))
-    np.maximum.at(high, surface.bodies, local.max(axis=1))
+    low, high = sides.body_boxes(local, surface.bodies).swapaxes(0, 1)
     solids = np.arange(n_bodies)
     walls = np.flatnonzero(volumes > 0.0)
     walls = walls[walls > 0]

@@ -307,13 +307,8 @@ def _guess(sides: _Sides, signs: Floats) -> None:
 
 def _voids(sides: _Sides, tree: "kernels.TriangleTree") -> NDArray[np.bool_]:
     """Whether each body (B,) is a void's wall: completely inside an odd number of closed bodies."""
-    n_bodies = int(sides.body.max()) + 1
-    low = np.full((n_bodies, 3), np.inf)  # as of 0: open bodies enclose nothing
-    high = -low
-    bodies, starts = np.unique(tree.bodies, return_index=True)
-    low[bodies] = np.minimum.reduceat(tree.corners.min(axis=1), starts)
-    high[bodies] = np.maximum.reduceat(tree.corners.max(axis=1), starts)
-    low[0], high[0] = np.inf, -np.inf
+    low, high = kernels.body_boxes(sides.triangles, sides.body).swapaxes(0, 1)
+    low[0], high[0], n_bodies = np.inf, -np.inf, len(low)  # open bodies enclose nothing
     pairs = [
         (inner, outer)
         for inner in range(1, n_bodies)

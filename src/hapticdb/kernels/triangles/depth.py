@@ -282,19 +282,17 @@ def pieces_kernel(corners, points, pieces, starts, pose, is_back, box, reach, ou
     corners (T, 3, 3), moved by a rigid pose (4, 4) or back; points (V,): numbers of corners; pieces
     (V,) of these, 0 to P - 1; starts (P,): a point of each; box (2, 3): larger by `reach` metres.
     """
-    place, count = np.empty(3), np.int64(0)
-    is_in = np.empty(starts.shape[0], dtype=np.bool_)
-    for piece in range(starts.shape[0]):
-        _place_corner(corners, points[starts[piece]], pose, is_back, place)
-        is_in[piece] = _below_ball(box, place, reach) >= 0.0
-        count += is_in[piece]
-    if count == 0:
-        return count
+    place, left = np.empty(3), starts.shape[0]
+    is_in = np.ones(starts.shape[0], dtype=np.bool_)
     for n in range(points.shape[0]):
         if is_in[pieces[n]]:
             _place_corner(corners, points[n], pose, is_back, place)
-            is_in[pieces[n]] = _below_ball(box, place, reach) >= 0.0
-    count = np.int64(0)
+            if _below_ball(box, place, reach) < 0.0:
+                is_in[pieces[n]] = False
+                left -= 1
+                if left == 0:
+                    return 0
+    count = 0
     for piece in range(starts.shape[0]):
         if is_in[piece]:
             _place_corner(corners, points[starts[piece]], pose, is_back, out[count])

@@ -280,6 +280,15 @@ def nearest_kernel(a, b, poses, farthest, enough, pairs, out):
         nearest_pair(a, b, poses[n], enough, nodes, squares, placed, found, pairs[n], out[n])
 
 
+@leaf
+def are_near(one, n, other, m, far, found):
+    """Whether two triangles are within `far` metres; found (7,) is scratch."""
+    return (
+        triangle_gap(one, n, other, m) < far * far
+        and measure_pair(one, n, other, m, 0.0, found)[1] <= far
+    )
+
+
 @entry(TREE, TREE, FLOATS2, FLOATS2, INTS2, FLOAT, INTS)
 def free_shift_kernel(a, b, pose, shifts, first, far, out):
     """Find a shift after which tree b, at a pose (4, 4) in a's frame, is `far` metres from a.
@@ -294,16 +303,13 @@ def free_shift_kernel(a, b, pose, shifts, first, far, out):
     while out[0] < shifts.shape[0]:
         for axis in range(3):
             here[axis, 3] = pose[axis, 3] + shifts[out[0], axis]
-        is_near = False
+        is_free = True
         for n in range(first.shape[0]):
             place_corners(b.corners, first[n, 1], first[n, 1] + 1, here, placed)
-            is_near = (
-                triangle_gap(a.corners, first[n, 0], placed, 0) < far * far
-                and measure_pair(a.corners, first[n, 0], placed, 0, 0.0, found)[1] <= far
-            )
-            if is_near:
+            is_free = not are_near(a.corners, first[n, 0], placed, 0, far, found)
+            if not is_free:
                 break
-        if not is_near:
+        if is_free:
             near[0], near[1] = far, math.inf
             nearest_pair(a, b, here, far, nodes, squares, placed, found, pair, near)
             if pair[0] < 0:

@@ -5,8 +5,7 @@ import math
 import numpy as np
 
 from hapticdb.kernels._jit import BOOL, FLOAT, FLOATS, FLOATS2, FLOATS3, INT, INTS2, entry, leaf
-from hapticdb.kernels.triangles.nearest import place_corners, triangle_gap
-from hapticdb.kernels.triangles.pairs import measure_pair
+from hapticdb.kernels.triangles.nearest import are_near, place_corners
 
 WHOLE, ACROSS, ALONG = range(3)
 """Direction of an offset: the normal, or its component across or along an axis."""
@@ -57,9 +56,6 @@ def any_near_kernel(one, other, pose, pairs, far, normals, is_other, reach, axis
                 first[0, i, x] = one[n, i, x] + (0.0 if is_other else by[0, i, x])
                 second[0, i, x] = other[m, i, x] + (by[0, i, x] if is_other else 0.0)
         place_corners(second, 0, 1, pose, placed)
-        if (
-            triangle_gap(first, 0, placed, 0) < far * far
-            and measure_pair(first, 0, placed, 0, 0.0, found)[1] <= far
-        ):
+        if are_near(first, 0, placed, 0, far, found):
             return True
     return False

@@ -263,6 +263,26 @@ BENDS: Layout = _record(
 )
 """The two ways in which a hollow surface bends towards a near point."""
 
+LOOK: Layout = _record(
+    [
+        ("number", "<i8"),
+        ("epoch", "<i8"),  # numbers of points that are older are forgotten
+        ("run", "<i8"),  # points of a run
+        # as FOLLOWER has them, for the pose that is tried
+        ("is_large", "?"),
+        ("is_anew", "?"),
+        ("is_bent", "?"),
+        ("merged", "<i8"),
+        ("travelled", "<f8"),
+        ("way", "<f8"),
+        ("pose", "<f8", (3, 4)),
+        # for `put_back` alone
+        ("last", "<i8"),  # point up to which stays what the look wrote
+        ("n_due", "<i8"),  # runs of its second launch
+    ]
+)
+"""What is asked of a look on the GPU (`kernels.gpu.looks`)."""
+
 FRAME: Layout = np.dtype(
     [
         ("time", "<f8"),  # s since the session's start, when the frame began

@@ -22,7 +22,7 @@ from hapticdb.kernels.hand.near_points import (
     POINTS_ANEW,
     SHUT,
 )
-from hapticdb.kernels.records import MOST_MISSED, views_of
+from hapticdb.kernels.records import LOOK, MOST_MISSED, views_of
 from hapticdb.kernels.resident.cells import LISTED, READER_STRIDE, Place
 from hapticdb.query.law import DISTANCE
 from hapticdb.resident.mirror import CellMirror
@@ -34,8 +34,6 @@ ROOM = 1 << 17, 8
 of a larger tool's, at 0.2 kB each. More make new room, in a frame that is late."""
 NOBODY = 1 << 62
 """In the place of a point's number: none."""
-NUMBER, RUN, LAST, N_DUE = map(kernels.Look._fields.index, ("number", "run", "last", "n_due"))
-"""Of `Look`."""
 NOTHING = np.array([0.0, 0.0, 0.0, NEVER])
 """What a look finds at first."""
 MERGES_FROM = 4096
@@ -120,14 +118,14 @@ class GpuQueries:
         self._stream = cuda.stream()
         self._nothing = cuda.to_device(NOTHING)
         self._found: NDArray[np.float64] = cuda.pinned_array(kernels.FOUND, np.float64)
-        self._asked: NDArray[np.float64] = cuda.pinned_array(kernels.ASKED, np.float64)
+        self._asked: NDArray[np.void] = cuda.pinned_array(1, LOOK)
         self._view = self._view_of(state)
         n_runs = self._view.run_due.size
         self._of_runs = min(-(-n_runs // kernels.THREADS_OF_RUNS), kernels.MOST_BLOCKS)
         self._of_points = min(n_runs, kernels.MOST_BLOCKS)
         self._kernel = kernels.look_at_runs(kernels.THREADS)
-        self._asked[:] = 0.0
-        self._asked[NUMBER], self._asked[RUN] = -1, 1
+        self._asked[:] = np.zeros((), LOOK)
+        self._asked["number"], self._asked["run"] = -1, 1
         self._launch_look()  # compiles them; no run is due yet
         self._launch_put_back()
         self._stream.synchronize()
@@ -153,7 +151,7 @@ class GpuQueries:
             epochs=cuda.to_device(np.full(n_runs, -1)),
             seen=cuda.to_device(np.zeros(n_runs, np.int64)),
             due_runs=cuda.device_array(n_runs, np.int64),
-            asked=cuda.device_array(kernels.ASKED, np.float64),
+            asked=cuda.device_array(1, LOOK),
             used=cuda.to_device(np.zeros(table.n_slots, np.uint8)),
             missed=cuda.to_device(np.full(kernels.ROOM_FOR_MISSED, -1)),
             found=cuda.to_device(NOTHING),
@@ -229,12 +227,11 @@ class GpuQueries:
         """Look at the tried pose once -> what was found (FOUND,). It forgets what it is to."""
         follower = self._follower
         self._n_looks += 1
-        asked = kernels.Look(
+        self._asked[0] = (
             self._n_looks, self._epoch, self._state.clusters.run, follower.is_large,
-            follower.anew > 0, follower.is_bent, follower.merged, -1, 0, follower.travelled,
-            follower.way, tuple(self._tried[:3].ravel().tolist()),
+            follower.anew > 0, follower.is_bent, follower.merged, follower.travelled, follower.way,
+            self._tried[:3], -1, 0,
         )  # fmt: skip
-        self._asked[: -len(asked.pose)], self._asked[-len(asked.pose) :] = asked[:-1], asked.pose
         follower.anew[()] = 0
         self._begin_look()
         self._stream.synchronize()
@@ -242,7 +239,7 @@ class GpuQueries:
 
     def _put_back(self, last: int, n_due: float) -> None:
         """Put back what a look wrote beyond a point; a later launch waits for it."""
-        self._asked[LAST], self._asked[N_DUE] = last, n_due
+        self._asked["last"], self._asked["n_due"] = last, n_due
         self._begin_put_back()
         self._stream.synchronize()
 

@@ -36,9 +36,8 @@ DUE_RUNS, NEARS, UNKNOWNS, LEAST, FOUND = 0, 1, 2, 3, 4
 """Of `Sight.found`: runs in the second launch; near points; points in unknown cells; the least way
 at which a run is due; their number."""
 
-_moved, _slot_of, _cell_key, _spread = map(
-    on_gpu, (rigid.moved, cells.slot_of, cells.cell_key, cells.spread_key)
-)
+_moved, _transform_of = map(on_gpu, (rigid.moved, rigid.transform_of))
+_slot_of, _cell_key, _spread = map(on_gpu, (cells.slot_of, cells.cell_key, cells.spread_key))
 _clamped_into, _bound_at, _distance_at, _rest_of_sphere = map(
     on_gpu,
     (
@@ -60,7 +59,7 @@ class Sight(NamedTuple):
     run_due (R,): as the record POINT has them; due_before, run_due_before: the same before the last
     look, of what it looked at; epochs (R,) int64: since when the points' numbers
     are true; seen (R,) int64: number of the last look at the run; due_runs (R,) int64: runs of the
-    second launch. asked (ASKED,): a look's `Look`. used (S,) uint8: slots that were read. missed
+    second launch. asked (1,): a look's LOOK. used (S,) uint8: slots that were read. missed
     (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. found (FOUND,).
     points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, if there are no more than M;
     neighbours lie side by side, since they are written to the memory of the processor.
@@ -83,49 +82,11 @@ class Sight(NamedTuple):
     near: Any
 
 
-class Look(NamedTuple):
-    """What is asked of a look: numbers of the coupling's record, as FOLLOWER has them.
-
-    epoch: numbers of points that are older are forgotten; run: points of a run; pose: the rows of
-    the pose that is tried. For `put_back` alone: last, the point up to which what the look wrote
-    stays, and n_due, the runs of its second launch.
-    """
-
-    number: int
-    epoch: int
-    run: int
-    is_large: int
-    is_anew: int
-    is_bent: int
-    merged: int
-    last: int
-    n_due: int
-    travelled: float
-    way: float
-    pose: tuple[float, ...]
-
-
-ASKED = 23
-"""Numbers of a `Look`."""
-
-
-@cuda.jit(device=True)
-def _look_of(asked):
-    """The `Look` that is in asked (ASKED,)."""
-    return Look(
-        int64(asked[0]), int64(asked[1]), int64(asked[2]), int64(asked[3]), int64(asked[4]),
-        int64(asked[5]), int64(asked[6]), int64(asked[7]), int64(asked[8]), asked[9], asked[10],
-        (
-            asked[11], asked[12], asked[13], asked[14], asked[15], asked[16], asked[17], asked[18],
-            asked[19], asked[20], asked[21], asked[22],
-        ),
-    )  # fmt: skip
-
-
 @cuda.jit
 def list_due_runs(place, seen, sight):
     """First launch. seen: `resident.cells.Seen`."""
-    least, asked = NEVER, _look_of(sight.asked)
+    least, asked = NEVER, sight.asked[0]
+    transform = _transform_of(asked.pose)
     for run in range(cuda.grid(1), sight.run_due.shape[0], cuda.gridsize(1)):
         before = -NEVER if asked.is_anew else sight.run_due[run]
         if asked.travelled < before:
@@ -133,7 +94,7 @@ def list_due_runs(place, seen, sight):
             continue
         sight.seen[run], sight.run_due_before[run] = asked.number, before
         if asked.is_large and (before == -NEVER or before >= asked.travelled - asked.way):
-            rest = _rest_of_sphere(seen, sight.spheres, run, asked.pose, place)
+            rest = _rest_of_sphere(seen, sight.spheres, run, transform, place)
             if rest > 0.0:
                 sight.run_due[run] = asked.travelled + rest
                 least = min(least, asked.travelled + rest)
@@ -169,9 +130,9 @@ def _write_near(payload, slot, mask, inside, lever, looked, is_bent, near, at):
 
 
 @cuda.jit(device=True)
-def _look_at_point(n, place, asked, seen, payload, sight):
+def _look_at_point(n, place, asked, transform, seen, payload, sight):
     """Look at point n, which is due -> when it is due again; see `near_points.look`."""
-    points, center, transform = sight.points, sight.points.shape[1] - 1, asked.pose
+    points, center = sight.points, sight.points.shape[1] - 1
     px, py, pz = _moved(transform, points[0, n], points[1, n], points[2, n])
     inside = _clamped_into(place, px, py, pz)
     key = _cell_key(np.int64(inside[0]), np.int64(inside[1]), np.int64(inside[2]))
@@ -210,7 +171,8 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
     def look(place, seen, payload, sight):
         best = cuda.shared.array(threads, float64)
         nobody = cuda.shared.array(threads, int64)
-        t, n_points, asked = cuda.threadIdx.x, sight.due.shape[0], _look_of(sight.asked)
+        t, n_points, asked = cuda.threadIdx.x, sight.due.shape[0], sight.asked[0]
+        transform = _transform_of(asked.pose)
         for at in range(cuda.blockIdx.x, np.int64(sight.found[DUE_RUNS]), cuda.gridDim.x):
             run, least = sight.due_runs[at], NEVER
             is_known, start = sight.epochs[run] == asked.epoch, run * asked.run
@@ -218,7 +180,7 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
                 due = sight.due[n] if is_known else -NEVER
                 sight.due_before[n] = due
                 if asked.travelled >= due:
-                    due = _look_at_point(n, place, asked, seen, payload, sight)
+                    due = _look_at_point(n, place, asked, transform, seen, payload, sight)
                     sight.due[n] = due
                 least = min(least, due)
             best[t], nobody[t] = least, 0
@@ -234,7 +196,7 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
 @cuda.jit
 def put_back(sight):
     """Put back what the look wrote beyond its point `last`, whose run is not done either."""
-    first, step, asked = cuda.grid(1), cuda.gridsize(1), _look_of(sight.asked)
+    first, step, asked = cuda.grid(1), cuda.gridsize(1), sight.asked[0]
     last = asked.last
     for run in range(max(last, 0) // asked.run + first, sight.seen.shape[0], step):
         if sight.seen[run] == asked.number:

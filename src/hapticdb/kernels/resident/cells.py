@@ -128,9 +128,8 @@ class Place(NamedTuple):
 PLACE = fields_of(Place, FLOAT, FLOAT, FLOAT, FLOAT, FLOAT)
 
 
-SCRATCH_ROWS = 21
-"""Rows of `Clusters.scratch`: 0-2 have the placed points in metres, 3-5 in voxels, the last two the
-cells that the run meets (`runs.cells_of_run`); the others belong to frames (`feeling`)."""
+SCRATCH_ROWS = 24
+"""Rows of `Clusters.scratch`, which `runs.Scratch` names."""
 
 
 class Clusters(NamedTuple):

@@ -67,27 +67,15 @@ from hapticdb.kernels.resident.cells import (
     seen_in,
 )
 from hapticdb.kernels.resident.runs import (
-    BASE,
-    BIT,
-    INDEX,
-    KEPT,
-    WORD,
     WORD_BITS,
     cells_of_run,
     keep_points,
     next_run,
     place_run,
+    scratch_of,
     words_of_run,
 )
 from hapticdb.kernels.rigid import is_rigid, moved, transform_of, turned
-
-NORMAL, LOOK_UP, PART, HERE, THERE, DEPTH, WEIGHT = 6, 11, 12, 15, 16, 17, 18
-"""Rows of the scratch, after the six of `place_run` and beside `runs.INDEX` and `runs.BASE`.
-
-The turned normal (3); the index of the lowest corner around a place, and the place between the
-corners (3); distance at the point and ahead of it, voxels; depth, m; weight. Indices are whole
-numbers that a float has exactly.
-"""
 
 
 def _in_near_voxels(law, words, near):  # noqa: ARG001 - the arguments of each choice
@@ -120,7 +108,7 @@ def _near_of_run(
     last_key, slot, mask, base = last
     n_near = n_unknown = np.int64(0)
     for at in range(count):
-        x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
+        x, y, z = scratch.x[at], scratch.y[at], scratch.z[at]
         if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
             continue
         i, j, k = np.int64(x), np.int64(y), np.int64(z)
@@ -138,12 +126,12 @@ def _near_of_run(
         hit, bit = bit_in(words[slot, column], k), bit_in(seen.words[slot, column], k)
         met[n_hits] = start + at
         n_hits += np.int64(hit)
-        scratch[0, n_near], scratch[3, n_near] = scratch[0, at], x
-        scratch[1, n_near], scratch[4, n_near] = scratch[1, at], y
-        scratch[2, n_near], scratch[5, n_near] = scratch[2, at], z
-        scratch[INDEX, n_near], scratch[BASE, n_near] = start + at, base
+        scratch.px[n_near], scratch.x[n_near] = scratch.px[at], x
+        scratch.py[n_near], scratch.y[n_near] = scratch.py[at], y
+        scratch.pz[n_near], scratch.z[n_near] = scratch.pz[at], z
+        scratch.number[n_near], scratch.base[n_near] = start + at, base
         if anyway:
-            scratch[WORD, n_near] = (slot << WORD_BITS) + column
+            scratch.word[n_near] = (slot << WORD_BITS) + column
         n_near += np.int64(bit) | anyway
     return n_near, n_hits, n_missed, n_unknown, (last_key, slot, mask, base)
 
@@ -157,14 +145,14 @@ def _near_in_cells(words, felt, start, count, box, scratch, met, n_hits):
     words_of_run(count, box, start, scratch)
     n_near = np.int64(0)
     for at in range(count):
-        word, k = np.int64(scratch[WORD, at]), np.int64(scratch[BIT, at])
+        word, k = np.int64(scratch.word[at]), np.int64(scratch.bit[at])
         slot, column = word >> WORD_BITS, word & (CELL_WORDS - 1)
         hit, bit = bit_in(words[slot, column], k), bit_in(felt[slot, column], k)
         met[n_hits] = start + at
         n_hits += np.int64(hit)
-        scratch[KEPT, n_near] = at
+        scratch.kept[n_near] = at
         n_near += np.int64(bit)
-    keep_points(scratch, count, n_near, BASE + 1)
+    keep_points(scratch, count, n_near)
     return n_near, n_hits
 
 
@@ -172,32 +160,32 @@ def _near_in_cells(words, felt, start, count, box, scratch, met, n_hits):
 def _turn_normals(points, transform, scratch, count):
     """Turned normals of the first points of `scratch`."""
     for at in range(count):
-        n = np.int64(scratch[INDEX, at])
+        n = np.int64(scratch.number[at])
         nx, ny, nz = turned(transform, points[n, 3], points[n, 4], points[n, 5])
-        scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at] = nx, ny, nz
+        scratch.nx[at], scratch.ny[at], scratch.nz[at] = nx, ny, nz
 
 
 @inlined
 def _find_places(scratch, count, ahead):
     """Where to look up the first points of `scratch`, moved `ahead` voxels along their normals."""
     for at in range(count):
-        x = scratch[3, at] + ahead * scratch[NORMAL, at]
-        y = scratch[4, at] + ahead * scratch[NORMAL + 1, at]
-        z = scratch[5, at] + ahead * scratch[NORMAL + 2, at]
+        x = scratch.x[at] + ahead * scratch.nx[at]
+        y = scratch.y[at] + ahead * scratch.ny[at]
+        z = scratch.z[at] + ahead * scratch.nz[at]
         x0, y0, z0 = np.floor(x - 0.5), np.floor(y - 0.5), np.floor(z - 0.5)
-        scratch[LOOK_UP, at] = scratch[BASE, at] + place_before(x0, y0, z0)
-        scratch[PART, at] = x - 0.5 - x0
-        scratch[PART + 1, at] = y - 0.5 - y0
-        scratch[PART + 2, at] = z - 0.5 - z0
+        scratch.look_up[at] = scratch.base[at] + place_before(x0, y0, z0)
+        scratch.part_x[at] = x - 0.5 - x0
+        scratch.part_y[at] = y - 0.5 - y0
+        scratch.part_z[at] = z - 0.5 - z0
 
 
 @inlined
-def _look_up(payload, scratch, count, row):
+def _look_up(payload, scratch, count, out):
     """Distances u, voxels, at the places of the first points of `scratch`, into a row of it."""
     for at in range(count):
-        scratch[row, at] = VOXELS_A_STEP * interpolated(
-            payload, np.uint64(np.int64(scratch[LOOK_UP, at])), scratch[PART, at],
-            scratch[PART + 1, at], scratch[PART + 2, at],
+        out[at] = VOXELS_A_STEP * interpolated(
+            payload, np.uint64(np.int64(scratch.look_up[at])), scratch.part_x[at],
+            scratch.part_y[at], scratch.part_z[at],
         )  # fmt: skip
 
 
@@ -208,21 +196,20 @@ def _weigh_by_distance(law, cells, points, transform, place, scratch, count):  #
     frame of 100,000 contacts.
     """
     payload = cells.payload
-    for row in range(NORMAL, NORMAL + 3):
-        for at in range(count):
-            scratch[row, at] = 0.0
+    for at in range(count):
+        scratch.nx[at] = scratch.ny[at] = scratch.nz[at] = 0.0
     _find_places(scratch, count, 0.0)
     for at in range(count):
-        fetch_corners(payload, np.uint64(np.int64(scratch[LOOK_UP, at])))
+        fetch_corners(payload, np.uint64(np.int64(scratch.look_up[at])))
     _turn_normals(points, transform, scratch, count)
-    _look_up(payload, scratch, count, HERE)
+    _look_up(payload, scratch, count, scratch.here)
     _find_places(scratch, count, AHEAD)
-    _look_up(payload, scratch, count, THERE)
+    _look_up(payload, scratch, count, scratch.there)
     for at in range(count):
-        share = agreement(scratch[HERE, at], scratch[THERE, at])
-        depth, weight = depth_and_weight(scratch[HERE, at], place.size)
-        scratch[DEPTH, at] = max(depth * share, 0.0)
-        scratch[WEIGHT, at] = weight * share
+        share = agreement(scratch.here[at], scratch.there[at])
+        depth, weight = depth_and_weight(scratch.here[at], place.size)
+        scratch.depth[at] = max(depth * share, 0.0)
+        scratch.weight[at] = weight * share
 
 
 @inlined
@@ -236,14 +223,14 @@ def _weigh_by_plane(law, cells, points, transform, place, scratch, count):  # no
     _turn_normals(points, transform, scratch, count)
     for at in range(count):
         depth = depth_below_plane(
-            scratch[0, at], scratch[1, at], scratch[2, at],
-            scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at],
-            _center_on_axis(place.x, place.size, scratch[3, at]),
-            _center_on_axis(place.y, place.size, scratch[4, at]),
-            _center_on_axis(place.z, place.size, scratch[5, at]),
+            scratch.px[at], scratch.py[at], scratch.pz[at],
+            scratch.nx[at], scratch.ny[at], scratch.nz[at],
+            _center_on_axis(place.x, place.size, scratch.x[at]),
+            _center_on_axis(place.y, place.size, scratch.y[at]),
+            _center_on_axis(place.z, place.size, scratch.z[at]),
         )  # fmt: skip
-        scratch[DEPTH, at] = max(depth, 0.0)
-        scratch[WEIGHT, at] = 1.0
+        scratch.depth[at] = max(depth, 0.0)
+        scratch.weight[at] = 1.0
 
 
 def _weigh_by_leaves(law, cells, points, transform, place, scratch, count):
@@ -251,22 +238,22 @@ def _weigh_by_leaves(law, cells, points, transform, place, scratch, count):
     payload = cells.payload
     _turn_normals(points, transform, scratch, count)
     for at in range(count):
-        word, x, y, z = np.int64(scratch[WORD, at]), scratch[3, at], scratch[4, at], scratch[5, at]
+        word, x, y, z = np.int64(scratch.word[at]), scratch.x[at], scratch.y[at], scratch.z[at]
         slot = word >> WORD_BITS
         is_hit = bit_in(cells.words[slot, word & (CELL_WORDS - 1)], np.int64(z)) != 0
         sample = sample_slot(law, payload, slot, x, y, z)
-        scratch[DEPTH, at] = scratch[WEIGHT, at] = 0.0
+        scratch.depth[at] = scratch.weight[at] = 0.0
         if not (is_hit or sample <= reach(law)):
             continue
-        nx, ny, nz = scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at]
+        nx, ny, nz = scratch.nx[at], scratch.ny[at], scratch.nz[at]
         depth, weight = respond(
-            law, is_hit, sample, scratch[0, at], scratch[1, at], scratch[2, at], nx, ny, nz,
+            law, is_hit, sample, scratch.px[at], scratch.py[at], scratch.pz[at], nx, ny, nz,
             _center_on_axis(place.x, place.size, x), _center_on_axis(place.y, place.size, y),
             _center_on_axis(place.z, place.size, z), place.size,
         )  # fmt: skip
         share = share_slot(law, payload, slot, x, y, z, nx, ny, nz, sample)
-        scratch[DEPTH, at] = max(depth * share, 0.0)
-        scratch[WEIGHT, at] = weight * share
+        scratch.depth[at] = max(depth * share, 0.0)
+        scratch.weight[at] = weight * share
 
 
 OF_LAWS: dict[type, Any] = {
@@ -288,7 +275,7 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
     of the unknown cells that hold points. A point in an unknown cell is neither a hit nor a miss.
     Arithmetic and order of the sums are those of `contact.locate` and `refining.refine`.
     """
-    points, scratch, words, n_runs = shell.points, shell.scratch, cells.words, n_runs_of(shell)
+    points, scratch, words, n_runs = shell.points, scratch_of(shell), cells.words, n_runs_of(shell)
     felt_in, margin, anyway = felt_where(law, words, cells.near)
     seen = seen_in(cells, which, felt_in)
     transform = transform_of(pose)
@@ -318,13 +305,13 @@ def felt(law, cells, which, shell, pose, place, met, missed, out):
             continue
         _weigh(law, cells, points, transform, place, scratch, n_near)
         for at in range(n_near):
-            depth = scratch[DEPTH, at]
-            weight += scratch[WEIGHT, at]
+            depth = scratch.depth[at]
+            weight += scratch.weight[at]
             n_contacts += depth > 0.0
             deepest = max(deepest, depth)
             point = (
-                scratch[0, at], scratch[1, at], scratch[2, at],
-                scratch[NORMAL, at], scratch[NORMAL + 1, at], scratch[NORMAL + 2, at],
+                scratch.px[at], scratch.py[at], scratch.pz[at],
+                scratch.nx[at], scratch.ny[at], scratch.nz[at],
             )  # fmt: skip
             sums = accumulate(sums, point, center, depth, law.stiffness)
     average_into(out, weight, sums)

@@ -17,7 +17,7 @@ from hapticdb.kernels.resident.cells import (
     n_runs_of,
     slot_of,
 )
-from hapticdb.kernels.resident.runs import next_run, place_run
+from hapticdb.kernels.resident.runs import next_run, place_run, scratch_of
 from hapticdb.kernels.rigid import transform_of
 
 NOTHING, UNDECIDED = -1, -2
@@ -26,12 +26,12 @@ a cell that is not."""
 
 
 @inlined
-def _hit_in_run(seen, shell, run, transform, place):
+def _hit_in_run(seen, shell, scratch, run, transform, place):
     """A point of a run that is in an occupied voxel, NOTHING or UNDECIDED."""
-    scratch, side, hit = shell.scratch, place.side, np.int64(NOTHING)
+    side, hit = place.side, np.int64(NOTHING)
     start, count = place_run(shell, run, transform, place, scratch)
     for at in range(count):
-        x, y, z = scratch[3, at], scratch[4, at], scratch[5, at]
+        x, y, z = scratch.x[at], scratch.y[at], scratch.z[at]
         if not (0.0 <= x < side and 0.0 <= y < side and 0.0 <= z < side):
             continue
         i, j, k = np.int64(x), np.int64(y), np.int64(z)
@@ -46,14 +46,14 @@ def _hit_in_run(seen, shell, run, transform, place):
 @inlined
 def _first_hit(seen, shell, transform, place, begin):
     """A point that hits, NOTHING or UNDECIDED; the search begins at run `begin`."""
-    hit = np.int64(NOTHING)
+    scratch, hit = scratch_of(shell), np.int64(NOTHING)
     for turn in range(2):  # from there to the end, then the runs before
         run, end = (begin, n_runs_of(shell)) if turn == 0 else (np.int64(0), begin)
         while True:
             run = next_run(seen, shell, run, end, transform, place, 0.0)
             if run >= end:
                 break
-            found = _hit_in_run(seen, shell, run, transform, place)
+            found = _hit_in_run(seen, shell, scratch, run, transform, place)
             if found >= 0:
                 return found
             hit = min(hit, found)

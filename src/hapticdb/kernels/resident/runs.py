@@ -1,5 +1,7 @@
 """Runs of a shell's points: which runs are far from everything, and where the others lie."""
 
+from typing import NamedTuple
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,6 +13,7 @@ from hapticdb.kernels.resident.cells import (
     EMPTY_SLOT,
     GROUP,
     UNKNOWN,
+    Floats,
     in_voxels,
     key_of_cell,
     slot_of,
@@ -23,18 +26,60 @@ MOST_CELLS = 8
 """Most cells of a box that are read. A larger box counts as near, and its points are looked up."""
 
 
-SLOT_OF, BASE_OF = 19, 20
-"""Rows of the scratch: slots of the cells that a run meets, and where their distances begin."""
-PLACES = 6
-"""Rows of the scratch with the placed points."""
-INDEX, BASE, WORD, BIT, KEPT = 9, 10, 11, 12, 15
-"""Rows of the scratch for one run in cells: a point's index; where its cell's distances begin, less
-the way to the cell's first centre; which word holds its voxel, of all words of the table, and which
-bit; the points that are kept. Frames use these rows for other things later."""
 WORD_BITS = 10
 """Binary logarithm of `CELL_WORDS`."""
 FURTHEST = float(1 << 22)
 """Voxels: beyond every grid, and within 32 bits."""
+
+
+class Scratch(NamedTuple):
+    """A placed run of a shell: rows of `Clusters.scratch`, each with a number for each point.
+
+    px, py, pz: metres; x, y, z: voxels; nx, ny, nz: turned normal; number: the point's; base: where
+    the distances of its cell begin, less the way to the cell's first centre; word, bit: the word
+    that holds its voxel, of all words of the table, and the bit; kept: the points that are kept;
+    look_up: index of the lowest corner around a place; part_x, part_y, part_z: the place between
+    the corners; here, there: distance at the point and ahead of it, voxels; depth, m; weight.
+    slot_of, base_of: of the cells that the run meets.
+
+    Rows are arrays of their own, and no records of points, so that the compiler vectorizes loops
+    over points. Indices are whole numbers below 2^53, which a float has exactly.
+    """
+
+    px: Floats
+    py: Floats
+    pz: Floats
+    x: Floats
+    y: Floats
+    z: Floats
+    nx: Floats
+    ny: Floats
+    nz: Floats
+    number: Floats
+    base: Floats
+    word: Floats
+    bit: Floats
+    kept: Floats
+    look_up: Floats
+    part_x: Floats
+    part_y: Floats
+    part_z: Floats
+    here: Floats
+    there: Floats
+    depth: Floats
+    weight: Floats
+    slot_of: Floats
+    base_of: Floats
+
+
+@inlined
+def scratch_of(shell):
+    """Rows of a shell's scratch; for leaves, not for entries."""
+    r = shell.scratch
+    return Scratch(
+        r[0], r[1], r[2], r[3], r[4], r[5], r[6], r[7], r[8], r[9], r[10], r[11],
+        r[12], r[13], r[14], r[15], r[16], r[17], r[18], r[19], r[20], r[21], r[22], r[23],
+    )  # fmt: skip
 
 
 def _masks_of_runs(stride: int) -> NDArray[np.uint64]:
@@ -170,7 +215,7 @@ def next_run(seen, shell, run, end, transform, place, reached):
 
 @inlined
 def place_run(shell, run, transform, place, scratch):
-    """Place the points of a run: scratch takes metres (rows 0-2), voxels (rows 3-5).
+    """Place the points of a run: scratch takes metres and voxels.
 
     Returns the first point and their number. One loop for each axis, which the compiler vectorizes:
     this halves the time of a flat frame of 100,000 points.
@@ -181,13 +226,13 @@ def place_run(shell, run, transform, place, scratch):
     for at in range(count):
         x, y, z = columns[0, start + at], columns[1, start + at], columns[2, start + at]
         x, y, z = moved(transform, x, y, z)
-        scratch[0, at], scratch[1, at], scratch[2, at] = x, y, z
+        scratch.px[at], scratch.py[at], scratch.pz[at] = x, y, z
     for at in range(count):
-        scratch[3, at] = (scratch[0, at] - ox) / size
+        scratch.x[at] = (scratch.px[at] - ox) / size
     for at in range(count):
-        scratch[4, at] = (scratch[1, at] - oy) / size
+        scratch.y[at] = (scratch.py[at] - oy) / size
     for at in range(count):
-        scratch[5, at] = (scratch[2, at] - oz) / size
+        scratch.z[at] = (scratch.pz[at] - oz) / size
     return start, count
 
 
@@ -201,20 +246,20 @@ def _voxel_on_axis(x):
 def cells_of_run(seen, count, side, scratch):
     """Slots of the cells that a placed run meets, into the scratch -> cells, and where they begin.
 
-    The cells are those of the box around the run's voxels, k fastest, then j; `BASE_OF` takes where
+    The cells are those of the box around the run's voxels, k fastest, then j; `base_of` takes where
     the distances of each begin, less the way to the cell's first centre. Returns their number, the
     numbers along j and k, and the first cell. The number is 0 if none holds anything, and below 0
     if the run must be looked up point by point: a part of it is outside the grid or in a cell that
     is unknown, or it meets more than `MOST_CELLS`. The loop over points is plain, so that the
     compiler vectorizes it.
     """
-    i0 = i1 = _voxel_on_axis(scratch[3, 0])
-    j0 = j1 = _voxel_on_axis(scratch[4, 0])
-    k0 = k1 = _voxel_on_axis(scratch[5, 0])
+    i0 = i1 = _voxel_on_axis(scratch.x[0])
+    j0 = j1 = _voxel_on_axis(scratch.y[0])
+    k0 = k1 = _voxel_on_axis(scratch.z[0])
     for at in range(count):
-        i = _voxel_on_axis(scratch[3, at])
-        j = _voxel_on_axis(scratch[4, at])
-        k = _voxel_on_axis(scratch[5, at])
+        i = _voxel_on_axis(scratch.x[at])
+        j = _voxel_on_axis(scratch.y[at])
+        k = _voxel_on_axis(scratch.z[at])
         i0, i1 = min(i0, i), max(i1, i)
         j0, j1 = min(j0, j), max(j1, j)
         k0, k1 = min(k0, k), max(k1, k)
@@ -233,15 +278,15 @@ def cells_of_run(seen, count, side, scratch):
         if slot > EMPTY_SLOT:
             seen.used[slot] = 1
             met |= seen.masks[slot]
-        scratch[SLOT_OF, n] = slot
+        scratch.slot_of[n] = slot
         first = cell_place(np.int64(0), np.int64(0), np.int64(0)) + slot * CELL_VALUES
-        scratch[BASE_OF, n] = float(first - place_before(i << 5, j << 5, k << 5))
+        scratch.base_of[n] = float(first - place_before(i << 5, j << 5, k << 5))
     return n_cells if met else np.int64(0), n_j, n_k, ci, cj, ck
 
 
 @inlined
 def words_of_run(count, box, start, scratch):
-    """Enter `INDEX`, `BASE`, `WORD` and `BIT` of a run in the cells that `cells_of_run` found.
+    """Enter number, base, word and bit of a run in the cells that `cells_of_run` found.
 
     All numbers are whole and below 2^53, so floats have them exactly, and the compiler vectorizes
     the loops: it cannot do so with integers of 64 bits. Runs in a single cell, more than half of
@@ -249,37 +294,35 @@ def words_of_run(count, box, start, scratch):
     """
     n_cells, n_j, n_k, ci, cj, ck = box
     for at in range(count):
-        scratch[INDEX, at] = start + at
-        scratch[BIT, at] = np.floor(scratch[5, at]) - 32.0 * np.floor(scratch[5, at] / 32.0)
+        scratch.number[at] = start + at
+        scratch.bit[at] = np.floor(scratch.z[at]) - 32.0 * np.floor(scratch.z[at] / 32.0)
     if n_cells == 1:
-        first = scratch[SLOT_OF, 0] * CELL_WORDS - 32.0 * (32.0 * ci + cj)
-        base = scratch[BASE_OF, 0]
+        first = scratch.slot_of[0] * CELL_WORDS - 32.0 * (32.0 * ci + cj)
+        base = scratch.base_of[0]
         for at in range(count):
-            scratch[WORD, at] = first + 32.0 * np.floor(scratch[3, at]) + np.floor(scratch[4, at])
-            scratch[BASE, at] = base
+            scratch.word[at] = first + 32.0 * np.floor(scratch.x[at]) + np.floor(scratch.y[at])
+            scratch.base[at] = base
         return
     for at in range(count):
-        i, j = np.floor(scratch[3, at] / 32.0), np.floor(scratch[4, at] / 32.0)
-        cell = ((i - ci) * n_j + (j - cj)) * n_k + (np.floor(scratch[5, at] / 32.0) - ck)
-        scratch[KEPT, at] = cell
-        scratch[WORD, at] = (
-            32.0 * (np.floor(scratch[3, at]) - 32.0 * i) + np.floor(scratch[4, at]) - 32.0 * j
+        i, j = np.floor(scratch.x[at] / 32.0), np.floor(scratch.y[at] / 32.0)
+        cell = ((i - ci) * n_j + (j - cj)) * n_k + (np.floor(scratch.z[at] / 32.0) - ck)
+        scratch.kept[at] = cell
+        scratch.word[at] = (
+            32.0 * (np.floor(scratch.x[at]) - 32.0 * i) + np.floor(scratch.y[at]) - 32.0 * j
         )
     for at in range(count):
-        cell = np.int64(scratch[KEPT, at])
-        scratch[WORD, at] += CELL_WORDS * scratch[SLOT_OF, cell]
-        scratch[BASE, at] = scratch[BASE_OF, cell]
+        cell = np.int64(scratch.kept[at])
+        scratch.word[at] += CELL_WORDS * scratch.slot_of[cell]
+        scratch.base[at] = scratch.base_of[cell]
 
 
 @inlined
-def keep_points(scratch, count, n_kept, n_rows):
-    """Move the points of a run that are listed in `KEPT` to the front, if not all of them are.
-
-    Moved are the first `n_rows` rows: those of the places, and from `INDEX` on.
-    """
+def keep_points(scratch, count, n_kept):
+    """Move the points of a run that are listed as kept to the front, if not all of them are."""
     if n_kept == count:
         return
-    for row in range(n_rows):
-        if row < PLACES or row >= INDEX:
-            for n in range(n_kept):
-                scratch[row, n] = scratch[row, np.int64(scratch[KEPT, n])]
+    for n in range(n_kept):
+        at = np.int64(scratch.kept[n])
+        scratch.px[n], scratch.py[n], scratch.pz[n] = scratch.px[at], scratch.py[at], scratch.pz[at]
+        scratch.x[n], scratch.y[n], scratch.z[n] = scratch.x[at], scratch.y[at], scratch.z[at]
+        scratch.number[n], scratch.base[n] = scratch.number[at], scratch.base[at]

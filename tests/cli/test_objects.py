@@ -1,6 +1,7 @@
 """The listing of objects: filtered, cut where a terminal shows it, in columns."""
 
 import json
+import re
 from pathlib import Path
 
 import pytest
@@ -56,6 +57,25 @@ def test_a_terminal_has_as_many_as_it_shows(bolts: Path) -> None:
     text = "".join(lines)
     assert "bolt_39" in text
     assert "bolt_40" not in text
+
+
+def test_a_table_is_as_narrow_as_the_terminal(bolts: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "52")
+    lines = on_terminal("objects", bolts, "--limit", 3).splitlines()[:-1]
+    assert max(map(len, lines)) <= 52
+    assert "fr…bolt_1" in lines[3]
+    monkeypatch.setenv("COLUMNS", "40")
+    shown = on_terminal("info", bolts)
+    assert max(map(len, shown.splitlines())) <= 40
+    assert re.search(r"scene +.*\n +\S", shown)  # goes on below its beginning
+
+
+def test_a_verdict_has_a_colour_on_a_terminal_unless_none_is_wanted(
+    bolts: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    assert "\x1b[32m" in on_terminal("check", bolts)
+    monkeypatch.setenv("NO_COLOR", "1")
+    assert "\x1b[3" not in on_terminal("check", bolts).rpartition("\x1b[2K")[2]
 
 
 # -- columns --------------------------------------------------------------------------------------

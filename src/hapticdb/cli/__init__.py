@@ -6,6 +6,7 @@ and exit code 2; anything unforeseen one line and exit code 1, its traceback beh
 
 import contextlib
 import os
+import re
 import sys
 import traceback
 from collections.abc import Callable, Sequence
@@ -111,16 +112,17 @@ def _fail(message: str, code: int, *, show_trace: bool = False) -> int:
 def _usage(error: Exception) -> str:
     """Typer's complaint as one line that says where to look."""
     text = str(error.format_message()).replace("Value error, ", "").rstrip(".")  # type: ignore[attr-defined]
+    text = re.sub(r" \(Possible options: (.*)\)", r"; did you mean \1?", text)
     context = getattr(error, "ctx", None)
     command = getattr(context, "command_path", "hapticdb")
     return f"{text[:1].lower()}{text[1:]}; see '{command} --help'"
 
 
 def _print_anything() -> None:
-    """Print characters that the terminal's encoding lacks as escapes, and not as an error."""
+    """Print what the terminal's encoding lacks in ASCII or as escapes, and not as an error."""
     for stream in (sys.stdout, sys.stderr):
         if hasattr(stream, "reconfigure"):
-            stream.reconfigure(errors="backslashreplace")
+            stream.reconfigure(errors="as_ascii")
 
 
 def _close_stdout() -> None:

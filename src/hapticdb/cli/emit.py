@@ -29,12 +29,14 @@ class Output:
 
     json: bool = False
 
-    def emit(self, result: object, words: str | Callable[[], object]) -> None:
-        """Write a result as JSON, or its words: a line, or what prints them."""
+    def emit(
+        self, result: object, words: str | Callable[[], object], status: int | None = None
+    ) -> None:
+        """Write a result as JSON, or its words: a line, or what prints them; status : as `say`."""
         if self.json:
             render.say_json(result)
         elif isinstance(words, str):
-            render.say(words)
+            render.say(words, status)
         else:
             words()
 

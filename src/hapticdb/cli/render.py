@@ -1,10 +1,13 @@
 """What people see: tables and notes; bars on a terminal only."""
 
+import codecs
 import json
+import os
 import re
 import shlex
 import shutil
 import sys
+import textwrap
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -25,6 +28,12 @@ _UNPRINTABLE = re.compile(
 )
 """Controls of a terminal, and of the direction of writing; a line's end is neither."""
 NEW_LINE = "\n"
+COLOURS = {0: 32, 1: 31}
+"""Green and red of a terminal, for exit codes of verdicts; others are yellow, 33."""
+ASCII = {"─": "-", "…": "...", "µ": "u", "±": "+-", "³": "3"}
+"""What stands for our characters where an encoding lacks them."""
+NARROW = 8
+"""Columns that a cut text has at least."""
 GAP, FACTS_GAP = 3, 2
 """Blanks between two columns of a table, and between a name and its value."""
 
@@ -57,9 +66,25 @@ def program() -> str:
     return "hapticdb" if shutil.which("hapticdb") == str(Path(run).absolute()) else shlex.quote(run)
 
 
-def say(text: str = "") -> None:
-    """Print a line of a result."""
-    print(printable(text))
+def say(text: str = "", status: int | None = None) -> None:
+    """Print a line of a result; the first clause of a verdict in the colour of its exit code."""
+    shown, plain_one = printable(text), os.environ.get("NO_COLOR") or not sys.stdout.isatty()
+    if status is not None and not plain_one:
+        clause = re.split("[:;,]", shown, maxsplit=1)[0]
+        colour = COLOURS.get(status, 33)
+        shown = f"\x1b[{colour}m{clause}\x1b[0m{shown.removeprefix(clause)}"
+    print(shown)
+
+
+def as_ascii(error: UnicodeError) -> tuple[str, int]:
+    """Replace what an encoding lacks, by `ASCII` or an escape: a handler of encoding errors."""
+    assert isinstance(error, UnicodeEncodeError)  # noqa: S101 - of a stream that is written
+    lacking = error.object[error.start : error.end]
+    escaped = (ASCII.get(one) or one.encode("unicode_escape").decode() for one in lacking)
+    return "".join(escaped), error.end
+
+
+codecs.register_error("as_ascii", as_ascii)
 
 
 def say_json(result: object) -> None:
@@ -70,31 +95,55 @@ def say_json(result: object) -> None:
 def table(headings: Sequence[str], rows: Iterable[Sequence[str]]) -> None:
     """Print rows under headings; a heading that ends in ``>`` is of a column of numbers."""
     numbers = [heading.endswith(">") for heading in headings]
-    lines = _laid([[heading.rstrip(">") for heading in headings], *rows], numbers, GAP)
+    lines = _laid([[heading.rstrip(">") for heading in headings], *rows], numbers)
     rule = "─" * (max(map(_width_of, lines)) + 2)
     print("\n".join([f" {lines[0]}", rule, *(f" {line}" for line in lines[1:])]))
 
 
 def facts(rows: Iterable[tuple[str, str]]) -> None:
-    """Print names and values, a pair a line."""
-    print("\n".join(_laid([*rows], [False, False], FACTS_GAP)))
+    """Print names and values, a pair a line; on a terminal long ones in lines below one another."""
+    pairs = [*rows]
+    indent = max(len(name) for name, _ in pairs) + FACTS_GAP
+    for name, value in pairs:
+        shown = printable(value).replace(NEW_LINE, "\\n")
+        room = max(_room() - indent, NARROW)
+        lines = textwrap.wrap(shown, room) if len(shown) > room else [shown]
+        print(f"{name:<{indent}}" + f"\n{'':<{indent}}".join(lines))
 
 
-def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool], gap: int) -> list[str]:
-    """Lines of rows whose columns are as wide as they need.
+def _room() -> int:
+    """Columns of the terminal; as many as are needed where there is none."""
+    return shutil.get_terminal_size().columns if sys.stdout.isatty() else sys.maxsize
+
+
+def _cut(text: str, width: int) -> str:
+    """Text without its middle, so that it is no wider."""
+    if _width_of(text) <= width:
+        return text
+    head = (width - 1) // 3
+    return f"{text[:head]}…{text[head + 1 - width :]}"
+
+
+def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
+    """Lines of rows whose columns are as wide as they need, or texts cut to fit a terminal.
 
     Of 4,000 objects a general table library laid out the columns in 9.8 of 11 s, under a profiler.
     """
     cells = [[printable(text).replace(NEW_LINE, "\\n") for text in row] for row in rows]
     widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
+    texts = [n for n, is_number in enumerate(numbers) if not is_number]
+    room = _room() - 2 - GAP * (len(widths) - 1)
+    while sum(widths) > room and (widest := max(widths[n] for n in texts)) > NARROW:
+        widths[next(n for n in texts if widths[n] == widest)] -= 1
     lines = []
-    for row in cells:
+    for full in cells:
+        row = [_cut(text, width) for text, width in zip(full, widths, strict=True)]
         blanks = [" " * (width - _width_of(text)) for text, width in zip(row, widths, strict=True)]
         padded = (
             blank + text if is_number else text + blank
             for text, blank, is_number in zip(row, blanks, numbers, strict=True)
         )
-        lines.append((" " * gap).join(padded).rstrip())
+        lines.append((" " * GAP).join(padded).rstrip())
     return lines
 
 

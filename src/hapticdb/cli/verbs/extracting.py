@@ -135,7 +135,7 @@ def extract(
     found: Extraction | Disassembly
     steps: list[tuple[Extraction, Sequence[int]]]
     with hapticdb.open(url, read_only=True) as env:
-        ids = ids_of(env, parts, "PART")
+        ids = ids_of(env, parts, "WORDS")
         chosen = felt.felt(env, ids)
         kept = ids_of(env, order.keep, "--keep") if order.keep else []
         with render.bar("pulling", "searches" if order.on else "pulls") as progress:
@@ -195,7 +195,7 @@ def _report(
     written = [("path", names), ("animation", output.animation if steps else "")]
 
     def words() -> None:
-        render.say(line)
+        render.say(line, found.verdict.exit_status)
         render.facts([*shown(), *((name, file) for name, file in written if file)])
 
     output.emit({"line": line} | plain(found), words)

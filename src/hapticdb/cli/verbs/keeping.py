@@ -1,5 +1,6 @@
 """The verbs that keep an environment: check, backup, grant."""
 
+from functools import partial
 from typing import TYPE_CHECKING
 
 import typer
@@ -41,10 +42,7 @@ def check(url: str, *, repair: bool = False, output: Output) -> None:
         with render.bar("mending", "objects") as progress:
             repair_environment(url, report, progress=progress)
         report = _read(url)
-    lines = list(report.findings)
-    if report.n_findings > len(lines):
-        lines.append(f"and {render.counted(report.n_findings - len(lines), 'finding')} more")
-    output.emit(report, "\n".join([*lines, _checked(report)]))
+    output.emit(report, partial(_show, report))
     if not report.is_sound:
         raise typer.Exit(1)
 
@@ -54,6 +52,15 @@ def _read(url: str) -> "CheckReport":
 
     with render.bar("checking", "rows") as progress:
         return check_environment(url, progress=progress)
+
+
+def _show(report: "CheckReport") -> None:
+    lines = list(report.findings)
+    if report.n_findings > len(lines):
+        lines.append(f"and {render.counted(report.n_findings - len(lines), 'finding')} more")
+    for line in lines:
+        render.say(line)
+    render.say(_checked(report), int(not report.is_sound))
 
 
 def _checked(report: "CheckReport") -> str:

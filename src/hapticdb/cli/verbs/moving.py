@@ -85,7 +85,7 @@ def diff(a: str, b: str, *, output: Output) -> None:
         difference = diff_environments(a, b, progress=progress)
     told = _record(difference)
     shown = partial(_show, difference, told["differences"])
-    output.emit(told, _equal(difference) if difference.is_equal else shown)
+    output.emit(told, _equal(difference) if difference.is_equal else shown, 0)
     if not difference.is_equal:
         raise typer.Exit(1)
 
@@ -139,4 +139,4 @@ def _show(found: "Difference", told: list[dict[str, Any]]) -> None:
         render.table(("id>", "name", "what", "moved by>", "file"), rows)
         render.say(f"A: {found.a}; B: {found.b}")
     count = render.counted(len(told) + (not found.is_same_grid), "difference")
-    render.say(count + (f", {MOST_LINES} of them shown" if len(told) > MOST_LINES else ""))
+    render.say(count + (f", {MOST_LINES} of them shown" if len(told) > MOST_LINES else ""), 1)

@@ -52,7 +52,7 @@ def replay(recording: str, url: str | None = None, *, output: TableOutput) -> No
         render.note(f"{session.path} names {place}, which is opened")
     with hapticdb.open(place, read_only=True) as env:
         replayed = hapticdb.replay(session, env)
-    output.emit(replayed, replayed.describe())
+    output.emit(replayed, replayed.describe(), int(not replayed.is_equal))
     if not replayed.is_equal:
         raise typer.Exit(1)
 

@@ -240,7 +240,7 @@ def _show(told: _Told) -> None:
     from hapticdb.exact.report import gap_text, percent, until_text, verdict_line
 
     found = told.found
-    render.say(verdict_line(found, told.shell))
+    render.say(verdict_line(found, told.shell), found.verdict.exit_status)
     rows = [
         (str(place.object.id), place.object.name, "hit", f"at {percent(place.fraction)}", "", "")
         for place in found.hits

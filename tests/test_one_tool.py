@@ -22,6 +22,10 @@ def test_one_tool_feels_the_same_by_command_library_and_page(run: Run, scene: Pa
         assert env.has_distances
         tool = env.tool("tool.stl")
         library = env.touch(tool, path[0])
+        assert (env.touch("tool.stl", path[0]).force == library.force).all()
+        for wrong in ((tool, path), (path[0], tool)):
+            with pytest.raises(hapticdb.errors.UsageError, match="many as poses="):
+                env.touch(*wrong)
         (held,) = from_files(["tool.stl"], env.grid.voxel_size, has_distances=env.has_distances)
         centred = path[0].copy()
         centred[:3, 3] += middle_of(tool)

@@ -53,8 +53,8 @@ def test_every_verb_with_a_result_has_json() -> None:
 @pytest.mark.parametrize(
     ("args", "word"),
     [
-        ("nothing", "nothing"), ("import a.db", "missing argument"), ("info", "missing argument"),
-        ("info a.db --jsn", "--jsn"), ("touch a.db", "missing option"),
+        ("tuch", "'touch'"), ("import a.db", "missing argument"), ("info", "missing argument"),
+        ("info a.db --jsn", "did you mean --json?"), ("touch a.db", "missing option"),
         ("import a.db b.glb --bits x", "--bits"), ("import a.db b.glb --unit yard", "--unit"),
     ],
 )  # fmt: skip
@@ -139,6 +139,12 @@ def test_an_import_says_what_went_in_with_its_chord_error_and_defects(
         assert words in out
 
 
+def test_the_environment_and_the_file_of_an_import_may_be_swapped(run: Run, tmp_path: Path) -> None:
+    file = boxes(tmp_path / "boxes.glb")
+    refused(run("import", "boxes.glb", "a.db"), "the environment is first: a.db boxes.glb")
+    refused(run("import", file, tmp_path / "tool.stl"), "the environment is first")
+
+
 def test_a_negative_origin_is_read(run: Run, tmp_path: Path) -> None:
     form = ("--origin", "-1,-2,-0.5", "--voxel-size", 0.05, "--bits", 7)
     succeeded(run("import", "a.db", boxes(tmp_path / "boxes.glb"), *form))
@@ -185,3 +191,4 @@ def test_names_beyond_the_terminals_encoding_are_printed(tmp_path: Path) -> None
     for args in (["import", "a.db", "ä.obj", "--bits", "4"], ["objects", "a.db"]):
         done = finished(command(*args), cwd=tmp_path, env=environment)
         assert (done.returncode, done.stderr) == (0, "")
+    assert re.search(r"^-+$", done.stdout, re.MULTILINE)

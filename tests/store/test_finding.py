@@ -101,6 +101,7 @@ def test_words_choose_objects(car: Environment, words: list[int | str], ids: lis
         (1 << 80, "no object"),
         ("9" * 5000, "no object 9999"),
         ("door_left", "no object 'door_left' in"),
+        ("hod", "did you mean 'hood'?"),
         ("front/tyre", "no object 'front/tyre' in"),  # not the start of a path
         ("hood,boot", "no object 'boot' in"),
         ("body", "case counts: there is 'Body/hood'"),

@@ -20,7 +20,6 @@ from hapticdb.paper.figures import QueryFigures
 from hapticdb.paper.quantiles import DEFAULT_RESOLUTION, QuantileVector
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import as_id
-from hapticdb.query.law import inset_of
 from hapticdb.store.base import Layout, Object, Size, Store
 from hapticdb.store.covering import object_ranges
 from hapticdb.store.filtering import Filter
@@ -77,17 +76,6 @@ class Environment(Queries, Closes):
         """Store of the engine: for direct queries, such as benchmarks."""
         return self._store
 
-    @property
-    def has_distances(self) -> bool:
-        """Whether there is an object, and every object has distances to its surface.
-
-        As of the last revision read. Costs a statement only before the first frame and after an
-        edit of this environment.
-        """
-        if self._query.known.version is None:
-            self.objects()
-        return self._query.known.have_distances
-
     def size(self) -> Size:
         """Rows, bytes and leaf blocks of the database."""
         return self._store.size()
@@ -133,31 +121,6 @@ class Environment(Queries, Closes):
         """
         drawn = self._inset if inset is None else inset
         return shell_of_objects(self._store, self.find(*words), points, spacing, seed, drawn)
-
-    def tool(
-        self,
-        file: str | os.PathLike[str],
-        points: int | None = None,
-        *,
-        spacing: float | None = None,
-        unit: str | None = None,
-        seed: int = 0,
-        inset: float | None = None,
-    ) -> PointShell:
-        """Make a tool of a file, like the verbs and the page.
-
-        file, points, spacing, unit, seed : as for `PointShell.from_file`
-        inset : inward offset of the points, metres; unless given, chosen so that contact begins at
-            the tool's surface: 1.5 voxels where objects have distances, for the distance law
-        """
-        drawn = self._inset if inset is None else inset
-        return PointShell.from_file(
-            file, points, spacing=spacing, unit=unit, seed=seed, inset=drawn
-        )
-
-    @property
-    def _inset(self) -> float:
-        return inset_of(self.grid.voxel_size, "distance" if self.has_distances else "plane")
 
     def add(
         self,

@@ -1,5 +1,6 @@
 """Queries of an opened environment for a tool, at one pose or at many."""
 
+import os
 from collections.abc import Generator, Iterator
 from functools import partial
 from typing import TYPE_CHECKING, cast, overload
@@ -13,7 +14,7 @@ from hapticdb.paper.grouping import DEFAULT_MAXGAP
 from hapticdb.paper.strategies import Strategies, Strategy
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.query.frame import as_poses
-from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law
+from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law, inset_of
 from hapticdb.query.touches import Touch
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import ALL, NOTHING, Filter, FiltersOfWords
@@ -22,6 +23,8 @@ from hapticdb.store.finding import Words
 if TYPE_CHECKING:
     from hapticdb.batches.feeler import BatchDevice, Feeler, PoseCallback
     from hapticdb.batches.result import ClearanceBatch, TouchBatch
+
+FilePath = str | os.PathLike[str]
 
 
 class Queries:
@@ -35,10 +38,46 @@ class Queries:
         self._query = self._strategies.query
         self._filters = FiltersOfWords()
 
+    @property
+    def has_distances(self) -> bool:
+        """Whether there is an object, and every object has distances to its surface.
+
+        As of the revision that was read last. Costs a statement only before the first frame and
+        after an edit of this environment.
+        """
+        if self._query.known.version is None:
+            self._query.known.newest()
+        return self._query.known.have_distances
+
+    def tool(
+        self,
+        file: FilePath,
+        points: int | None = None,
+        *,
+        spacing: float | None = None,
+        unit: str | None = None,
+        seed: int = 0,
+        inset: float | None = None,
+    ) -> PointShell:
+        """Make a tool of a file as the verbs and the page do.
+
+        file, points, spacing, unit, seed : as for `PointShell.from_file`
+        inset : how far points are drawn inward, metres. Unless given, so far that contact begins at
+            the tool's surface: 1.5 voxels where objects have distances, for the distance law.
+        """
+        drawn = self._inset if inset is None else inset
+        return PointShell.from_file(
+            file, points, spacing=spacing, unit=unit, seed=seed, inset=drawn
+        )
+
+    @property
+    def _inset(self) -> float:
+        return inset_of(self._store.grid.voxel_size, "distance" if self.has_distances else "plane")
+
     @overload
     def touch(
         self,
-        shell: PointShell,
+        shell: PointShell | FilePath,
         pose: ArrayLike,
         strategy: Strategy = "auto",
         *,
@@ -51,7 +90,7 @@ class Queries:
     @overload
     def touch(
         self,
-        shell: PointShell,
+        shell: PointShell | FilePath,
         *,
         poses: ArrayLike,
         where: Words = NOTHING,
@@ -64,7 +103,7 @@ class Queries:
 
     def touch(
         self,
-        shell: PointShell,
+        shell: PointShell | FilePath,
         pose: ArrayLike | None = None,
         strategy: Strategy = "auto",
         *,
@@ -81,7 +120,7 @@ class Queries:
 
         Points outside the grid miss. All statements of a touch read one committed revision.
 
-        shell : points in metres and inward unit normals, tool frame
+        shell : points in metres and inward unit normals, tool frame; or a file, as for `tool`
         pose (4, 4) : world_from_tool, rigid, metres; returns a `Touch`
         poses (B, 4, 4) : many of them instead, for a `TouchBatch`, the same bit for bit, by all
             processors
@@ -102,6 +141,10 @@ class Queries:
         """
         if (pose is None) == (poses is None):
             raise UsageError("touch: give either one pose, or poses=...")
+        if isinstance(shell, str | os.PathLike):
+            shell = self.tool(shell)
+        if not isinstance(shell, PointShell) or getattr(pose, "ndim", 2) == 3:
+            raise UsageError("touch: give a tool, then one pose, or many as poses=...")
         if pose is not None:
             felt = ALL if where is exclude is NOTHING else self._filters.of(where, exclude)
             chosen = as_law(law) if isinstance(law, str) else law

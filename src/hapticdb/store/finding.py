@@ -4,6 +4,7 @@ import re
 import unicodedata
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
+from difflib import get_close_matches
 from fnmatch import translate
 from operator import index
 from typing import Protocol
@@ -174,6 +175,14 @@ def _branches(name: str, *, is_path: bool) -> list[str]:
     return ["/".join(elements[: n + 1]) for n in range(len(elements))]
 
 
+def _nearest_names(objects: Sequence[Object], word: str) -> str:
+    """Hint at up to three names, or elements of their paths, that differ in few letters."""
+    branches = (_branches(obj.name, is_path="/" in word) for obj in objects)
+    names = {text.casefold(): text for texts in branches for text in texts}
+    near = [repr(names[one]) for one in get_close_matches(word.casefold(), names, 3, 0.7)]
+    return f"; did you mean {' or '.join(near)}?" if near else ""
+
+
 def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFoundError:
     """Build the error for a name or pattern without a match."""
     folded = [replace(obj, name=obj.name.casefold()) for obj in objects]
@@ -183,7 +192,7 @@ def _nothing_like(word: str, objects: Sequence[Object], url: str) -> ObjectNotFo
     elif word.strip("*/ ") and (alike := _named_like(folded, f"*{word.strip('*/ ').casefold()}*")):
         hint = f", but {names[alike[0].id]!r}" + (f" and {len(alike) - 1} more" * (len(alike) > 1))
     else:
-        hint = attribute_hint(objects, word)
+        hint = attribute_hint(objects, word) or _nearest_names(objects, word)
     return ObjectNotFoundError(
         f"no object {word[:80]!r} in {url}{hint}; 'hapticdb objects {url}' lists the names"
     )

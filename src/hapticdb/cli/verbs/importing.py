@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import typer
@@ -14,6 +15,7 @@ from hapticdb.cli.options import CurveName, LayoutName, UnitName
 from hapticdb.cli.root import left_at
 from hapticdb.cli.schema import plain
 from hapticdb.cli.values import Point
+from hapticdb.errors import UsageError
 from hapticdb.units import length_text
 
 if TYPE_CHECKING:
@@ -75,8 +77,12 @@ def import_(
     """
     from hapticdb.grid import GridOptions
     from hapticdb.ingest.files import ImportOptions
+    from hapticdb.mesh.parse import READERS
     from hapticdb.store.urls import with_partitions
 
+    if Path(url).suffix.lower() in READERS:
+        env = next((one for one in files if Path(one).suffix.lower() not in READERS), "car.db")
+        raise UsageError(f"{url} is a file to import; the environment is first: {env} {url}")
     if grid.partitions is not None:
         url = with_partitions(url, grid.partitions)
     memory = None if reading.memory_limit is None else reading.memory_limit << 20

@@ -1,4 +1,4 @@
-"""The loop, run in this process on a fetching process's cells: its counts and refusals."""
+"""The loop, run in this process on a prefetch process's cells: its counts and refusals."""
 
 import dataclasses
 from collections.abc import Callable, Iterator

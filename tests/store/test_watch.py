@@ -246,7 +246,7 @@ def test_a_flood_of_notifications_leads_to_few_round_trips(
     reader.watch()
     asked.clear()
     channel = channel_of(parse(url).environment)
-    for n in range(100):  # the fetching process looks each millisecond
+    for n in range(100):  # the prefetch process looks each millisecond
         clock.now += 1e-3
         stranger.execute(
             "SELECT pg_notify(%s, %s::text || n) FROM generate_series(1, 20) n", (channel, n)

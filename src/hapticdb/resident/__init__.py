@@ -1,1 +1,1 @@
-"""Resident cells of an environment, and frames that read only these cells."""
+"""Resident cells of an environment, and frames on these cells alone."""

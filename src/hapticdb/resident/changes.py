@@ -1,4 +1,4 @@
-"""What the writes of others change: cells that they touch, and which objects are left out."""
+"""Effects of other writers: changed cells, and the excluded objects."""
 
 from collections.abc import Callable, Sequence
 
@@ -12,20 +12,19 @@ from hapticdb.store.base import CELL_SHIFT, NO_KEYS, Change, Keys, Object, Store
 from hapticdb.store.filtering import Filter
 
 MOST_CHANGES = 4096
-"""Greatest number of writes that are followed one by one; after more, every cell counts as touched.
-A larger value keeps cells after long absences and takes longer to catch up."""
+"""Most writes followed one by one; after more, every cell counts as changed. Larger: cells survive
+long absences, and catching up takes longer."""
 FEW_CELLS = 1 << 14
-"""Cells in the ranges of writes up to which each of them is looked up. Where there are more, the
-known cells are searched for those in the ranges. The result is the same; the value decides only
-which way is faster."""
+"""Most cells in the ranges of writes for a search of each of them. For more, the ranges are
+searched for each resident cell. The result is the same; the value decides on speed alone."""
 
 
 def writes_since(store: Store, known_revision: int, revision: int) -> list[Change] | None:
-    """Writes after the known revision up to the present one, or None if they cannot be listed.
+    """Writes after a revision up to the present one, or None if they cannot be listed.
 
-    They cannot be listed if no revision is known (below 0), if a server came back without its last
-    commits (the known revision is ahead), if there are more than `MOST_CHANGES`, or if the store
-    has not kept all of them.
+    They cannot be listed without a revision (below 0), if a server came back without its last
+    commits (the revision is ahead), if there are more than `MOST_CHANGES`, or if the store
+    has lost some of them.
     """
     n_missed = revision - known_revision
     if known_revision < 0 or not 0 <= n_missed <= MOST_CHANGES:
@@ -40,9 +39,9 @@ def known_cells_touched(
     slots_of: Callable[[Keys], Keys],
     known: Callable[[], Keys],
 ) -> Keys:
-    """Known cells (n,), resident or empty, that writes have touched.
+    """Cells (n,), resident or empty, changed by writes.
 
-    slots_of : slots of cells, UNKNOWN for the unknown ones; known : all known cells.
+    slots_of : slots of cells, UNKNOWN for the unknown ones; known : all resident and empty cells.
     """
     if not changes:
         return NO_KEYS
@@ -67,7 +66,7 @@ def known_cells_touched(
 
 
 class LeftOutObjects:
-    """Ids of the objects that a filter leaves out, of the revision that was followed last.
+    """Ids of the objects outside of a filter, at the last followed revision.
 
     Attributes
     ----------
@@ -108,5 +107,5 @@ class LeftOutObjects:
 
 
 def _read_by_words(obj: Object | None) -> object:
-    """What words read of an object."""
+    """Parts of an object for the words of a filter."""
     return None if obj is None else (obj.name, dict(obj.attributes))

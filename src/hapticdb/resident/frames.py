@@ -29,11 +29,11 @@ from hapticdb.resident.held import clusters_of
 from hapticdb.resident.residency import Residency
 
 LEAST_FOUND = 1 << 16
-"""Least number of entries of the hash table of cells that poses meet. A larger table has fewer
-collisions and takes longer to clear."""
+"""Least number of entries of the hash table of the poses' cells. Larger: fewer collisions and more
+time to clear."""
 SMALL = 16.0
-"""Greatest radius of a run, voxels, for which the search for cells uses the run's middle instead of
-its points. A larger value looks up fewer places and fetches more cells that no point meets."""
+"""Greatest radius (voxels) of a run for which the search for cells uses the run's middle instead of
+its points. Larger: fewer lookups and more unused cells."""
 
 Floats = NDArray[np.float64]
 
@@ -42,8 +42,8 @@ class FeltFrames(NamedTuple):
     """Wrenches and counts of a shell at M poses.
 
     wrenches (M, 6): N and N m about the centre of mass, world frame; hits, contacts, unknown (M,)
-    int64: numbers of points that hit (in a voxel or, with distances, near a surface), that touch
-    (below their tangent plane or the onset), in a cell that is not resident; deepest (M,): depth of
+    int64: numbers of points with a hit (in a voxel or, with distances, near a surface), with a
+    contact (below their tangent plane or the onset), in an unknown cell; deepest (M,): depth of
     the deepest contact, metres.
     """
 
@@ -78,8 +78,8 @@ class Surroundings(NamedTuple):
 def _surroundings_of(clusters: Clusters, voxel_size: float, beyond: float) -> Surroundings:
     """Places of the runs: one place for a run with a radius of `SMALL` voxels or less.
 
-    The reach has room for `beyond` voxels around the runs, in which frames look for voxels before
-    they skip a run. It is `SMALL` at most: a cell that is missing there costs time, not exactness.
+    The reach has room for `beyond` voxels around the runs: frames search them before they skip a
+    run. It is `SMALL` at most: a missing cell there costs time, not exactness.
     """
     n_points = len(clusters.points)
     starts = np.arange(0, n_points, clusters.run)
@@ -177,10 +177,10 @@ class ResidentFrames:
     ) -> NDArray[np.bool_]:
         """Whether a point is in an occupied voxel at each of poses (M, 4, 4), rigid transforms.
 
-        These are the poses at which `feel` counts hits under the plane law. The search of a pose
-        ends at its first hit, and cells are fetched only where it does not know them.
+        The poses with hits in `feel` under the plane law. The search of a pose ends at its first
+        hit, and only unknown cells are fetched.
 
-        search : looks for a point that hits at each pose, such as `first_hits` in several threads.
+        search : finds a point with a hit at each pose, such as `first_hits` in several threads.
         """
         search = search or self.first_hits
         found = search(poses)
@@ -192,14 +192,14 @@ class ResidentFrames:
         return np.asarray(found >= 0)
 
     def first_hits(self, poses: Floats) -> NDArray[np.int64]:
-        """A point (M,) that hits at each of poses (M, 4, 4), `NOTHING` or `UNDECIDED`."""
+        """A point (M,) with a hit at each of poses (M, 4, 4), `NOTHING` or `UNDECIDED`."""
         found = np.empty(len(poses), dtype=np.int64)
         cells = self.residency.table.cells.without_distances()
         find_first_hits(cells, self._row, self.clusters, poses, self.residency.place, found)
         return found
 
     def wrenches(self, poses: Floats) -> tuple[Floats, NDArray[np.int64]]:
-        """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form that a replay needs."""
+        """Wrenches (M, 6) and numbers of hits (M,) at poses, in the form for a replay."""
         felt = self.feel(poses)
         return felt.wrenches, felt.hits
 
@@ -222,7 +222,7 @@ class ResidentFrames:
         return int(n_poses)
 
     def _run(self, poses: Floats, out: Floats, start: int, n_poses: int) -> None:
-        """Compute the frames at poses start .. start + n_poses - 1, whose cells are resident."""
+        """Compute the frames at poses start .. start + n_poses - 1, with resident cells."""
         part = slice(start, start + n_poses)
         done = feel_kernel(
             self.cells, self._row, self.clusters, poses[part], self.residency.place, self.law,

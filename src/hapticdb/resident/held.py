@@ -9,7 +9,7 @@ from hapticdb.pointshell.shell import PointShell
 RUN = 64
 """Points of a cluster. A larger value tests fewer spheres and skips fewer points."""
 FLAT_RUN = 512
-"""Points that are transformed at once without clusters: as many as a processor's L1 cache holds."""
+"""Points per transformation without clusters: as many as fit into a processor's L1 cache."""
 NO_RUNS = np.empty(0, dtype=np.int64)
 
 Floats = NDArray[np.float64]
@@ -50,7 +50,7 @@ def spheres_of(points: Floats, voxel_size: float, run: int) -> tuple[Floats, Flo
 def _around(points: Floats, run: int, slack: float) -> Floats:
     """Sphere (C, 4) at the centre of the box of each run of points (N, 3+), radius plus `slack`.
 
-    The radius also has room for the stretch of a pose that `is_rigid` just accepts.
+    The radius also has room for the greatest stretch of a pose under `is_rigid`.
     """
     starts = np.arange(0, len(points), run)
     low = np.minimum.reduceat(points[:, :3], starts)
@@ -63,7 +63,7 @@ def _around(points: Floats, run: int, slack: float) -> Floats:
 def _blocks_of(spheres: Floats) -> Floats:
     """Spheres (B, 4) around those (C, 4) of each `BLOCK` runs, or (0, 4) for fewer runs.
 
-    The radius has room for the stretch of a pose that `is_rigid` just accepts.
+    The radius has room for the greatest stretch of a pose under `is_rigid`.
     """
     starts = np.arange(0, len(spheres), BLOCK) if len(spheres) >= BLOCK else NO_RUNS
     if not len(starts):

@@ -21,16 +21,15 @@ from hapticdb.kernels.resident.cells import (
 from hapticdb.resident.table import CellTable
 
 MOST_LISTED = 1 << 21
-"""Cells of a grid up to which the GPU has a list of all of them, 8 MB: one look-up finds a slot. A
-larger value lists larger grids, and the list is copied whenever a cell comes or goes."""
+"""Most cells of a grid for a list of all of them on the GPU, 8 MB: one access finds a slot. Larger:
+larger grids are listed, and the list is copied at each change of cells."""
 
 
 class CellMirror:
-    """The cells of a table on the GPU: slots that have changed are copied, the directory whole.
+    """The cells of a table on the GPU: changed slots are copied, the directory whole.
 
-    It has as many slots as the table, so what the table evicts leaves the GPU, too, and what is
-    unknown in the table is unknown there. The process that writes the table may use it, and a
-    reader within a frame.
+    It has as many slots as the table, so evicted cells leave the GPU, too, and unknown cells are
+    unknown there. The table's writer may use it, and a reader within a frame.
 
     Parameters
     ----------
@@ -39,8 +38,8 @@ class CellMirror:
     law : NamedTuple
         Law of the frames that read it, in the kernels' form.
     side : int or None
-        Voxels of the grid on each axis; None: for looks of a hand, which need the directory, the
-        masks and the payload alone.
+        Voxels of the grid on each axis; None: for the queries of a hand, with directory,
+        masks and payload alone.
 
     Attributes
     ----------
@@ -88,9 +87,9 @@ class CellMirror:
         )
 
     def update(self, version: int | None = None) -> int:
-        """Copy what the table has published since the last time; returns the slots copied.
+        """Copy the changes since the last time; returns the number of copied slots.
 
-        version: of the directory that a reader's frame has; None: the newest. No kernel may read
+        version: of the directory of a reader's frame; None: the newest. No kernel may read
         the arrays meanwhile.
         """
         version = version or self._table.version
@@ -119,9 +118,9 @@ class CellMirror:
         return n_slots
 
     def seen(self) -> Seen:
-        """Voxels of the cells that are there, as searches see them.
+        """Voxels of the copied cells, in the form for searches.
 
-        The arrays are the same each time; `used` has what kernels write.
+        The arrays are the same each time; kernels write `used`.
         """
         version, arrays = self._directory
         if version != self._version:
@@ -150,7 +149,7 @@ class CellMirror:
         return found
 
     def _gate_of(self, cells: Cells, part: slice) -> NDArray[np.uint32]:
-        """Voxels of slots in which a point may be felt: a frame looks up no distances elsewhere."""
+        """Voxels of slots with possible contacts: a frame reads no distances elsewhere."""
         if isinstance(self._law, DistanceFieldLaw) and cells.near is not None:
             return cells.near[part]
         voxels = np.zeros((len(cells.masks[part]), CELL_WORDS), np.uint32)  # of the marked bricks

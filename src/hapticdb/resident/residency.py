@@ -26,14 +26,14 @@ BATCH = 256
 """Greatest number of cells in one statement. A larger value fetches more cells a second; a smaller
 one fetches the most urgent ones sooner."""
 MOST_RENEWED = 512
-"""Greatest number of cells that are read again at once after a write of others. A larger value
-keeps more cells; a smaller one makes the write felt sooner: it shall be felt within 50 ms."""
+"""Most cells read again at once after a write of others. Larger: more cells stay; smaller: the
+write takes effect sooner. It shall do so within 50 ms."""
 NOTHING_KNOWN = -1
 """Value of the database's revision, and of its commit counter, before the first query."""
 
 
 def check_cells(store: Store) -> None:
-    """Refuse an environment whose curve has no cells."""
+    """Refuse an environment if its curve has no cells."""
     if not store.grid.is_hierarchical:
         raise UsageError(
             f"{store.url} is in lexicographic order, which has no cells: "
@@ -42,9 +42,9 @@ def check_cells(store: Store) -> None:
 
 
 def check_distances(store: Store, exclude: Keys, changes: Sequence[Change] | None = None) -> None:
-    """Refuse objects without distances: a law by distances would not feel them.
+    """Refuse objects without distances: the law distance has no forces on them.
 
-    exclude (E,) : ids of objects that may have none; changes : the writes since the last check, or
+    exclude (E,) : ids of excepted objects; changes : the writes since the last check, or
     None to check every object.
     """
     if changes is None:
@@ -64,9 +64,9 @@ def check_distances(store: Store, exclude: Keys, changes: Sequence[Change] | Non
 
 
 class Loaded(NamedTuple):
-    """Result of a load: cells fetched, rows read, ranges queried, seconds that the database took.
+    """Result of a load: cells fetched, rows read, ranges queried, seconds of the database.
 
-    There are fewer cells than requested if the table has no room; 0 if all others are still wanted.
+    A full table gives fewer cells than requested; 0 if all its cells are still requested.
     """
 
     cells: int
@@ -78,7 +78,7 @@ class Loaded(NamedTuple):
 class Residency:
     """Cells of one environment in one table, without the excluded objects.
 
-    It decides which cells are read, and when. `CellSource` reads; `CellWriter` writes the table.
+    It chooses cells and times of reads. `CellSource` reads; `CellWriter` writes the table.
 
     Parameters
     ----------
@@ -88,8 +88,8 @@ class Residency:
         A table without another writer. If an earlier writer has filled it and has ended, the urgent
         cells are read again and all others are forgotten, in one version.
     exclude, where : iterable of int or str
-        Which objects are felt: see `hapticdb.store.filtering.Filter`. All others are left out of
-        all cells. The words are read again as others write; one that chooses nothing is no error.
+        Filter of the objects: see `hapticdb.store.filtering.Filter`. The words are read again as
+        others write; a word without an object is no error.
     urgent : (n,) int64
         Cells near tools, distinct, most urgent first.
     clock : callable
@@ -105,8 +105,8 @@ class Residency:
     Raises
     ------
     UsageError
-        If the environment's curve has no cells. If the table has distances and an object that is
-        not excluded has none; also later, after a write of others.
+        If the environment's curve has no cells. If the table has distances and an object of the
+        filter has none; also later, after a write of others.
     """
 
     def __init__(
@@ -136,7 +136,7 @@ class Residency:
         self.refresh()
 
     def _take_over(self, urgent: Keys) -> None:
-        """Continue with the table of a writer that has ended: its last version is complete.
+        """Continue with the table of an ended writer: its last version is complete.
 
         Its cells may be out of date: the environment may have been replaced since then, and a new
         file may have the same number of writes as the old one.
@@ -169,12 +169,12 @@ class Residency:
 
     @property
     def store(self) -> Store:
-        """The connection that reads cells."""
+        """The connection for cells."""
         return self._source.store
 
     @property
     def exclude(self) -> Keys:
-        """Ids (E,) of the objects that are left out of all cells, at `revision`."""
+        """Ids (E,) of the excluded objects, at `revision`."""
         return self._source.exclude
 
     @property
@@ -184,13 +184,13 @@ class Residency:
 
     @property
     def revision(self) -> int:
-        """Revision of the database at which all resident cells were read."""
+        """Revision of the database for all resident cells."""
         return self._revision
 
     # -- what is wanted and known ------------------------------------------------------------------
 
     def begin_round(self) -> None:
-        """Begin a round of wanted cells; cells last wanted a few rounds ago may be evicted."""
+        """Begin a round of requests; cells last requested a few rounds ago may be evicted."""
         self.writer.slots.begin_round()
 
     def slots_of(self, cells: Keys) -> Keys:
@@ -206,7 +206,7 @@ class Residency:
         self._urgent = cells
 
     def missing(self, cells: Keys) -> Keys:
-        """Return the unknown ones of cells (n,), in their order; all the cells become wanted."""
+        """Return the unknown ones of cells (n,), in their order; all count as requested."""
         slots = self.slots_of(cells)
         self.want(cells, slots)
         return np.compress(slots == UNKNOWN, cells)
@@ -235,7 +235,7 @@ class Residency:
         )
 
     def warm_up(self) -> None:
-        """Compile the kernels that an eviction or a write calls first."""
+        """Compile the kernels of an eviction and a write."""
         kernels.cells_of_curve_keys(NO_KEYS, self.grid.bits, self.grid.curve_code)
         self.writer.slots.warm_up()
 
@@ -268,17 +268,17 @@ class Residency:
     def refresh(self) -> int:
         """Follow the writes of others; returns their number.
 
-        Cells that a write has touched are read again or become unknown, in one version, so no frame
-        mixes two revisions of an object.
+        Changed cells are read again or become unknown, in one version, so no frame mixes two
+        revisions of an object.
         """
         n_writes, _ = self._follow_writes(NO_KEYS)
         return n_writes
 
     def _follow_writes(self, asked: Keys) -> tuple[int, UnpublishedCells]:
-        """Update the known cells to the last revision, and read the unknown cells `asked` (n,).
+        """Update all cells to the last revision, and read the unknown cells `asked` (n,).
 
-        The most urgent touched cells are read again, the others are forgotten. So memory and time
-        are bounded, however much was written. Returns the number of writes, and all cells read.
+        The most urgent changed cells are read again, the others are forgotten. So memory and time
+        are bounded for any amount of writes. Returns the number of writes, and all cells read.
         """
         with self.store.snapshot():
             revision = self.store.revision()
@@ -328,10 +328,10 @@ class Residency:
         return UnpublishedCells(cells, slots, n_rows, n_ranges)
 
     def _make_room(self, n_cells: int) -> None:
-        """Free slots for `n_cells` cells, but keep cells that are still wanted."""
+        """Free slots for `n_cells` cells, but none of a requested cell."""
         surplus = min(4 * BATCH, self.table.n_slots // 8)
         self.writer.evict_for(n_cells, surplus, self._urgent, self._revision)
 
     def _publish(self, leaving: Keys, read: UnpublishedCells) -> None:
-        """Publish the cells that leave and come, with the present revision."""
+        """Publish the removed and added cells, with the present revision."""
         self.writer.publish(leaving, read, self._urgent, self._revision)

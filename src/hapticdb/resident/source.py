@@ -28,12 +28,12 @@ from hapticdb.store.urls import scheme_of
 from hapticdb.user_cache import content_of, entry_of, keep
 
 ROWS_AT_ONCE = 1024
-"""Rows whose distances are unpacked together, into a megabyte. A larger value makes fewer calls; a
-smaller one merges the values while they are still in the processor's cache."""
+"""Rows with distances unpacked together, into a megabyte. Larger: fewer calls; smaller: the values
+are merged while they are still in the processor's cache."""
 
 FAR = 2e-3
-"""Greatest round trip (s) at which a calibration, which takes thousands of round trips, is done at
-the start. Larger: slower starts."""
+"""Greatest round trip (s) for a calibration at the start, of thousands of round trips. Larger:
+slower starts."""
 ASKED = 3
 """Number of timed round trips; the shortest counts."""
 
@@ -42,14 +42,14 @@ class CellSource:
     """Reads cells of one environment, a batch by one statement.
 
     The cells of a batch are grouped into ranges by cost, as in the strategy `cbgroup`: a gap is
-    scanned if that costs no more than another descent of the index on this database.
+    scanned if this costs no more than another descent of the index on this database.
 
     Parameters
     ----------
     store : Store
         A connection; it may be replaced by another one to the same environment.
     exclude : (E,) int64
-        Ids of objects that are left out of all cells, ascending; it may be replaced, too.
+        Ids of the excluded objects, ascending; it may be replaced, too.
     clock : callable
         Returns seconds, to time round trips at the start.
     may_measure : bool
@@ -68,7 +68,7 @@ class CellSource:
     def read(
         self, cells: Keys, table: CellTable, slots: Keys
     ) -> tuple[NDArray[np.bool_], int, int]:
-        """Read cells (n,), distinct, by one statement into slots (n,) that no frame can read.
+        """Read cells (n,), distinct, by one statement into slots (n,) outside of the directory.
 
         Returns whether each has no voxel and no distances (n,), rows read, and ranges queried.
         """
@@ -130,9 +130,9 @@ class CellSource:
 def costs_at_start(
     store: Store, clock: Callable[[], float], *, may_measure: bool = True
 ) -> CostModel:
-    """Cost model from the figures that the store keeps for this machine, or else from measurement.
+    """Cost model from the store's figures for this machine, or else from measurement.
 
-    A measurement takes 0.4 s, and is kept in the user's cache for the environment as it is now.
+    A measurement takes 0.4 s, and stays in the user's cache for the environment as it is now.
     clock : returns seconds, to time a round trip; may_measure : whether there is time for a
     measurement, and a row to measure. If not, or if a round trip takes longer than `FAR`, all parts
     cost the same: results are equal, ranges less efficient.

@@ -1,7 +1,7 @@
-"""CellTable: a fixed amount of memory that one process fills with cells and others read.
+"""CellTable: a fixed amount of memory with cells, of one writer and many readers.
 
-The memory is anonymous and inherited by file descriptor. The system frees it when the last process
-that maps it ends, even after a crash.
+The memory is anonymous and inherited by file descriptor. The system frees it at the end of its last
+process, even after a crash.
 """
 
 import mmap
@@ -31,7 +31,7 @@ FIRST_VERSION = 1
 """Version number of a table before the first write."""
 MOST_READERS = 80
 """Greatest number of readers of a table at the same time: the 64 sessions of a host, and others.
-Larger: 2.5 KiB of the table for each, and eviction looks at more of them."""
+Larger: 2.5 KiB of the table for each, and an eviction checks more of them."""
 HEARTBEAT, LOST, STOP = 8, 9, 10
 """Indices in the control block, after those of `kernels.cells`: time of the database's last answer
 (ns, CLOCK_MONOTONIC), whether it is lost, whether all processes must end."""
@@ -40,10 +40,10 @@ _joining = threading.Lock()
 
 
 class RequestQueue(NamedTuple):
-    """Messages between sessions and the fetching process; `kernels.records` defines the fields.
+    """Messages between sessions and the prefetch process; `kernels.records` defines the fields.
 
-    sessions (R,) of SESSION, one row for each reader; pids (R,) int64: ids of the processes that
-    own the rows, 0 for none; figures () of FIGURES: counts of the fetching process.
+    sessions (R,) of SESSION, one row for each reader; pids (R,) int64: ids of the processes of
+    the rows, 0 for none; figures () of FIGURES: counts of the prefetch process.
     """
 
     sessions: NDArray[np.void]
@@ -95,7 +95,7 @@ def _capacity(n_slots: int) -> int:
 
 
 def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
-    """Number of slots that fit into a budget, with the slot for empty cells.
+    """Number of slots within a budget, with the slot for empty cells.
 
     A slot with distances takes 47 KiB, one without them 4 KiB.
 
@@ -117,13 +117,13 @@ def slots_within(budget_bytes: int, *, has_distances: bool = False) -> int:
 
 
 class CellTable(Closes):
-    """A table of cells in memory that processes share.
+    """A table of cells in shared memory.
 
     Parameters
     ----------
     descriptor : int
-        File descriptor of the memory of a table that `create` has made, in any process. The table
-        owns it and closes it.
+        File descriptor of the memory from `create`, in any process. The table owns it and closes
+        it.
     n_slots : int
         Number of its slots.
 
@@ -132,7 +132,7 @@ class CellTable(Closes):
     cells : Cells
         The arrays that frames read; see `hapticdb.kernels.resident.cells`.
     queue : RequestQueue
-        Messages between sessions and the fetching process.
+        Messages between sessions and the prefetch process.
     filled : (slots,) int64
         Version of the directory in which each slot's cell appeared, for copies of the table.
     descriptor : int
@@ -165,7 +165,7 @@ class CellTable(Closes):
 
     @classmethod
     def create(cls, budget_bytes: int = DEFAULT_BUDGET, *, distances: bool = False) -> "CellTable":
-        """Make a table of at most `budget_bytes`, in which every cell is unknown.
+        """Make a table of at most `budget_bytes`, every cell unknown.
 
         With `distances` its cells have the distances to surfaces of the law distance; then
         a tenth as many cells fit.
@@ -186,7 +186,7 @@ class CellTable(Closes):
         return table
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle it for a process that inherits its descriptor."""
+        """Pickle it for a process with the same descriptor."""
         return CellTable, (self.descriptor, self.n_slots)
 
     def close(self) -> None:
@@ -207,7 +207,7 @@ class CellTable(Closes):
 
     @property
     def revision(self) -> int:
-        """Revision of the database at which the published cells were read."""
+        """Revision of the database for the published cells."""
         return int(self.cells.control[kernels.REVISION + self.version % kernels.BUFFERS])
 
     def join(self) -> int:
@@ -235,7 +235,7 @@ class CellTable(Closes):
         self.queue.pids[row] = 0
 
     def release_dead(self) -> None:
-        """Release the versions and sessions of readers that have died; their rows stay taken."""
+        """Release the versions and sessions of dead readers; their rows stay in use."""
         pids = self.queue.pids
         dead = [pid for pid in set(pids.tolist()) - {0} if not is_alive(pid)]  # one may own many
         if dead:

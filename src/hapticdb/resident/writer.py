@@ -1,4 +1,4 @@
-"""The only writer of a cell table: keeps slots, empty cells and the directory consistent.
+"""The only writer of a cell table: makes slots, empty cells and the directory consistent.
 
 A table has several copies of its directory. A frame reads one copy, the published version, from its
 start to its end, so it never reads a part of a change. The writer changes the oldest copy after all
@@ -18,20 +18,20 @@ from hapticdb.resident.table import CellTable
 from hapticdb.store.base import NO_KEYS, Keys
 
 PATIENCE = 0.02
-"""Seconds that the writer waits for frames of old versions before it checks whether the processes
-of these readers still run. A larger value delays the writer longer after a reader has died."""
+"""Seconds of waiting for frames of old versions before the writer checks the processes of these
+readers. Larger: a dead reader delays the writer longer."""
 PAUSE = 5e-5
 """Seconds between two checks of the readers. A larger value delays each eviction; a smaller one
-takes processor time from the frames that the writer waits for."""
+takes processor time from these frames."""
 ROUNDS_KEPT = 4
-"""Rounds in which a wanted cell is not evicted if others can be. A larger value keeps the cells of
-a tool that turns back; in a small table it leaves fewer cells to evict."""
+"""Rounds without eviction after a cell's last request, if others can be evicted. Larger: a
+returning tool finds its cells; in a small table fewer cells are left to evict."""
 
 
 class CellSlots:
     """Slots of one table: free, filled, or retired until no frame can see them.
 
-    Slot `EMPTY_SLOT` belongs to no cell: it represents all cells that are known to be empty.
+    Slot `EMPTY_SLOT` belongs to no cell: it represents all empty cells.
 
     Attributes
     ----------
@@ -51,7 +51,7 @@ class CellSlots:
 
     @property
     def n_free(self) -> int:
-        """Number of slots that a cell can be read into now."""
+        """Number of free slots."""
         return len(self._free)
 
     def cells(self) -> Keys:
@@ -59,7 +59,7 @@ class CellSlots:
         return self._cell_of_slot[self._cell_of_slot >= 0]
 
     def begin_round(self) -> None:
-        """Begin a round of wanted cells."""
+        """Begin a round of requests."""
         self._round += 1
 
     def want(self, slots: Keys) -> None:
@@ -78,11 +78,11 @@ class CellSlots:
         del self._free[len(self._free) - len(slots) :]
 
     def give_back(self, slots: Keys) -> None:
-        """Free slots (n,) that were taken but are in no directory; ignores EMPTY_SLOT."""
+        """Free slots (n,) in use but in no directory; ignores EMPTY_SLOT."""
         self._free += slots[slots > EMPTY_SLOT].tolist()
 
     def fill(self, slots: Keys, cells: Keys) -> None:
-        """Store the cells (n,) of slots (n,); they count as used, and as wanted in this round."""
+        """Store the cells (n,) of slots (n,): used, and requested in this round."""
         self._cell_of_slot[slots] = cells
         self._wanted_at[slots] = self._round
         self._used[slots] = 1
@@ -91,10 +91,10 @@ class CellSlots:
     # -- from filled to free ----------------------------------------------------------------------
 
     def cells_to_evict(self, n_free: int, surplus: int) -> Keys:
-        """Cells to evict so that `n_free` slots are free; fewer if all others are wanted.
+        """Cells to evict for `n_free` free slots; fewer if all others are requested.
 
-        The clock algorithm: cells that no frame has used since the hand last passed leave first.
-        If any must leave, `surplus` cells leave if possible. Cells wanted in this round stay.
+        The clock algorithm: cells without use since the hand's last pass leave first. If any must
+        leave, `surplus` cells leave if possible. Cells requested in this round stay.
         """
         if self.n_free >= n_free:
             return np.empty(0, dtype=np.int64)
@@ -122,34 +122,34 @@ class CellSlots:
             self._retired.append((version, slots))
 
     def free_retired(self, oldest_version_read: int) -> None:
-        """Free the retired slots that no running frame can read."""
+        """Free the retired slots out of reach of running frames."""
         while self._retired and self._retired[0][0] <= oldest_version_read:
             self._free += self._retired.popleft()[1]
 
     # -- after a failure --------------------------------------------------------------------------
 
     def take_over(self, cells: Keys, slots: Keys) -> None:
-        """Continue with the cells (n,) that an earlier writer has left in slots (n,)."""
+        """Continue with the cells (n,) of an earlier writer in slots (n,)."""
         self._cell_of_slot[slots] = cells
         self.n_filled = len(slots)
         self._free = [slot for slot in self._free if self._cell_of_slot[slot] == UNKNOWN]
 
     def free_lost(self) -> None:
-        """Free the slots that were taken for a load which then failed."""
+        """Free the slots of a failed load."""
         retired = {slot for _, slots in self._retired for slot in slots}
         unnamed = np.flatnonzero(self._cell_of_slot == UNKNOWN).tolist()
         self._free = [slot for slot in unnamed if slot != EMPTY_SLOT and slot not in retired]
 
     def warm_up(self) -> None:
-        """Compile the kernels that an eviction calls."""
+        """Compile the kernels of an eviction."""
         nothing = np.empty(0, dtype=np.int64)
         kernels.slots_to_free(self._cell_of_slot, self._wanted_at, self._used, 0, 0, 0, nothing)
 
 
 class UnpublishedCells(NamedTuple):
-    """Cells (n,) in slots (n,) that are in no directory yet, and the cost of reading them.
+    """Cells (n,) in slots (n,) in no directory yet, and the cost of reading them.
 
-    The slot of a cell that is empty is EMPTY_SLOT.
+    The slot of an empty cell is EMPTY_SLOT.
     """
 
     cells: Keys = NO_KEYS
@@ -178,10 +178,10 @@ class CellWriter:
         self._table = table
         self.slots = CellSlots(table)
         self._empty: dict[int, None] = {}
-        """Cells known to be empty, oldest first."""
+        """Empty cells, oldest first."""
         self._most_empty = table.capacity // 2 - table.n_slots
         self._changes: deque[tuple[Keys, UnpublishedCells]] = deque(maxlen=BUFFERS - 1)
-        """Cells that left, and that came, with the last versions."""
+        """Cells removed and added with the last versions."""
         self._n_unknown_copies = 0
         self.n_evicted = 0
 
@@ -192,7 +192,7 @@ class CellWriter:
 
     @property
     def n_empty(self) -> int:
-        """Number of cells known to be empty."""
+        """Number of empty cells."""
         return len(self._empty)
 
     def known(self) -> Keys:
@@ -216,7 +216,7 @@ class CellWriter:
         return table.keys[which][filled], table.slots[which][filled].astype(np.int64)
 
     def take_over(self) -> None:
-        """Continue with the cells that an earlier writer, which has ended, published last."""
+        """Continue with the last published cells of an ended writer."""
         cells, slots = self.entries()
         is_filled = slots > EMPTY_SLOT
         self.slots.take_over(cells[is_filled], slots[is_filled])
@@ -226,7 +226,7 @@ class CellWriter:
         self._wait_for_readers(self._table.version)
 
     def evict_for(self, n_free: int, surplus: int, urgent: Keys, revision: int) -> None:
-        """Evict cells until `n_free` slots are free, but keep cells that are still wanted.
+        """Evict cells until `n_free` slots are free, but no requested cells.
 
         surplus : as for `CellSlots.cells_to_evict`; urgent, revision : as for `publish`.
         """
@@ -241,7 +241,7 @@ class CellWriter:
     def publish(self, leaving: Keys, read: UnpublishedCells, urgent: Keys, revision: int) -> None:
         """Remove cells and add others in one version; cells in both get new slots.
 
-        urgent : cells that are forgotten last if too many are empty; revision : of the database,
+        urgent : last to be forgotten if too many are empty; revision : of the database,
         the same for all cells.
         """
         slots = self.slots_of(leaving)
@@ -276,10 +276,10 @@ class CellWriter:
         kernels.publish(table.control, version, revision)
 
     def _forget_for(self, n_new: int, urgent: Keys) -> Keys:
-        """Forget empty cells so that `n_new` others have room; returns them.
+        """Forget empty cells to make room for `n_new` others; returns them.
 
         If there is room, no cell is removed. Otherwise the oldest leave, and an eighth of the limit
-        more than necessary, so that this happens seldom. Urgent cells (U,), most urgent first,
+        more than necessary, so this happens seldom. Urgent cells (U,), most urgent first,
         leave only if the other cells are not enough; the least urgent ones leave first.
         """
         surplus = len(self._empty) + n_new - self._most_empty
@@ -295,7 +295,7 @@ class CellWriter:
         return leaving
 
     def _oldest_version_read(self) -> int:
-        """Oldest version that a frame is reading; a very large number if no frame runs."""
+        """Oldest version in use by a frame; a very large number if no frame runs."""
         return int(kernels.oldest_version_read(self._table.cells.readers))
 
     def _wait_for_readers(self, version: int) -> None:

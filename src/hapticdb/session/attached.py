@@ -20,11 +20,11 @@ LOG = logging.getLogger("hapticdb.session")
 
 
 class AttachedHost(Closes):
-    """The `SessionHost` of another process, which serves the other end of `sock`.
+    """The `SessionHost` of another process, by `SessionHost.serve` at the other end of `sock`.
 
-    Frames, contacts and hands are in memory that both processes share; all else goes over the
-    socket, one request at a time. The sessions that this process has begun end when it dies or
-    closes. Also a context manager. Raises `HapticDBError` if the other process does not answer.
+    Frames, contacts and hands are in shared memory; all else goes over the socket, one request at a
+    time. The sessions of this process end when it dies or closes. Also a context manager. Raises
+    `HapticDBError` if the other process does not answer.
     """
 
     def __init__(self, sock: socket.socket) -> None:
@@ -56,7 +56,7 @@ class AttachedHost(Closes):
         return self._channel.ask("call", word, session, *content)
 
     def close(self) -> None:
-        """Leave the host; the sessions that this process has begun end."""
+        """Leave the host; the sessions of this process end."""
         self._channel.close()
         self._shared.close()
 

@@ -23,20 +23,20 @@ RENDERINGS: tuple[Rendering, ...] = get_args(Rendering)
 """How a session renders forces: by the virtual coupling with contact constraints, or each frame's
 wrench, up to the device's caps."""
 HOLD = FADE = 0.02
-"""Seconds. In unknown cells the last wrench is kept for `HOLD` and then falls to zero in `FADE`. It
-rises again within `FADE`, in at least four frames; so it does when a session starts and when the
-clutch closes. Larger: a longer gap is bridged, with a force that may be wrong."""
+"""Seconds. In unknown cells the last wrench stays for `HOLD` and then falls to zero in `FADE`. It
+rises again within `FADE`, in at least four frames; likewise when a session starts or the clutch
+closes. Larger: a longer gap is bridged, with a possibly wrong force."""
 MOST = 1e9
 """Largest number of a `Coupling`, in its unit: more than any device has."""
 
 
 def limit_text(newtons: float, cap: float) -> str:
-    """Words behind a force that the device's cap holds back; rounding keeps it below the cap."""
+    """Words behind a force at the device's cap; rounding keeps it below the cap."""
     return ", at its limit" if newtons >= 0.999 * cap else ""
 
 
 def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
-    """Rendering of a session under a law; by default coupled where the law reads distances.
+    """Rendering of a session under a law; by default coupled if the law reads distances.
 
     Raises
     ------
@@ -59,10 +59,10 @@ def rendering_of(rendering: Rendering | None, law: ForceLaw) -> Rendering:
 class Coupling:
     """The spring between hand and tool; all in device units.
 
-    The tool has no mass: in each period it rests where the spring and the contacts balance. The
-    hand feels the spring, so the force is min(stiffness times depth, cap), whatever the voxel size,
-    the number of points and the scale. A number that is not given comes from the device's profile
-    (`hapticdb.devices.profiles`), and the stiffness is lowered to what stays stable
+    The tool has no mass: in each period it rests at the balance of spring and contacts. The
+    hand feels the spring, so the force is min(stiffness times depth, cap), for any voxel size,
+    number of points and scale. Missing numbers come from the device's profile
+    (`hapticdb.devices.profiles`), and the stiffness is lowered to a stable one
     (`hapticdb.devices.stability`).
 
     The rendering direct has no spring: `cap`, `torque_cap` and `profile` then bound the wrench, and
@@ -202,7 +202,7 @@ class Coupling:
 
 @dataclass(frozen=True, kw_only=True)
 class DirectRendering:
-    """Rendering without a coupling: the tool is at the hand, and feels what the device renders.
+    """Rendering without a coupling: the tool is at the hand.
 
     This is the loop of the paper (section 4, Figure 4). The wrench of each frame goes to the
     device, up to its caps; nothing keeps the tool out of surfaces.
@@ -230,7 +230,7 @@ class DirectRendering:
     fade: float = FADE
 
     def spring(self) -> DeviceSpring:
-        """Return the numbers in the kernel's form; those of a spring that is not there are 0."""
+        """Numbers in the kernel's form, 0 without a spring."""
         numbers = {name: float(getattr(self, name, 0.0)) for name in DeviceSpring._fields}
         return DeviceSpring(**numbers | {"turn_cap": float(self.torque_cap)})
 
@@ -264,5 +264,5 @@ def radius_of(shell: PointShell, voxel_size: float) -> float:
 
 
 def _first(*values: float | None) -> float:
-    """Return the first value that is not None."""
+    """First value except None."""
     return next(value for value in values if value is not None)

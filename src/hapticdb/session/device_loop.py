@@ -1,6 +1,6 @@
 """The loop of a session with a device: every frame on time, no frame queries the database.
 
-The loop is one kernel, which calls this module to read the device and to push it. While it runs, no
+The loop is one kernel; it calls this module to read the device and to push it. While it runs, no
 kernel is compiled and no garbage is collected.
 """
 
@@ -46,12 +46,12 @@ EMPTY_SECONDS = 2.0
 """Greatest duration (s) of the empty loop; in a shorter session it is the session's duration.
 Larger: the machine's own lateness is measured better, the first frame comes later."""
 WARM_PATIENCE = 30.0
-"""Greatest time (s) that the loop waits for its first cells and for a device's first valid pose."""
+"""Longest wait (s) of the loop for its first cells and for a device's first valid pose."""
 
 
 @dataclass(frozen=True)
 class DeviceRequest:
-    """Session of which the worker has the device: see `hapticdb.session.session.Session`."""
+    """Session with a device: see `hapticdb.session.session.Session`."""
 
     slot_request: SlotRequest
     table: CellTable
@@ -64,9 +64,9 @@ class DeviceRequest:
 
 
 class DeviceLoop:
-    """The loop of a session whose device this process has. It is made, warmed up, and run once.
+    """The loop of a session with a device. It is made, warmed up, and run once.
 
-    request : its slot and reader row are taken; timing : of the loop; clock : of its one slot.
+    request : with slot and reader row; timing : of the loop; clock : of its one slot.
     """
 
     def __init__(self, request: DeviceRequest, timing: Timing, clock: PeriodClock) -> None:
@@ -98,7 +98,7 @@ class DeviceLoop:
     def prepare(self) -> None:
         """Place the tool at the hand and wait for its cells.
 
-        Without a database it does not wait: what supervises the session tells of that at once.
+        Without a database it does not wait: the supervisor reports that at once.
         """
         started = time.monotonic()
         session, asked = self.session, 0
@@ -120,7 +120,7 @@ class DeviceLoop:
         self._place()
 
     def _place(self) -> None:
-        """Put the tool where the hand is, at rest."""
+        """Put the tool at the hand, at rest."""
         if isinstance(self.device, SupportsRewind):
             self.device.rewind()
         reading, handle = self._read(), self.request.handle
@@ -131,7 +131,7 @@ class DeviceLoop:
         self.state.rest_at(pose_numbers(self.hand).copy())
 
     def _read(self) -> Reading:
-        """Read the hand's pose; wait for a device that does not know it yet after its opening."""
+        """Read the hand's pose; wait for the first valid one after the device's opening."""
         until = time.monotonic() + WARM_PATIENCE
         reading = self.reader.read()
         while not is_somewhere(reading.pose, reading.velocity):
@@ -145,7 +145,7 @@ class DeviceLoop:
         return reading
 
     def warm_up(self) -> None:
-        """Run every kernel of a frame, so that none is compiled later; the tool stays in place."""
+        """Run every kernel of a frame, so none is compiled later; the tool stays in place."""
         if isinstance(self.device, SupportsOpen):
             self.device.open()
         self._place()
@@ -194,16 +194,16 @@ class DeviceLoop:
         return LoopFigures.of_slot(self.slot, seconds)
 
     def _end(self, number: int, _: object) -> None:
-        """End the loop, and the call of a device that hangs.
+        """End the loop, and a hanging call of the device.
 
-        What is raised at the entrance of a kernel's call is lost; `run` then raises the signal.
+        An exception at the entrance of a kernel's call is lost; `run` then raises the signal.
         """
         self._signal = number
         self.clock.stop()
         raise SystemExit(128 + number)
 
     def _called(self, work: Callable[[], bool]) -> Any:  # noqa: ANN401 - of ctypes
-        """Return what a kernel calls for `work`, which says if the loop ends: an error ends it."""
+        """C function for `work` -> whether the loop ends; an error ends it, too."""
 
         def answer() -> bool:
             try:
@@ -219,7 +219,7 @@ class DeviceLoop:
         return False
 
     def _pusher(self) -> Callable[[], bool]:
-        """Return what pushes the device and looks whether the loop ends."""
+        """Function to push the device -> whether the loop ends."""
         device = self.device
         ends = device if isinstance(device, SupportsEnd) else None
         applied, x, n_frames = self.sent.wrench, self.hand["position"][:1], self.slot["n_frames"]
@@ -248,9 +248,9 @@ class DeviceLoop:
 def empty_loop(
     law: ForceLaw, rendering: Rendering | None, rate: float, seconds: float
 ) -> LoopFigures:
-    """Run a loop that does nothing at that rate, to measure the machine's lateness.
+    """Run an empty loop at that rate, to measure the machine's lateness.
 
-    It ends at once if the process that started this one ends, or closes its channel.
+    It ends at once if the parent ends, or closes its channel.
     """
     clock = PeriodClock(law, rendering=rendering)
     clock.rows["source"], clock.rows["is_running"] = NOBODY, True
@@ -268,7 +268,7 @@ def empty_loop(
 
 
 def n_compiled() -> int:
-    """Number of signatures of all kernels that have been compiled or loaded."""
+    """Number of compiled or loaded signatures of all kernels."""
     return sum(len(getattr(e.compiled, "signatures", ())) for e in ENTRIES.values())
 
 

@@ -1,4 +1,4 @@
-"""Proximity queries of a session's coupling on a GPU, which the kernel of its periods calls."""
+"""Proximity queries of a session's coupling on a GPU, called by the kernel of its periods."""
 
 from collections.abc import Callable
 from typing import Any
@@ -30,22 +30,22 @@ from hapticdb.resident.table import CellTable
 from hapticdb.session.states import SessionState
 
 ROOM = 1 << 17, 8
-"""Near points for which there is room at first: so many, or all of a smaller tool's, or this part
-of a larger tool's, at 0.2 kB each. More make new room, in a frame that is late."""
+"""Room for near points at first: so many, or all of a smaller tool's, or this part of a larger
+tool's, at 0.2 kB each. More make new room, in a late frame."""
 NOBODY = 1 << 62
 """In the place of a point's number: none."""
 NOTHING = np.array([0.0, 0.0, 0.0, NEVER])
-"""What a look finds at first."""
+"""Result of a query at first."""
 MERGES_FROM = 4096
-"""Near points from which one contact stands for several: the processor solves for them, 34 ms a
-period with 57,600 of them, 1.3 ms merged. Larger: broad contacts are felt point by point."""
+"""Most near points before contacts are merged: the processor solves for them, 34 ms a period with
+57,600 of them, 1.3 ms merged. Larger: broad contacts are resolved point by point."""
 USED_EVERY = 16
-"""Looks after which the table learns which cells were read. Larger: less copying; a cell may be
-evicted sooner after it was read."""
+"""Queries between two copies of the read cells to the table. Larger: less copying; a cell may be
+evicted sooner after its last use."""
 
 
 def check_frames(frames_on: str, rendering: str) -> None:
-    """Refuse a session whose frames cannot be computed there."""
+    """Raise unless frames can be computed there."""
     if frames_on != "cuda":
         raise UsageError(f"frames on {frames_on!r}: choose 'cpu' or 'cuda'")
     if rendering != "coupled":
@@ -54,7 +54,7 @@ def check_frames(frames_on: str, rendering: str) -> None:
 
 
 class _Repeated:
-    """Launches and copies of a stream, repeated with the arguments that they have now.
+    """Launches and copies of a stream, repeated with their present arguments.
 
     A launch by numba reads its arguments in Python, a third of a millisecond for twenty arrays; a
     CUDA graph has read them. numba's simulator has no graphs.
@@ -160,14 +160,14 @@ class GpuQueries:
         )
 
     def check(self) -> None:
-        """Raise what went wrong in a look of the last period, or a signal that came in one."""
+        """Raise an error or a signal during a query of the last period."""
         if isinstance(self._error, Exception):
             raise HapticDBError(f"the GPU has failed: {self._error}") from self._error
         if self._error is not None:
             raise self._error
 
     def _answer(self) -> int:
-        """Do what a look asks for; an error leaves the tool held until `check`."""
+        """Answer a query; after an error the tool stays until `check`."""
         try:
             return self._looked()
         except BaseException as error:  # noqa: BLE001 - no kernel can take it
@@ -175,7 +175,7 @@ class GpuQueries:
             return NOT_KNOWN
 
     def _looked(self) -> int:
-        """Look at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
+        """Near points at the tried pose, as `near_points.look` -> OPEN, SHUT or NOT_KNOWN."""
         follower, state = self._follower, self._state
         self._mirror.update(int(state.cells.readers[state.reader * READER_STRIDE]))
         self._mirror.seen()  # in the arrays that the launches read
@@ -214,7 +214,7 @@ class GpuQueries:
         return NOT_KNOWN if n_unknown else OPEN
 
     def _first_shut(self, numbers: NDArray[np.int64]) -> int:
-        """First of the near points that may not be there; NOBODY if all may."""
+        """First forbidden near point; NOBODY without one."""
         if not self._follower.is_walking:
             return NOBODY
         before = self._state.kept[numbers]
@@ -224,7 +224,7 @@ class GpuQueries:
         return int(numbers[is_shut].min(initial=NOBODY))
 
     def _look_once(self) -> NDArray[np.float64]:
-        """Look at the tried pose once -> what was found (FOUND,). It forgets what it is to."""
+        """One query at the tried pose -> its result (FOUND,)."""
         follower = self._follower
         self._n_looks += 1
         self._asked[0] = (
@@ -238,13 +238,13 @@ class GpuQueries:
         return self._found
 
     def _put_back(self, last: int, n_due: float) -> None:
-        """Put back what a look wrote beyond a point; a later launch waits for it."""
+        """Undo the writes of a query beyond a point; a later launch waits for it."""
         self._asked["last"], self._asked["n_due"] = last, n_due
         self._begin_put_back()
         self._stream.synchronize()
 
     def _launch_look(self) -> None:
-        """Launches and copies of a look."""
+        """Launches and copies of a query."""
         place, stream, view = self._place, self._stream, self._view
         seen = self._mirror.seen()._replace(used=view.used)
         view.asked.copy_to_device(self._asked, stream=stream)
@@ -256,12 +256,12 @@ class GpuQueries:
         view.found.copy_to_device(self._nothing, stream=stream)
 
     def _launch_put_back(self) -> None:
-        """Launch and copy of what puts back."""
+        """Launch and copy of an undo."""
         self._view.asked.copy_to_device(self._asked, stream=self._stream)
         kernels.put_back[self._of_runs, kernels.THREADS_OF_RUNS, self._stream](self._view)
 
     def _repeat(self) -> None:
-        """Take both with the arrays that they have now."""
+        """Take both with their present arrays."""
         self._begin_look = _Repeated(self._stream, self._launch_look)
         self._begin_put_back = _Repeated(self._stream, self._launch_put_back)
 
@@ -275,7 +275,7 @@ class GpuQueries:
         self._repeat()
 
     def _tell_missed(self, n_unknown: int) -> None:
-        """List the unknown cells that the look met, for the fetching process."""
+        """List the query's unknown cells, for the prefetch process."""
         missed, keys = self._state.missed, self._view.missed
         missed[LISTED] = 0
         if n_unknown:
@@ -286,7 +286,7 @@ class GpuQueries:
             missed[LISTED + 1 : LISTED + 1 + len(found)] = found
 
     def _tell_used(self) -> None:
-        """Mark the cells that were read in the table, which evicts others."""
+        """Mark the read cells in the table, so others are evicted."""
         used = self._view.used
         found = used.copy_to_host()
         self._table.cells.used[found > 0] = 1

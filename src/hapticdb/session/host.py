@@ -1,4 +1,4 @@
-"""SessionHost: many hands in few worker processes, over tables of cells that they share."""
+"""SessionHost: many hands in few worker processes, over shared tables of cells."""
 
 import itertools
 import logging
@@ -39,24 +39,24 @@ LOG = logging.getLogger("hapticdb.session")
 MOST_SESSIONS = 64
 """Most sessions of a host. Larger: more shared memory, 960 kB each."""
 TEND_EVERY = 0.05
-"""Seconds between two looks after recordings and processes. Larger: less work, and what has died is
-noticed later. A recording loses frames from 2 s on."""
+"""Seconds between two checks of recordings and processes. Larger: less work, and a death is noticed
+later. A recording loses frames from 2 s on."""
 
 
 class SessionHost(Closes):
-    """Hands in an environment, `MOST_SESSIONS` at once, each felt in real time.
+    """Hands in an environment, `MOST_SESSIONS` at once, each in real time.
 
-    Sessions run in worker processes, many in each. All sessions that feel the same objects share
-    one table of resident cells and its fetching process. Also a context manager.
+    Sessions run in worker processes, many in each. All sessions with the same filter share
+    one table of resident cells and its prefetch process. Also a context manager.
 
     url : the environment; rate : frames a second of each session; budget_bytes : memory of each
     table of cells; processes : most worker processes, one for each processor unless given, and one
-    for each rendering; rendering : of all sessions. Without it sessions whose objects have
-    distances to surfaces are coupled, and the others feel tangent planes directly.
+    for each rendering; rendering : of all sessions. By default a session is coupled if its objects
+    have distances to surfaces, and renders tangent planes directly otherwise.
     """
 
     _pid = 0
-    """Id of the process that made this object. In a forked copy `close` does nothing."""
+    """Id of the process of this object. In a forked copy `close` does nothing."""
 
     def __init__(
         self,
@@ -81,7 +81,7 @@ class SessionHost(Closes):
         self._served: list[socket.socket] = []
         self._is_closed = threading.Event()
         self.failure: HapticDBError | None = None
-        """Error that keeps the database from being read again; None while all is well."""
+        """Lasting error of a prefetch process; None without one."""
         self._pid = os.getpid()
         self._logged: set[str] = set()
         self._tending = [
@@ -110,7 +110,7 @@ class SessionHost(Closes):
         the scene's.
 
         Raises `UsageError` if a number is out of its range, no slot is free, or a hand is to be
-        coupled where an object has no distances to its surfaces; `ObjectNotFoundError` if a word
+        coupled without distances to surfaces; `ObjectNotFoundError` if a word
         chooses nothing; `DatabaseError` if the environment cannot be opened.
         """
         pose = pose_at(start)
@@ -160,12 +160,12 @@ class SessionHost(Closes):
         return HostedSession(self._shared, running.slot, number, self._call)
 
     def sessions(self) -> list[HostedSession]:
-        """Sessions that run now, by their ids."""
+        """Sessions now, by their ids."""
         running = sorted(self._running.items())
         return [HostedSession(self._shared, r.slot, number, self._call) for number, r in running]
 
     def _call(self, word: str, session: int, /, *content: object) -> object:
-        """Do what a session asks for; see `HostedSession`."""
+        """Do a session's request; see `HostedSession`."""
         with self._changing:
             running = self._running.get(session)
             if running is None:
@@ -176,7 +176,7 @@ class SessionHost(Closes):
             return do(*content)
 
     def _end(self, running: Running) -> Recorded:
-        """End a session, whatever of it still works; returns what its recording has."""
+        """End a session, working or not; returns the size of its recording."""
         self._running.pop(running.session, None)
         with ExitStack() as ends:  # the last one runs first, and each runs even if another fails
             ends.callback(self._tables.release, running.cells)
@@ -199,12 +199,12 @@ class SessionHost(Closes):
         ).start()
 
     def _tend(self, look: Callable[[], None]) -> None:
-        """Look after something again and again; without `_changing`, which a slow begin holds."""
+        """Repeat a check, without `_changing`: a slow begin has that lock."""
         while not self._is_closed.wait(TEND_EVERY):
             look()
 
     def _look_after_sessions(self) -> None:
-        """Record frames, notice workers that died."""
+        """Record frames, notice dead workers."""
         for running in list(self._running.values()):
             with self._surviving("recording a session"):
                 if running.worker.is_alive:
@@ -213,9 +213,9 @@ class SessionHost(Closes):
                     self._shared.lose(running.slot, running.session)
 
     def _look_after_cells(self) -> None:
-        """Start fetching processes again that have ended."""
+        """Start ended prefetch processes again."""
         for cells in self._tables.all():
-            with self._surviving("starting a fetching process again"):
+            with self._surviving("starting a prefetch process again"):
                 try:
                     cells.supervise()
                 except HapticDBError as error:
@@ -223,7 +223,7 @@ class SessionHost(Closes):
 
     @contextmanager
     def _surviving(self, work: str) -> Iterator[None]:
-        """Go on after an error, which is logged when it is met for the first time."""
+        """Go on after an error; its first occurrence is logged."""
         try:
             yield
         except Exception as error:
@@ -234,7 +234,7 @@ class SessionHost(Closes):
 
     @property
     def cells(self) -> list[ResidentCells]:
-        """Tables of cells in use, one for each filter of what is felt, with their figures."""
+        """Tables of cells in use, one for each filter, with their figures."""
         return self._tables.all()
 
     @property

@@ -1,4 +1,4 @@
-"""HostedSession: one hand that a host runs, seen from the process that moves it."""
+"""HostedSession: one hand of a host, from the process of its motion."""
 
 import math
 import os
@@ -20,25 +20,24 @@ from hapticdb.session.shared_table import TAKEN, SharedTable
 
 
 class Recorded(NamedTuple):
-    """What a recording has at its end: frames, and frames that were lost on the way to it."""
+    """Frames of a recording at its end, and frames lost on the way to it."""
 
     frames: int
     lost: int
 
 
 Calls = Callable[..., object]
-"""What a hosted session asks of the host: a word, the session's id, what goes with it -> result."""
+"""A hosted session's request to the host: a word, the session's id, arguments -> result."""
 
 
 class HostedSession:
-    """A hand in an environment that a worker process of the host runs, among others.
+    """A hand in an environment, in a worker process of the host, among others.
 
-    `move`, `latest`, `contacts`, `touched` and `figures` read and write shared memory and take
-    microseconds; the others wait for the host, which `call` reaches.
+    `move`, `latest`, `contacts`, `touched`, `figures` and `counts` read and write shared memory and
+    take microseconds; the others wait for the host, by `call`.
 
-    id : number that no other session of the host ever has; slot : its row of the shared table;
-    lost_frames : frames that this session's last recording lacks, known when this object has ended
-    it.
+    id : unique number among all sessions of the host; slot : its row of the shared table;
+    lost_frames : frames missing in the last recording, once this object has ended it.
     """
 
     def __init__(self, shared: SharedTable, slot: int, session: int, call: Calls) -> None:
@@ -62,8 +61,8 @@ class HostedSession:
 
         A position and a unit quaternion, (7,), are a pose, too, and save the conversion.
 
-        The hand moves there from where it is, in about the time between two calls, so that calls at
-        20 to 100 Hz give a smooth motion. It never goes beyond the last pose that was given.
+        The hand moves there in about the time between two calls, so calls at 20 to 100 Hz give a
+        smooth motion. It never goes beyond the last pose.
         UsageError if the pose is no rigid transform or is beyond 1e9 m, or the session is over.
         """
         row = np.asarray(pose, dtype=np.float64)
@@ -80,7 +79,7 @@ class HostedSession:
         return self._shared.last_frame(self._open_slot())
 
     def touched(self) -> tuple[int, ...]:
-        """Ids of the objects that the tool touches now, or lies in; asked 100 times a second."""
+        """Ids of objects in contact with the tool now, or around it; sampled 100 times a second."""
         slot = self._open_slot()
         last = self._shared.last_frame(slot)
         if last is None or not (last["hits"][0] or last["state"][0] & State.IN_OBJECT):
@@ -107,11 +106,11 @@ class HostedSession:
         self._call("record", self.id, os.path.abspath(path), replace)  # noqa: PTH100 - a text to send
 
     def stop_recording(self) -> int:
-        """End the recording, which stays; returns the number of its frames, 0 without one."""
+        """End the recording; its file stays. Returns the number of its frames, 0 without one."""
         return self._ended_recording("stop_recording")
 
     def _ended_recording(self, word: str) -> int:
-        """Do what ends a recording; returns the number of its frames."""
+        """End a recording by a request; returns the number of its frames."""
         recorded = self._call(word, self.id)
         if recorded is None:  # the session was over
             return 0

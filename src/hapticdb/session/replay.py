@@ -24,16 +24,16 @@ from hapticdb.session.prefetch.tracking import PrefetchRequest
 from hapticdb.session.states import PeriodClock, SessionState
 
 BLOCK = 256
-"""Frames that are run at once, and again when they met a cell that was not in memory. Larger: fewer
-copies of the session's state, and more frames to run again."""
+"""Frames of a block; it is run again if a cell was not in memory. Larger: fewer copies of the
+session's state, and more frames to run again."""
 NEVER_NS = 1 << 62
-"""Nanoseconds without an answer of the database: no time is that long."""
+"""Nanoseconds of silence of the database: more than any session has."""
 OUTPUTS = ("tool", "applied", "hits", "contacts", "deepest", "state")
-"""Fields of a frame that are compared."""
+"""Compared fields of a frame."""
 
 
 class Parting(NamedTuple):
-    """The first frame whose outputs differ from the recorded ones."""
+    """The first frame with other outputs than the recorded ones."""
 
     frame: int
     time: float  # s since the recording's start
@@ -60,7 +60,7 @@ class Replayed:
     n_frames: int
     """Frames in the recording: all were computed again."""
     n_differing: int
-    """Frames of which an output is not the same."""
+    """Frames with a different output."""
     parting: Parting | None
     revision: int
     """Of the database at the end."""
@@ -86,9 +86,9 @@ class Replayed:
 def replay(recording: Recording, environment: Environment) -> Replayed:
     """Run the session's kernel over the recorded hand, all cells in memory, and compare outputs.
 
-    Tool, applied wrench and contacts are equal bit for bit, unless a frame met cells that were not
-    in memory, frames were lost, the environment was edited, the frames were computed on a GPU, or
-    by another build. `Parting.reason` says which. Cells take 256 MiB of memory at most.
+    Tool, applied wrench and contacts are equal bit for bit, unless a frame had cells missing in
+    memory, frames were lost, the environment was edited, the frames were computed on a GPU, or by
+    another build: see `Parting.reason`. Cells take 256 MiB of memory at most.
 
     Parameters
     ----------
@@ -121,7 +121,7 @@ def replay(recording: Recording, environment: Environment) -> Replayed:
 
 
 class _Again:
-    """The session's state, whose hand is the recorded one."""
+    """The session's state, with the recorded hand."""
 
     def __init__(self, recording: Recording, residency: Residency, table: CellTable) -> None:
         header, self._residency, self._table = recording.header, residency, table
@@ -172,7 +172,7 @@ class _Again:
         return np.sort(around.cells(grid)[0][: self._table.n_slots // 2])
 
     def _run(self, frames: Frames) -> NDArray[np.int64]:
-        """Run frames into the ring -> cells (n,) that they met and that are not in memory."""
+        """Run frames into the ring -> their cells (n,) missing in memory."""
         row, servo, hand = self._row, self._row.servo, self._row.servo.hand
         version, missed = servo.tool.version, [np.empty(0, np.int64)]
         state = frames["state"].astype(np.int64)
@@ -228,7 +228,7 @@ class _Comparison:
         self._n_frames += len(recorded)
 
     def _look_for_reasons(self, frames: Frames) -> None:
-        """Find the first frames after which a replay may differ."""
+        """Find the first frames with a reason for a difference."""
         now, times = self._residency.revision, frames["time"]
         begun = times[0] - frames["dt"][0] if self._last is None else self._last
         begins = np.append(begun, times[:-1])

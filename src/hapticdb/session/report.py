@@ -14,7 +14,7 @@ from hapticdb.session.prefetch.resident_cells import CacheFigures
 class Spread(NamedTuple):
     """Distribution of a time over frames, seconds.
 
-    Percentiles are exact to 1 us; one above 20 ms is told as the worst.
+    Percentiles are exact to 1 us; above 20 ms they are the worst.
     """
 
     p50: float
@@ -42,8 +42,8 @@ def spread_of(counts: NDArray[np.int64], worst: float) -> Spread:
 class LoopFigures:
     """Timing of a loop.
 
-    frames : number of frames; seconds : time that they took; missed : deadlines at which no frame
-    began, because the frame before was not finished or the machine did other work; lateness : time
+    frames : number of frames; seconds : their time; missed : deadlines without a frame, because
+    the frame before was not finished or the machine did other work; lateness : time
     from each deadline to the begin of its frame; elapsed : computing time of each frame, with the
     device's.
     """
@@ -63,7 +63,7 @@ class LoopFigures:
 
     @classmethod
     def of_slot(cls, slot: NDArray[np.void], seconds: float) -> Self:
-        """Timing of a session that ran for so long; slot : its row of `SEAT`."""
+        """Timing of a session; slot : its row of `SEAT`; seconds : its duration."""
         spreads = [
             spread_of(slot[name], float(slot[f"worst_{name}"])) for name in ("lateness", "elapsed")
         ]
@@ -73,7 +73,7 @@ class LoopFigures:
 class LoopAnswer(NamedTuple):
     """Last message of a worker with a device; a `Report` is made of it and the counts.
 
-    card: name of the GPU that looked, if one did.
+    card: name of the GPU, if one was used.
     """
 
     loop: LoopFigures
@@ -105,7 +105,7 @@ class Report:
         Whether all wanted cells were resident before the first frame; after
         `hapticdb.session.device_loop.WARM_PATIENCE` a session starts without them.
     cache : CacheFigures
-        Figures of the fetching process.
+        Figures of the prefetch process.
     objects, loose_objects : tuple of int
         Ids of objects touched, and of those that the tool lay in; sampled a hundred times a second.
     recorded_frames, lost_records : int

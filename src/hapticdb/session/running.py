@@ -1,4 +1,4 @@
-"""Running: one session in the process that began it, with a device or hosted."""
+"""Running: one session in its parent process, with a device or hosted."""
 
 import threading
 from contextlib import ExitStack
@@ -19,9 +19,9 @@ from hapticdb.session.workers import WorkerProcess
 
 
 class Running(Closes):
-    """A session that runs: its slot and reader row, until `close`; its worker; its recording.
+    """A running session: its slot and reader row, until `close`; its worker; its recording.
 
-    session : its number; worker : its process, or the number of one that is still to start.
+    session : its number; worker : number of its worker.
     """
 
     def __init__(
@@ -49,7 +49,7 @@ class Running(Closes):
 
     @property
     def worker(self) -> WorkerProcess:
-        """Process that runs its periods."""
+        """Process of its periods."""
         assert self._worker is not None  # noqa: S101 - set before anybody else knows the session
         return self._worker
 
@@ -89,7 +89,7 @@ class Running(Closes):
     def begin_recording(
         self, recording: Recorder, first: int, start: Start, frames_on: str = "cpu"
     ) -> None:
-        """Record from frame `first` on, before which the state is `start`."""
+        """Record from frame `first` on; `start` is the state before that frame."""
         request, of_worker = self.request, self.worker.request
         header = self.cells.header(
             request.shell, of_worker.timing.rate, of_worker.law, request.coupling, start, frames_on
@@ -109,7 +109,7 @@ class Running(Closes):
                     raise
 
     def stop_recording(self) -> Recorded:
-        """End the recording, which stays."""
+        """End the recording; its file stays."""
         try:
             self.take_frames()
         finally:
@@ -120,7 +120,7 @@ class Running(Closes):
         return Recorded(0, 0) if recording is None else Recorded(len(recording), recording.n_lost)
 
     def end_worker(self) -> None:
-        """End the worker of a session that runs alone, if it was started."""
+        """End the worker of a session with a device, if it was started."""
         if self._worker is not None:
             self.shared.slots["is_asked_to_end"][self.slot] = True
             self._worker.end()

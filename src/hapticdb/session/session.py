@@ -1,4 +1,4 @@
-"""Session: a hand in an environment, felt in real time by processes of its own."""
+"""Session: one device in an environment, with processes of its own."""
 
 import os
 import time
@@ -36,20 +36,20 @@ if TYPE_CHECKING:
     from hapticdb.batches.feeler import BatchDevice
 
 RING_SECONDS = 4.0
-"""Seconds of frames that the ring in shared memory holds until they are recorded. A larger value
-loses no frame over longer pauses of this process, and takes more memory."""
+"""Seconds of frames in the ring until they are recorded. Larger: longer pauses of this process lose
+no frame, at more memory."""
 LEAST_RING = 1024
 """Least number of frames in the ring, however low the rate."""
 DRAIN_EVERY = 0.05
 """Seconds between two checks of the loop in `wait`. A larger value reports its end later."""
 END_PATIENCE = 10.0
-"""Seconds in which the loop must end after a request to end; normally it ends after a frame."""
+"""Seconds from a request until the loop must have ended; normally one frame."""
 DEFAULT_STALENESS = 1.0
 """Default of `staleness`, seconds without an answer of the database."""
 
 
 class Session(Closes):
-    """A hand in an environment, felt in real time.
+    """A hand in an environment, in real time.
 
     The loop and the fetching of its cells run in two separate processes. This object starts and
     supervises them, records, and reports. Also a context manager.
@@ -57,7 +57,7 @@ class Session(Closes):
     Parameters
     ----------
     cells : ResidentCells or str
-        The environment: its resident cells, which several sessions may share, or its URL. With a
+        The environment: its resident cells, shared by several sessions, or its URL. With a
         URL all objects are felt, and cells take the default budget.
     shell : PointShell
         The tool.
@@ -109,7 +109,7 @@ class Session(Closes):
     """
 
     _pid = 0
-    """Id of the process that made this object. In a forked copy `close` does nothing."""
+    """Id of the process of this object. In a forked copy `close` does nothing."""
 
     def __init__(
         self,
@@ -239,7 +239,7 @@ class Session(Closes):
 
     @property
     def loose_objects(self) -> tuple[int, ...]:
-        """Ids of the objects in which the tool lay so far; sampled a hundred times a second."""
+        """Ids of objects around the tool so far; sampled a hundred times a second."""
         return tuple(sorted(self._loose_objects))
 
     @property
@@ -260,7 +260,7 @@ class Session(Closes):
         """Supervise the session until it ends; returns its report, or None after `seconds`.
 
         Call this again and again, or without a time: only during the call frames are recorded, and
-        a fetching process that has died is started again.
+        a dead prefetch process is started again.
         """
         running = self._open
         process = running.worker
@@ -337,14 +337,14 @@ class Session(Closes):
         )
 
     def _conditions(self) -> dict[str, str]:
-        """What a report says of the tool and the processor."""
+        """Tool and processor, for the report."""
         points, processor = {"points": str(len(self.shell))}, self.timing.processor
         if processor is None:
             return points
         return points | {"processor": f"bound to processor {processor}"}
 
     def close(self) -> None:
-        """End the processes and close the recording, which stays.
+        """End the processes and close the recording; its file stays.
 
         Does nothing in a forked copy, because the session belongs to the parent process.
         """
@@ -372,7 +372,7 @@ def _check_choices(seconds: float | None, staleness: float) -> None:
 
 
 def _checked_frames(frames_on: "BatchDevice", rendering: Rendering) -> "BatchDevice":
-    """Refuse a session whose frames cannot be computed there."""
+    """Raise unless frames can be computed there."""
     if frames_on != "cpu":
         from hapticdb.session.gpu_queries import check_frames  # noqa: PLC0415 - loads numba.cuda
 

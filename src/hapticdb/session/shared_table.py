@@ -1,9 +1,8 @@
-"""SharedTable: a slot for each session, in memory that several processes share.
+"""SharedTable: a slot for each session, in shared memory.
 
-A slot is a row of `SEAT`: frames and counts of a session, and a hosted hand. The process that moves
-a hosted hand writes the hand's pose; the worker that runs the session writes its results. No reader
-waits for a writer: a sequence number, odd while a part of a row is written, asks a reader to read
-again.
+A slot is a row of `SEAT`: frames and counts of a session, and a hosted hand. A page
+or its like writes the hand's pose, the session's worker the results. No reader waits for a writer:
+an odd sequence number marks an unfinished write, and the reader reads again.
 """
 
 import mmap
@@ -24,18 +23,18 @@ from hapticdb.recording.frame import Frames
 from hapticdb.resident.table import anonymous_memory
 
 RING = 2048
-"""Frames of a hosted session that the shared table holds: two seconds at 1 kHz. Larger: a recording
+"""Frames of a hosted session in the shared table: two seconds at 1 kHz. Larger: a recording
 survives longer pauses of the host's process, and each session takes more memory."""
 QUICK_ATTEMPTS = 100
-"""Attempts, without a pause between them, to read what another process writes: that takes it
-microseconds, unless it is stopped in the middle by a busy machine."""
+"""Attempts without a pause to read an unfinished row: writing takes microseconds, unless a busy
+machine stops the writer in the middle."""
 READ_PATIENCE = 1.0
-"""Seconds of further attempts. Larger: a busier machine is borne, and a reader is held up for
-longer by a process that died while it wrote."""
+"""Seconds of further attempts. Larger: a busier machine is borne, and a writer's death delays a
+reader for longer."""
 READ_PAUSE = 5e-4
-"""Seconds between further attempts, which let the writer have a processor."""
+"""Seconds between further attempts, so that the writer gets a processor."""
 FREE, TAKEN, LOST = 0, 1, 2
-"""States of a slot: nobody's; a session's; a session's whose worker process has died."""
+"""States of a slot: free, in use, in use by a session with a dead worker."""
 
 Slots = NDArray[np.void]
 """Rows of `kernels.records.SEAT`."""
@@ -44,7 +43,7 @@ Slots = NDArray[np.void]
 class SharedTable(Closes):
     """Slots of sessions in shared memory.
 
-    descriptor : of the memory of a table that `create` has made; owned from now on; slots (S,) of
+    descriptor : of the memory from `create`; owned from now on; slots (S,) of
     `SEAT`; rings (S, ring) of `FRAME`: frame n of a session is at index n modulo ring.
     """
 
@@ -61,11 +60,11 @@ class SharedTable(Closes):
 
     @classmethod
     def create(cls, n_slots: int, ring: int = RING) -> Self:
-        """Make a shared table with free slots, and that many frames for each."""
+        """Make a table of free slots with `ring` frames each."""
         return cls(anonymous_memory("hapticdb-slots", n_slots * _bytes_a_slot(ring)), ring)
 
     def __reduce__(self) -> tuple[object, ...]:
-        """Pickle it for a process that inherits its descriptor."""
+        """Pickle it for a process with the same descriptor."""
         return SharedTable, (self.descriptor, self.rings.shape[1])
 
     def close(self) -> None:
@@ -95,13 +94,13 @@ class SharedTable(Closes):
             self.slots["state"][row] = FREE
 
     def lose(self, row: int, session: int) -> None:
-        """Tell that a session's worker has died, unless the slot is free or another's by now."""
+        """Mark a session's worker as dead, unless the slot is free or another's by now."""
         with self._taking:
             if self.slots["state"][row] == TAKEN and self.slots["id"][row] == session:
                 self.slots["state"][row] = LOST
 
     def put_hand(self, row: int, time: int, pose: NDArray[np.float64]) -> None:
-        """Write where the hand is (7,), and when."""
+        """Write the hand's pose (7,) and its time."""
         slots = self.slots
         slots["hand_sequence"][row] += 1
         slots["hand_pose"][row] = pose
@@ -140,7 +139,7 @@ def _bytes_a_slot(ring: int) -> int:
 
 
 def _attempts() -> Iterator[None]:
-    """Times to try to read what another process may be writing, until patience ends."""
+    """Attempts to read a row during a possible write, until patience ends."""
     yield from repeat(None, QUICK_ATTEMPTS)
     end = time.monotonic() + READ_PATIENCE
     while time.monotonic() < end:

@@ -1,4 +1,4 @@
-"""Sessions in the form that the kernel of their periods reads, and the clock of the periods."""
+"""States of sessions in the form of their kernel, and the clock of their periods."""
 
 import time
 from dataclasses import dataclass
@@ -33,23 +33,22 @@ from hapticdb.resident.table import HEARTBEAT, CellTable
 from hapticdb.session.coupling import DirectRendering, Rendering, rendering_of
 
 LARGE_FROM = 4096
-"""Points from which the quasi-static coupling tests spheres of runs before their points. The
-results are the same: a larger value only costs time."""
+"""Least number of points for which the quasi-static coupling tests spheres of runs before their
+points. The results are the same: a larger value only costs time."""
 STALENESS_NS = 1_000_000_000
-"""Nanoseconds without an answer of the database after which hosted hands take all cells for
-unknown."""
+"""Longest silence (ns) of the database before all cells count as unknown for hosted hands."""
 FOREVER = 1e9
-"""Seconds that mean "no limit": thirty years."""
+"""Seconds for "no limit": thirty years."""
 
 Record = NDArray[np.void]
 
 
 @dataclass(frozen=True)
 class SlotRequest:
-    """Session that a worker process is to run.
+    """Session for a worker process.
 
     slot, reader : its rows of the shared table and of the table of cells; grid : of the cells;
-    shell : the tool, without triangles, which no frame reads; coupling : between hand and tool.
+    shell : the tool, without triangles; coupling : between hand and tool.
     """
 
     slot: int
@@ -60,14 +59,14 @@ class SlotRequest:
 
 
 class SessionState:
-    """One session: its row of STATION, and the memory whose addresses the row has.
+    """One session: its row of STATION, and the memory at the row's addresses.
 
     Parameters
     ----------
     row : array
         (1,) of STATION.
     cells, reader : Cells, int
-        The cells that the session reads, and its row there.
+        Cells of the session, and its row there.
     session : array
         (1,) of SESSION: its row on the request queue.
     grid : Grid
@@ -140,14 +139,14 @@ class SessionState:
         pose_numbers(tool)[:] = pose_numbers(hand)[:] = pose
 
     def save(self) -> Start:
-        """What the next period depends on, beside its cells and the hand."""
+        """All that the next period depends on, except cells and hand."""
         tool = self.servo["tool"]
         of_points = (self.kept, self.near_points, self.bends) if tool["version"] else ()
         parts = (self.servo, self.follower, *of_points)
         return Start(*(part.tobytes() for part in parts))
 
     def restore(self, saved: Start) -> None:
-        """Continue from what `save` returned, for the same tool and build."""
+        """Continue from a result of `save`, for the same tool and build."""
         looker, parts = (
             self.follower["looker"].copy(),
             (self.servo, self.follower, self.kept, self.near_points, self.bends),
@@ -158,7 +157,7 @@ class SessionState:
         self.follower["looker"] = looker
 
     def arrive_at(self, pose: NDArray[np.float64]) -> None:
-        """Take the hand from the shared table, where it has arrived at a pose (7,)."""
+        """Take the hand from the shared table; its first pose is (7,)."""
         way = self.record["way"]
         way["start"], way["end"], way["seconds"] = pose, pose, 1e-9
         self.row["source"], self.row["gap"] = loop.BOARD, USUAL_GAP_NS
@@ -203,10 +202,10 @@ class PeriodClock:
         return state
 
     def run(self, rate: float, seconds: float = FOREVER) -> float:
-        """Run periods at a rate until `stop` or for so long -> seconds that they took.
+        """Run periods at a rate until `stop` or for so long -> their time, s.
 
-        A period that takes longer than its time misses the deadlines within it; the next one is due
-        at the next deadline of the grid. It holds no interpreter lock.
+        A long period misses the deadlines within it; the next one is due at the next deadline of
+        the grid. The interpreter lock is free meanwhile.
         """
         begun, record = time.monotonic_ns(), self.record
         self.rows["began"] = self.rows["last"] = begun
@@ -216,7 +215,7 @@ class PeriodClock:
         return 1e-9 * (time.monotonic_ns() - begun)
 
     def step(self, dt: float, begun: int) -> None:
-        """Run one period that has begun at a time, ns, `dt` s after the last one."""
+        """Run one period, begun at a time in ns, `dt` s after the last one."""
         times = self._times
         times[0][()], times[1][()], times[2][()] = begun, begun, dt
         loop.run(*self._arguments)

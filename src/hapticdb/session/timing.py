@@ -1,4 +1,4 @@
-"""How a loop is scheduled, and settings of the process that make it less disturbed."""
+"""How a loop is scheduled, and settings of its process against disturbances."""
 
 import contextlib
 import ctypes
@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from hapticdb.errors import UsageError
 
 SWITCH_INTERVAL = 1e-4
-"""Seconds after which another thread of this process may run, while the loop runs. Python's own
+"""Seconds before another thread of this process may run beside the loop. Python's own
 value is 5e-3, five periods at 1 kHz; a smaller one costs more switches."""
 _PR_SET_TIMERSLACK = 29
 _PR_GET_TIMERSLACK = 30

@@ -1,9 +1,9 @@
 """A worker process: one loop that runs the frames of its sessions, period by period.
 
-The loop is one kernel, which needs no interpreter. It runs in a thread of its own; commands of the
-process that started the worker are done beside it: a session is made there, and enters the loop
-between two periods. A session with a device runs alone, in the main thread, where a signal ends a
-call of the device that hangs.
+The loop is one kernel without an interpreter, in a thread of its own. The main thread takes the
+parent's commands: it makes a session's memory, and the session enters the loop between two periods.
+A session with a device is alone, in the main thread: there a signal ends a hanging call of the
+device.
 """
 
 import os
@@ -33,7 +33,7 @@ from hapticdb.session.states import PeriodClock, SessionState, SlotRequest
 from hapticdb.session.timing import Timing, undisturbed
 
 LEAVE_PATIENCE = 5.0
-"""Seconds in which the loop must have left a session that ends; normally it is one period."""
+"""Seconds until the loop must have left an ending session; normally one period."""
 
 
 @dataclass(frozen=True)
@@ -53,8 +53,8 @@ class WorkerRequest:
 class Worker:
     """The sessions of one process and their loop.
 
-    A session's memory is made beside the loop. The loop sees the session when `is_running` of its
-    state is set, which is done last, and leaves it between two periods when that is withdrawn.
+    The loop runs a session as soon as `is_running` of its state is set, and leaves it between two
+    periods after that is withdrawn.
     """
 
     def __init__(self, shared: SharedTable, rate: float, clock: PeriodClock) -> None:
@@ -63,7 +63,7 @@ class Worker:
         self._running: dict[int, tuple[int, SessionState]] = {}  # table and state, by slot
 
     def obey(self) -> None:
-        """Do what the parent says until it ends; the work of the thread beside the loop's."""
+        """Take commands until the parent ends; the work of the main thread."""
         try:
             while not parent_is_gone():
                 reply_to_parent(self._do, LOOK_EVERY)
@@ -87,7 +87,7 @@ class Worker:
         table: int,
         n_slots: int,
     ) -> None:
-        """Begin a session whose hand and tool wait at a pose (7,); table : a name for its cells."""
+        """Begin a session, hand and tool at rest at a pose (7,); table : a name for its cells."""
         if table not in self._tables:
             self._tables[table] = CellTable(os.dup(descriptor), n_slots)
         state = self._clock.add(request, self._tables[table])

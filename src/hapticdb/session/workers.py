@@ -1,4 +1,4 @@
-"""Worker processes from the process that starts them: of one session with a device, or of many."""
+"""Worker processes in their parent: of one session with a device, or of many."""
 
 from collections.abc import Sequence
 from typing import Any
@@ -13,17 +13,17 @@ from hapticdb.session.timing import Timing
 from hapticdb.session.worker import WorkerRequest
 
 WORK = "hapticdb.session.worker:work"
-"""What a worker process runs, and what it calls kernels for."""
+"""Function of a worker process."""
 ANSWER_PATIENCE = 30.0
-"""Seconds in which a worker must answer a command; normally milliseconds."""
+"""Seconds for the answer to a command; normally milliseconds."""
 FILLED = 8
-"""Sessions of a worker from which another process is started, while the host may have more."""
+"""Sessions of a worker before another one is started, up to the host's most."""
 
 
 class WorkerProcess(Process):
-    """A worker process, from the one that started it.
+    """A worker process, in its parent.
 
-    number : of the worker, from 0; request : what it runs; ready : content of its first message.
+    number : of the worker, from 0; request : its sessions; ready : content of its first message.
     """
 
     def __init__(self, number: int, request: WorkerRequest) -> None:
@@ -36,7 +36,7 @@ class WorkerProcess(Process):
         self._channel.sock.settimeout(ANSWER_PATIENCE)
 
     def ask(self, word: str, *content: object, descriptors: Sequence[int] = ()) -> Any:  # noqa: ANN401
-        """Tell the worker to do something, and wait for its answer; see `Channel.ask`."""
+        """Send a command and wait for its answer; see `Channel.ask`."""
         return self._channel.ask(word, *content, descriptors=descriptors)
 
 
@@ -50,7 +50,7 @@ class Workers:
 
     @property
     def pids(self) -> list[int]:
-        """Process ids of those that run."""
+        """Process ids of living workers."""
         return [process.pid for process in self._processes if process.is_alive]
 
     def least_busy(self, law: ForceLaw, rendering: Rendering) -> WorkerProcess:

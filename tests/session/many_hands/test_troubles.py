@@ -128,7 +128,7 @@ def test_looking_after_sessions_survives_errors_and_logs_each_once(
     finally:
         other.end()
     said = [record.getMessage().partition(" failed")[0] for record in caplog.records]
-    assert sorted(said) == ["recording a session", "starting a fetching process again"]
+    assert sorted(said) == ["recording a session", "starting a prefetch process again"]
     assert host.failure is None
 
 

@@ -85,7 +85,7 @@ def test_a_fetching_process_that_is_killed_comes_back_and_so_does_the_force(
 
 
 def test_unknown_cells_hold_and_fade(sphere: PointShell, tmp_path: Path) -> None:
-    """The fetching process is stopped while the hand moves far."""
+    """The prefetch process is stopped while the hand moves far."""
     path = Player([0.0, 0.4, 3600.0], [at(x, 0.0, 0.010) for x in (-0.45, 0.45, 0.45)])
     hand = Beckoned(path, tmp_path / "come")
     with make(tmp_path, bits=9) as env:

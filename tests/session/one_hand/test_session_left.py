@@ -163,7 +163,7 @@ def test_a_process_that_is_slow_to_begin_is_not_taken_for_one_that_died(
 ) -> None:
     with ResidentCells(voxel_floor.url, budget_bytes=4 << 20) as cells:
         monkeypatch.setattr(process, "START_PATIENCE", 0.0)
-        for environment, name in ((voxel_floor.url, "fetching"), (cells, "worker")):
+        for environment, name in ((voxel_floor.url, "prefetch"), (cells, "worker")):
             with pytest.raises(HapticDBError, match=f"^the {name} process was not ready after 0 s"):
                 Session(environment, sphere, still(0.03), law="plane")
 

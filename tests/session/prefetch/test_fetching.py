@@ -39,7 +39,7 @@ def until(claim: Callable[[], object], do: Callable[[], object] = lambda: None) 
 
 
 class Side:
-    """A session as the fetching process meets it: it writes its state, and runs frames."""
+    """A session as the prefetch process meets it: it writes its state, and runs frames."""
 
     def __init__(self, table: CellTable, grid: Grid, shell: PointShell) -> None:
         self.reader = Reader(table, grid, shell)
@@ -79,7 +79,7 @@ class Side:
 
 
 class LockStep:
-    """A hand, its frames and the fetching process on one clock, which only `wait` moves.
+    """A hand, its frames and the prefetch process on one clock, which only `wait` moves.
 
     During a slow round trip to the database the hand moves on and its frames run.
     """

@@ -1,4 +1,4 @@
-"""The fetching process when its file is deleted, restored or replaced, also by another grid."""
+"""The prefetch process when its file is deleted, restored or replaced, also by another grid."""
 
 import os
 import signal

@@ -1,1 +1,1 @@
-"""Cells that tools are heading for, fetched before a frame needs them."""
+"""Cells ahead of the tools, fetched before a frame needs them."""

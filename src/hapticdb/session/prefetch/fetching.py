@@ -1,8 +1,8 @@
-"""The fetching process: brings in the cells that tools are heading for.
+"""The prefetch process: fetches the cells ahead of the tools.
 
-The process has a connection of its own and is the only writer of its table. Sessions report where
-tool and hand are and how they move. The process asks the database for the cells within reach,
-nearest first, follows the writes of others, and names the objects that tools touch.
+The process has a connection of its own and is the only writer of its table. Sessions report pose
+and velocity of tool and hand. The process queries the database for the cells within reach, nearest
+first, follows the writes of others, and names the objects in contact.
 """
 
 import contextlib
@@ -31,44 +31,42 @@ from hapticdb.store.engines import MayLag
 from hapticdb.store.filtering import ALL, Filter
 
 LOOKAHEAD = 0.05
-"""Least time (s) that cells are fetched ahead of the hand. Larger: fewer unknown cells, more cells
-that are fetched and never used."""
+"""Least look-ahead time (s). Larger: fewer unknown cells, more cells fetched and never used."""
 MOST_LOOKAHEAD = 0.5
-"""Greatest time (s) that cells are fetched ahead, however slow the database is. Larger: a slower
-database can serve the hand, more cells are fetched and never used."""
+"""Greatest look-ahead time (s), however slow the database is. Larger: a slower database can serve
+the hand, more cells are fetched and never used."""
 LATENCIES = 3.0
-"""The look-ahead time is at least this many times the latency of the slowest recent batch. Larger:
-fewer unknown cells, more cells that are never used."""
+"""Least look-ahead time in latencies of the slowest recent batch. Larger: fewer unknown cells, more
+cells never used."""
 LATENCY_MARGIN = 0.02
-"""Seconds added to that product, for the other work of a round."""
+"""Seconds added to this product, for the other work of a round."""
 BATCHES_REMEMBERED = 32
-"""Batches whose latencies count. A larger value follows a database that gets faster more slowly."""
+"""Recent batches. Larger: a faster database shortens the look-ahead time later."""
 IDLE = 1e-3
 """Seconds between rounds while no cell is missing. A larger value notices a moving hand later."""
 MOST_IDLE = 1e-2
-"""Greatest of these times (s), which is as long as a round takes if that is more. Larger: with many
-sessions more of the processor is left to loops, and a moving hand is noticed later."""
+"""Greatest pause (s): a pause lasts as long as its round, within these bounds. Larger: with many
+sessions loops get more of the processor, and a moving hand is noticed later."""
 ASK_EVERY = 5e-3
-"""Seconds between queries for the objects that a tool touches. Larger: names come later."""
+"""Seconds between queries for the objects in contact. Larger: names come later."""
 CONFIRM_EVERY = 0.05
 """Seconds between queries for the revision. A store reports commits without a round trip, so only a
-query shows that the database still answers. Larger: its loss is reported later."""
+query shows a lost database. Larger: its loss is reported later."""
 RELEASE_EVERY = 1.0
-"""Seconds between checks for sessions whose processes have ended, and between questions to a
-standby for its lag. Larger: rows stay longer, the lag that is told is older."""
+"""Seconds between checks for sessions of dead processes, and between queries for a standby's lag.
+Larger: rows stay longer, the reported lag is older."""
 RETRY = (0.05, 0.5)
 """Seconds until a lost database is tried again: first and greatest delay; it doubles each time."""
 
 Wrap = Callable[[Store], Store]
-"""Takes the store that a fetching process has opened, and returns the store that it uses."""
+"""Store as opened -> store for use."""
 
 
 @dataclass(frozen=True)
 class FetchRequest:
-    """Request to a fetching process.
+    """Request to a prefetch process.
 
-    url, grid : of the environment, which must have that grid; filter : which objects are felt;
-    wrap : a hook for tests.
+    url, grid : of the environment; filter : of the objects; wrap : a hook for tests.
     """
 
     url: str
@@ -79,7 +77,7 @@ class FetchRequest:
 
 
 class Fetcher:
-    """Fills a table with the cells that sessions need, round by round.
+    """Fills a table with the cells of sessions, round by round.
 
     Parameters
     ----------
@@ -108,7 +106,7 @@ class Fetcher:
         self._latencies: list[float] = [0.0]
         self.store = self._open()
         try:
-            # if an earlier fetching process has died, sessions already use the table
+            # if an earlier prefetch process has died, sessions already use the table
             self.tracker.read_queue(0.0, self.lookahead)
             self.residency = Residency(
                 self.store, self.table, request.filter.exclude, where=request.filter.where,
@@ -142,7 +140,7 @@ class Fetcher:
         return store
 
     def warm_up(self) -> None:
-        """Run all steps of a round once, on one cell, so that no later round compiles a kernel."""
+        """Run all steps of a round once, on one cell, so no later round compiles a kernel."""
         grid = self.request.grid
         told = np.zeros((), TOLD)
         told["tool"] = told["handle"] = grid.origin
@@ -154,7 +152,7 @@ class Fetcher:
 
     @property
     def lookahead(self) -> float:
-        """Seconds that cells are fetched ahead of the hand; more than the database's latency."""
+        """Look-ahead time, s; more than the database's latency."""
         needed = LATENCIES * max(self._latencies) + LATENCY_MARGIN
         return min(max(LOOKAHEAD, needed), MOST_LOOKAHEAD)
 
@@ -180,7 +178,7 @@ class Fetcher:
         return is_busy
 
     def _confirm(self, begun: int) -> None:
-        """Note when the database was last asked for all that is new: when the round began, ns."""
+        """Write the time of the last complete answer: the begin of the round, ns."""
         control = self.table.cells.control
         if self._is_confirmed:
             self._confirmed_at = self._now
@@ -248,10 +246,10 @@ class Fetcher:
 
 
 def fetch(request: FetchRequest, sender: MessageSender) -> None:
-    """Fetch until told to stop, even if the database is lost meanwhile; the work of the process.
+    """Fetch until a stop is requested, even without a database; the work of the process.
 
-    If the database cannot be opened, the process ends only if its table is new. A process that
-    continues with the table of an earlier one tries again.
+    If the database cannot be opened, the process ends only if its table is new. With the table of
+    an earlier process it tries again.
 
     Raises
     ------

@@ -1,4 +1,4 @@
-"""ResidentCells: a table of cells and the process that fills it, for one or several sessions."""
+"""ResidentCells: a table of cells and its prefetch process, for one or several sessions."""
 
 import math
 import os
@@ -27,25 +27,24 @@ from hapticdb.store.finding import Words
 from hapticdb.store.urls import redact
 
 FETCH = "hapticdb.session.prefetch.fetching:fetch"
-"""What a fetching process runs, and what it calls kernels for."""
+"""Function of a prefetch process."""
 END_PATIENCE = 0.5
-"""Seconds that a fetching process has to end by itself; a database that hangs may hold it up. It
-only reads, so it may be killed at any time."""
+"""Seconds until a prefetch process is killed at its end; a hung database may delay it. It only
+reads, so it may be killed at any time."""
 RESTART_EVERY = 1.0
 """Least time (s) between two starts of the process. Smaller: more attempts if each one fails."""
 SILENCE_NS = 1_000_000_000
-"""Nanoseconds since the last answer after which the database counts as away."""
+"""Longest silence (ns) before the database counts as lost."""
 
 
 class CacheFigures(NamedTuple):
-    """Figures of a fetching process.
+    """Figures of a prefetch process.
 
-    budget_bytes : memory of the table, fixed; resident, empty : cells in memory, and cells known to
-    be empty; loaded, evicted, rows, ranges, statements : numbers so far; latency, worst : seconds
-    that the database took for a batch, median of recent batches and greatest; hit_rate : share of
-    the wanted cells that were resident when they were wanted; losses : how often the database was
-    lost; restarts : how often the process was started again; lag : where a standby answers, seconds
-    since the commit that it had replayed last, as it said itself (`hapticdb.store.engines.Lag`).
+    budget_bytes : memory of the table, fixed; resident, empty : cells in memory, and empty cells;
+    loaded, evicted, rows, ranges, statements : numbers so far; latency, worst : seconds of the
+    database for a batch, median of recent batches and greatest; hit_rate : share of the requested
+    cells with data at the time of the request; losses : of the database; restarts : of the process;
+    lag : of a standby, seconds since its last replayed commit (`hapticdb.store.engines.Lag`).
     """
 
     budget_bytes: int
@@ -65,7 +64,7 @@ class CacheFigures(NamedTuple):
 
 
 def without_distances(url: str, instead: str) -> str:
-    """Words for a coupling in an environment without distances: what may be done `instead`."""
+    """Message for a coupling in an environment without distances; `instead` : a way on."""
     return (
         f"{redact(url)} has no distances to surfaces, which the coupling of hand and tool needs: "
         f"import with distances into another environment, or {instead}"
@@ -73,9 +72,9 @@ def without_distances(url: str, instead: str) -> str:
 
 
 class ResidentCells(Closes):
-    """Cells of an environment in memory, fetched by a separate process.
+    """Cells of an environment in memory, fetched by a process of their own.
 
-    Sessions that feel the same objects may share one. Also a context manager.
+    Sessions with the same objects may share one. Also a context manager.
 
     Parameters
     ----------
@@ -91,7 +90,7 @@ class ResidentCells(Closes):
         Whether the cells have distances to surfaces, for the law distance: a tenth as many cells
         fit then. Every object that is felt must have distances. None: where they have them.
     wrap : callable or None
-        Takes the fetching process's store and returns the store to use; importable. For tests.
+        Takes the prefetch process's store and returns the store to use; importable. For tests.
 
     Raises
     ------
@@ -112,7 +111,7 @@ class ResidentCells(Closes):
     """
 
     _pid = 0
-    """Id of the process that made this object. In a forked copy `close` does nothing."""
+    """Id of the process of this object. In a forked copy `close` does nothing."""
 
     def __init__(
         self,
@@ -133,7 +132,7 @@ class ResidentCells(Closes):
         self._request = FetchRequest(url, self.table, self.grid, self.filter, wrap)
         try:
             self._process = self._begun()
-            self._process.await_ready("fetching")
+            self._process.await_ready("prefetch")
         except BaseException:
             self.table.close()
             raise
@@ -184,7 +183,7 @@ class ResidentCells(Closes):
 
     @property
     def pid(self) -> int:
-        """Process id of the fetching process."""
+        """Process id of the prefetch process."""
         return self._process.pid
 
     @property
@@ -203,7 +202,7 @@ class ResidentCells(Closes):
         return None
 
     def supervise(self) -> None:
-        """Start the fetching process again if it has ended. Sessions call it in `wait`.
+        """Start the prefetch process again if it has ended. Sessions call it in `wait`.
 
         Raises
         ------
@@ -230,7 +229,7 @@ class ResidentCells(Closes):
             ended.end()
 
     def _take_messages(self) -> None:
-        """Take what the process has sent; raises an error with which a new one would fail, too."""
+        """Take the messages of the process; raises an error of every later process, too."""
         try:
             while self._failure is None and (message := self._process.receive(0.0)):
                 if message.word == "lost":
@@ -243,7 +242,7 @@ class ResidentCells(Closes):
             raise self._failure
 
     def figures(self) -> CacheFigures:
-        """Figures of the fetching process so far."""
+        """Figures of the prefetch process so far."""
         counted = self.table.queue.figures
         shared = set(CacheFigures._fields) & set(FIGURES.names or ())
         told = {name: counted[name].item() for name in shared}
@@ -273,7 +272,7 @@ class ResidentCells(Closes):
         )  # fmt: skip
 
     def close(self) -> None:
-        """End the fetching process and free the memory; does nothing in a forked copy."""
+        """End the prefetch process and free the memory; does nothing in a forked copy."""
         if os.getpid() != self._pid:
             return
         self.table.cells.control[STOP] = 1

@@ -1,4 +1,4 @@
-"""Tables of cells of one environment: one for each filter of what is felt, while it is used."""
+"""Tables of cells of one environment, one for each filter in use."""
 
 import threading
 
@@ -16,7 +16,7 @@ class SharedTables:
         self._making = threading.Lock()
 
     def take(self, felt: Filter) -> ResidentCells:
-        """Table of the objects that the filter lets feel, for one more session."""
+        """Table of the filter's objects, for one more session."""
         with self._making:
             if felt not in self._tables:
                 self._tables[felt] = ResidentCells(
@@ -38,7 +38,7 @@ class SharedTables:
         cells.close()
 
     def all(self) -> list[ResidentCells]:
-        """Tables that are in use; does not wait while one is made."""
+        """Tables in use; does not wait while one is made."""
         return list(self._tables.values())
 
     def close(self) -> None:

@@ -1,4 +1,4 @@
-"""Tracks sessions for the fetching process: where tools are, which cells they need and touch."""
+"""Tracks sessions for the prefetch process: poses of tools, cells to fetch, objects in contact."""
 
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
@@ -18,32 +18,30 @@ from hapticdb.store.base import NO_KEYS, Keys, Store
 from hapticdb.store.objects_at import ids_near_voxels, ids_of_voxels
 
 REACH_VOXELS = 500.0
-"""Voxels a second that a hand may reach from rest: 1 m/s in voxels of 2 mm. A larger value fetches
-more cells around a resting hand."""
+"""Speed of a hand from rest, voxels/s: 1 m/s in voxels of 2 mm. Larger: more cells around a resting
+hand are fetched."""
 SLACK_VOXELS = 1.0
-"""Voxels that a request may move until its cells are computed again. A larger value computes less
-often and fetches a wider margin."""
+"""Least motion (voxels) of a request before its cells are computed again. Larger: fewer
+computations and a wider margin."""
 MOST_CELLS_WANTED = 1 << 15
 """Greatest number of cells of one request: the box around a faster or larger tool is cut at its far
 ends. A larger value serves larger tools and takes more time."""
 CELL = float(1 << CELL_BITS)
 """Voxels on a cell's edge."""
 SPEED_HALF_LIFE = 0.7
-"""Half-life (s) of a hand's greatest observed speed. A larger value fetches more cells around a
-hand that has slowed down."""
+"""Half-life (s) of a hand's greatest observed speed. Larger: more cells are fetched around a slowed
+hand."""
 SHARE_OF_TABLE = 0.75
-"""Share of the table that all sessions together may want. The rest keeps recently used cells. A
-larger value serves larger tools and evicts more."""
+"""Share of the table for the requests of all sessions. The rest has recently used cells. Larger:
+larger tools are served, and more is evicted."""
 READ_ATTEMPTS = 100
-"""Attempts to read a row that a loop is writing. Writing takes microseconds, so a row that stays
-unfinished belongs to a loop that died."""
+"""Attempts to read an unfinished row. Writing takes microseconds, so its loop is dead."""
 MET = -1.0
-"""Urgency of unknown cells that a frame has already met; all other cells have 0 or more, and come
-later."""
+"""Urgency of unknown cells in a frame; all other cells have 0 or more, and come later."""
 NEAR = ONSET + 0.87
-"""Voxels within which an object is felt, where cells have distances: the onset of the distance law,
-and half a voxel's diagonal, since the distance counts at the centre of the voxel that holds the
-point. Larger: objects are named that are not felt."""
+"""Greatest distance (voxels) of a named object, in cells with distances: the onset of the distance
+law, and half a voxel's diagonal, since the distance counts at the centre of the point's voxel.
+Larger: objects without a force are named, too."""
 
 Floats = NDArray[np.float64]
 Ranked = tuple[Keys, NDArray[np.float64]]
@@ -51,10 +49,10 @@ Ranked = tuple[Keys, NDArray[np.float64]]
 
 
 class PrefetchRequest(NamedTuple):
-    """Where a tool is and may soon be, in voxels of the grid.
+    """Present and expected place of a tool, in voxels of the grid.
 
     start, move (3,): the bounding sphere's centre, and its displacement to the hand's expected
-    place; radius: of the sphere; margin: greatest distance of the sphere from that path.
+    place; radius: of the sphere; margin: greatest distance of the sphere from this path.
     """
 
     start: Floats
@@ -66,12 +64,12 @@ class PrefetchRequest(NamedTuple):
     def of_told(
         cls, grid: Grid, told: NDArray[np.void], lookahead: float, peak_speed: float
     ) -> "PrefetchRequest | None":
-        """Request for what a loop tells of its tool; None unless all of its numbers are finite.
+        """Request of a session; None unless all numbers of its tool are finite.
 
         told () : of `kernels.records.TOLD`. The bounding sphere moves from the tool to the hand,
         and on with the hand's velocity for `lookahead` seconds. The margin is the greatest distance
-        of the hand from this path after that time, at 1.5 times its recent `peak_speed` (m/s), or
-        at `REACH_VOXELS` if that is more.
+        of the hand from this path after this time, at 1.5 times its recent `peak_speed` (m/s), at
+        `REACH_VOXELS` at least.
         """
         tool, handle, velocity = told["tool"], told["handle"], told["velocity"]
         radius, size = float(told["radius"]), grid.voxel_size
@@ -98,7 +96,7 @@ class PrefetchRequest(NamedTuple):
         """Cells within reach, most urgent first, and their urgency in voxels.
 
         The urgency of a cell is the least distance between it and the moving sphere, plus the
-        distance that the sphere moves until it is nearest.
+        sphere's path until it is nearest.
         """
         n_cells = max(grid.side >> CELL_BITS, 1)
         reach = self.radius + self.margin + 2.0 * SLACK_VOXELS
@@ -134,9 +132,9 @@ class PrefetchRequest(NamedTuple):
 class _TrackedSession:
     """State of one session.
 
-    sequence : number of the queue's row at its last reading; request : the one whose cells were
-    computed; cells, urgency (n,) : most urgent first; speed : recent greatest speed of the hand,
-    m/s; n_missing : wanted cells that were unknown at the last check.
+    sequence : number of the queue's row at its last reading; request : the last one with computed
+    cells; cells, urgency (n,) : most urgent first; speed : recent greatest speed of the hand, m/s;
+    n_missing : unknown cells of the request at the last check.
     """
 
     sequence: int = 0
@@ -169,9 +167,9 @@ class SessionTracker:
         self.sessions: dict[int, _TrackedSession] = {}
 
     def read_queue(self, elapsed: float, lookahead: float) -> bool:
-        """Read where the tools are; returns whether any now wants other cells.
+        """Read the poses of the tools; returns whether any request has other cells.
 
-        elapsed : seconds since the last call; lookahead : seconds that cells are fetched ahead.
+        elapsed : seconds since the last call; lookahead : look-ahead time, s.
         """
         queue = self._table.queue.sessions
         active = set(np.flatnonzero(queue["told"]["is_active"]).tolist())
@@ -205,7 +203,7 @@ class SessionTracker:
         return None
 
     def has_met_unknown_cells(self) -> bool:
-        """Whether any session's last frame has met cells that are not resident."""
+        """Whether any session's last frame had unknown cells."""
         return bool(self._table.queue.sessions["n_missed"][list(self.sessions)].any())
 
     def urgent_cells(self) -> Keys:
@@ -213,7 +211,7 @@ class SessionTracker:
         return ranked([(one.cells, one.urgency) for one in self.sessions.values()])
 
     def missing_cells(self, residency: Residency) -> Keys:
-        """Unknown cells that sessions want, most urgent first; protects the known ones."""
+        """Unknown cells of all requests, most urgent first; protects the resident ones."""
         residency.begin_round()
         wanted = [part for row in self.sessions for part in self._wanted(row, residency)]
         return residency.missing(ranked(wanted))
@@ -239,7 +237,7 @@ class SessionTracker:
             yield missed, np.full(len(missed), MET)
 
     def report_missing(self) -> None:
-        """Report to each session how many of its cells are missing, and for which position."""
+        """Report the number of missing cells to each session, with the number of its request."""
         queue = self._table.queue.sessions
         for row, session in self.sessions.items():
             queue["n_missing"][row] = session.n_missing
@@ -259,7 +257,7 @@ def ranked(wanted: Sequence[Ranked]) -> Keys:
 
 
 class ObjectAnswers:
-    """Answers on the request queue: ids of the objects that are felt in the voxels asked for.
+    """Answers on the request queue: ids of the objects in the requested voxels.
 
     These are the objects in the voxels; in a table with distances, those near the voxels, too.
 
@@ -268,7 +266,7 @@ class ObjectAnswers:
     table : CellTable
         Table of the sessions.
     residency : Residency
-        Its cells; objects that are left out of them are left out of the answers.
+        Its cells, without the objects to exclude.
     """
 
     def __init__(self, table: CellTable, residency: Residency) -> None:
@@ -278,11 +276,11 @@ class ObjectAnswers:
         self._answered: dict[int, bytes] = {}
 
     def forget(self) -> None:
-        """Forget all answers, so that every request is answered again: the database has changed."""
+        """Forget all answers after a change of the database."""
         self._answered.clear()
 
     def answer(self, store: Store, rows: Iterable[int]) -> None:
-        """Answer the sessions in `rows` whose requests have changed since the last answer."""
+        """Answer new requests of the sessions in `rows`."""
         before, self._answered = self._answered, {}
         for row in rows:
             n_asked = int(self._queue["n_asked"][row])
@@ -298,7 +296,7 @@ class ObjectAnswers:
             self._answered[row] = question
 
     def ids_of(self, store: Store, keys: Keys) -> Keys:
-        """Ids of the objects that are felt in voxels (n,), distinct and ascending."""
+        """Ids of the objects in voxels (n,), distinct and ascending."""
         exclude = self._residency.exclude
         if self._has_distances:
             return ids_near_voxels(store, keys, exclude, NEAR)

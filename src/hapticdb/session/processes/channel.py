@@ -1,7 +1,7 @@
-"""Channel: pickled messages between processes of our own, with file descriptors beside them.
+"""Channel: pickled messages between processes of our own, with file descriptors.
 
-The processes trust one another: one of them started the others, and the socket between them is a
-pair that has no name. Nothing of a client from outside goes through a channel unparsed.
+The processes trust one another: one of them started the others, and the sockets between them have
+no name. Nothing of a client from outside goes through a channel unparsed.
 """
 
 import contextlib
@@ -17,20 +17,20 @@ from hapticdb.errors import HapticDBError
 
 LOG = logging.getLogger("hapticdb.session")
 MOST_DESCRIPTORS = 16
-"""Most file descriptors beside one message."""
+"""Most file descriptors of one message."""
 HEADER = 8
 """Bytes of a message's length."""
 
 
 class Message(NamedTuple):
-    """A word for the kind of a message, and its content: of "error" the error, which is raised."""
+    """A word for the kind of a message, and its content: of "error" an exception."""
 
     word: str
     content: Any = None
 
 
 class Channel:
-    """Messages over one end of a pair of sockets of the family AF_UNIX, which it owns."""
+    """Messages over its end of a pair of sockets of the family AF_UNIX."""
 
     def __init__(self, sock: socket.socket) -> None:
         self.sock = sock
@@ -72,10 +72,10 @@ class Channel:
         return answer.content
 
     def reply(self, do: Callable[[Message, list[int]], Any]) -> None:
-        """Receive a request, do it, and send its result or the error that it raised.
+        """Receive a request, do it, and send its result or error.
 
-        An error that is no HapticDBError is logged, and sent as one without its words. The
-        descriptors that came with the request are closed afterwards.
+        Any other error than a HapticDBError is logged, and sent as one without its words. The
+        request's descriptors are closed afterwards.
 
         Raises
         ------

@@ -1,8 +1,8 @@
-"""A server that forks the processes of sessions, which so begin with numba and kernels loaded.
+"""A server for the processes of sessions: its copies begin with numba and kernels loaded.
 
 A process has one fork server from its first `Process` on. The server is a plain ``python -c``, so a
 user's script needs no ``if __name__ == "__main__"`` guard. It opens no database and no device, and
-has one thread, so that its copies are sound. It ends with the process that it serves.
+has one thread, so its copies are sound. It ends with its owner.
 """
 
 import atexit
@@ -28,17 +28,16 @@ from hapticdb.errors import HapticDBError
 from hapticdb.session.processes.channel import Channel
 
 ANSWER_PATIENCE = 300.0
-"""Seconds that the server has for an answer: it may load numba and compile. Larger: a caller waits
-longer for a server that hangs."""
+"""Seconds for the server's answer: it may load numba and compile. Larger: a caller waits longer for
+a hung server."""
 
 
 class Order(NamedTuple):
-    """What a process shall do, and in which surroundings.
+    """Work and surroundings of a process.
 
-    work : function, as ``package.module:function``; with_kernels : whether the server loads
-    its module and that module's kernels before the fork; numbers : of the descriptors that it gets,
-    or None where no process is wanted yet; path, environment, most_files : as the process that
-    gives the order has them.
+    work : function, as ``package.module:function``; with_kernels : whether the server loads its
+    module and kernels before the fork; numbers : of its descriptors, or None for no process yet;
+    path, environment, most_files : as in the owner.
     """
 
     work: str
@@ -83,7 +82,7 @@ class _ForkServer:
             )
 
     def end(self) -> None:
-        """End the server at once; what it has started goes on."""
+        """End the server at once; its copies go on."""
         self.channel.close()
         self._popen.kill()
         self._popen.wait()
@@ -94,7 +93,7 @@ _lock = threading.Lock()
 
 
 def _forget() -> None:
-    """In a forked copy: the server is its parent's, whose other threads may hold the lock."""
+    """In a forked copy: the server is its parent's, and the lock may be locked for ever."""
     global _server, _lock
     _server, _lock = None, threading.Lock()
 
@@ -120,7 +119,7 @@ def _end() -> None:
 def prepare(work: str, *, with_kernels: bool) -> None:
     """Have the server load a function's module, or its kernels, too, and go on here.
 
-    To be called as soon as it is known that a process will be started.
+    To be called as early as possible before a process is started.
     """
     with _lock:
         try:
@@ -132,12 +131,12 @@ def prepare(work: str, *, with_kernels: bool) -> None:
 def start(
     work: str, streams: Sequence[int], numbers: Sequence[int], *, with_kernels: bool
 ) -> tuple[int, int]:
-    """Start a process that runs a function.
+    """Start a process for a function.
 
     work, with_kernels : as for `Order`; streams : descriptors of its standard input, output and
-    errors; numbers : more descriptors, which it has under the same numbers.
+    errors; numbers : more descriptors, with the same numbers there.
 
-    Returns its process id, and a descriptor that stands for it.
+    Returns its process id, and its descriptor (pidfd).
 
     Raises
     ------
@@ -158,7 +157,7 @@ def start(
 
 
 def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, list[int]]:
-    """Give an order and wait for the answer; a server that was killed is replaced once."""
+    """Give an order and wait for the answer; a killed server is replaced once."""
     with _lock:
         for is_last in (False, True):
             try:
@@ -186,7 +185,7 @@ def _answered(wanted: Order, descriptors: Sequence[int]) -> tuple[int, list[int]
 
 
 def serve(descriptor: int, owner: int) -> None:
-    """Run the server of the process `owner`, until that process ends or closes the channel."""
+    """Run the server of the process `owner`, until it ends or closes the channel."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     with contextlib.suppress(ProcessLookupError):
         owning = os.pidfd_open(owner)
@@ -229,7 +228,7 @@ def _serve(channel: Channel, owning: int) -> None:
 
 
 def _load(work: str, *, with_kernels: bool) -> None:
-    """Load a function's module, and kernels; the process itself tells what cannot be loaded."""
+    """Load a function's module, and kernels; the process itself reports errors."""
     with contextlib.suppress(Exception):
         import_module(work.partition(":")[0])
         if with_kernels:
@@ -238,7 +237,7 @@ def _load(work: str, *, with_kernels: bool) -> None:
 
 
 def _forked(wanted: Order, descriptors: list[int], owning: int) -> tuple[int, int]:
-    """Fork a process; its id, and a descriptor that stands for it."""
+    """Fork a process; its id and its descriptor (pidfd)."""
     pid = os.fork()
     if pid == 0:
         try:
@@ -251,7 +250,7 @@ def _forked(wanted: Order, descriptors: list[int], owning: int) -> tuple[int, in
 
 
 def _become(wanted: Order, descriptors: list[int], owning: int) -> None:
-    """In the copy: take on the surroundings that were ordered, and run the function."""
+    """In the copy: take on the order's surroundings, and run the function."""
     os.setsid()
     resource.setrlimit(resource.RLIMIT_NOFILE, wanted.most_files)
     targets = [0, 1, 2, *(wanted.numbers or ())]

@@ -1,7 +1,7 @@
 """Processes of a real-time session: each gets a request and sends messages over a `Channel`.
 
 Each process is a copy of the fork server (`fork_server`) and calls one function. The request and
-the messages go only between a process and what it has started.
+the messages go only between a process and its parent.
 """
 
 import contextlib
@@ -21,21 +21,21 @@ from hapticdb.session.processes.channel import Channel, Message
 from hapticdb.session.processes.fork_server import start
 
 END_PATIENCE = 5.0
-"""Seconds that a process has to end by itself before it is killed. Larger: slower devices can
-close, a hanging process delays the end longer."""
+"""Seconds for a process to end by itself before it is killed. Larger: slower devices can close, a
+hung process delays the end longer."""
 START_PATIENCE = 120.0
-"""Seconds in which a process must be ready: a device may take long to open. Larger: a caller waits
-longer for a process that hangs."""
+"""Seconds until a process must be ready: a device may take long to open. Larger: a caller waits
+longer for a hung process."""
 LOOK_EVERY = 0.25
-"""Seconds between two checks of a process whether the one that started it still runs."""
+"""Seconds between two checks of a process for its parent."""
 _ends = select.poll()
-"""Tells that the process that started this one has ended, or has closed its channel."""
+"""Becomes readable when the parent has ended, or has closed its channel."""
 _parent: Channel | None = None
-"""Of a process that was started: to the one that started it."""
+"""To the parent."""
 
 
 class Process:
-    """One process of a session, used by the process that started it.
+    """One process of a session, in its parent.
 
     Parameters
     ----------
@@ -103,7 +103,7 @@ class Process:
         return message
 
     def await_ready(self, name: str) -> Any:  # noqa: ANN401 - what was sent
-        """Content of the first message; where none comes the process is ended.
+        """Content of the first message; without one the process is ended.
 
         Raises
         ------
@@ -126,7 +126,7 @@ class Process:
         )
 
     def send(self, content: object) -> None:
-        """Send an object, which the process takes by `receive_from_parent`; nothing if it ended."""
+        """Send an object for `receive_from_parent` there; does nothing after its end."""
         with contextlib.suppress(OSError):  # `receive` reports that
             self._channel.send(content)
 
@@ -154,7 +154,7 @@ class _EndQuietly(SystemExit):
 
 
 class MessageSender:
-    """Sends messages from a process to the one that started it."""
+    """Sends messages from a process to its parent."""
 
     def __init__(self, channel: Channel) -> None:
         self._channel = channel
@@ -166,9 +166,9 @@ class MessageSender:
 
 
 def run(module: str, name: str, starter: int) -> None:
-    """Run the request in the process that `Process` started, and end that process.
+    """Run the request of a `Process` in its process, and end this process.
 
-    `starter` is a descriptor that stands for the process that used `Process`.
+    starter : descriptor (pidfd) of the parent.
     """
     global _parent  # noqa: PLW0603 - one a process
     _parent = Channel(socket.socket(fileno=os.dup(0)))
@@ -198,13 +198,13 @@ def run(module: str, name: str, starter: int) -> None:
 
 
 def _end(number: int, _: object) -> None:
-    """Signal handler: raise an exit, so that each `finally` runs and no device keeps its force."""
+    """Signal handler: raise an exit, so each `finally` runs and no device keeps its force."""
     signal.signal(number, signal.SIG_IGN)  # a second signal must not interrupt the clean-up
     raise _EndQuietly(128 + number)
 
 
 def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
-    """Next object that the parent has sent by `Process.send`; a SystemExit if the parent ended."""
+    """Next object from the parent's `Process.send`; a SystemExit if the parent ended."""
     assert _parent is not None  # noqa: S101 - `run` was called
     try:
         return _parent.receive()[0]
@@ -213,14 +213,14 @@ def receive_from_parent() -> Any:  # noqa: ANN401 - whatever was sent
 
 
 def reply_to_parent(do: Callable[[Message, list[int]], Any], seconds: float) -> None:
-    """Do what the parent asks by its channel, if that comes in `seconds`; see `Channel.reply`."""
+    """Do a request of the parent, if one comes in `seconds`; see `Channel.reply`."""
     assert _parent is not None  # noqa: S101 - `run` was called
     if select.select([_parent.sock], [], [], seconds)[0]:
         _parent.reply(do)
 
 
 def _request() -> object:
-    """Read the request of the process; a UsageError if a module that it names cannot be found."""
+    """Read the request of the process; a UsageError if one of its modules is missing."""
     try:
         return pickle.loads(receive_from_parent())  # noqa: S301 - from our own parent
     except (AttributeError, ImportError) as error:
@@ -231,8 +231,8 @@ def _request() -> object:
 
 
 def parent_is_gone(seconds: float = 0.0) -> bool:
-    """Whether the process that started this one has ended, or has closed its channel.
+    """Whether the parent has ended, or has closed its channel; waits up to `seconds`.
 
-    It waits so long for that. Processes that were forked from it may still hold the channel open.
+    Its forked copies may still have the channel open.
     """
     return bool(_ends.poll(1000.0 * seconds))

@@ -131,10 +131,10 @@ def _laid(rows: Sequence[Sequence[str]], numbers: Sequence[bool]) -> list[str]:
     """
     cells = [[printable(text).replace(NEW_LINE, "\\n") for text in row] for row in rows]
     widths = [max(map(_width_of, column)) for column in zip(*cells, strict=True)]
-    texts = [n for n, is_number in enumerate(numbers) if not is_number]
+    texts = [n for n, is_number in enumerate(numbers) if not is_number and widths[n] > NARROW]
     room = _room() - 2 - GAP * (len(widths) - 1)
-    while sum(widths) > room and (widest := max(widths[n] for n in texts)) > NARROW:
-        widths[next(n for n in texts if widths[n] == widest)] -= 1
+    while sum(widths) > room and texts and max(widths[n] for n in texts) > NARROW:
+        widths[max(texts, key=widths.__getitem__)] -= 1
     lines = []
     for full in cells:
         row = [_cut(text, width) for text, width in zip(full, widths, strict=True)]

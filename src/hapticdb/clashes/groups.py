@@ -63,7 +63,7 @@ class Group(NamedTuple):
         return f"{a}, {b}" + (f" and {more} alike" if more else "")
 
     def length_text(self) -> str:
-        """Gap or depth, from the least to the greatest of several, and the sum of known volumes."""
+        """Gap or depth, from the least to the greatest of several, and the sum of the volumes."""
         known = [one.at_least for one in self.pairs if one.at_least or one.kind != Kind.OVERLAPPING]
         if len(self.pairs) == 1 or not known:
             return self.pairs[0].length_text()

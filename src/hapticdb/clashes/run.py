@@ -85,7 +85,7 @@ def find_clashes(
         One object of each pair is of the first, the other of the second; all unless given. Words as
         for `Environment.find`.
     seconds : float or None
-        Time after which the rest is left; a later call goes on there.
+        Time of the search; a later call goes on with the rest.
     budget : int
         Bytes for shapes in memory.
     progress : callable or None
@@ -124,7 +124,7 @@ def accept_clash(env: Environment, a: Words, b: Words, because: str | None) -> l
     Raises
     ------
     UsageError
-        If no such pair is known, or the reason is empty.
+        If there is no such pair, or the reason is empty.
     """
     ones, others = ({obj.id: obj for obj in find_objects(env.store, words)} for words in (a, b))
     known = {obj.id: (obj.name, obj.digest) for obj in (ones | others).values()}

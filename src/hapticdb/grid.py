@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike, NDArray
 from hapticdb.errors import GridError
 from hapticdb.kernels import curves
 from hapticdb.kernels.records import GRID
-from hapticdb.units import place_text
+from hapticdb.units import length_text, place_text
 
 CurveName = Literal["z", "hilbert", "lexicographic"]
 CURVE_NAMES: tuple[CurveName, ...] = get_args(CurveName)
@@ -138,7 +138,7 @@ class Grid:
     def describe(self) -> str:
         """One line for people: voxels on each axis, voxel size, origin, curve."""
         return (
-            f"{self.side}^3 voxels of {self.voxel_size * 1000:.4g} mm, origin "
+            f"{self.side}^3 voxels of {length_text(self.voxel_size)}, origin "
             f"{place_text(self.origin, self.voxel_size / 100)} m, {self.curve} order"
         )
 

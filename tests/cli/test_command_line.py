@@ -145,6 +145,14 @@ def test_the_environment_and_the_file_of_an_import_may_be_swapped(run: Run, tmp_
     refused(run("import", file, tmp_path / "tool.stl"), "the environment is first")
 
 
+def test_voxels_that_are_no_good_size_are_noted(run: Run, tmp_path: Path) -> None:
+    far = boxes(tmp_path / "far.glb", count=1, side=3000.0)
+    hint = "voxels of 75 m are coarse: --bits 14 makes them 0.293 m"
+    assert hint in run("import", "a.db", far, "--bits", 6)[2]
+    tiny = boxes(tmp_path / "tiny.glb", count=1, side=3e-7)
+    assert "is --unit right?" in run("import", "b.db", tiny, "--bits", 6)[2]
+
+
 def test_a_negative_origin_is_read(run: Run, tmp_path: Path) -> None:
     form = ("--origin", "-1,-2,-0.5", "--voxel-size", 0.05, "--bits", 7)
     succeeded(run("import", "a.db", boxes(tmp_path / "boxes.glb"), *form))

@@ -157,18 +157,22 @@ def test_others_who_write_meanwhile_are_told_of(
 
 
 @pytest.mark.parametrize(
-    ("lengths", "told"), [((20.0,), "longer than the scene"), ((1e-4,), "shorter than a voxel")]
+    ("lengths", "told", "hint"),
+    [
+        ((20.0,), "longer than the scene", "would --tool-unit mm be right?"),
+        ((1e-4,), "shorter than a voxel", "is --tool-unit right?"),
+    ],
 )
 @pytest.mark.parametrize("args", [("touch", "--poses"), ("sweep", "--path")])
 def test_a_tool_of_the_wrong_size_is_noted(
-    run: Run, scene: Path, args: tuple[str, str], lengths: tuple[float], told: str
+    run: Run, scene: Path, args: tuple[str, str], lengths: tuple[float], told: str, hint: str
 ) -> None:
     trimesh.creation.box(lengths * 3).export(scene.parent / "wrong.stl")
     words = (args[0], scene, args[1], "path.csv", "--tool", "wrong.stl")
     (line,) = run(*words)[2].splitlines()
     assert line.startswith("hapticdb: the tool is ")
     assert told in line
-    assert line.endswith("is --tool-unit right?")
+    assert line.endswith(hint)
     assert run(*words, "--tool-unit", "m")[2] == ""
 
 

@@ -7,13 +7,16 @@ from typing import TYPE_CHECKING
 from hapticdb.cli import render
 from hapticdb.cli.options import UnitName
 from hapticdb.errors import UsageError
-from hapticdb.units import length_text
+from hapticdb.units import UNITS, length_text
 
 if TYPE_CHECKING:
     from hapticdb.environment import Environment
     from hapticdb.pointshell.kept import Tool
     from hapticdb.pointshell.shell import PointShell
     from hapticdb.query.law import LawName
+
+LIKELY = ("mm", "in", "cm", "um", "ft")
+"""Units that a tool may be in which is no good size in metres, the likeliest first."""
 
 
 @dataclass(frozen=True)
@@ -91,7 +94,10 @@ def warn_of_size(env: "Environment", tool: "Tool", left_out: Iterable[int]) -> N
         compared = f"shorter than a voxel ({length_text(env.grid.voxel_size)})"
     else:
         return
-    render.note(f"the tool is {length_text(length)} long, {compared}: is --tool-unit right?")
+    fits = (u for u in LIKELY if env.grid.voxel_size <= length * UNITS[u] <= extent)
+    unit = next(fits, None)
+    hint = "is --tool-unit right?" if unit is None else f"would --tool-unit {unit} be right?"
+    render.note(f"the tool is {length_text(length)} long, {compared}: {hint}")
 
 
 def shell_text(shell: "PointShell") -> str:

@@ -4,6 +4,7 @@ import time
 from collections.abc import Sequence
 from contextlib import closing
 from dataclasses import dataclass
+from math import ceil, log2
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -20,6 +21,10 @@ from hapticdb.units import length_text
 
 if TYPE_CHECKING:
     from hapticdb.ingest.files import FileReport, ImportOptions
+
+COARSE, FINE_ENOUGH, TINY = 1.0, 0.5, 1e-8
+"""Voxels, metres: larger ones are told, with the bits that make them fine enough, and tiny ones."""
+MOST_BITS = 21
 
 
 @dataclass(frozen=True)
@@ -122,12 +127,13 @@ def _tell(
     from hapticdb.store.attributes import scene_bounds
     from hapticdb.store.connect import open_store
 
-    line, scene = "", None
+    line, scene, voxel_size, bits = "", None, 0.0, 0
     if not all(report.error for report in reports):
         with closing(open_store(url, read_only=True)) as store:
             size, objects = store.size(), store.objects()
             scene, held = scene_bounds(objects), render.counted(len(objects), "object")
             rows, size_text = render.counted(size.rows, "row"), render.bytes_text(size.bytes)
+            voxel_size, bits = store.grid.voxel_size, store.grid.bits
             line = f"{store.url}: {held}, {rows}, {size_text}; {store.grid.describe()}"
     for file, report in zip(files, reports, strict=True):
         if output.json:
@@ -140,6 +146,17 @@ def _tell(
         render.say(f"{line}; {elapsed:.1f} s")
         if scene is not None:
             render.say(f"the scene: {render.box(scene)}")
+            _warn_of_voxels(voxel_size, bits)
+
+
+def _warn_of_voxels(size: float, bits: int) -> None:
+    """Note voxels that are too coarse or too fine for parts, with the option that helps."""
+    if size > COARSE and bits < MOST_BITS:
+        more = min(bits + ceil(log2(size / FINE_ENOUGH)), MOST_BITS)
+        finer = length_text(size / 2 ** (more - bits))
+        render.note(f"voxels of {length_text(size)} are coarse: --bits {more} makes them {finer}")
+    elif size < TINY:
+        render.note(f"voxels of {1e9 * size:.3g} nm: is --unit right?")
 
 
 def _record(report: "FileReport") -> dict[str, Any]:

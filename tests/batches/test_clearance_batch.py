@@ -44,11 +44,12 @@ def assert_is_right(
 ) -> None:
     found = env.clearance(shell, poses, reach * SIZE, exclude=exclude)
     by_hand = distances_by_hand(env, shell, poses, exclude)
-    expected = np.minimum(by_hand.min(axis=1), reach)
-    assert np.abs(found.distances / SIZE - expected).max() < ROUNDING
-    assert (found.distances <= found.reach).all()
-    assert found.is_beyond.tolist() == (found.distances == found.reach).tolist()
+    expected = by_hand.min(axis=1)
     near = ~found.is_beyond
+    assert np.abs(found.distances[near] / SIZE - expected[near]).max(initial=0.0) < ROUNDING
+    assert (found.distances[near] <= found.reach).all()
+    assert (expected[~near] > reach - ROUNDING).all()
+    assert np.isinf(found.distances[~near]).all()
     at_point = by_hand[near, found.points[near]]
     assert np.abs(at_point - expected[near]).max(initial=0.0) < ROUNDING
 
@@ -79,13 +80,14 @@ def test_what_is_known_of_cubes_changes_no_distance(
         line = np.stack([along, np.sin(9.0 * along), np.cos(9.0 * along)], axis=1)
         shell = PointShell(0.01 * line, np.tile([0.0, 0.0, 1.0], (n_points, 1)), np.zeros(3))
         poses = poses_in(env.grid, 12)
-        expected = np.minimum(distances_by_hand(env, shell, poses, []).min(axis=1), 9.0)
+        expected = distances_by_hand(env, shell, poses, []).min(axis=1)
         for n_cubes in (4, threads.CUBES):
             monkeypatch.setattr(threads, "CUBES", n_cubes)
             with env.feeler(shell, jobs=1, law="plane") as feeler:
                 for reach in (9.0, 3.0, 9.0):
                     found = feeler.clearance(poses, reach * SIZE).distances / SIZE
-                    assert np.abs(found - np.minimum(expected, reach)).max() < ROUNDING
+                    within = np.where(expected < reach, expected, np.inf)
+                    assert found == pytest.approx(within, abs=ROUNDING)
 
 
 def test_many_threads_and_little_memory_find_the_same_distances(
@@ -97,7 +99,8 @@ def test_many_threads_and_little_memory_find_the_same_distances(
         ijk = np.unique(np.random.default_rng(0).integers(0, 256, (3000, 3)), axis=0)
         write_voxels(env.store, ijk)
         shell, poses = cloud(90, extent=0.02), poses_in(env.grid, 40, beyond=0.05)
-        expected = np.minimum(distances_by_hand(env, shell, poses, []).min(axis=1), 16.0)
+        expected = distances_by_hand(env, shell, poses, []).min(axis=1)
+        expected[expected >= 16.0] = np.inf
         for jobs in (1, 4):
             told: list[tuple[int, int]] = []
             with env.feeler(shell, budget_bytes=LEAST_BUDGET, jobs=jobs, law="plane") as feeler:
@@ -105,7 +108,7 @@ def test_many_threads_and_little_memory_find_the_same_distances(
                     poses, 16.0 * SIZE, progress=lambda *done, told=told: told.append(done)
                 )
                 assert feeler.n_loaded > 200
-            assert np.abs(found.distances / SIZE - expected).max() < ROUNDING
+            assert found.distances / SIZE == pytest.approx(expected, abs=ROUNDING)
             assert told[-1] == (40, 40)
 
 
@@ -117,16 +120,17 @@ def test_the_clearance_of_a_point_above_a_floor_is_its_height(tmp_path: Path) ->
         poses = np.tile(np.eye(4), (6, 1, 1))
         poses[:, 2, 3] = heights
         found = env.clearance(shell, poses, 0.04)
-        assert np.allclose(found.distances, np.clip(heights, 0.0, 0.04), rtol=0.0, atol=1e-12)
+        above = [np.inf, 3e-4, 0.0, 0.02, np.inf, 0.0]
+        assert found.distances == pytest.approx(above, rel=0.0, abs=1e-12)
         assert found.points.tolist() == [-1, 0, 0, 0, -1, 0]
         poses[:, :3, 3] = np.ldexp(1.0, 70) * np.array([[1.0, 0.0, -1.0]] * 6)
-        assert env.clearance(shell, poses, 0.04).distances.tolist() == [0.04] * 6
+        assert env.clearance(shell, poses, 0.04).distances.tolist() == [np.inf] * 6
 
 
 def test_a_reach_that_is_none_is_refused(tmp_path: Path) -> None:
     with make(tmp_path, 10) as env:
         poses = poses_in(env.grid, 2)
-        assert env.clearance(cloud(50), poses).distances.tolist() == [32 * SIZE] * 2  # empty
+        assert env.clearance(cloud(50), poses).distances.tolist() == [np.inf] * 2  # empty
         scatter(env)
         for reach in (0.0, -1.0, np.nan, np.inf):
             with pytest.raises(UsageError, match="finite length above 0"):
@@ -159,14 +163,26 @@ def test_an_exact_clearance_is_that_of_boxes(tmp_path: Path) -> None:
     poses = np.tile(np.eye(4), (count, 1, 1))
     poses[:, :3, :3] = Rotation.random(count, rng=rng).as_matrix()
     poses[:, :3, 3] = rng.uniform(-0.2, 0.2, (count, 3))
+    poses[0, :3, 3] = (places[0] @ [halves[0, 0], 0.0, 0.0, 1.0])[:3]  # in a side
     expected, _ = apart(half, poses, Boxes(places, halves))
     with hapticdb.open(tmp_path / "boxes.db") as env:
         found = env.clearance(shell, poses, reach, exact=True)
-        only = env.clearance(shell, poses, reach, where=["box1"], exact=True)
+        only = env.clearance(shell, poses, where=["box1"], exact=True)
+        met = env.collides(shell, poses, exact=True)
+        between = env.distance("box0", "box1")
+        with pytest.raises(UsageError, match="two different"):
+            env.distance("box0", "box0")
         with pytest.raises(UsageError, match="above 0"):
             env.clearance(shell, poses, -1.0, exact=True)
         with pytest.raises(UsageError, match="no surface"):
             env.clearance(cloud(9), poses, exact=True)
-    assert found.distances == pytest.approx(np.minimum(expected.min(axis=1), reach), abs=1e-8)
-    assert only.distances == pytest.approx(np.minimum(expected[:, 1], reach), abs=1e-8)
-    assert found.is_beyond.tolist() == (expected.min(axis=1) >= reach).tolist()
+    least = expected.min(axis=1)
+    assert met.tolist() == (least == 0.0).tolist()
+    assert 0 < met.sum() < count
+    assert found.distances == pytest.approx(np.where(least < reach, least, np.inf), abs=1e-8)
+    assert only.distances == pytest.approx(expected[:, 1], abs=1e-8)
+    assert found.is_beyond.tolist() == (least >= reach).tolist()
+    wanted, _ = apart(halves[1], places[1:], Boxes(places[:1], halves[:1]))
+    assert between.at_least == pytest.approx(float(wanted[0, 0]), abs=1e-7)
+    assert (between.a.name, between.b.name) == ("box0", "box1")
+    assert np.linalg.norm(between.on_a - between.on_b) == pytest.approx(between.at_most)

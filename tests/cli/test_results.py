@@ -93,7 +93,7 @@ def test_the_page_has_every_key_that_a_verb_prints(run: Run, scene: Path) -> Non
         ("clashes", scene, "--of", "box1", "--turn", "z"), ("diff", scene, "b.db"),
         ("check", scene), ("backup", scene, "c.db"), ("import", "d.db", "tool.stl"),
         ("clashes", scene, "--accept", "box1", "box2", "--because", "meant"),
-        ("extract", scene, "box1", "--motions", 0),
+        ("extract", scene, "box1", "--motions", 0), ("distance", scene, 1, 2),
     ):  # fmt: skip
         code, out, err = run(*words, "--json")
         assert code in {0, 1, 4}, err

@@ -70,6 +70,12 @@ def test_calibrate_prints_figures_with_their_spread(run: Run, scene: Scene) -> N
     refused(run("info", scene, "--cold"), "--calibrate")
 
 
+def test_a_distance_is_that_of_the_nearest_two(run: Run, scene: Scene) -> None:
+    out = succeeded(run("distance", scene, "box0", "box*"))
+    assert out.startswith("box0 and box1 are 100 mm apart\non box0  (0.05, ")
+    refused(run("distance", scene, "box0", "bix1"), "did you mean 'box1'")
+
+
 # -- move, remove ---------------------------------------------------------------------------------
 
 

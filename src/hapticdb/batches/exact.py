@@ -1,18 +1,64 @@
-"""Exact distances of a tool's surface from surfaces of objects, at many poses."""
+"""Exact distances of surfaces: of a tool from objects at many poses, and of two objects."""
 
 from collections.abc import Callable, Sequence
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from hapticdb.batches.result import ClearanceBatch
+from hapticdb.errors import UsageError
 from hapticdb.ingest.geometry import parts_of
+from hapticdb.kernels.surfaces.sides import TriangleTree
+from hapticdb.kernels.triangles.nearest import nearest
 from hapticdb.pointshell.moving import MovingSurface
 from hapticdb.pointshell.shape import tree_of
 from hapticdb.pointshell.shell import PointShell
 from hapticdb.store.base import Object, Store
 
 Floats = NDArray[np.float64]
+
+MET = 1e-9
+"""Metres: surfaces that are farther apart do not meet."""
+
+
+class Distance(NamedTuple):
+    """Least distance of the surfaces of two objects, metres.
+
+    a, b : the objects; at_least, at_most : bounds, 0 where the surfaces meet; they differ by
+    rounding and by chord errors; on_a, on_b (3,) : the nearest places, world frame.
+    """
+
+    a: Object
+    b: Object
+    at_least: float
+    at_most: float
+    on_a: Floats
+    on_b: Floats
+
+
+def least_distance(store: Store, ones: Sequence[Object], others: Sequence[Object]) -> Distance:
+    """Least distance of any of some objects from any of others; broad phase by AABBs."""
+    boxes, more = (np.array([obj.bounds for obj in some]) for some in (ones, others))
+    apart = np.maximum(boxes[:, None, 0] - more[None, :, 1], more[None, :, 0] - boxes[:, None, 1])
+    gaps = np.linalg.norm(np.maximum(apart, 0.0), axis=2)
+    trees: dict[int, tuple[TriangleTree, float]] = {}
+    for obj, part in parts_of(store, list({obj.id: obj for obj in (*ones, *others)}.values())):
+        trees[obj.id] = tree_of(part.surface()), part.placed_chord
+    found: Distance | None = None
+    for n in np.argsort(gaps, axis=None, kind="stable").tolist():
+        i, j = divmod(n, len(others))
+        one, other, limit = ones[i], others[j], np.inf if found is None else found.at_most
+        if gaps[i, j] >= limit or one.id == other.id:
+            continue
+        (tree, chord), (second, more_chord) = trees[one.id], trees[other.id]
+        near, error = nearest(tree, second, np.eye(4)[None], np.array([limit])), chord + more_chord
+        if near.pairs[0, 0] >= 0:
+            least, most = max(float(near.at_least[0]) - error, 0.0), float(near.at_most[0]) + error
+            found = Distance(one, other, least, most, near.on_a[0], near.on_b[0])
+    if found is None:
+        raise UsageError("distance: give two different objects")
+    return found
 
 
 def exact_clearance(
@@ -35,10 +81,11 @@ def exact_clearance(
     order = np.argsort(gaps.min(axis=1, initial=np.inf), kind="stable").tolist()
     parts = parts_of(store, [objects[i] for i in order])
     for n, (i, (_, part)) in enumerate(zip(order, parts, strict=True)):
-        near = np.flatnonzero(gaps[i] < found.distances)
+        farthest = np.minimum(found.distances, reach)
+        near = np.flatnonzero(gaps[i] < farthest)
         if len(near):
             tree = tree_of(part.surface())
-            measured = tool.nearest(tree, poses[near], found.distances[near].copy())
+            measured = tool.nearest(tree, poses[near], farthest[near])
             is_nearer = measured.pairs[:, 0] >= 0
             at = near[is_nearer]
             found.distances[at] = measured.at_least[is_nearer]

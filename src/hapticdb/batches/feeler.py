@@ -163,7 +163,7 @@ class Feeler(Closes):
                 self._known_revision = found.revision
             for chosen in self._pieces(order, progress):
                 voxels, points = search.search(places[chosen])
-                found.distances[chosen] = np.where(points < 0, limit, voxels * size)
+                found.distances[chosen] = np.where(points < 0, np.inf, voxels * size)
                 found.points[chosen] = points
             return found
 

@@ -110,15 +110,15 @@ class ClearanceBatch:
     """Distances of a tool's points from the environment at B poses, at one committed revision.
 
     distances (B,) float64 : metres from the nearest of the shell's points to the nearest occupied
-        voxel's box: 0 for a pose with a hit, `reach` with nothing nearer, never more than to a
-        surface. If exact: from the tool's surface to the nearest surface of an object.
+        voxel's box: 0 for a pose with a hit, infinite with nothing within reach, never more than to
+        a surface. If exact: from the tool's surface to the nearest surface of an object.
     points (B,) int64 : index of a nearest point, -1 with nothing within reach
     reach : greatest distance of the search, metres
     revision : revision of the environment
     """
 
     def __init__(self, n_poses: int, reach: float) -> None:
-        self.distances: Floats = np.full(n_poses, reach)
+        self.distances: Floats = np.full(n_poses, np.inf)
         self.points: Ints = np.full(n_poses, -1, dtype=np.int64)
         self.reach = reach
         self.revision = 0

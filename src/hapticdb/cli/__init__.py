@@ -25,6 +25,7 @@ from hapticdb.cli.verbs.feeling import feel
 from hapticdb.cli.verbs.importing import import_
 from hapticdb.cli.verbs.keeping import backup, check, grant
 from hapticdb.cli.verbs.listing import info, objects
+from hapticdb.cli.verbs.measuring import distance
 from hapticdb.cli.verbs.moving import copy, diff
 from hapticdb.cli.verbs.replaying import replay
 from hapticdb.cli.verbs.sampling import demo, sample
@@ -52,6 +53,7 @@ VERBS: dict[Callable[..., None], str] = {
     replay: "Run a recorded session again.",
     sweep: "Say whether a tool or part comes out along a path.",
     clashes: "Say which parts meet, and which are near.",
+    distance: "Measure how far two objects are apart.",
     extract: "Search a path on which parts come out.",
     move: "Place an object anew.",
     remove: "Remove objects.",

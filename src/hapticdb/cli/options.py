@@ -171,6 +171,9 @@ clashes.about X,Y,Z/mm [middle of --of]: a point of the hinge, or the centre of 
 clashes.from DEG: Degrees: start of --turn.
 clashes.to DEG: Degrees: end of --turn.
 
+distance.a A: An object, by id or name, or several, such as 'wheel*'.
+distance.b B: Another one, or several.
+
 extract.parts WORDS...: As 'hapticdb objects' lists them: 7 or 3,4, 'wheel*', attribute=value.
 extract.disassemble: Take off what blocks the parts first, step by step.
 extract.depth N [3]: Most objects that wait for one another, beside the parts.

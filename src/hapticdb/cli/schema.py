@@ -15,6 +15,7 @@ FIELDS = {
         "is_equal a b is_same_grid with_distances objects=compared voxels=n_voxels renumbered"
     ),
     "Disassembly": "verdict parts steps failed is_out_of_time elapsed=seconds seed",
+    "Distance": "a=a.id a_name=a.name b=b.id b_name=b.name at_least at_most on_a on_b",
     "Extraction": (
         "verdict parts to way near blockers pulls motions looks=poses is_planned "
         "is_out_of_time elapsed=seconds seed"

@@ -18,9 +18,10 @@ from hapticdb.query.law import PLANE, ForceLaw, LawName, as_law, inset_of
 from hapticdb.query.touches import Touch
 from hapticdb.store.base import Store
 from hapticdb.store.filtering import ALL, NOTHING, Filter, FiltersOfWords
-from hapticdb.store.finding import Words
+from hapticdb.store.finding import Words, find_objects
 
 if TYPE_CHECKING:
+    from hapticdb.batches.exact import Distance
     from hapticdb.batches.feeler import BatchDevice, Feeler, PoseCallback
     from hapticdb.batches.result import ClearanceBatch, TouchBatch
 
@@ -198,13 +199,23 @@ class Queries:
         *,
         where: Words = (),
         exclude: Words = (),
+        exact: bool = False,
         device: "BatchDevice" = "cpu",
         progress: "PoseCallback | None" = None,
     ) -> NDArray[np.bool_]:
         """Whether the tool collides at rigid poses (B, 4, 4): `touch` has hits there.
 
+        By the shell's points, which may miss what is thinner than they are apart. With `exact`
+        whether its surface meets that of an object, as for `clearance`.
+
         Arguments as for `touch`, `feeler` and `Feeler.touch`; errors as for `touch`.
         """
+        if exact:
+            from hapticdb.batches.exact import MET  # noqa: PLC0415 - loads kernels
+
+            return ~self.clearance(
+                shell, poses, MET, where=where, exclude=exclude, exact=True, progress=progress
+            ).is_beyond
         with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.collides(poses, progress=progress)
 
@@ -222,11 +233,13 @@ class Queries:
     ) -> "ClearanceBatch":
         """Distance from the shell's points to the nearest occupied voxel at many poses.
 
-        With `exact`, the distance between the surfaces of the tool and the nearest object, with the
-        index of the shell's point nearest to it; some hundred times slower, on processors alone.
+        By points and voxels: never more than the distance of the surfaces. With `exact`, the
+        distance between the surfaces of the tool and the nearest object, with the index of the
+        shell's point nearest to it; some hundred times slower, on processors alone.
 
         poses (B, 4, 4) : world_from_tool, rigid, metres, in any order
-        reach : greatest distance searched, metres; 32 voxels unless given
+        reach : greatest distance searched, metres; unless given 32 voxels, or no limit with
+            `exact`. Distances beyond it are infinite.
 
         Raises `UsageError` for a pose that is not rigid, a reach that is not positive, or one too
         large for the memory; `ObjectNotFoundError` as for `touch`.
@@ -235,12 +248,24 @@ class Queries:
             from hapticdb.batches.exact import exact_clearance  # noqa: PLC0415 - loads kernels
             from hapticdb.batches.feeler import reach_of  # noqa: PLC0415 - likewise
 
-            limit = reach_of(reach, self._store.grid.voxel_size)
+            limit = np.inf if reach is None else reach_of(reach, 1.0)
             with self._store.snapshot():
                 felt = Filter(where, exclude).felt(self._store.objects(), self._store.url)
                 return exact_clearance(self._store, felt, shell, as_poses(poses), limit, progress)
         with self.feeler(shell, where=where, exclude=exclude, law=PLANE, device=device) as feeler:
             return feeler.clearance(poses, reach, progress=progress)
+
+    def distance(self, a: int | str, b: int | str) -> "Distance":
+        """Least distance of the surfaces of two objects, with the nearest places.
+
+        a, b : as for `find`; of several objects the two nearest are measured. How deep two overlap,
+        and whether one lies in the other, `hapticdb.find_clashes` says.
+        """
+        from hapticdb.batches.exact import least_distance  # noqa: PLC0415 - loads kernels
+
+        with self._store.snapshot():
+            ones, others = (find_objects(self._store, [word]) for word in (a, b))
+            return least_distance(self._store, ones, others)
 
     def feeler(
         self,

@@ -1,8 +1,8 @@
-"""A frame over decoded bricks that are kept in memory: one call if all of its bricks are there.
+"""Frame over a cache of decoded bricks: one call if all of its bricks are cached.
 
-A brick is a range of slots, a row for each object near it. A point is felt by the least distances
-of the rows that count: the only one of them, or a slot behind the brick's rows. The sums are those
-of `refining`, over the same numbers in the same order.
+A brick is a range of slots, one row for each object near it. A point is sampled from the least
+distances over the rows not excluded: the only such row, or an extra slot behind the brick's rows.
+The sums are those of `refining`, over the same numbers in the same order.
 """
 
 import numpy as np
@@ -39,7 +39,7 @@ from hapticdb.kernels.resident.cells import spread_key
 from hapticdb.kernels.rigid import is_rigid, transform_of
 
 NOT_RIGID, INCOMPLETE = -1, -2
-"""Instead of the number of hits: of a pose that is not rigid, and without all bricks in memory."""
+"""Results in place of the number of hits: pose not rigid; some bricks not cached."""
 
 
 BY_DISTANCE = {record_of(OCCUPIED): record_of(MEASURED), TANGENT_PLANE: DISTANCE_FIELD}
@@ -47,8 +47,8 @@ BY_DISTANCE = {record_of(OCCUPIED): record_of(MEASURED), TANGENT_PLANE: DISTANCE
 
 @inlined
 def _entry_of(directory, key):
-    """Place of a key's entry, or of the free entry where it belongs."""
-    # 8 bricks of a cube are neighbours: a frame takes few pages of memory
+    """Index of a key's entry in the directory, or of the free entry at the end of its probe."""
+    # locality: the 8 bricks of a cube are neighbours, so a frame touches few pages
     at = (spread_key(key >> 3, directory.shape[0] >> 3) << 3) | (key & 7)
     while directory[at].end != 0 and directory[at].key != key:
         at = (at + 1) & (directory.shape[0] - 1)
@@ -57,7 +57,7 @@ def _entry_of(directory, key):
 
 @inlined
 def _set_least(rows, first, end):
-    """Set the slot behind a brick's rows to the least distances of those that count."""
+    """Write the minimum distances over the rows not excluded to the slot behind them."""
     rows.counts[end] = True
     for value in range(rows.distances.shape[1]):
         rows.distances[end, value] = 255
@@ -70,7 +70,7 @@ def _set_least(rows, first, end):
 
 @inlined
 def _choose(brick, rows, exclude, number):
-    """Find out which rows of a brick count under a filter of that number, and their least."""
+    """Apply a filter of that number to a brick: mark the rows that count and set its least slot."""
     first, end = np.int64(brick.first), np.int64(brick.end)
     least, n_felt = np.int64(-1), 0
     for row in range(first, end):
@@ -86,7 +86,7 @@ def _choose(brick, rows, exclude, number):
 
 @maker
 def _missing_keys(directory, asked, keys):
-    """Write the distinct keys of bricks that are not there, ascending; how many they are."""
+    """Write the distinct keys of uncached bricks, ascending; return their number."""
     found, count = np.empty(asked.shape[1], dtype=np.int64), np.int64(0)
     table = new_table(asked.shape[1])
     for n in range(asked.shape[1]):
@@ -101,7 +101,7 @@ def _missing_keys(directory, asked, keys):
 
 @inlined
 def _find_touched(directory, rows, asked):
-    """Write the distinct ids of touched rows to `found`, ascending, and clear the marks."""
+    """Write the distinct ids of touched rows to `rows.found`, ascending, and clear the marks."""
     count = np.int64(0)
     for n in range(asked.shape[1]):
         at = asked[1, n]
@@ -116,7 +116,7 @@ def _find_touched(directory, rows, asked):
 
 @inlined
 def _find_bricks(directory, asked):
-    """Set the places of the addresses' bricks; whether all are there."""
+    """Set the directory indices of the addresses' bricks; return whether all are cached."""
     is_complete, last_key, last_at = True, np.int64(-1), np.int64(-1)
     for n in range(asked.shape[1]):
         if asked[0, n] < 0:
@@ -139,15 +139,16 @@ def touch_bricks(
     points, normals, center, pose, grid, directory, decoded, exclude, number, law, is_new, placed,
     asked, felt, met,
 ):  # fmt: skip
-    """Feel a shell at a pose -> hits H, other points felt A, and ids I, these in `found`.
+    """Evaluate a shell at a pose -> hits H, other contacts A, and ids I, these in `rows.found`.
 
     points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool; directory (C,)
-    and rows in memory; exclude (E,), ascending, of the filter of that number; is_new : not placed
-    by a call before. placed and felt take what `locate` and `refine` give, met (2 N,) likewise, but
-    no ids; asked (2, N) the addresses, and the places in the directory, -1 outside the grid.
+    and cached rows; exclude (E,) object ids, ascending, of the filter of that number; is_new :
+    false if an earlier call placed the shell. Outputs: placed as from `locate`; `felt` and `met`
+    (2 N,) as from `refine`, without ids; `asked` (2, N), addresses and indices in the directory, -1
+    outside the grid.
 
-    Without all bricks in memory: `INCOMPLETE`, and the number of those missing, whose keys are in
-    met, ascending. `NOT_RIGID` if the pose is not.
+    Returns `INCOMPLETE` and the number of uncached bricks, their keys in `met`, ascending, if there
+    are any; `NOT_RIGID` for a pose that is not rigid.
     """
     if not is_rigid(pose):
         return np.int64(NOT_RIGID), np.int64(0), np.int64(0)
@@ -180,7 +181,7 @@ def touch_bricks(
 
 @entry(record_of(BRICK, 1), record_of(BRICK, 1))
 def copy_entries(directory, larger):
-    """Enter the bricks of a directory into a larger one."""
+    """Rehash the bricks of a directory into a larger one."""
     for at in range(directory.shape[0]):
         if directory[at].end != 0:
             larger[_entry_of(larger, directory[at].key)] = directory[at]
@@ -188,7 +189,7 @@ def copy_entries(directory, larger):
 
 @entry(record_of(BRICK, 1), INTS, INTS)
 def absent_bricks(directory, keys, found):
-    """Write those of the keys (U,) that are not in the directory to found (U,); their number."""
+    """Write the keys (U,) absent from the directory to `found` (U,); return their number."""
     count = 0
     for n in range(keys.shape[0]):
         if directory[_entry_of(directory, keys[n])].end == 0:
@@ -199,9 +200,9 @@ def absent_bricks(directory, keys, found):
 
 @maker
 def _decode(rows, slots, bits, data, ends):
-    """Decode fetched rows into their slots, those with one -> -1, or the first damaged row.
+    """Decode fetched rows into their slots, except slots < 0 -> -1, or the first damaged row.
 
-    A loop of its own: between the entries' searches, unpacking takes a third longer.
+    A loop of its own: interleaved with the directory's probes, unpacking takes a third longer.
     """
     memory, has_distances = unpacking_memory(), rows.distances.shape[1] == ROW_VALUES
     for row in range(slots.shape[0]):
@@ -220,11 +221,11 @@ def _decode(rows, slots, bits, data, ends):
     also=BY_DISTANCE,
 )  # fmt: skip
 def enter_bricks(directory, decoded, keys, row_keys, row_ids, bits, data, ends, used):
-    """Enter bricks, and decode their rows straight into slots from `used` on.
+    """Enter bricks into the cache and decode their rows into slots from `used` on.
 
-    keys (U,) of bricks that are not there, ascending; row_keys (R,), ascending, row_ids (R,) and
-    occupancy bits (64 R,) of their rows, among which others may lie; data (n,), ends (R,): packed
-    distances. Needs R + R / 2 free slots. Returns the first free slot then, or -1 - r if row r is
+    keys (U,) of uncached bricks, ascending; row_keys (R,), ascending, row_ids (R,) and occupancy
+    bits (64 R,) of fetched rows, other bricks' rows allowed; data (n,), ends (R,): packed
+    distances. Needs R + R / 2 free slots. Returns the next free slot, or -1 - r if row r is
     damaged.
     """
     slots, rows = np.full(row_keys.shape[0], -1, dtype=np.int64), decoded[()]

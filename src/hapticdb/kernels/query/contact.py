@@ -1,4 +1,4 @@
-"""From points to keys: place a shell in the grid and find the rows that it asks for."""
+"""From points to keys: place a shell in the grid and compute the row keys under its points."""
 
 from typing import NamedTuple
 
@@ -48,13 +48,13 @@ LARGEST = 0x7FFFFFFFFFFFFFFF
 
 @leaf
 def center_of(x, origin, size):
-    """Centre, on one axis, of the voxel that holds coordinate x, metres."""
+    """Centre, on one axis, of the voxel around coordinate x, metres."""
     return origin + size * (np.floor((x - origin) / size) + 0.5)
 
 
 @inlined
 def place_shell(points, normals, center, transform, placed):
-    """Write points and normals of a placed shell, last its centre, to placed (N + 1, 6), world."""
+    """Transform points and normals, last the centre, into placed (N + 1, 6), world frame."""
     total = points.shape[0]
     for n in range(total):
         x, y, z = moved(transform, points[n, 0], points[n, 1], points[n, 2])
@@ -68,7 +68,7 @@ def place_shell(points, normals, center, transform, placed):
 
 @inlined
 def address_of(placed, n, place):
-    """Row key and address, as `Located` has it, of point n of a placed shell; -1 outside."""
+    """Row key and address of point n of a shell (see `Located`); both -1 outside the grid."""
     x = np.floor((placed[n, 0] - place.x) / place.voxel)
     y = np.floor((placed[n, 1] - place.y) / place.voxel)
     z = np.floor((placed[n, 2] - place.z) / place.voxel)
@@ -84,7 +84,7 @@ def address_of(placed, n, place):
 
 @maker
 def new_table(total):
-    """Table for `number_of_key`, of at most so many keys."""
+    """Empty table for `number_of_key`, at most half full with `total` keys."""
     capacity = 16
     while capacity < 2 * total:
         capacity *= 2
@@ -93,9 +93,9 @@ def new_table(total):
 
 @inlined
 def number_of_key(table, found, count, key):
-    """Number of a row key: its place in found (N,). A new key is entered there as number `count`.
+    """Index of a row key in `found` (N,); a new key is appended at index `count`.
 
-    table (capacity,) int32: an open-addressing set of those numbers, -1 where free.
+    table (capacity,) int32: open-addressing hash set of these indices, -1 if free.
     """
     at = spread_key(key, table.shape[0])  # at most half of the table is full
     while table[at] >= 0 and found[table[at]] != key:
@@ -108,7 +108,7 @@ def number_of_key(table, found, count, key):
 
 @maker
 def sort_keys(found, count, asked, keys):
-    """Write the first `count` of the keys found in ascending order; renumber the points' slots."""
+    """Sort the first `count` of `found` into `keys`; renumber the points' slots in `asked`."""
     order = sorting_order(found[:count])
     rank = np.empty(count, dtype=np.int32)
     for n in range(count):
@@ -124,10 +124,10 @@ def sort_keys(found, count, asked, keys):
     READ_FLOATS2, READ_FLOATS2, READ_FLOATS, FLOATS2, record_of(GRID), FLOATS2, INTS2, INTS
 )  # fmt: skip
 def locate(points, normals, center, pose, grid, placed, asked, keys):
-    """Place a shell in the grid, and collect the distinct row keys that it asks for.
+    """Place a shell in the grid and collect the distinct row keys under its points.
 
     points, normals (N, 3) and center (3,), tool frame; pose (4, 4), world_from_tool. Fills the
-    arrays of `Located`, keys (N,) up to the number U of the keys. Returns U, or -1 if the pose is
+    arrays of `Located`; keys has room for N, of which U are set. Returns U, or -1 if the pose is
     not rigid.
     """
     if not is_rigid(pose):
@@ -154,7 +154,7 @@ def locate(points, normals, center, pose, grid, placed, asked, keys):
 
 @leaf
 def voxel_at(address, bits, curve, shift):
-    """Voxel (i, j, k) of an address, as `Located` has it."""
+    """Voxel (i, j, k) of an address; see `Located`."""
     if shift == 0:
         return voxel_of(address, bits, curve)
     i, j, k = voxel_of(address >> 9, max(bits - 3, 0), curve)
@@ -167,9 +167,9 @@ def voxel_at(address, bits, curve, shift):
 
 @entry(INTS2, INTS, record_of(GRID))
 def spans_of_keys(asked, keys, grid):
-    """Lowest and highest voxel key (2, U) that a shell asks for under each row key.
+    """Lowest and highest voxel key (2, U) of a shell's points under each row key.
 
-    asked, keys: of `Located`.
+    `asked`, `keys` of `Located`.
     """
     bits, curve, shift = grid[()].bits, grid[()].curve, grid[()].shift
     spans = np.empty((2, keys.shape[0]), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""Grouping of sorted keys into ranges (the paper, section 5), and ranges that cover a box."""
+"""Grouping of sorted keys into ranges (the paper, section 5), and ranges over a box."""
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,10 +11,10 @@ Ints = NDArray[np.int64]
 
 @leaf
 def first_bound(x, bounds, start):
-    """Index of the first bound >= x, at `start` or above it; R + 1 when there is none.
+    """Index of the first bound >= x, from index `start` on; R + 1 if there is none.
 
-    The search doubles its steps, then halves the interval: a frame's keys lie close together, so
-    the next bound is mostly the same as the last one.
+    Galloping search: a frame's keys lie close together, so the next bound is mostly the same as
+    the last one.
     """
     total = bounds.shape[0]
     step = 1
@@ -72,7 +72,7 @@ def gap_rows(left, right, bounds, rows_per_bucket):
 def group_by_gap(keys, first, last, maxgap):
     """MaxGap: neighbouring keys p < q share a range if and only if q - p <= maxgap.
 
-    keys (U,) row keys, ascending; first, last (U,) the lowest and highest voxel key asked for under
+    keys (U,) row keys, ascending; first, last (U,) the lowest and highest requested voxel key of
     each. Returns the ranges' lowest and highest row keys.
     """
     total = keys.shape[0]
@@ -93,8 +93,8 @@ def group_by_gap(keys, first, last, maxgap):
 def group_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
     """CBGroup: a gap is closed if and only if scanning it costs no more than another descent.
 
-    lows, highs (U,) int64: closed spans of row keys, ascending and disjoint, which are merged in
-    place; bounds (R + 1,) int64, the quantile vector; both costs in the same unit. Returns the
+    lows, highs (U,) int64: closed spans of row keys, ascending and disjoint, merged in place;
+    bounds (R + 1,) int64, the quantile vector; both costs in the same unit. Returns the
     number of ranges.
     """
     count = at = np.int64(0)
@@ -113,7 +113,7 @@ def group_by_cost(lows, highs, bounds, rows_per_bucket, row_cost, descent_cost):
 
 
 def ranges_of_box(low: Ints, high: Ints, bits: int, curve: int, finest: int) -> Ints:
-    """Closed ranges of voxel keys (G, 2) that cover the voxels low .. high (3,), both included.
+    """Closed ranges of voxel keys (G, 2) covering the voxels low .. high (3,), both included.
 
     On a hierarchical curve each range is a cube with an edge of 2^finest voxels. In lexicographic
     order it is a run of slabs, at most 1024. Ascending, and not merged.

@@ -1,4 +1,4 @@
-"""From rows to a wrench: drop the false hits of a frame, and sum what its points feel.
+"""From rows to a wrench: drop the false hits of a frame, and sum the forces on its points.
 
 Every sum runs in the order of the shell's points and every product is written out, so that each
 strategy, layout, curve and engine gives the same wrench bit for bit (numba contracts no
@@ -44,9 +44,9 @@ Ints = NDArray[np.int64]
 
 @maker
 def _rows_of_keys(keys, row_keys):
-    """Where the rows of each asked key begin and end, (U,) int64 each.
+    """Start and end of the rows of each requested key, (U,) int64 each.
 
-    One merge of two ascending lists; rows of keys that were not asked for are the false hits.
+    One merge of two ascending lists; rows of other keys are the false hits.
     """
     total = keys.shape[0]
     starts = np.empty(total, dtype=np.int64)
@@ -77,8 +77,8 @@ def _counting_rows(row_ids, exclude):
 def is_felt(object_id, exclude):
     """Whether an object is not in exclude (E,), ascending and distinct.
 
-    An excluded id has id - exclude[0] smaller ids before it, less the ids in between that are not
-    excluded: the search begins there, which is close where almost all are excluded.
+    The search starts at a lower bound of the id's index: id - exclude[0], less the number of gaps
+    in `exclude`. The bound is tight if almost all objects are excluded.
     """
     total = exclude.shape[0]
     if total == 0 or object_id < exclude[0] or object_id > exclude[total - 1]:
@@ -90,7 +90,7 @@ def is_felt(object_id, exclude):
 
 @inlined
 def _has_voxel(occupancy, row, address):
-    """Whether a row has the voxel of an address; always true for a voxel row (no occupancy)."""
+    """Whether a row occupies the voxel of an address; always true for a voxel row."""
     if occupancy.shape[0] == 0:
         return True
     return (occupancy[64 * row + ((address & 511) >> 3)] >> (address & 7)) & 1 != 0
@@ -98,7 +98,7 @@ def _has_voxel(occupancy, row, address):
 
 @inlined
 def _distinct_ids(touched, row_ids, met, start):
-    """Write the distinct ids of touched rows into met[start:], ascending -> number of ids."""
+    """Write the distinct ids of touched rows into `met[start:]`, ascending -> number of ids."""
     count = np.int64(0)
     for row in range(row_ids.shape[0]):
         if touched[row]:
@@ -128,17 +128,18 @@ def _in_grid(placed, n, place):
 
 @inlined
 def _share_of(law, payload, counts, first, end, at, point, sample):
-    """Share of a point, at a place `at` in voxels, by rows first .. end - 1."""
+    """Share of a point at `at`, in voxels from the grid's origin, by rows first .. end - 1."""
     return share_rows(law, payload, counts, first, end, *at, point[3], point[4], point[5], sample)
 
 
 @inlined
 def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size, sample, is_hit):
-    """Mark the rows of the objects that a felt point touches, by each object's own sample.
+    """Mark the rows of the objects in contact with a point, by each object's own sample.
 
-    These are the objects that the point would feel alone. Between two objects the least distances,
-    interpolated, may be below the onset although each object's own distance is not: then it is the
-    nearest object. Nothing is marked under a law without samples, which feels hits alone.
+    An object is in contact if the law gives a depth for it alone. Between two objects the
+    interpolated least distances may be below the onset although each object's own distance is
+    above; then the nearest object is marked. A law without samples marks nothing: its contacts are
+    hits.
     """
     if not sample <= reach(law):
         return
@@ -170,7 +171,7 @@ def _touch_near_rows(law, payload, counts, touched, first, end, at, point, size,
 
 
 NO_TALLY = (NO_WRENCH, 0.0, 0, 0)
-"""Sums of force and torque, of weights, of hits, and of points felt that are no hits."""
+"""Initial sums: force and torque, weights, hits, and contacts without a hit."""
 
 
 @inlined
@@ -178,10 +179,10 @@ def feel_point(
     law, payload, counts, touched, occupancy, rows, least, n, address, placed, place, felt, met,
     tally,
 ):  # fmt: skip
-    """Feel point n of a placed shell, and add it to `NO_TALLY`.
+    """Evaluate the law at point n of a placed shell; return the tally with the point added.
 
-    rows, least : first row and the row behind the last of the point's brick: those of its objects,
-    and those by whose least distances it is felt; felt and met as for `refine`.
+    rows : first row of the point's brick and the row behind its last; least : the same of the rows
+    with the brick's least distances; `felt`, `met` as for `refine`; `tally` as `NO_TALLY`.
     """
     total = placed.shape[0] - 1
     first, end = rows
@@ -225,16 +226,16 @@ def feel_point(
 def refine(
     placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, felt, met
 ):
-    """Drop the false hits of a frame's rows, sum the wrench of the points felt -> H, A and I.
+    """Drop the false hits of a frame's rows and sum the wrench of its contacts -> H, A and I.
 
-    placed, asked, keys: of `Located`; row_keys (R,), ascending, and row_ids (R,); occupancy
-    (64 R,), or empty for voxel rows; payload (R, 1000), the rows' distances, or None for a law that
-    reads none; exclude (E,), ascending.
+    `placed`, `asked`, `keys` of `Located`; row_keys (R,), ascending, and row_ids (R,); occupancy
+    (64 R,), or empty for voxel rows; payload (R, 1000), the rows' distances, or None for a law
+    without payload; exclude (E,), ascending.
 
-    felt (6 + 2 N,) takes the wrench about the centre, world frame; from 6 on the depths of the H
-    hits, 0 where the law feels nothing; from 6 + N on those of the A points that are felt although
-    they are no hits. met (2 N + R,) takes the H indices, ascending; from N on the A indices; from
-    2 N on the I ids of the objects that the hits are in, and of those that felt points touch.
+    Output `felt` (6 + 2 N,): wrench about the centre, world frame, N and N m; from 6 on the depths
+    of the H hits, metres, 0 without contact; from 6 + N on those of the A contacts without a hit.
+    Output `met` (2 N + R,): the H indices, ascending; from N on the A indices; from 2 N on the I
+    ids of the objects around the hits or in contact.
     """
     place, total = grid[()], asked.shape[1]
     touched = np.zeros(row_ids.shape[0], dtype=np.bool_)
@@ -262,9 +263,9 @@ def refine(
 def pairs_of_points(
     placed, asked, keys, row_keys, row_ids, occupancy, payload, exclude, grid, law, chosen
 ):
-    """Every (point, object) pair of chosen points (C,) of a frame, (P, 2) int64, ordered by both.
+    """Touching (point, object) pairs (P, 2) of chosen points (C,) of a frame, ordered by both.
 
-    A point touches the objects in whose voxel it is, and those of `_touch_near_rows`. The other
+    A point touches the objects occupying its voxel, and those of `_touch_near_rows`. The other
     arguments are those of `refine`.
     """
     place = grid[()]
@@ -300,7 +301,7 @@ def pairs_of_points(
 
 @entry(INTS, INTS)
 def asked_rows(keys, row_keys):
-    """Mask (R,) of the rows whose keys a shell asks for; the others are the false hits.
+    """Mask (R,) of the rows with requested keys; the others are the false hits.
 
     keys (U,) and row_keys (R,) int64, both ascending.
     """
@@ -317,7 +318,7 @@ def wrench_of_addresses(placed, ordinals, addresses, grid, law, depths):
     """Wrench (6,) of hits given as ordinals (H,), ascending, and addresses (H,) int64.
 
     The paper's ``force(point, z_val)``: the voxel's centre comes from the address alone. For laws
-    that read no payload. depths (H,) takes each hit's depth, metres, 0 above its tangent plane.
+    without payload. Output depths (H,): of each hit, metres, 0 above its tangent plane.
     """
     place, last = grid[()], placed.shape[0] - 1
     size = place.voxel

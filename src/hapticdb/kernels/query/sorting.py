@@ -12,7 +12,7 @@ from hapticdb.kernels._jit import leaf, maker
 def sorting_order(keys):
     """Order (U,) that sorts distinct keys (U,) (Shell 1959, with Knuth's gaps).
 
-    A common frame asks for a few dozen bricks, whose keys are almost in order.
+    A common frame needs a few dozen bricks, and their keys are almost in order.
     """
     count = keys.shape[0]
     order = np.empty(count, dtype=np.int64)

@@ -8,6 +8,7 @@ import trimesh
 from numpy.typing import NDArray
 
 import hapticdb
+from hapticdb.clashes.rules import add_rules
 from hapticdb.errors import FileError, UsageError
 from hapticdb.mesh import Defects, parse_in_process
 from hapticdb.poses import read_poses
@@ -49,15 +50,21 @@ def test_the_car_is_read_as_closed_parts_of_distinct_names(files: SampleFiles) -
     assert np.ptp(car.bounds, axis=0) == pytest.approx([4.28, 2.04, 1.72], abs=0.02)
 
 
-def test_clashes_finds_the_two_planted_overlaps_alone(files: SampleFiles, tmp_path: Path) -> None:
+def test_clashes_finds_the_two_planted_overlaps_and_the_rules_leave_one(
+    files: SampleFiles, tmp_path: Path
+) -> None:
     options = hapticdb.ImportOptions(grid=hapticdb.GridOptions(bits=8))
     hapticdb.import_files(tmp_path / "car.db", [files.car], options)
     with hapticdb.open(tmp_path / "car.db") as env:
         name = {obj.id: obj.name for obj in env.objects()}
         found = hapticdb.find_clashes(env)
+        add_rules(env.store, (), 1e-3, files.rules)
+        ruled = hapticdb.find_clashes(env)
     assert (found.counts()["inside"], found.counts()["not known"]) == (0, 0)
     deep = {(name[one.a], name[one.b]) for one in found.pairs if one.kind == "overlapping"}
     assert deep == PLANTED
+    left = {(name[one.a], name[one.b]) for one in ruled.pairs if one.is_open}
+    assert left == {("frame/cross_member_middle", "supply/fuel_line")}
 
 
 def test_the_wrench_is_one_closed_piece(files: SampleFiles) -> None:

@@ -1,4 +1,4 @@
-"""The sample as files: car.glb, wrench.stl and path.csv."""
+"""The sample as files: car.glb, wrench.stl, path.csv and rules.toml."""
 
 import lzma
 import os
@@ -17,6 +17,15 @@ class SampleFiles(NamedTuple):
     car: Path
     wrench: Path
     path: Path
+    rules: Path
+
+
+RULES = """# Meant findings of the car: one clash is left, a fuel line through a cross member.
+rules = [
+    "engine/alternator in engine/block: overlap up to 3 mm is meant because its foot is pressed in",
+    "* in *: touching, apart is meant because the car's parts stand face to face",
+]
+"""
 
 
 def _content(name: str) -> bytes:
@@ -39,7 +48,7 @@ def _write(path: Path, content: bytes) -> Path:
 
 
 def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFiles:
-    """Write car.glb, wrench.stl and path.csv into a folder, made when missing.
+    """Write car.glb, wrench.stl, path.csv and rules.toml into a folder, made when missing.
 
     The path slides the wrench over hood, windscreen, roof, rear window and boot. It comes down from
     above. Then its deepest point is 1 mm below the surface, so it is in contact at any voxel size
@@ -62,4 +71,5 @@ def write_sample(folder: str | os.PathLike[str], count: int = 1000) -> SampleFil
         _write(target / "car.glb", _content("car.glb")),
         _write(target / "wrench.stl", _content("wrench.stl")),
         _write(target / "path.csv", header + b"".join(poses[index] for index in chosen)),
+        _write(target / "rules.toml", RULES.encode()),
     )

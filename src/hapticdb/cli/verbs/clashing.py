@@ -301,17 +301,21 @@ def _say_accepted(pairs: list[tuple[int, int]], because: str, output: _Output) -
 
 
 def _show_groups(groups: "list[Group]") -> None:
-    """Print the gravest groups."""
+    """Print the gravest open groups, and how many are closed."""
+    shown = [one for one in groups if one.is_open]
     rows = [
         (one.id, one.kind, f"{len(one.pairs):,}", f"{one.n_parts:,}", one.length_text(),
          _millimetres(one.pairs[0].place), one.status(), one.title())
-        for one in groups[:MOST_ROWS]
+        for one in shown[:MOST_ROWS]
     ]  # fmt: skip
     if rows:
         headings = ("group", "are", "pairs>", "parts>", "by>", "at, mm", "status", "which")
         render.table(headings, rows)
-    if len(groups) > MOST_ROWS:
-        render.say(f"{len(groups):,} groups, {MOST_ROWS} of them shown; --csv writes all pairs")
+    if len(shown) > MOST_ROWS:
+        render.say(f"{len(shown):,} groups, {MOST_ROWS} of them shown; --csv writes all pairs")
+    if len(shown) < len(groups):
+        count = render.counted(len(groups) - len(shown), "group")
+        render.say(f"{count} meant or accepted: --all shows all pairs")
 
 
 def _millimetres(place: tuple[float, ...] | None) -> str:

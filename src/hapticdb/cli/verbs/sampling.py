@@ -13,7 +13,9 @@ if TYPE_CHECKING:
 
 
 def sample(folder: Path, *, frames: int = 1000) -> None:
-    """Write the sample: car.glb, wrench.stl, and path.csv that slides the wrench over the car.
+    """Write the sample: car.glb, wrench.stl, path.csv, rules.toml.
+
+    The path slides the wrench over the car; the rules leave one clash of its parts.
 
     Example: hapticdb sample sample
     """

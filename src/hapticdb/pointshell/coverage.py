@@ -41,16 +41,13 @@ class Ball(NamedTuple):
 
 
 class Interior:
-    """Inside of the closed bodies of a result of `orient`, or of a ball.
+    """Inside of the closed bodies of a result of `orient`.
 
     Open bodies enclose nothing, and a void is outside. solid : the bodies, about `origin` (3,),
     metres.
     """
 
-    def __init__(self, surface: "Surface | Ball") -> None:
-        self._ball = surface if isinstance(surface, Ball) else None
-        if isinstance(surface, Ball):
-            return
+    def __init__(self, surface: "Surface") -> None:
         self.origin = surface.center
         local = surface.triangles - surface.center
         tree = sides.triangle_tree(local, surface.bodies)
@@ -65,12 +62,12 @@ class Interior:
         self.solid = Solid(tree, closed, signs, boxes, np.stack([low, high]))
 
     def __bool__(self) -> bool:
-        return self._ball is not None or len(self.solid.bodies) > 0
+        return len(self.solid.bodies) > 0
 
     def moved(self, by: Floats) -> "Interior":
         """The inside after a motion of the triangles' corners by (F, 3, 3) metres.
 
-        Not for a ball. Bodies stay closed under any motion.
+        Bodies stay closed under any motion.
         """
         found, reach = copy(self), float(np.abs(by).max(initial=0.0))
         solid, larger = self.solid, np.array([[-reach], [reach]])
@@ -84,8 +81,6 @@ class Interior:
 
         By the parity of crossings of lines; undefined on the surface itself.
         """
-        if self._ball is not None:
-            return np.asarray(np.linalg.norm(positions, axis=1) < self._ball.radius)
         count = np.zeros(len(positions), dtype=np.int64)
         local = np.ascontiguousarray(positions - self.origin)
         solid = self.solid

@@ -67,9 +67,9 @@ def measure(
             swept(place, tool, results)
         if place != places[0]:
             found = command("diff", places[0].url, place.url)
-            (digest := Digest()).feed(found["objects_compared"], found["voxels_compared"])
+            (digest := Digest()).feed(found["objects"], found["voxels"])
             results[f"{place.name}/diff"] = digest.entry(
-                found["voxels_compared"], "voxels", int(not found["equal"])
+                found["voxels"], "voxels", int(not found["is_equal"])
             )
 
 

@@ -101,7 +101,7 @@ def test_check_speaks_by_its_exit_code(tmp_path: Path, run: Run) -> None:
     assert "1 finding" in out
     code, out, _ = run("check", path, "--json")
     assert code == 1
-    assert json.loads(out)["sound"] is False
+    assert json.loads(out)["is_sound"] is False
     (tmp_path / "text.db").write_text("x,y\n" * 100)
     assert run("check", tmp_path / "text.db")[0] == 2
     assert run("check", tmp_path / "none.db")[0] == 2

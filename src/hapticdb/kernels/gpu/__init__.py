@@ -1,4 +1,4 @@
-"""Kernels of the graphics processor: the leaves of the others, compiled for it."""
+"""GPU kernels, from the leaves of the CPU kernels compiled for CUDA."""
 
 from hapticdb.kernels._later import later_modules
 

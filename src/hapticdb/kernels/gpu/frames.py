@@ -1,9 +1,9 @@
-"""Frames on a graphics processor: `resident.feeling.felt` at many poses, or of millions of points.
+"""Frames on the GPU: `resident.feeling.felt` at many poses, or of millions of points.
 
-A block of threads takes a pose, or one of several shares of the points of a large shell. Each
-thread adds up every so manieth point; the threads' sums are added in pairs, and the block that ends
-last adds those of the shares. So the order of a sum depends on the number of points alone, and a
-frame repeats bit for bit, whatever poses are beside it.
+A thread block evaluates one pose, or one of several shares of a large shell's points. Each thread
+sums a strided subset of the points; a tree reduction adds the threads' sums, and the last block to
+end adds those of the shares. The order of a sum depends on the number of points alone, so a frame
+repeats bit for bit in any batch of poses.
 """
 
 import functools
@@ -23,14 +23,14 @@ WEIGHT = RESULTS
 """Row of a block's sums, after those of the results."""
 SUMS = RESULTS + 1
 NOT_RIGID = -1.0
-"""In the place of a frame's number of points in unknown cells: the pose is not rigid."""
+"""Value in place of a frame's number of points in unknown cells: the pose is not rigid."""
 THREADS, THREADS_OF_LARGE = 64, 256
-"""Threads of a block. More of them end a large shell sooner, and idle for a small one."""
+"""Threads of a block. More: large shells finish sooner, and small ones leave threads idle."""
 LARGE_FROM = 4096
-"""Points from which several blocks share a shell."""
+"""Least number of points of a shell shared by several blocks."""
 MOST_SHARES = 1056
-"""Most blocks that share a shell: 8 for each multiprocessor of the largest cards. More of them
-leave less to each block and more to the one that adds up."""
+"""Most blocks for a shell: 8 for each multiprocessor of the largest cards. More: less work for each
+block, and more for the final sum."""
 
 _moved, _turned, _transform_of, _is_rigid = map(
     on_gpu, (rigid.moved, rigid.turned, rigid.transform_of, rigid.is_rigid)
@@ -42,7 +42,7 @@ _accumulate, _average_into = on_gpu(laws.accumulate), on_gpu(laws.average_into)
 
 
 def shares_of(n_points: int) -> tuple[int, int]:
-    """Blocks that share a shell of so many points, and the threads of each."""
+    """Number of blocks for a shell of so many points, and threads of each."""
     if n_points < LARGE_FROM:
         return 1, THREADS
     return min(-(-n_points // THREADS_OF_LARGE), MOST_SHARES), THREADS_OF_LARGE
@@ -50,7 +50,7 @@ def shares_of(n_points: int) -> tuple[int, int]:
 
 @on_gpu
 def _slot_at(keys, slots, side, i, j, k):
-    """Slot of the cell of voxel (i, j, k): from a list of all cells, or from a directory."""
+    """Slot of the cell of voxel (i, j, k): by an array of all cells, or by the hash directory."""
     if keys.shape[1] == 1:
         n = (np.int64(side) + 31) >> 5
         return slots[0, ((i >> 5) * n + (j >> 5)) * n + (k >> 5)]
@@ -65,13 +65,13 @@ def _transform_at(poses, n):
 
 @on_gpu
 def _transform_itself(pose, n):  # noqa: ARG001 - as `_transform_at`
-    """Transform of the only pose, which is given as one."""
+    """Identity: the transform of a single pose is the argument itself."""
     return pose
 
 
 @functools.cache
 def _adding_under(law_type: type) -> Callable[..., Any]:
-    """Function that adds up every `step`-th point of a placed shell under that type of law."""
+    """Device function: sums of every `step`-th point of a shell under that type of law."""
     leaves = laws.LEAVES[law_type]
     respond, reach = on_gpu(leaves.respond), on_gpu(leaves.reach)
     sample_at, share_at = on_gpu(leaves.sample_slot), on_gpu(leaves.share_slot)
@@ -124,7 +124,7 @@ def _adding_under(law_type: type) -> Callable[..., Any]:
 
 @cuda.jit(device=True)
 def _add_up(both, t):
-    """Add up the rows of both (SUMS, threads) over the threads, into the first; deepest: most."""
+    """Tree reduction of both (SUMS, threads) into column 0: sums, and the maximum of DEEPEST."""
     cuda.syncthreads()
     half = both.shape[1] // 2
     while half > 0:
@@ -140,7 +140,7 @@ def _add_up(both, t):
 
 @cuda.jit(device=True)
 def _write(sums, n, total, out):
-    """Write frame n of `total` from its sums (SUMS,), as `frames_under` has it."""
+    """Write frame n of `total` from its sums (SUMS,), in the layout of `frames_under`."""
     _average_into(sums, sums[WEIGHT], sums)
     for axis in range(3):
         out[3 * n + axis] = sums[axis]
@@ -151,15 +151,15 @@ def _write(sums, n, total, out):
 
 @functools.cache
 def frames_under(law_type: type, threads: int, *, single: bool) -> Any:  # noqa: ANN401 - numba's kernels are untyped
-    """Kernel of frames under that type of law, for blocks of so many threads (a power of two).
+    """CUDA kernel of frames under that type of law, for blocks of so many threads (a power of two).
 
     Its arguments: law, place; shell (6, N + 1): points and normals, last the centre; poses
-    (B, 4, 4), or if `single` the 12 numbers of one transform, known to be rigid; keys
-    (1, capacity), slots (1, capacity), words (S, 1024), payload (S, 34^3) as
-    `resident.cells.Cells`, or keys (1, 1) and slots of all cells of the grid; gate (S, 1024)
-    uint32: voxels in which a point may be felt; sums (B, shares, SUMS): scratch of the shares;
-    ended (B,) int32: 0 before and after; out (RESULTS x B,): forces (B, 3), torques (B, 3), and B
-    each of hits, contacts, points in unknown cells or `NOT_RIGID`, and deepest.
+    (B, 4, 4), or if `single` the 12 numbers of one rigid transform, unchecked; keys
+    (1, capacity), slots (1, capacity), words (S, 1024), payload (S, 34^3) as in
+    `resident.cells.Cells`, or keys (1, 1) and the slots of all cells of the grid; gate (S, 1024)
+    uint32: voxels with possible contacts; sums (B, shares, SUMS): scratch of the shares; ended (B,)
+    int32: 0 before and after; out (RESULTS x B,): forces (B, 3), torques (B, 3), and B each of
+    hits, contacts, points in unknown cells or `NOT_RIGID`, and deepest.
     """
     add_points = _adding_under(law_type)
     transform_at = _transform_itself if single else _transform_at

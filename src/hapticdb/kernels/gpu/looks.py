@@ -1,11 +1,11 @@
-"""Looks of the coupling on a graphics processor: `hand.near_points.look` at tools of any size.
+"""Proximity queries of the coupling on the GPU: `hand.near_points.look` for tools of any size.
 
-Two launches are a look. A CUDA graph repeats them with the arguments that they had at first, so
-what changes from look to look is read from memory (`Sight.asked`). In the first a thread takes a
-run of points: is it due, and is its sphere free? In the second a block takes a run that is not: its
-threads look at the points that are due. Only near points leave the GPU, in any order; each point's
-number is beside it. When a point is due stays on the GPU, and a look that ends early puts back what
-it wrote beyond its last point, so that a tool goes the way that it goes on the processor.
+A query is two launches, replayed by a CUDA graph with fixed arguments, so its parameters are read
+from memory (`Sight.asked`). In the first launch a thread tests a run of points: is it due, and is
+its bounding sphere free? In the second a block processes a due run without a free sphere, a thread
+each point. Only near points are copied to the host, in any order, each with its number; the `due`
+values of points (see POINT) stay on the GPU. A query that ends early restores them beyond its last
+point, so that a tool takes the same path as on the CPU.
 """
 
 import functools
@@ -24,17 +24,17 @@ from hapticdb.kernels.resident import cells
 from hapticdb.kernels.resident.cells import EMPTY_SLOT
 
 THREADS_OF_RUNS, THREADS = 128, 64
-"""Threads of a block of each launch; a block of the second one has a thread for each point."""
+"""Threads of a block in the first and the second launch."""
 MOST_BLOCKS = 1 << 13
-"""Most blocks of a launch; each takes several runs if there are more."""
+"""Most blocks of a launch; with more runs, a block processes several."""
 NEAR_NUMBERS, CURVATURE = 22, 8
 """Rows of `Sight.near`: the fields of the record NEAR from `u` on, and from CURVATURE on those of
 BENDS, 0 where the surface is not hollow."""
 ROOM_FOR_MISSED = 128
-"""Unknown cells that a look can tell of, a power of two. Larger: fewer rounds of fetching."""
+"""Most unknown cells reported by a query, a power of two. Larger: fewer rounds of fetching."""
 DUE_RUNS, NEARS, UNKNOWNS, LEAST, FOUND = 0, 1, 2, 3, 4
-"""Of `Sight.found`: runs in the second launch; near points; points in unknown cells; the least way
-at which a run is due; their number."""
+"""Indices in `Sight.found`: runs of the second launch; near points; points in unknown cells; least
+path length at which a run is due, voxels. Last, the number of these."""
 
 _moved, _transform_of = map(on_gpu, (rigid.moved, rigid.transform_of))
 _slot_of, _cell_key, _spread = map(on_gpu, (cells.slot_of, cells.cell_key, cells.spread_key))
@@ -53,16 +53,16 @@ _along_and_about, _bends_at, _may_be_hollow = map(
 
 
 class Sight(NamedTuple):
-    """What the GPU keeps of a tool of N points in R runs, and what a look finds.
+    """Device view of a tool of N points in R runs, and the results of a query.
 
     points (3, N + 1): m, last the centre; spheres (R, 4), or none for a small tool. due (N,),
-    run_due (R,): as the record POINT has them; due_before, run_due_before: the same before the last
-    look, of what it looked at; epochs (R,) int64: since when the points' numbers
-    are true; seen (R,) int64: number of the last look at the run; due_runs (R,) int64: runs of the
-    second launch. asked (1,): a look's LOOK. used (S,) uint8: slots that were read. missed
-    (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. found (FOUND,).
-    points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, if there are no more than M;
-    neighbours lie side by side, since they are written to the memory of the processor.
+    run_due (R,): as in the record POINT; due_before, run_due_before: the values overwritten by the
+    last query; epochs (R,) int64: epoch in which the run's `due` was written, valid only in the
+    current one; seen (R,) int64: number of the last query of the run; due_runs (R,) int64: runs of
+    the second launch. `asked` (1,): a query's LOOK. used (S,) uint8: slots read. missed
+    (ROOM_FOR_MISSED,) int64: keys of unknown cells, in no order, -1 for none. `found` (FOUND,).
+    points_near (M,) int64 and near (NEAR_NUMBERS, M): the near points, at most M, in host memory;
+    values of neighbouring points are adjacent, for coalesced writes.
     """
 
     points: Any
@@ -84,7 +84,7 @@ class Sight(NamedTuple):
 
 @cuda.jit
 def list_due_runs(place, seen, sight):
-    """First launch. seen: `resident.cells.Seen`."""
+    """First launch: list the due runs without a free sphere. seen : `resident.cells.Seen`."""
     least, asked = NEVER, sight.asked[0]
     transform = _transform_of(asked.pose)
     for run in range(cuda.grid(1), sight.run_due.shape[0], cuda.gridsize(1)):
@@ -105,7 +105,7 @@ def list_due_runs(place, seen, sight):
 
 @cuda.jit(device=True)
 def _miss(missed, key):
-    """Enter an unknown cell, if absent and there is room."""
+    """Add an unknown cell to the hash set `missed`, if absent and there is room."""
     at = _spread(key, ROOM_FOR_MISSED)
     for _ in range(ROOM_FOR_MISSED):
         before = cuda.atomic.cas(missed, at, -1, key)
@@ -131,7 +131,7 @@ def _write_near(payload, slot, mask, inside, lever, looked, is_bent, near, at):
 
 @cuda.jit(device=True)
 def _look_at_point(n, place, asked, transform, seen, payload, sight):
-    """Look at point n, which is due -> when it is due again; see `near_points.look`."""
+    """Query due point n -> path length at which it is due again; see `near_points.look`."""
     points, center = sight.points, sight.points.shape[1] - 1
     px, py, pz = _moved(transform, points[0, n], points[1, n], points[2, n])
     inside = _clamped_into(place, px, py, pz)
@@ -144,7 +144,7 @@ def _look_at_point(n, place, asked, transform, seen, payload, sight):
     if slot > EMPTY_SLOT:
         seen.used[slot] = 1
         mask = seen.masks[slot]
-    if n & (asked.merged - 1):  # another point's contact stands for this one
+    if n & (asked.merged - 1):  # merged into another point's contact
         bound = _bound_at(payload, slot, mask, inside)
         if bound >= LEAST_BOUND:
             return asked.travelled + bound - FAR
@@ -162,7 +162,7 @@ def _look_at_point(n, place, asked, transform, seen, payload, sight):
 
 @functools.cache
 def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
-    """Kernel of the second launch, for blocks of so many threads (a power of two).
+    """CUDA kernel of the second launch, for blocks of so many threads (a power of two).
 
     Its arguments: those of `list_due_runs`, and payload (S, 34^3).
     """
@@ -195,7 +195,7 @@ def look_at_runs(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are unt
 
 @cuda.jit
 def put_back(sight):
-    """Put back what the look wrote beyond its point `last`, whose run is not done either."""
+    """Restore the due values of points beyond `last`, and those of runs from its own on."""
     first, step, asked = cuda.grid(1), cuda.gridsize(1), sight.asked[0]
     last = asked.last
     for run in range(max(last, 0) // asked.run + first, sight.seen.shape[0], step):

@@ -1,7 +1,7 @@
-"""Distances on a graphics processor: the occupied voxel nearest to a shell, at many poses.
+"""Distances on the GPU: the occupied voxel nearest to a shell, at many poses.
 
-A block of threads takes a pose. Its threads search around as many points at once, no farther than
-the nearest voxel found so far; then they agree on the nearest, and go on with the next points.
+A thread block evaluates a pose, one point a thread. Each thread searches up to the least distance
+so far; a reduction then renews that bound for the next points.
 """
 
 import functools
@@ -16,9 +16,9 @@ from hapticdb.kernels.resident import cells
 from hapticdb.kernels.resident import nearest as searches
 
 THREADS = 64
-"""Threads of a block. More of them search side by side, with a bound that is renewed seldomer."""
+"""Threads of a block. More: more parallel searches, and a bound renewed less often."""
 NO_POINT, UNDECIDED = -1, -2
-"""In the place of a pose's nearest point: nothing within reach; a cell in reach is unknown."""
+"""Values in place of a pose's nearest point: nothing within reach; an unknown cell within reach."""
 
 _transform_of, _in_voxels = on_gpu(rigid.transform_of), on_gpu(cells.in_voxels)
 _nearest_voxel = on_gpu(searches.nearest_voxel)
@@ -26,7 +26,7 @@ _nearest_voxel = on_gpu(searches.nearest_voxel)
 
 @cuda.jit(device=True)
 def agree(squares, points, t):
-    """Least of squares (threads,) and its point, the first one of several, to the first place."""
+    """Tree reduction to element 0: least of squares (threads,), and the lowest of its points."""
     cuda.syncthreads()
     half = squares.shape[0] // 2
     while half > 0:
@@ -40,10 +40,11 @@ def agree(squares, points, t):
 
 @functools.cache
 def search_kernel(threads: int) -> Any:  # noqa: ANN401 - numba's kernels are untyped
-    """Kernel that searches, for blocks of so many threads (a power of two).
+    """CUDA kernel of the search, for blocks of so many threads (a power of two).
 
     Its arguments: place; shell (6, N + 1), as in `frames`; poses (B, 4, 4), rigid; seen, of
-    `resident.cells.Seen`; reach, voxels; found squares (B,) of distances, voxels, and points (B,).
+    `resident.cells.Seen`; reach, voxels; outputs: squares (B,) of distances, voxels, and points
+    (B,).
     """
 
     @cuda.jit

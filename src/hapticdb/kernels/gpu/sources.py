@@ -1,8 +1,8 @@
-"""One source for both targets: a leaf of the processor's kernels becomes a function of the GPU's.
+"""One source for both targets: leaves of CPU kernels as device functions of CUDA kernels.
 
-numba compiles a leaf again where a kernel of the GPU calls it. numba's simulator of a GPU
-(NUMBA_ENABLE_CUDASIM=1), on which tests run, calls Python and hands on arrays of its own, which no
-compiled leaf takes. There a leaf and all that it calls run as the Python that they were written in.
+numba recompiles a leaf for the GPU at its call in a CUDA kernel. In numba's CUDA simulator
+(NUMBA_ENABLE_CUDASIM=1), used by the tests, kernels run in Python on arrays of the simulator's own
+type, unsupported by compiled leaves. There a leaf and all its callees run as plain Python.
 """
 
 from collections.abc import Callable
@@ -14,7 +14,7 @@ from numba.core.dispatcher import Dispatcher
 
 
 def on_gpu(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Make a leaf, or the plain function of a law, callable by kernels of the GPU."""
+    """Make a leaf, or a plain function of a law, callable from CUDA kernels."""
     if config.ENABLE_CUDASIM:
         return _as_python(function)
     if isinstance(function, Dispatcher):
@@ -23,7 +23,7 @@ def on_gpu(function: Callable[..., Any]) -> Callable[..., Any]:
 
 
 def _as_python(function: Callable[..., Any]) -> Callable[..., Any]:
-    """Copy a function so that the leaves that it calls are plain Python, too."""
+    """Copy a function, with its leaves replaced by their plain Python, recursively."""
     plain = getattr(function, "py_func", function)
     if not isinstance(plain, FunctionType):
         return plain

@@ -1,1 +1,1 @@
-"""Kernels of a loop: one period of a hand, as a session's loop and a host's worker run it."""
+"""Kernels of the servo loop: one period of a session, for a device loop and a host's worker."""

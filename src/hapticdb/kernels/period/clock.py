@@ -1,4 +1,4 @@
-"""The system's clock and its sleep, for a kernel that runs a loop without the interpreter."""
+"""System clock and sleep for the servo loop, without the interpreter lock."""
 
 import time
 
@@ -7,12 +7,12 @@ from numba import config, types
 from hapticdb.kernels._jit import leaf
 
 MONOTONIC = int(time.CLOCK_MONOTONIC)
-"""The system's number of the clock that `time.monotonic_ns` reads."""
+"""Clock id of `time.monotonic_ns`."""
 SECOND = 1_000_000_000
 """Nanoseconds."""
 SPIN = 60_000
-"""Nanoseconds before a deadline at which a loop stops sleeping and watches the clock. A larger
-value hides a later wake-up by the system, and takes more of the processor."""
+"""Nanoseconds of busy waiting before a deadline. Larger: later wake-ups by the system are hidden,
+and more processor time is spent."""
 
 if config.DISABLE_JIT:
 
@@ -44,7 +44,7 @@ else:
 
 @leaf
 def wait_until(moment, due):
-    """Sleep until shortly before a time, ns, then watch the clock until then."""
+    """Sleep until `SPIN` before a time, ns, then busy-wait until it."""
     left = due - now_ns(moment) - SPIN
     if left > 0:
         sleep_ns(moment, left)

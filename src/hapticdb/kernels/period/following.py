@@ -1,8 +1,8 @@
-"""Following: where a hand is between two arrivals of its pose, at the loop's own rate.
+"""Interpolation of a hosted hand between arrivals of its pose, at the loop's own rate.
 
-At each arrival the hand starts from where it is and moves to the new pose in a little more than the
-usual time between two arrivals. So the motion has no jumps, its delay is bounded, and the hand
-never goes where nobody has put it: when arrivals stop, it rests at the last pose.
+At each arrival the hand starts a segment from its present pose to the new one, a little longer than
+the mean time between arrivals. So the motion is continuous, its delay is bounded, and nothing is
+extrapolated: when arrivals stop, the hand rests at the last pose.
 """
 
 import math
@@ -12,18 +12,18 @@ from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import product, quaternion_by, turn_of
 
 STRETCH = 1.25
-"""Time of the way to a new pose, in times between two arrivals. Larger: less stopping when arrivals
-come unevenly, and more delay."""
+"""Duration of a segment, in mean times between arrivals. Larger: fewer stops when arrivals are
+uneven, and more delay."""
 LONGEST_GAP_NS, USUAL_GAP_NS = 60_000_000, 33_000_000
-"""Nanoseconds: the longest time between two arrivals that counts, and the one that is assumed
-before the second arrival. Larger: smoother for slower senders, and more delay."""
+"""Nanoseconds: cap on the time between two arrivals, and its value before the second one. Larger:
+smoother for slower senders, and more delay."""
 SILENCE_NS = 250_000_000
-"""Nanoseconds without an arrival after which the next one says nothing about the sender's rate."""
+"""Nanoseconds between two arrivals from which on they do not count in the rate."""
 
 
 @leaf
 def _take_arrival(station, seat, hand, now):
-    """Begin the way to a pose that has arrived on the board, if it is written to its end."""
+    """Start a segment to a new pose in the session's slot (a seqlock), unless half-written."""
     sequence = seat.hand_sequence
     if sequence == station.seen or sequence & 1:
         return
@@ -34,7 +34,7 @@ def _take_arrival(station, seat, hand, now):
         way.arriving[n] = pose[n]
     fence()
     if seat.hand_sequence != sequence:
-        return  # it is being written again: the next period takes it
+        return  # overwritten during the read: the next period retries
     gap = arrived - station.arrived
     station.arrived, station.seen = arrived, sequence
     if 0 < gap < SILENCE_NS:
@@ -42,7 +42,7 @@ def _take_arrival(station, seat, hand, now):
     if not is_held:
         station.is_let_go = 1
         return
-    # who takes the tool again takes it where the hand is now
+    # after a release the hand starts at the pose of its arrival, without a segment
     is_new = station.is_let_go != 0
     for n in range(3):
         way.start[n] = way.arriving[n] if is_new else hand.position[n]
@@ -56,7 +56,7 @@ def _take_arrival(station, seat, hand, now):
 
 @leaf
 def follow_arrivals(station, seat, hand, now):
-    """Write where the hand is at a time, ns; NaN while nobody holds the tool."""
+    """Write the hand's pose and velocity at a time, ns; position NaN while the hand is released."""
     _take_arrival(station, seat, hand, now)
     position, turned, velocity = hand.position, hand.quaternion, hand.velocity
     if station.is_let_go:

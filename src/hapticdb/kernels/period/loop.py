@@ -1,13 +1,14 @@
-"""The loop of sessions: their periods, one call each or period by period, in one kernel.
+"""Servo loop of sessions in one kernel: a single period a call, or all periods until the end.
 
-A period of a session reads its hand, moves the tool, pushes the hand, tells others of it, and notes
-the frame. The kernel is one call that ends with the loop: of a session, whose device it reads and
-pushes by functions of Python, or of a worker of a host, which has many sessions and no device. It
-allocates nothing, compiles nothing, holds no interpreter lock and asks no database. What moves a
-tool and what feels a frame are kernels of their own, which it calls by address: they are compiled
-side by side, and the loop once for all laws.
-Another thread makes sessions and withdraws them: it sets `is_running` of a station whose other
-fields are complete, and may free a station two periods after it was withdrawn.
+A period reads the hand, moves the tool, sends the wrench to the hand, publishes its state and
+records the frame. One call runs a whole loop: of one session, with its device read and driven by
+Python callbacks, or of a host's worker, with many sessions and no device. The kernel makes no
+allocation, no compilation and no query of the database, and runs without the interpreter lock. The
+kernels of tool motion and of a frame are called by address: they compile in parallel with the loop,
+and the loop compiles once for all laws.
+
+Another thread adds and removes sessions: it sets `is_running` of a station after all other fields,
+and may free a station two periods after clearing it.
 """
 
 from typing import Any
@@ -58,27 +59,27 @@ from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import is_rigid, numbers_of, pose_of_quaternion
 
 GIVEN, BOARD, DEVICE, NOBODY = 0, 1, 2, 3
-"""Sources of a session's hand: the caller has written it; it arrives on the board; a device's
-reading is beside; there is none, and only the times of its periods are counted."""
+"""Sources of a session's hand: the caller; the session's slot in the shared table; the device's
+reading in the station; none, and only the times of its periods are counted."""
 TELL_EVERY_NS = 900_000
-"""Nanoseconds between two reports of the tool's place. Larger: cells are requested later. Smaller:
-the loop computes more."""
+"""Nanoseconds between two prefetch requests. Larger: cells are requested later. Smaller: the loop
+computes more."""
 ASK_EVERY_NS, SHOW_EVERY_NS = 10_000_000, 30_000_000
-"""Nanoseconds between two requests for the ids of what is touched, and between two lists of the
-contacts. Larger: less computing, and what is shown is older."""
+"""Nanoseconds between two requests for the ids of touched objects, and between two lists of the
+contacts. Larger: less computing, and older ids and contacts."""
 WITHDRAWN_NS = 250_000_000
-"""Nanoseconds. A request for ids is withdrawn once the database has answered this much later: by
-then the objects are named, and whoever wants to know has read them."""
+"""Nanoseconds from a request for ids to its withdrawal, which waits for a reply of the database at
+least this much later: by then the ids have been published and read."""
 
 
 MOVER = from_dtype(STATION), from_dtype(SEAT), from_dtype(PACE)
 PLANE, DISTANCE = types.CPointer(TANGENT_PLANE), types.CPointer(DISTANCE_FIELD)
-"""Types of the arguments of what moves a tool, and of a pointer to a law's numbers."""
+"""Argument types of the kernels of tool motion, and of a pointer to a law's numbers."""
 
 
 @entry(*MOVER, by_address=True)
 def move_by_coupling(station, seat, pace):
-    """Move the tool of a session to where spring and contacts balance."""
+    """Move the tool of a session to the equilibrium of spring and contacts."""
     shell, place, memory = tool_of(station), grid_of(station), memory_of(station)
     cells, servo, at = cells_of(station), station.servo, station.reader * READER_STRIDE
     tool, sent, follower, spring = servo.tool, servo.sent, station.follower, spring_of(station)
@@ -107,14 +108,14 @@ _cells = chosen_by_type(
         else (lambda law, station: voxels_of(station))  # noqa: ARG005
     )
 )
-"""Cells of a station, with distances if that type of law reads them."""
+"""Cells of a station, with distances for `DistanceFieldLaw`."""
 
 
 @entry(from_dtype(STATION), INT, PLANE, also={PLANE: DISTANCE}, by_address=True)
 def feel(station, which, laws):
     """Compute the law's frame at `station.pose`, into `station.felt` and `station.met`.
 
-    which: the directory that the frame reads; laws: a pointer to the law.
+    which : index of the directory of cells; laws : pointer to the law.
     """
     law, memory = laws[0], memory_of(station)
     felt(
@@ -125,7 +126,7 @@ def feel(station, which, laws):
 
 
 def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's NamedTuple
-    """Addresses of `feel` for a law and of the law's numbers, and these, to be kept."""
+    """Addresses of `feel` for a law and of the law's numbers, and their owner, to be referenced."""
     if config.DISABLE_JIT:
         plain = lambda station, which, _: feel(station, which, [numbers])  # noqa: E731
         return address_of_kernel(plain, ()), 0, plain
@@ -136,7 +137,7 @@ def feeler_of(numbers: Any) -> tuple[int, int, Any]:  # noqa: ANN401 - a law's N
 
 
 def _layout_of(kind: Any) -> Any:  # noqa: ANN401 - of numba
-    """Layout in memory of a value of a law, as kernels read it."""
+    """Memory layout of a law's value in compiled kernels."""
     if isinstance(kind, types.BaseTuple):
         fields = [(str(n), _layout_of(each)) for n, each in enumerate(kind.types)]
         return np.dtype(fields, align=True)
@@ -146,9 +147,9 @@ def _layout_of(kind: Any) -> Any:  # noqa: ANN401 - of numba
 
 
 def _packed(value: Any) -> Any:  # noqa: ANN401 - likewise
-    """Value of a law for that layout: of an array, size, bytes of an item, address, shape, strides.
+    """Value of a law in `_layout_of`; of an array, size, item size, address, shape and strides.
 
-    The two numbers before these are numba's references, which nobody counts here.
+    The two zeros before these are numba's `meminfo` and `parent`: no reference counts.
     """
     if isinstance(value, tuple):
         return tuple(map(_packed, value))
@@ -159,7 +160,7 @@ def _packed(value: Any) -> Any:  # noqa: ANN401 - likewise
 
 @entry(*MOVER, by_address=True)
 def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
-    """Put the tool of a session at the hand, and send the law's frame there."""
+    """Place the tool of a session at the hand and send the law's wrench there: direct rendering."""
     cells, servo, memory = voxels_of(station), station.servo, memory_of(station)
     sent = servo.sent
     pose_of_quaternion(*numbers_of(servo.hand), memory.pose)
@@ -176,10 +177,10 @@ def move_directly(station, seat, pace):  # noqa: ARG001 - as `move_by_coupling`
 
 @leaf
 def _ask_objects(station, seat, session, shell, place, memory, heartbeat):
-    """Ask for the objects that are touched, and show those that were answered.
+    """Request the ids of touched objects from the fetching process, and publish those received.
 
-    A request that stays would be answered again at each write, for voxels that are no longer
-    touched. A request withdrawn at once would never be answered by a slow database.
+    A request without end would be answered again at each write, for voxels no longer touched. A
+    request withdrawn immediately would never be answered by a slow database.
     """
     sent = station.servo.sent
     if sent.hits > 0 or sent.marks & IS_LOOSE:
@@ -195,7 +196,7 @@ def _ask_objects(station, seat, session, shell, place, memory, heartbeat):
 
 @leaf
 def _run_period(station, seat, ring, pace):
-    """Run one period of a session, which was due and has begun as `pace` says."""
+    """Run one period of a session, due at `pace.due` and started at `pace.begun`."""
     servo, begun = station.servo, pace.begun
     lateness = 1e-9 * (begun - pace.due)
     if station.source == NOBODY:
@@ -242,7 +243,7 @@ def _run_period(station, seat, ring, pace):
 
 @leaf
 def _count_missed(stations, seats, pace):
-    """Count the deadlines that passed during a period, which all sessions miss; set the next."""
+    """Count the deadlines passed during a period, as missed by all sessions; set the next one."""
     done = now_ns(pace.moment)
     pace.due += pace.period
     behind = (done - pace.due) // pace.period + 1 if done > pace.due else np.int64(0)
@@ -259,10 +260,10 @@ def _count_missed(stations, seats, pace):
 def run(stations, seats, rings, pace_record):
     """Run one period of all sessions, or periods until `pace.is_over` or `pace.most` deadlines.
 
-    stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the board; pace_record ()
-    of PACE, which also has what moves all tools: the coupling (`move_by_coupling`), or
-    direct rendering (`move_directly`). If the frames of a period take longer than it, the deadlines
-    within that time are missed by all sessions alike.
+    stations (S,) of STATION: the sessions; seats (B,) and rings (B, R): the shared table;
+    pace_record () of PACE, with the kernel of motion for all tools: `move_by_coupling`, or
+    `move_directly`. If the frames of a period take longer than it, all sessions miss the deadlines
+    within that time.
     """
     pace = pace_record[()]
     is_alone = pace.period > 0

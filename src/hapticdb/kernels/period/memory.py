@@ -1,7 +1,7 @@
-"""Arrays at addresses: cells and tools of many sessions, which no kernel takes as arguments.
+"""Arrays at addresses: cells and tools of a variable number of sessions, in one kernel.
 
-Sessions have tools and tables of different sizes. A record (`kernels.records.STATION`) has the
-addresses and sizes of their arrays, and the arrays are made where they are used.
+Sessions have tools and tables of different sizes. A record (`kernels.records.STATION`) contains the
+addresses and sizes of their arrays, and kernels make array views from them.
 """
 
 import ctypes
@@ -40,7 +40,7 @@ else:
 
     @intrinsic
     def array_at(typing_context, address, shape, dtype):  # noqa: ARG001 - numba's signature
-        """Array of that shape and type at an address: memory that nobody counts references to."""
+        """Array of that shape and type at an address, without reference counts."""
         kind = types.Array(dtype.dtype, len(shape), "C")
 
         def generate(context, builder, signature, arguments):  # noqa: ARG001
@@ -61,7 +61,7 @@ else:
 
 @leaf
 def _cells_with(station, payload, near):
-    """Cells of a session with those distances, or None."""
+    """Cells of a session; payload, near : arrays of distances, or None."""
     n_slots, capacity = station.n_slots, station.capacity
     return Cells(
         array_at(station.control, (station.n_control,), np.int64),
@@ -106,11 +106,11 @@ def tool_of(station):
 
 
 class Memory(NamedTuple):
-    """Arrays that the parts of a period share.
+    """Arrays shared by the parts of a period.
 
-    pose (4, 4): of the tool; felt (RESULTS,): the law's frame; missed (1 + MOST_MISSED,): unknown
-    cells, as `felt` fills it; met, kept, near, bends: of the tool's points, as `near_points.Grasp`
-    has them.
+    pose (4, 4): of the tool; `felt` (RESULTS,): the law's frame; missed (1 + MOST_MISSED,): unknown
+    cells, as from `feeling.felt`; `met`, `kept`, near, bends: of the tool's points, as in
+    `near_points.Grasp`.
     """
 
     pose: NDArray[np.float64]
@@ -124,7 +124,7 @@ class Memory(NamedTuple):
 
 @leaf
 def memory_of(station):
-    """What the parts of a session's period share."""
+    """Arrays shared by the parts of a session's period."""
     n_points = station.n_points
     return Memory(
         array_at(station.pose, (4, 4), np.float64),

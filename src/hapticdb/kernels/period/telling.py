@@ -1,4 +1,4 @@
-"""What a period tells others: where the tool is, its frame, what it touches, its counts."""
+"""Outputs of a period to other processes: tool pose, frame, touched objects, counts."""
 
 import math
 
@@ -16,15 +16,16 @@ from hapticdb.kernels.resident.fence import fence
 from hapticdb.kernels.rigid import length_at, moved, transform_of, turned
 
 HELD, FADING, CLUTCH_OPEN, IN_OBJECT, STALE, ANEW = 1, 2, 4, 8, 16, 32
-"""Bits of a frame's state, as `hapticdb.recording.frame.State` names them."""
+"""Bits of a frame's state, named in `hapticdb.recording.frame.State`."""
 
 
 @leaf
 def tell(session, hand, is_let_go, pose, center, radius, missed):
-    """Report tool, hand and the unknown cells of the last look on the session's row of the desk.
+    """Write a prefetch request: tool, hand and the unknown cells of the last query.
 
-    pose (4, 4), center (3,): of the tool; radius: of its farthest point; missed (1 + MOST_MISSED,)
-    as `felt` fills it. The row's sequence number is odd while the row is written.
+    session : a SESSION of the request queue, a seqlock: its sequence number is odd during a write;
+    pose (4, 4), center (3,): of the tool; radius : of its farthest point; missed (1 + MOST_MISSED,)
+    as from `feeling.felt`.
     """
     told, transform = session.told, transform_of(pose)
     x, y, z = moved(transform, center[0], center[1], center[2])
@@ -33,7 +34,7 @@ def tell(session, hand, is_let_go, pose, center, radius, missed):
     told.is_active = True
     told.tool[0], told.tool[1], told.tool[2] = x, y, z
     told.radius = radius
-    if not is_let_go:  # else cells around the tool stay wanted
+    if not is_let_go:  # else the request covers the tool's surroundings alone
         rx, ry, rz = turned(transform, center[0], center[1], center[2])
         at = hand.position
         x, y, z = at[0] + rx, at[1] + ry, at[2] + rz
@@ -49,10 +50,9 @@ def tell(session, hand, is_let_go, pose, center, radius, missed):
 
 @leaf
 def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
-    """Ask for the objects in the voxels that a placed shell hits: write these voxels' keys.
+    """Request the ids of the objects in the voxels hit by a placed shell: write the voxels' keys.
 
-    met (n_hits,): indices of the hits. If there are more than MOST_ASKED, every second, third, ...
-    hit is taken.
+    `met` (n_hits,): indices of the hits, decimated to at most MOST_ASKED.
     """
     step = max((n_hits + MOST_ASKED - 1) // MOST_ASKED, 1)
     count = 0
@@ -69,10 +69,10 @@ def name_voxels(session, shell, pose, place, bits, curve, met, n_hits):
 
 @leaf
 def list_touching(grasp, n_hits):
-    """Number of the points that touch, in grasp.met.
+    """Number of touching points, listed in `grasp.met`.
 
-    Where the tool lies in something these are the points that are in it. Their voxels may be free:
-    the fetching process looks around them.
+    For a loose tool (inside an object, without contacts) these are the points inside. Their voxels
+    may be free: the fetching process also searches around them.
     """
     if not grasp.follower.is_loose:
         return n_hits
@@ -142,7 +142,7 @@ def count(seat, servo, follower):
 
 @leaf
 def _bin_of(seconds):
-    """Bin of a time; a clock of a test may not agree with the system's."""
+    """Histogram bin of a time, clamped: with a test's clock a time may be negative."""
     return min(max(np.int64(seconds / TIME_BIN), np.int64(0)), np.int64(TIME_BINS))
 
 
@@ -157,7 +157,7 @@ def count_times(seat, lateness, elapsed):
 
 @leaf
 def show_contacts(seat, grasp, pose, spring):
-    """List the contacts on the board: their points and forces, world frame."""
+    """Publish points, m, and forces, N, of at most MOST_SHOWN contacts in the slot, world frame."""
     follower, points, transform = grasp.follower, grasp.shell.points, transform_of(pose)
     near, n_near = grasp.near[follower.side], 0 if follower.is_loose else follower.n_near
     stiffness = contact_stiffness(spring, grasp.place.size)
@@ -186,7 +186,7 @@ def show_contacts(seat, grasp, pose, spring):
 
 @leaf
 def show_objects(seat, session):
-    """Copy the ids of what is touched from the desk to the board."""
+    """Copy the ids of touched objects from the request queue to the slot."""
     n_objects = min(session.n_objects, np.int64(MOST_ASKED))
     for n in range(n_objects):
         seat.objects[n] = session.objects[n]
